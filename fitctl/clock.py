@@ -1,0 +1,67 @@
+"""Time: the machine's monotonic clock with absolute deadlines, and a virtual clock, one interface."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import time
+from typing import Protocol
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+
+
+class Clock(Protocol):
+    """What the loop needs of time."""
+
+    def now_s(self) -> float:
+        """Seconds since an arbitrary, fixed origin; never goes back."""
+        ...
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Return at `deadline_s`, or at once if it has passed."""
+        ...
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+class MonotonicClock:
+    """The machine's CLOCK_MONOTONIC; all processes of one machine share it."""
+
+    def __init__(self) -> None:
+        self._nanosleep = ctypes.CDLL(None, use_errno=True).clock_nanosleep
+
+    def now_s(self) -> float:
+        """Seconds since the machine's monotonic origin."""
+        return time.monotonic()
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Sleep to an absolute deadline, so that oversleeping once does not shift the next."""
+        seconds = int(deadline_s)
+        spec = _Timespec(seconds, int((deadline_s - seconds) * 1e9))
+        while True:
+            code = self._nanosleep(
+                _CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(spec), ctypes.c_void_p(None)
+            )
+            if code == 0:
+                return
+            if code != errno.EINTR:
+                raise OSError(code, os.strerror(code))
+
+
+class VirtualClock:
+    """A clock that stands still until it is told to go on: simulation and tests."""
+
+    def __init__(self, start_s: float = 0.0) -> None:
+        self._now_s = start_s
+
+    def now_s(self) -> float:
+        """The virtual time."""
+        return self._now_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Move the time on, at once."""
+        self._now_s = max(self._now_s, deadline_s)

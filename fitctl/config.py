@@ -1,0 +1,508 @@
+"""Rig files: TOML in, frozen and validated settings with units in their names out.
+
+Every key is required, so that a rig file shows everything that fitctl will use. A wrong file ends in a
+:class:`ConfigError` whose lines each name the file, the key and what is allowed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+ARCSEC_PER_RAD = 180 * 3600 / math.pi
+
+
+class ConfigError(Exception):
+    """A rig file that cannot be used; ``str()`` gives one line for each thing that is wrong."""
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+TimeoutS = Annotated[float, Field(gt=0, le=60)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Settings(BaseModel):
+    """A part of a rig file: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class AxisPair(Settings):
+    """One number for each axis."""
+
+    az: Finite
+    el: Finite
+
+
+class Range(Settings):
+    """A closed range."""
+
+    low: NonNegative
+    high: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Range:
+        if self.low >= self.high:
+            msg = "low must be below high"
+            raise ValueError(msg)
+        return self
+
+
+class Optics(Settings):
+    """Optics that all loops share."""
+
+    compressor_ratio: Positive
+    focal_length_m: Positive
+
+
+class GigeDevice(Settings):
+    """Where a GigE Vision camera answers."""
+
+    driver: Literal["gige"]
+    address: str
+    gvcp_port: Annotated[int, Field(ge=1, le=65535)]
+    packet_size_bytes: Annotated[int, Field(ge=576, le=9000)]
+    response_timeout_s: TimeoutS
+    heartbeat_s: Annotated[float, Field(ge=0.5, le=60)]
+
+
+class Camera(Settings):
+    """The focal plane and the camera that reads it."""
+
+    width_px: Annotated[int, Field(ge=8, le=4096)]
+    height_px: Annotated[int, Field(ge=8, le=4096)]
+    pixel_size_m: Annotated[float, Field(ge=1e-6, le=1e-3)]
+    frame_rate_hz: Annotated[float, Field(ge=1, le=2000)]
+    exposure_s: Positive
+    frame_delay_s: NonNegative
+    bias_dn: NonNegative
+    pixel_noise_dn: Positive
+    device: GigeDevice
+
+    @property
+    def period_s(self) -> float:
+        """Time between frames."""
+        return 1.0 / self.frame_rate_hz
+
+    @model_validator(mode="after")
+    def _exposure_fits(self) -> Camera:
+        if self.exposure_s > self.period_s:
+            msg = f"exposure_s must not pass the frame period, {self.period_s:g} s"
+            raise ValueError(msg)
+        return self
+
+
+class ServoSettings(Settings):
+    """The siderostat's position servo."""
+
+    rate_hz: Annotated[float, Field(ge=50, le=2000)]
+    gain_per_s: Positive
+    following_error_limit_rad: Positive
+    reading_timeout_s: TimeoutS
+
+
+class Cia402Device(Settings):
+    """A two-axis CANopen CiA 402 drive."""
+
+    driver: Literal["cia402"]
+    interface: str
+    channel: str
+    bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000]
+    node_id: Annotated[int, Field(ge=1, le=127)]
+    response_timeout_s: TimeoutS
+    drive_heartbeat_s: Annotated[float, Field(ge=0.01, le=10)]
+    master_heartbeat_timeout_s: Annotated[float, Field(ge=0.02, le=10)]
+
+
+class Siderostat(Settings):
+    """The coarse stage: geometry, limits, servo, amplifiers."""
+
+    encoder_counts_per_rev: Count
+    spur_gear_ratio: Positive
+    ball_screw_m_per_rad: Positive
+    lever_arm_m: Positive
+    travel_sky_arcsec: Positive
+    velocity_limit_rad_s: Positive
+    acceleration_limit_rad_s2: Positive
+    servo: ServoSettings
+    device: Cia402Device
+
+
+class ModbusDacDevice(Settings):
+    """A Modbus/TCP D/A converter: consecutive holding registers, one a channel."""
+
+    driver: Literal["modbus_dac"]
+    host: str
+    port: Annotated[int, Field(ge=1, le=65535)]
+    device_id: Annotated[int, Field(ge=0, le=247)]
+    first_register: Annotated[int, Field(ge=0, le=65535)]
+    full_scale_v: Positive
+    bits: Annotated[int, Field(ge=8, le=16)]
+    response_timeout_s: TimeoutS
+
+
+class Mdt693Device(Settings):
+    """A Thorlabs MDT693A or MDT693B."""
+
+    driver: Literal["mdt693"]
+    port: str
+    baud_rate: Count
+    response_timeout_s: TimeoutS
+    gain: Positive
+    limit_v: Annotated[float, Field(gt=0, le=151)]
+    poll_s: Annotated[float, Field(ge=0.2, le=60)]
+
+
+class Fsm(Settings):
+    """The fast steering mirror, its D/A and its piezo amplifier."""
+
+    stack_scale_m_per_v: Positive
+    stack_radius_m: Positive
+    beam_per_mirror: Positive
+    bias_v: Positive
+    range_rad: Positive
+    slew_v_per_s: Positive
+    dac: ModbusDacDevice
+    piezo: Mdt693Device
+
+    @model_validator(mode="after")
+    def _range_fits_the_dac(self) -> Fsm:
+        swing_v = self.stack_radius_m * self.range_rad / self.stack_scale_m_per_v
+        if self.bias_v - swing_v < 0 or self.bias_v + swing_v > self.dac.full_scale_v:
+            msg = (
+                f"range_rad needs {self.bias_v - swing_v:.3f} to {self.bias_v + swing_v:.3f} V, "
+                f"and the D/A gives 0 to {self.dac.full_scale_v:g} V; lower range_rad"
+            )
+            raise ValueError(msg)
+        return self
+
+
+class Acquisition(Settings):
+    """How the star is searched for, and when it counts as found or lost."""
+
+    search_radius_sky_arcsec: Positive
+    detection_sigma: Annotated[float, Field(ge=3, le=100)]
+    found_frames: Count
+    lost_frames: Count
+    field_overlap: Annotated[float, Field(ge=0.05, le=0.6)]
+    settle_s: NonNegative
+    confirm_timeout_s: Positive
+
+
+class Coarse(Settings):
+    """The siderostat's integrator, and when it hands over to the mirror."""
+
+    gain_rad_per_m: Positive
+    reach_fraction: Fraction
+    reach_frames: Count
+
+
+class Vernier(Settings):
+    """Which compensator drives the mirror."""
+
+    controller: Literal["eq20"]
+
+
+class Prefilter(Settings):
+    """The filter on commanded beam angle."""
+
+    time_constant_s: Positive
+
+
+class Loop(Settings):
+    """One stellar loop."""
+
+    target_px: AxisPair
+    star_flux_dn: Positive
+    flux_range: Range
+    requirement_px: Positive
+    siderostat: Siderostat
+    fsm: Fsm
+    acquisition: Acquisition
+    coarse: Coarse
+    vernier: Vernier
+    prefilter: Prefilter
+
+
+class Supervisor(Settings):
+    """Time limits and rates of the supervisor."""
+
+    frame_timeout_s: TimeoutS
+    late_tick_s: Positive
+    stall_s: Positive
+    safe_disable_after_s: NonNegative
+    telemetry_hz: Annotated[float, Field(ge=1, le=100)]
+
+
+class Service(Settings):
+    """Where the supervisor's sockets live."""
+
+    folder: str
+
+
+class Logging(Settings):
+    """The log: where, and how much may be lost."""
+
+    folder: str
+    chunk_bytes: Annotated[int, Field(ge=4096, le=16_777_216)]
+    flush_s: Annotated[float, Field(gt=0, le=60)]
+    queue_records: Annotated[int, Field(ge=16, le=1_000_000)]
+    compression: Literal["zstd", "lz4", "none"]
+
+
+class Hysteresis(Settings):
+    """Play operators of one stack."""
+
+    loop_width_fraction: Annotated[float, Field(ge=0, le=0.5)]
+    breakpoints_v: Annotated[list[NonNegative], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _ascending_from_zero(self) -> Hysteresis:
+        points = self.breakpoints_v
+        if points[0] != 0 or any(b <= a for a, b in zip(points, points[1:], strict=False)):
+            msg = "breakpoints_v must start at 0 and ascend"
+            raise ValueError(msg)
+        return self
+
+
+class Structure(Settings):
+    """Lightly damped modes of the mirror's mount."""
+
+    mode_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    damping: Annotated[float, Field(gt=0, lt=1)]
+    cross_axis: NonNegative
+    participation: Annotated[float, Field(ge=0, le=1)]
+
+
+class AirPath(Settings):
+    """Eq. 8: gain / (b1 s^2 + b2 s + 1)."""
+
+    gain_px: NonNegative
+    b1_s2: Positive
+    b2_s: Positive
+    relative_rms_px: NonNegative
+
+
+class Spot(Settings):
+    """One spot on the focal plane."""
+
+    name: str
+    offset_px: AxisPair
+    flux_dn: Positive
+    diameter_px: Positive
+
+
+class LoopPlant(Settings):
+    """What one loop's hardware truly is; nothing but mocks and simulation reads it."""
+
+    star_offset_sky_arcsec_max: NonNegative
+    backlash_sky_arcsec: NonNegative
+    amplifier_bandwidth_hz: Positive
+    hysteresis: Hysteresis
+    structure: Structure
+    air_path: AirPath
+    spots: Annotated[list[Spot], Field(min_length=1)]
+
+
+class PlantTruth(Settings):
+    """The simulated hardware."""
+
+    step_s: Annotated[float, Field(gt=0, le=1e-3)]
+    history_s: Annotated[float, Field(ge=1, le=3600)]
+    loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
+
+
+class DacMock(Settings):
+    """Settings of the mock D/A."""
+
+    watchdog_s: Positive
+    safe_v: NonNegative
+
+
+class Mdt693Mock(Settings):
+    """Settings of the mock piezo amplifier."""
+
+    model: Literal["MDT693A", "MDT693B"]
+    firmware: str
+    limit_switch_v: Literal[75, 100, 150]
+    reply_s: NonNegative
+
+
+class Mocks(Settings):
+    """Where the mock devices listen, always on 127.0.0.1; port 0 means any free one."""
+
+    gvcp_port: Port
+    slcan_port: Port
+    modbus_port: Port
+    mdt693_port: Port
+    bench_port: Port
+    dac: DacMock
+    mdt693: Mdt693Mock
+
+
+class Rig(Settings):
+    """A whole rig file. ``plant`` and ``mocks`` are for mock rigs; a rig of real hardware leaves them out."""
+
+    schema_version: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,40}$")]
+    description: str
+    optics: Optics
+    camera: Camera
+    loops: Annotated[dict[str, Loop], Field(min_length=1)]
+    supervisor: Supervisor
+    service: Service
+    logging: Logging
+    plant: PlantTruth | None = None
+    mocks: Mocks | None = None
+
+    @model_validator(mode="after")
+    def _names_agree(self) -> Rig:
+        for name, loop in self.loops.items():
+            if not (
+                0 <= loop.target_px.az < self.camera.width_px
+                and 0 <= loop.target_px.el < self.camera.height_px
+            ):
+                msg = (
+                    f"loops.{name}.target_px lies outside the camera's "
+                    f"{self.camera.width_px}x{self.camera.height_px} px"
+                )
+                raise ValueError(msg)
+        if self.plant is not None and set(self.plant.loops) != set(self.loops):
+            msg = f"plant.loops must name the same loops as loops: {', '.join(self.loops)}"
+            raise ValueError(msg)
+        return self
+
+    def mock_parts(self) -> tuple[PlantTruth, Mocks]:
+        """The sections that only mocks and simulation need.
+
+        Raises
+        ------
+        ConfigError
+            If this rig file describes hardware only.
+        """
+        if self.plant is None or self.mocks is None:
+            msg = (
+                f"rig {self.name}: sections plant and mocks are missing, so it can be neither mocked "
+                "nor simulated; copy them from rigs/fit-mock.toml"
+            )
+            raise ConfigError(msg)
+        return self.plant, self.mocks
+
+
+def default_rig_path() -> Path:
+    """The shipped default rig: beside the package in a checkout, inside it once installed."""
+    package = Path(__file__).parent
+    installed = package / "rigs" / "fit-mock.toml"
+    return installed if installed.exists() else package.parent / "rigs" / "fit-mock.toml"
+
+
+def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
+    """Read and validate a rig file.
+
+    Parameters
+    ----------
+    path : Path
+        The TOML file.
+    overrides : sequence of str
+        ``key.path=value`` texts that replace values of the file; the value is read as TOML, or as
+        plain text where it is not TOML.
+
+    Raises
+    ------
+    ConfigError
+        One line for each thing that is wrong: file, key, what is allowed.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        msg = f"{path}: no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+        raise ConfigError(msg) from None
+    except (OSError, UnicodeDecodeError) as error:
+        msg = f"{path}: cannot be read: {error}"
+        raise ConfigError(msg) from None
+    except tomllib.TOMLDecodeError as error:
+        msg = f"{path}: not TOML: {error}"
+        raise ConfigError(msg) from None
+    for override in overrides:
+        _override(document, override)
+    return rig_from_document(document, str(path))
+
+
+def rig_from_document(document: Mapping[str, Any], origin: str) -> Rig:
+    """Validate a rig that is already a dictionary; `origin` is what errors call it."""
+    try:
+        return Rig.model_validate(document)
+    except ValidationError as error:
+        lines = [_explain(origin, problem) for problem in error.errors()]
+        raise ConfigError("\n".join(lines)) from None
+
+
+def _override(document: dict[str, Any], text: str) -> None:
+    key, equals, value_text = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        msg = f"--set {text}: expected key.path=value, for example camera.frame_rate_hz=50.0"
+        raise ConfigError(msg)
+    try:
+        value = tomllib.loads(f"value = {value_text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = value_text
+    table: Any = document
+    for depth, part in enumerate(parts[:-1]):
+        table = table.setdefault(part, {}) if isinstance(table, dict) else None
+        if not isinstance(table, dict):
+            msg = f"--set {text}: {'.'.join(parts[: depth + 1])} is not a table"
+            raise ConfigError(msg)
+    table[parts[-1]] = value
+
+
+def _explain(origin: str, problem: Any) -> str:
+    location = [str(part) for part in problem["loc"]]
+    key = ".".join(location) or "the whole file"
+    if problem["type"] == "extra_forbidden":
+        allowed = _allowed_keys(location[:-1])
+        near = difflib.get_close_matches(location[-1], allowed, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        return f"{origin}: {key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
+    if problem["type"] == "missing":
+        return f"{origin}: {key}: is missing; rigs/fit-mock.toml shows every key with its unit"
+    message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    given = problem.get("input")
+    shown = f" (is {given!r})" if isinstance(given, str | int | float | list) else ""
+    return f"{origin}: {key}: {message}{shown}"
+
+
+def _allowed_keys(location: Sequence[str]) -> list[str]:
+    """The keys that the rig file may have at `location`, by walking the settings' own fields."""
+    annotation: Any = Rig
+    for part in location:
+        if isinstance(annotation, type) and issubclass(annotation, Settings):
+            annotation = annotation.model_fields[part].annotation
+        elif get_origin(annotation) in {dict, list}:
+            annotation = get_args(annotation)[-1]
+        annotation = _without_none(annotation)
+    return sorted(annotation.model_fields) if isinstance(annotation, type) else []
+
+
+def _without_none(annotation: Any) -> Any:
+    """``X`` of ``X | None`` and of ``Annotated[X, ...]``."""
+    if get_origin(annotation) is Annotated:
+        return get_args(annotation)[0]
+    options = [option for option in get_args(annotation) if option is not type(None)]
+    return options[0] if type(None) in get_args(annotation) else annotation

@@ -1,0 +1,1 @@
+"""What is computed each tick: from a frame to a command."""

@@ -1,0 +1,223 @@
+"""What the supervisor sees of the devices, and the errors that they raise.
+
+One folder a device beside this file. Each driver checks, times out and translates; none decides.
+Every call returns or raises within the device's time limit. A driver is used by one thread at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class DeviceError(Exception):
+    """Something is wrong with a device: which one, where, what was expected, what came, what to do.
+
+    Parameters
+    ----------
+    device : str
+        Its name for people, such as ``"D/A"``.
+    endpoint : str
+        Where it was spoken to, such as ``"127.0.0.1:502"``.
+    expected, got : str
+        What should have happened, and what did.
+    hint : str
+        The next step for the operator.
+    """
+
+    def __init__(self, device: str, endpoint: str, expected: str, got: str, hint: str = "") -> None:
+        self.device = device
+        self.endpoint = endpoint
+        self.expected = expected
+        self.got = got
+        self.hint = hint
+        text = f"{device} at {endpoint}: expected {expected}, got {got}"
+        super().__init__(f"{text}; {hint}" if hint else text)
+
+
+class DeviceUnreachable(DeviceError):
+    """Nothing answers at the endpoint, or the link broke."""
+
+
+class DeviceTimeout(DeviceError):
+    """The device is there but did not answer in time."""
+
+
+class DeviceRefused(DeviceError):
+    """The device answered that it will not: an exception code, an abort, access denied."""
+
+
+class DeviceProtocolError(DeviceError):
+    """An answer that the protocol does not allow."""
+
+
+class DeviceFault(DeviceError):
+    """The device reports a fault of its own."""
+
+
+class DeviceMismatch(DeviceError):
+    """The device works, but is not set as the rig file says."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceIdentity:
+    """Who answered."""
+
+    maker: str
+    model: str
+    serial: str
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One camera frame.
+
+    Attributes
+    ----------
+    number : int
+        Counts exposures; a gap is a lost frame.
+    mid_exposure_s : float
+        Host's monotonic time of the middle of the exposure.
+    received_s : float
+        Host's monotonic time at which the frame was complete.
+    image : uint16 array, shape (height, width)
+    """
+
+    number: int
+    mid_exposure_s: float
+    received_s: float
+    image: NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCounts:
+    """Since the stream was started."""
+
+    frames: int
+    lost: int
+    packets_lost: int
+
+
+class CameraDriver(Protocol):
+    """A camera that streams frames."""
+
+    def open(self) -> DeviceIdentity:
+        """Take control and check that the device fits the rig file."""
+        ...
+
+    def start(self) -> None:
+        """Start the stream."""
+        ...
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        """The next complete frame, oldest first; None when none came in time."""
+        ...
+
+    def counts(self) -> CameraCounts:
+        """Frames and losses so far; may be called from any thread."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the stream."""
+        ...
+
+    def close(self) -> None:
+        """Give up control; safe to call twice and after a failure."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ServoReading:
+    """What the two amplifiers said in one servo period.
+
+    Attributes
+    ----------
+    time_s : float
+        Host's monotonic time at which the encoders were read.
+    position_rad : float array, shape (2,)
+        Motor angles, azimuth and elevation.
+    enabled : bool
+        Both axes follow velocity commands.
+    fault : str
+        Empty, or what the amplifiers report.
+    """
+
+    time_s: float
+    position_rad: NDArray[np.float64]
+    enabled: bool
+    fault: str
+
+
+class ServoAmplifiers(Protocol):
+    """Both axes' amplifiers in velocity mode, with their encoders."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect and configure; nothing moves."""
+        ...
+
+    def enable(self) -> None:
+        """Power both axes at zero velocity. Raises DeviceFault when an axis refuses."""
+        ...
+
+    def disable(self) -> None:
+        """Take power from both axes."""
+        ...
+
+    def reset_fault(self) -> None:
+        """Clear a latched fault. Raises DeviceFault if it stays."""
+        ...
+
+    def exchange(self, velocity_rad_s: NDArray[np.float64]) -> ServoReading | None:
+        """One servo period: command both motors, read both encoders.
+
+        Returns None when no reading came within the period; the caller judges how often it may.
+        """
+        ...
+
+    def close(self) -> None:
+        """Disable if possible and disconnect; safe to call twice and after a failure."""
+        ...
+
+
+class MirrorDac(Protocol):
+    """The three D/A channels behind the fast steering mirror."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect; outputs stay as they are."""
+        ...
+
+    def write_v(self, volts: NDArray[np.float64]) -> None:
+        """Set all three channels at once; shape (3,), stack 1 first."""
+        ...
+
+    def read_v(self) -> NDArray[np.float64]:
+        """Read what the channels are set to; shape (3,)."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; outputs stay as they are. Safe to call twice and after a failure."""
+        ...
+
+
+class PiezoAmplifier(Protocol):
+    """The high-voltage amplifier between D/A and stacks; slow, never inside the tick."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect and check the voltage limit against the rig file. Raises DeviceMismatch."""
+        ...
+
+    def stack_volts(self) -> NDArray[np.float64]:
+        """Measured output, shape (3,), stack 1 first, at the stack."""
+        ...
+
+    def limit_v(self) -> float:
+        """The voltage-limit switch as the device reports it."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; safe to call twice and after a failure."""
+        ...

@@ -1,0 +1,1 @@
+"""Records and their schemas, the recorder process, and reading logs back."""

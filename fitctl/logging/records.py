@@ -1,0 +1,169 @@
+"""What the supervisor reports, as plain structures: the log, the console and the scripts all read these.
+
+Times named ``time_s`` are the host's monotonic clock; :class:`RunInfo` carries the offset to wall time.
+A field's unit is in its name; a value that does not exist at a tick is NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+RECORD_VERSION = 1
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True, tag=True):
+    """The common base: everything that is recorded has a time."""
+
+    time_s: float
+
+
+class RunInfo(Record):
+    """The first record of a run: what is needed to understand all others."""
+
+    wall_minus_monotonic_s: float
+    rig_name: str
+    rig_json: str
+    versions: dict[str, str]
+    scheduling: str
+    random_seed: int | None = None
+
+
+class Tick(Record):
+    """One tick of one loop: a frame came (or did not), and a command was made from it."""
+
+    loop: str
+    number: int
+    mode: str
+    mode_number: int
+    mid_exposure_s: float
+    frame_age_s: float
+    compute_s: float
+    late: bool
+    frames_lost: int
+    star_visible: bool
+    star_az_px: float
+    star_el_px: float
+    star_flux_dn: float
+    window_az_px: int
+    window_el_px: int
+    target_az_px: float
+    target_el_px: float
+    error_az_px: float
+    error_el_px: float
+    fsm_az_rad: float
+    fsm_el_rad: float
+    fsm_range_fraction: float
+    fsm_saturated: bool
+    stack1_v: float
+    stack2_v: float
+    stack3_v: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+    siderostat_setpoint_az_rad: float
+    siderostat_setpoint_el_rad: float
+    siderostat_az_sky_arcsec: float
+    siderostat_el_sky_arcsec: float
+    search_progress: float
+
+
+class FrameRecord(Record):
+    """One whole camera frame; ``data`` is little-endian 16 bit, row by row. ``time_s`` is mid-exposure."""
+
+    camera: str
+    number: int
+    width_px: int
+    height_px: int
+    data: bytes
+
+
+class ModeChange(Record):
+    """A loop went from one mode to another."""
+
+    loop: str
+    source: str
+    target: str
+    target_number: int
+    trigger: str
+    reason: str
+
+
+class Event(Record):
+    """Something that an operator should read."""
+
+    severity: Literal["info", "warning", "error"]
+    source: str
+    message: str
+
+
+class DeviceHealth(Record):
+    """How one device is, about once a second."""
+
+    device: str
+    endpoint: str
+    state: Literal["ok", "fault", "closed"]
+    identity: str
+    detail: str
+
+
+class PiezoReading(Record):
+    """Measured stack voltages, about once a second."""
+
+    loop: str
+    stack1_v: float
+    stack2_v: float
+    stack3_v: float
+    limit_v: float
+
+
+class LoopTiming(Record):
+    """Timing over the last second: frame loop and position servo."""
+
+    loop: str
+    ticks: int
+    late_ticks: int
+    frames_lost: int
+    compute_median_s: float
+    compute_worst_s: float
+    frame_age_median_s: float
+    frame_age_worst_s: float
+    servo_periods: int
+    servo_late_median_s: float
+    servo_late_worst_s: float
+    servo_missed: int
+    stalls: int
+    worst_stall_s: float
+
+
+class RecorderStatus(Record):
+    """What the recorder has done so far."""
+
+    path: str
+    records: int
+    lost: int
+    bytes_written: int
+
+
+AnyRecord = (
+    RunInfo
+    | Tick
+    | FrameRecord
+    | ModeChange
+    | Event
+    | DeviceHealth
+    | PiezoReading
+    | LoopTiming
+    | RecorderStatus
+)
+
+
+class Envelope(msgspec.Struct, frozen=True, array_like=True):
+    """A record on its way to the recorder.
+
+    ``sequence`` counts every record offered, so that the recorder sees a gap as records lost.
+    """
+
+    version: int
+    sequence: int
+    record: AnyRecord

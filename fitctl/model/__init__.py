@@ -1,0 +1,1 @@
+"""What the physics is: pure numerics, without I/O, threads or clocks."""

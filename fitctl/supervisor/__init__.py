@@ -1,0 +1,1 @@
+"""Modes, the loop, and the service through which consoles and commands reach them."""

@@ -1,0 +1,111 @@
+"""What travels between the supervisor and its consoles: one schema for commands, replies and telemetry."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from fitctl.logging.records import (
+    DeviceHealth,
+    Event,
+    FrameRecord,
+    LoopTiming,
+    ModeChange,
+    PiezoReading,
+    RecorderStatus,
+    Tick,
+)
+
+PROTOCOL_VERSION = 1
+
+
+class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
+    """The common base of commands; ``loop`` is empty for all loops."""
+
+    version: int = PROTOCOL_VERSION
+    loop: str = ""
+
+
+class Standby(Command):
+    """From OFF: connect and enable all devices, then STANDBY."""
+
+
+class Acquire(Command):
+    """Search for the star, pull it in, hold it."""
+
+
+class Hold(Command):
+    """Stop tracking where the stages are: STANDBY."""
+
+
+class Stop(Command):
+    """SAFE, at once, from every mode."""
+
+
+class Recover(Command):
+    """From SAFE: reconnect what is lost, reset faults, then STANDBY."""
+
+
+class Off(Command):
+    """From STANDBY or SAFE: disable the amplifiers and let go of the devices."""
+
+
+class SetTarget(Command):
+    """Move the point where the star is held, through the prefilter."""
+
+    az_px: float
+    el_px: float
+
+
+class Status(Command):
+    """Ask for one telemetry message."""
+
+
+class Shutdown(Command):
+    """SAFE, OFF, then end the supervisor process."""
+
+
+AnyCommand = Standby | Acquire | Hold | Stop | Recover | Off | SetTarget | Status | Shutdown
+
+
+class Reply(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to every command; ``text`` says why not, and what to do."""
+
+    accepted: bool
+    text: str = ""
+
+
+class LoopState(msgspec.Struct, frozen=True, kw_only=True):
+    """One loop as consoles show it."""
+
+    name: str
+    mode: str
+    since_s: float
+    requirement_px: float
+    usable_commands: list[str]
+
+
+class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
+    """Sent `telemetry_hz` times a second. Ticks, events and mode changes since the last one; the rest is newest."""
+
+    version: int = PROTOCOL_VERSION
+    sequence: int
+    time_s: float
+    wall_minus_monotonic_s: float
+    rig_name: str
+    pid: int
+    loops: list[LoopState]
+    ticks: list[Tick]
+    events: list[Event]
+    mode_changes: list[ModeChange]
+    frame: FrameRecord | None
+    devices: list[DeviceHealth]
+    piezo: list[PiezoReading]
+    timing: list[LoopTiming]
+    recorder: RecorderStatus | None
+    records_lost: int
+    scheduling: str
+
+
+Mode = Literal["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE"]
