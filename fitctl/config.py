@@ -7,6 +7,7 @@ Every key is required, so that a rig file shows everything that fitctl will use.
 from __future__ import annotations
 
 import difflib
+import itertools
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -269,13 +270,14 @@ class Logging(Settings):
 class Hysteresis(Settings):
     """Play operators of one stack."""
 
+    full_swing_stroke_m: Positive
     loop_width_fraction: Annotated[float, Field(ge=0, le=0.5)]
     breakpoints_v: Annotated[list[NonNegative], Field(min_length=2)]
 
     @model_validator(mode="after")
     def _ascending_from_zero(self) -> Hysteresis:
         points = self.breakpoints_v
-        if points[0] != 0 or any(b <= a for a, b in zip(points, points[1:], strict=False)):
+        if points[0] != 0 or any(b <= a for a, b in itertools.pairwise(points)):
             msg = "breakpoints_v must start at 0 and ascend"
             raise ValueError(msg)
         return self
@@ -344,16 +346,22 @@ class Mdt693Mock(Settings):
     reply_s: NonNegative
 
 
+class LoopMocks(Settings):
+    """Where the mock devices of one loop listen, and how they are."""
+
+    slcan_port: Port
+    modbus_port: Port
+    mdt693_port: Port
+    dac: DacMock
+    mdt693: Mdt693Mock
+
+
 class Mocks(Settings):
     """Where the mock devices listen, always on 127.0.0.1; port 0 means any free one."""
 
     gvcp_port: Port
-    slcan_port: Port
-    modbus_port: Port
-    mdt693_port: Port
     bench_port: Port
-    dac: DacMock
-    mdt693: Mdt693Mock
+    loops: Annotated[dict[str, LoopMocks], Field(min_length=1)]
 
 
 class Rig(Settings):
@@ -383,9 +391,10 @@ class Rig(Settings):
                     f"{self.camera.width_px}x{self.camera.height_px} px"
                 )
                 raise ValueError(msg)
-        if self.plant is not None and set(self.plant.loops) != set(self.loops):
-            msg = f"plant.loops must name the same loops as loops: {', '.join(self.loops)}"
-            raise ValueError(msg)
+        for section, part in (("plant", self.plant), ("mocks", self.mocks)):
+            if part is not None and set(part.loops) != set(self.loops):
+                msg = f"{section}.loops must name the same loops as loops: {', '.join(self.loops)}"
+                raise ValueError(msg)
         return self
 
     def mock_parts(self) -> tuple[PlantTruth, Mocks]:

@@ -221,3 +221,20 @@ class PiezoAmplifier(Protocol):
     def close(self) -> None:
         """Disconnect; safe to call twice and after a failure."""
         ...
+
+
+@dataclass(frozen=True)
+class LoopDevices:
+    """What one stellar loop acts through."""
+
+    amplifiers: ServoAmplifiers
+    dac: MirrorDac
+    piezo: PiezoAmplifier
+
+
+@dataclass(frozen=True)
+class Devices:
+    """Everything that a rig has."""
+
+    camera: CameraDriver
+    loops: dict[str, LoopDevices]

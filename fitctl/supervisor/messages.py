@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import msgspec
 
 from fitctl.logging.records import (
@@ -66,7 +64,13 @@ class Shutdown(Command):
     """SAFE, OFF, then end the supervisor process."""
 
 
-AnyCommand = Standby | Acquire | Hold | Stop | Recover | Off | SetTarget | Status | Shutdown
+class RecorderReport(Command):
+    """The recorder tells what it has written."""
+
+    status: RecorderStatus
+
+
+AnyCommand = Standby | Acquire | Hold | Stop | Recover | Off | SetTarget | Status | Shutdown | RecorderReport
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
@@ -83,6 +87,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     mode: str
     since_s: float
     requirement_px: float
+    sky_arcsec_per_px: float
     usable_commands: list[str]
 
 
@@ -107,5 +112,3 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     records_lost: int
     scheduling: str
 
-
-Mode = Literal["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE"]

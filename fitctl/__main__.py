@@ -1,0 +1,5 @@
+"""``python -m fitctl``."""
+
+from fitctl.cli import main
+
+main()

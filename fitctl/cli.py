@@ -1,0 +1,177 @@
+"""Commands. Each is short: it reads its options and calls the room that does the work.
+
+What is slow to import is imported inside the command that needs it, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+
+app = typer.Typer(
+    name="fitctl",
+    help="Points starlight: acquires a star, pulls it in and holds it to a fraction of a pixel.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+RigOption = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Replace a value of the rig file; may be repeated."
+    ),
+]
+SeedOption = Annotated[int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+WithParentOption = Annotated[
+    bool, typer.Option("--with-parent", hidden=True, help="End when the parent process ends.")
+]
+
+
+def _rig(path: Path | None, overrides: list[str] | None) -> Rig:
+    return load_rig(path or default_rig_path(), overrides or ())
+
+
+def _rig_arguments(path: Path | None, overrides: list[str] | None) -> list[str]:
+    """The same rig for another fitctl process."""
+    arguments = ["--rig", str(path or default_rig_path())]
+    for override in overrides or ():
+        arguments += ["--set", override]
+    return arguments
+
+
+@app.command()
+def demo(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    seed: SeedOption = 0,
+    duration: Annotated[
+        float, typer.Option(min=1.0, help="Seconds to run without a console.")
+    ] = 60.0,
+    headless: Annotated[
+        bool, typer.Option("--headless", help="No console, also on a terminal.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the whole instrument on mock devices: see a star acquired and held.
+
+    On a terminal the console comes up. Without one, or with --headless, the same runs for a while and
+    a summary is printed at the end.
+    """
+    from fitctl.commands import run_demo
+
+    settings = _rig(rig, overrides)
+    console = not (headless or as_json) and sys.stdin.isatty() and sys.stdout.isatty()
+    arguments = (rig or default_rig_path(), overrides or [], seed)
+    raise typer.Exit(run_demo(settings, *arguments, duration, console=console, as_json=as_json))
+
+
+@app.command()
+def mocks(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+    free_ports: Annotated[
+        bool, typer.Option("--free-ports", help="Take any free port for every device.")
+    ] = False,
+    with_parent: WithParentOption = False,
+) -> None:
+    """Serve the rig's mock devices on 127.0.0.1 until Ctrl-C, and print where they listen."""
+    from fitctl.commands import run_mocks
+
+    settings = _rig(rig, overrides)
+    run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, with_parent=with_parent)
+
+
+@app.command()
+def run(
+    rig: RigOption = None, overrides: SetOption = None, with_parent: WithParentOption = False
+) -> None:
+    """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
+    from fitctl.commands import run_rig
+
+    run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), with_parent=with_parent)
+
+
+@app.command()
+def console(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Attach an operator console to the running supervisor of a rig."""
+    from fitctl.commands import run_console
+
+    run_console(_rig(rig, overrides))
+
+
+@app.command()
+def send(
+    command: Annotated[
+        str, typer.Argument(help="standby, acquire, hold, stop, recover, off, status or shutdown.")
+    ],
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    loop: Annotated[str, typer.Option(help="One loop by name; without it, all.")] = "",
+) -> None:
+    """Give one command to the running supervisor of a rig."""
+    from fitctl.commands import send_command
+
+    raise typer.Exit(send_command(_rig(rig, overrides), command, loop))
+
+
+@app.command()
+def simulate(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    seed: SeedOption = 0,
+    duration: Annotated[float, typer.Option(min=1.0, help="Seconds of virtual time.")] = 120.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Acquire and hold on the virtual clock: same supervisor and plant, no wires, much faster."""
+    from fitctl.commands import run_simulation
+
+    raise typer.Exit(run_simulation(_rig(rig, overrides), seed, duration, as_json=as_json))
+
+
+@app.command()
+def check(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Read a rig file and say whether it is well."""
+    settings = _rig(rig, overrides)
+    loops = ", ".join(settings.loops)
+    typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
+
+
+@app.command()
+def log(path: Annotated[Path, typer.Argument(help="An MCAP file, finished or not.")]) -> None:
+    """Say what a log holds."""
+    from fitctl.commands import show_log
+
+    show_log(path)
+
+
+@app.command(hidden=True)
+def record(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Record what a supervisor sends; the supervisor starts this by itself."""
+    from fitctl.commands import run_recorder
+
+    run_recorder(_rig(rig, overrides))
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
+    try:
+        return app(arguments)
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,321 @@
+"""What the commands do, between their options (:mod:`fitctl.cli`) and the rooms that do the work."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from fitctl import demo as demos
+from fitctl.config import ConfigError, Rig
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import log_info
+from fitctl.logging.records import RecorderStatus
+from fitctl.processes import end_with_parent, ended_by_signals
+from fitctl.supervisor import messages
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.endpoints import RECORDS_SOCKET, service_folder
+from fitctl.supervisor.messages import Telemetry
+
+FAILED = 1
+_REPORT_TIMEOUT_S = 0.5
+
+COMMANDS: dict[str, type[messages.Command]] = {
+    "standby": messages.Standby,
+    "acquire": messages.Acquire,
+    "hold": messages.Hold,
+    "stop": messages.Stop,
+    "recover": messages.Recover,
+    "off": messages.Off,
+    "status": messages.Status,
+    "shutdown": messages.Shutdown,
+}
+
+
+def _parent(with_parent: bool) -> int | None:
+    return os.getppid() if with_parent else None
+
+
+def _progress() -> Progress:
+    """A progress line on standard error, so that results alone are on standard output."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=False,
+    )
+
+
+# ---------------------------------------------------------------- demo
+
+
+def run_demo(
+    rig: Rig,
+    rig_path: Path,
+    overrides: Sequence[str],
+    seed: int,
+    duration_s: float,
+    *,
+    console: bool,
+    as_json: bool,
+) -> int:
+    """Run the demo; returns the exit status."""
+    rig.mock_parts()
+    with ended_by_signals(_interrupt):
+        try:
+            with demos.instrument(rig_path, overrides, seed) as running:
+                if console:
+                    return _demo_with_console(running)
+                return _demo_headless(rig, running, duration_s, as_json=as_json)
+        except (demos.DemoError, ConnectionError) as error:
+            typer.echo(f"demo: {error}", err=True)
+            return FAILED
+
+
+def _interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def _demo_with_console(running: demos.Instrument) -> int:
+    from fitctl.tui.app import ConsoleApp
+
+    thread = demos.acquire_in_background(running)
+    ConsoleApp(Client(running.folder), quit_shuts_down=True).run()
+    thread.join(timeout=5.0)
+    status = running.client.receive(1.0)
+    if status is not None and status.recorder is not None:
+        typer.echo(f"log: {status.recorder.path}")
+    return 0
+
+
+def _demo_headless(
+    rig: Rig, running: demos.Instrument, duration_s: float, *, as_json: bool
+) -> int:
+    demos.acquire(running)
+    with _progress() as progress:
+        task = progress.add_task("starting", total=duration_s)
+
+        def show(gone_s: float, telemetry: Telemetry) -> None:
+            progress.update(task, completed=gone_s, description=_progress_text(telemetry))
+
+        course = demos.watch(running, duration_s, show)
+    results = {name: demos.summary(rig, running, course, name) for name in rig.loops}
+    if as_json:
+        # One loop: its summary. Several: one for each, by name.
+        typer.echo(
+            demos.to_json(next(iter(results.values())) if len(results) == 1 else results)
+        )
+    else:
+        for name, result in results.items():
+            typer.echo(_summary_text(name, result))
+    held = all(not math.isnan(result["vernier_s"]) for result in results.values())
+    return 0 if held else FAILED
+
+
+def _progress_text(telemetry: Telemetry) -> str:
+    parts = []
+    for loop in telemetry.loops:
+        ticks = [t for t in telemetry.ticks if t.loop == loop.name and t.star_visible]
+        error = (
+            f" az {ticks[-1].error_az_px:+.3f} el {ticks[-1].error_el_px:+.3f} px" if ticks else ""
+        )
+        parts.append(f"{loop.name} {loop.mode:<11}{error:<28}")
+    return "; ".join(parts)
+
+
+def _summary_text(name: str, result: dict[str, Any]) -> str:
+    rms, measured, arcsec = result["rms_px"], result["measured_rms_px"], result["rms_arcsec"]
+    lines = [
+        f"loop {name}",
+        f"  star found after     {result['acquired_s']:8.1f} s",
+        f"  vernier after        {result['vernier_s']:8.1f} s",
+        f"  true residual RMS    az {rms['az']:.4f} px, el {rms['el']:.4f} px"
+        f" (az {arcsec['az']:.3f}, el {arcsec['el']:.3f} arcsec on the sky)"
+        f" over the last {result['judged_s']:.0f} s",
+        f"  measured RMS         az {measured['az']:.4f} px, el {measured['el']:.4f} px",
+        f"  frames               {result['frames']} ({result['frames_lost']} lost),"
+        f" {result['late_ticks']} late ticks, {result['records_lost']} records lost",
+        f"  log                  {result['log']}",
+    ]
+    if result["machine_stalls"]:
+        lines.insert(
+            -1,
+            f"  this machine stalled {result['machine_stalls']} times,"
+            f" {result['worst_stall_s'] * 1e3:.0f} ms at worst",
+        )
+    return "\n".join(lines)
+
+
+# ---------------------------------------------------------------- processes
+
+
+def run_mocks(
+    rig: Rig, seed: int, *, as_json: bool, free_ports: bool, with_parent: bool
+) -> None:
+    """Serve the mock testbed until a signal comes."""
+    if free_ports:
+        rig = _with_free_ports(rig)
+    end_with_parent(_parent(with_parent))
+    asyncio.run(_serve_mocks(rig, seed, as_json=as_json))
+
+
+def _with_free_ports(rig: Rig) -> Rig:
+    _, mocks = rig.mock_parts()
+    loops = {
+        name: loop.model_copy(update={"slcan_port": 0, "modbus_port": 0, "mdt693_port": 0})
+        for name, loop in mocks.loops.items()
+    }
+    free = mocks.model_copy(update={"gvcp_port": 0, "bench_port": 0, "loops": loops})
+    return rig.model_copy(update={"mocks": free})
+
+
+async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
+    from fitctl.mocks.testbed import Testbed
+
+    ending = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ending.set)
+    testbed = Testbed(rig, seed)
+    try:
+        endpoints = await testbed.start()
+    except OSError as error:
+        await testbed.stop()
+        msg = f"mocks: a port is taken: {error}; choose others with --set, or use --free-ports"
+        raise ConfigError(msg) from None
+    if as_json:
+        print(demos.to_json(endpoints), flush=True)
+    else:
+        width = max(map(len, endpoints))
+        for key, value in endpoints.items():
+            print(f"{key:<{width}}  {value}", flush=True)
+    await ending.wait()
+    await testbed.stop()
+
+
+def run_rig(rig: Rig, rig_arguments: Sequence[str], *, with_parent: bool) -> None:
+    """Supervise a rig."""
+    from fitctl.supervisor.run import run_supervisor
+
+    end_with_parent(_parent(with_parent))
+    run_supervisor(
+        rig,
+        ["record", *rig_arguments],
+        lambda folder: print(f"supervising {rig.name}; sockets in {folder}", flush=True),
+    )
+
+
+def run_recorder(rig: Rig) -> None:
+    """Record until the supervisor ends us, or is gone."""
+    from fitctl.logging.recorder import record
+
+    folder = service_folder(rig)
+    client = Client(folder)
+
+    def report(status: RecorderStatus) -> None:
+        try:
+            client.send(messages.RecorderReport(status=status), _REPORT_TIMEOUT_S)
+        except ConnectionError:
+            return  # no supervisor to tell; the log has it all the same
+
+    stop = threading.Event()
+    with ended_by_signals(stop.set):
+        try:
+            record(
+                f"ipc://{folder / RECORDS_SOCKET}",
+                rig.logging,
+                rig_name=rig.name,
+                folder=Path(rig.logging.folder).expanduser(),
+                stop=stop,
+                on_status=report,
+            )
+        except LogError as error:
+            raise ConfigError(str(error)) from None
+        finally:
+            client.close()
+
+
+# ---------------------------------------------------------------- a running instrument
+
+
+def run_console(rig: Rig) -> None:
+    """Attach a console."""
+    from fitctl.tui.app import ConsoleApp
+
+    ConsoleApp(Client(service_folder(rig))).run()
+
+
+def send_command(rig: Rig, name: str, loop: str) -> int:
+    """Give one command and print the answer; returns the exit status."""
+    if name not in COMMANDS:
+        msg = f"send: {name} is no command; there are {', '.join(COMMANDS)}"
+        raise ConfigError(msg)
+    client = Client(service_folder(rig))
+    try:
+        reply = client.send(COMMANDS[name](loop=loop))
+    except ConnectionError as error:
+        typer.echo(f"send: {error}", err=True)
+        return FAILED
+    finally:
+        client.close()
+    answer = reply.text or ("accepted" if reply.accepted else "refused")
+    typer.echo(answer, err=not reply.accepted)
+    return 0 if reply.accepted else FAILED
+
+
+# ---------------------------------------------------------------- without an instrument
+
+
+def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
+    """Simulate and print the result; returns the exit status."""
+    from fitctl.supervisor.simulate import simulate
+
+    rig.mock_parts()
+    with _progress() as progress:
+        task = progress.add_task("simulating", total=1.0)
+        results = simulate(
+            rig, seed, duration_s, on_progress=lambda part: progress.update(task, completed=part)
+        )
+        progress.update(task, completed=1.0)
+    plain = {name: result._asdict() for name, result in results.items()}
+    if as_json:
+        typer.echo(demos.to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
+    else:
+        for name, result in results.items():
+            rms, measured = result.rms_px, result.measured_rms_px
+            typer.echo(
+                f"loop {name}: star found after {result.acquired_s:.1f} s, vernier after "
+                f"{result.vernier_s:.1f} s\n"
+                f"  true residual RMS  az {rms['az']:.4f} px, el {rms['el']:.4f} px"
+                f" over {result.judged_s:.0f} s\n"
+                f"  measured RMS       az {measured['az']:.4f} px, el {measured['el']:.4f} px\n"
+                f"  speed              {result.speed_x:.0f}x real time"
+            )
+    return 0 if all(not math.isnan(result.vernier_s) for result in results.values()) else FAILED
+
+
+def show_log(path: Path) -> None:
+    """Print what a log holds."""
+    try:
+        info = log_info(path)
+    except LogError as error:
+        raise ConfigError(str(error)) from None
+    state = "finished" if info.finished else "not finished (cut off, or still being written)"
+    start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(info.start_s))
+    typer.echo(f"{info.path}: {state}\nfrom {start}, {info.duration_s:.1f} s")
+    width = max(map(len, info.counts), default=0)
+    for topic, count in sorted(info.counts.items()):
+        typer.echo(f"  {topic:<{width}}  {count}")
+
+

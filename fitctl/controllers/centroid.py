@@ -1,0 +1,111 @@
+"""Where the star is on a frame: centre of gravity over a window (Eq. 7), and a finder over the whole frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Camera, Loop
+
+HALF_WINDOW_PX = 3
+_LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
+_MAX_CANDIDATES = 6
+
+
+class Star(NamedTuple):
+    """A star on a frame.
+
+    Attributes
+    ----------
+    az_px, el_px : float
+        Centre of gravity, global pixel coordinates.
+    flux_dn : float
+        Sum over the window, bias subtracted.
+    window_az_px, window_el_px : int
+        Centre of the 7x7 window.
+    """
+
+    az_px: float
+    el_px: float
+    flux_dn: float
+    window_az_px: int
+    window_el_px: int
+
+
+class StarSensor:
+    """Finds one loop's pointing spot.
+
+    Parameters
+    ----------
+    camera : Camera
+    loop : Loop
+        Its flux range tells the pointing spot from fringe spots and hot pixels.
+    """
+
+    def __init__(self, camera: Camera, loop: Loop) -> None:
+        self._bias_dn = camera.bias_dn
+        self._threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
+        self._flux_low_dn = loop.flux_range.low * loop.star_flux_dn
+        self._flux_high_dn = loop.flux_range.high * loop.star_flux_dn
+        self._largest_az_px = camera.width_px - 1 - HALF_WINDOW_PX
+        self._largest_el_px = camera.height_px - 1 - HALF_WINDOW_PX
+
+    def measure(
+        self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
+    ) -> Star | None:
+        """Eq. 7 over the window nearest to the given centre; None when this loop's star is not in it."""
+        return self._accepted(self._centroid(image, window_az_px, window_el_px))
+
+    def find(self, image: NDArray[np.uint16]) -> Star | None:
+        """Look over the whole frame, brightest spot first; None when this loop's star is not there."""
+        search = image.astype(np.float64)
+        for _ in range(_MAX_CANDIDATES):
+            el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
+            if search[el_px, az_px] - self._bias_dn < self._threshold_dn:
+                return None
+            candidate = self._centroid(image, az_px, el_px)
+            if candidate is not None:
+                # Once more about its own centre, so that the window does not cut the spot.
+                candidate = self._centroid(image, candidate.az_px, candidate.el_px)
+            star = self._accepted(candidate)
+            if star is not None and self._is_centred(star):
+                return star
+            search[
+                max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
+                max(0, az_px - HALF_WINDOW_PX) : az_px + HALF_WINDOW_PX + 1,
+            ] = 0.0
+        return None
+
+    def _centroid(
+        self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
+    ) -> Star | None:
+        az = min(max(round(window_az_px), HALF_WINDOW_PX), self._largest_az_px)
+        el = min(max(round(window_el_px), HALF_WINDOW_PX), self._largest_el_px)
+        window = (
+            image[
+                el - HALF_WINDOW_PX : el + HALF_WINDOW_PX + 1,
+                az - HALF_WINDOW_PX : az + HALF_WINDOW_PX + 1,
+            ]
+            - self._bias_dn
+        )
+        columns = window.sum(axis=0)
+        flux_dn = float(columns.sum())
+        if flux_dn <= 0:
+            return None
+        az_px = az + float(columns @ _LEVER_PX) / flux_dn
+        el_px = el + float(window.sum(axis=1) @ _LEVER_PX) / flux_dn
+        return Star(az_px, el_px, flux_dn, az, el)
+
+    def _accepted(self, star: Star | None) -> Star | None:
+        if star is None or not self._flux_low_dn <= star.flux_dn <= self._flux_high_dn:
+            return None
+        return star
+
+    def _is_centred(self, star: Star) -> bool:
+        """A spot cut by the frame's edge has its centre of gravity away from the window's centre."""
+        return (
+            abs(star.az_px - star.window_az_px) <= 1.0
+            and abs(star.el_px - star.window_el_px) <= 1.0
+        )

@@ -1,0 +1,50 @@
+"""Where the star falls when no frame shows it: from siderostat encoders and mirror voltages (Eq. 5)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.model.optics import Scales
+
+Floats = NDArray[np.float64]
+
+
+class StarEstimator:
+    """Remembers where the star would fall with both stages at zero, and adds what the stages do.
+
+    Its error is that of the encoders behind the backlash and of the voltages before the hysteresis:
+    about half a pixel, enough to search and to bridge lost frames.
+
+    Parameters
+    ----------
+    scale : Scales
+    target_px : array, shape (2,)
+        Where an unknown star is taken to be at the start: on the target.
+    """
+
+    def __init__(self, scale: Scales, target_px: Floats) -> None:
+        self._scale = scale
+        self._origin_px = target_px.copy()
+        self.known = False
+
+    def assume(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
+        """Take the star to be at `star_px` with the stages as given; all shapes (2,)."""
+        self._origin_px = star_px - self._stages_px(motor_rad, mirror_rad)
+
+    def observe(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
+        """A frame showed the star at `star_px` with the stages as they were at its exposure."""
+        self.assume(star_px, motor_rad, mirror_rad)
+        self.known = True
+
+    def predict_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
+        """Where the star falls with the stages as given, shape (2,)."""
+        return self._origin_px + self._stages_px(motor_rad, mirror_rad)
+
+    def motor_for_rad(self, star_px: Floats, mirror_rad: Floats) -> Floats:
+        """Motor angles that bring the star to `star_px`, shape (2,)."""
+        mirror_px = self._scale.mirror_px_per_rad * mirror_rad
+        return (star_px - self._origin_px - mirror_px) / self._scale.motor_px_per_rad
+
+    def _stages_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
+        return self._scale.motor_px_per_rad * motor_rad + self._scale.mirror_px_per_rad * mirror_rad

@@ -1,0 +1,122 @@
+"""Archimedean search spiral, in pixels of the focal plane.
+
+With a usable field that holds a circle of radius h, the turns are sqrt(2) h (less the overlap) apart, so
+that every star passes within h / sqrt(2) of the field's centre and stays in the circle over a chord of at
+least sqrt(2) h. The speed puts the wanted number of frames into that chord.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.controllers.centroid import HALF_WINDOW_PX
+from fitctl.model.optics import scales
+
+_LOOKS_BEYOND_FOUND = 2  # frames in the chord beyond those that count a star as found
+
+
+@dataclass(frozen=True, slots=True)
+class SpiralPlan:
+    """What a search will do.
+
+    Attributes
+    ----------
+    pitch_px : float
+        Distance between turns.
+    speed_px_s : float
+        Along the path.
+    acceleration_px_s2 : float
+        The path is slower near its middle, so as not to pass this.
+    radius_px : float
+        Where the search ends.
+    field_radius_px : float
+        Circle in which a star is certain to be seen.
+    """
+
+    pitch_px: float
+    speed_px_s: float
+    acceleration_px_s2: float
+    radius_px: float
+    field_radius_px: float
+
+
+def plan_spiral(rig: Rig, loop_name: str) -> SpiralPlan:
+    """The spiral that misses no star within the rig's search radius.
+
+    Its pitch follows from the field of view, its speed from the frame rate, the motors and the blur of
+    a spot: not more than one window half in one exposure.
+    """
+    loop = rig.loops[loop_name]
+    scale = scales(rig, loop)
+    camera, acquisition = rig.camera, loop.acquisition
+    # The 7x7 window must fit, and its centre may be half a pixel off the spot's.
+    field_px = min(camera.width_px, camera.height_px) / 2 - HALF_WINDOW_PX - 1.0
+    reach_px = field_px * (1 - acquisition.field_overlap)
+    looks = acquisition.found_frames + _LOOKS_BEYOND_FOUND
+    speed_px_s = min(
+        math.sqrt(2) * reach_px / looks * camera.frame_rate_hz,
+        HALF_WINDOW_PX / camera.exposure_s,
+        0.5 * loop.siderostat.velocity_limit_rad_s * scale.motor_px_per_rad,
+    )
+    return SpiralPlan(
+        pitch_px=math.sqrt(2) * reach_px,
+        speed_px_s=speed_px_s,
+        acceleration_px_s2=0.25
+        * loop.siderostat.acceleration_limit_rad_s2
+        * scale.motor_px_per_rad,
+        radius_px=acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px,
+        field_radius_px=field_px,
+    )
+
+
+class Spiral:
+    """A walk along the spiral; it can wait, but not go back.
+
+    Parameters
+    ----------
+    plan : SpiralPlan
+    """
+
+    def __init__(self, plan: SpiralPlan) -> None:
+        self._plan = plan
+        self._growth_px = plan.pitch_px / (2 * math.pi)
+        self._angle = 0.0
+
+    @property
+    def radius_px(self) -> float:
+        """Distance from the middle."""
+        return self._growth_px * self._angle
+
+    @property
+    def exhausted(self) -> bool:
+        """The search radius has been covered."""
+        return self.radius_px >= self._plan.radius_px
+
+    @property
+    def progress(self) -> float:
+        """Part of the searched area, 0 to 1."""
+        return min(1.0, (self.radius_px / self._plan.radius_px) ** 2)
+
+    def position_px(self) -> NDArray[np.float64]:
+        """Where the search is, from its middle, shape (2,)."""
+        return self.radius_px * np.array([math.cos(self._angle), math.sin(self._angle)])
+
+    def advance(self, duration_s: float) -> NDArray[np.float64]:
+        """Go on for `duration_s` and return the new position, shape (2,)."""
+        # The speed is judged where the step ends, where the path is longest for the angle.
+        angle = self._angle + self._angular_rate(self._angle) * duration_s
+        self._angle += self._angular_rate(angle) * duration_s
+        return self.position_px()
+
+    def _angular_rate(self, angle: float) -> float:
+        length_per_angle = self._growth_px * math.sqrt(1 + angle**2)
+        curvature_radius = self._growth_px * (1 + angle**2) ** 1.5 / (2 + angle**2)
+        speed = min(
+            self._plan.speed_px_s, math.sqrt(self._plan.acceleration_px_s2 * curvature_radius)
+        )
+        return speed / length_per_angle

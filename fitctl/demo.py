@@ -1,0 +1,283 @@
+"""``fitctl demo``: mock testbed, supervisor and recorder as processes of their own, and a look at how it went."""
+
+from __future__ import annotations
+
+import json
+import math
+import selectors
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from fitctl.config import Rig
+from fitctl.logging.records import LoopTiming, Tick
+from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
+from fitctl.model.optics import scales
+from fitctl.processes import end_process, start_process
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.messages import Acquire, AnyCommand, Shutdown, Standby, Telemetry
+from fitctl.supervisor.modes import Mode
+
+JUDGED_S = 30.0
+_START_TIMEOUT_S = 60.0
+_END_TIMEOUT_S = 15.0
+
+
+class DemoError(Exception):
+    """The demo could not run; the text says which part failed and what to do."""
+
+
+@dataclass
+class Instrument:
+    """A running mock instrument."""
+
+    client: Client
+    folder: Path
+    bench_port: int
+    started_s: float
+    supervisor: subprocess.Popen[bytes]
+    mocks: subprocess.Popen[bytes]
+
+    def check(self) -> None:
+        """Raise DemoError if a part of it has ended."""
+        for name, process in (("mock testbed", self.mocks), ("supervisor", self.supervisor)):
+            if process.poll() is not None:
+                msg = f"the {name} ended with status {process.returncode}; its message is above"
+                raise DemoError(msg)
+
+
+@contextmanager
+def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[Instrument]:
+    """Start everything on free ports and a folder of its own; end everything, whatever happens.
+
+    Raises
+    ------
+    DemoError
+        If a part does not start.
+    """
+    started_s = time.monotonic()
+    folder = Path(tempfile.mkdtemp(prefix="fitctl-demo-"))
+    processes: list[subprocess.Popen[bytes]] = []
+    client = Client(folder)
+    try:
+        common = ["--rig", str(rig_path), *_set(overrides)]
+        mocks = start_process(
+            ["mocks", *common, "--seed", str(seed), "--free-ports", "--json", "--with-parent"],
+            stdout=subprocess.PIPE,
+        )
+        processes.append(mocks)
+        endpoints = _first_line(mocks)
+        devices = [
+            f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
+        ]
+        supervisor = start_process(
+            ["run", *common, *_set([*devices, f"service.folder={folder}"]), "--with-parent"]
+        )
+        processes.append(supervisor)
+        running = Instrument(
+            client, folder, int(endpoints["mocks.bench_port"]), started_s, supervisor, mocks
+        )
+        _wait(running, lambda _: True, "the supervisor's first telemetry")
+        yield running
+    finally:
+        _end(client, processes)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def acquire(running: Instrument) -> None:
+    """Power up, then search.
+
+    Raises
+    ------
+    DemoError
+        If the supervisor refuses or a device fails.
+    """
+    _command(running, Standby())
+    _wait(
+        running,
+        lambda telemetry: all(loop.mode == Mode.STANDBY.name for loop in telemetry.loops),
+        "STANDBY",
+    )
+    _command(running, Acquire())
+
+
+def acquire_in_background(running: Instrument) -> threading.Thread:
+    """The same beside a console, with a telemetry connection of its own; failures show as events there."""
+
+    def work() -> None:
+        beside = Client(running.folder)
+        try:
+            acquire(Instrument(**{**vars(running), "client": beside}))
+        except (DemoError, ConnectionError):
+            return  # the console shows the supervisor's own event, or that it does not answer
+        finally:
+            beside.close()
+
+    thread = threading.Thread(target=work, name="demo-acquire", daemon=True)
+    thread.start()
+    return thread
+
+
+@dataclass
+class Course:
+    """What was seen of a run; grows with telemetry."""
+
+    ticks: dict[str, list[Tick]] = field(default_factory=dict)
+    reached_s: dict[tuple[str, str], float] = field(default_factory=dict)
+    vernier_since_s: dict[str, float] = field(default_factory=dict)
+    timing: dict[tuple[str, float], LoopTiming] = field(default_factory=dict)
+    last: Telemetry | None = None
+
+    def add(self, telemetry: Telemetry) -> None:
+        """Take one telemetry message."""
+        self.last = telemetry
+        for tick in telemetry.ticks:
+            if tick.number >= 0:
+                self.ticks.setdefault(tick.loop, []).append(tick)
+        for change in telemetry.mode_changes:
+            self.reached_s.setdefault((change.loop, change.target), change.time_s)
+            if change.target == Mode.VERNIER.name:
+                self.vernier_since_s[change.loop] = change.time_s
+            else:
+                self.vernier_since_s.pop(change.loop, None)
+        for timing in telemetry.timing:
+            self.timing[timing.loop, timing.time_s] = timing
+
+
+def watch(
+    running: Instrument, duration_s: float, on_progress: Callable[[float, Telemetry], None]
+) -> Course:
+    """Follow a run for `duration_s`; `on_progress` gets the seconds gone by and the newest telemetry.
+
+    Raises
+    ------
+    DemoError
+        If a part of the instrument ends meanwhile.
+    """
+    course = Course()
+    begun_s = time.monotonic()
+    while (gone_s := time.monotonic() - begun_s) < duration_s:
+        telemetry = running.client.receive(0.5)
+        running.check()
+        if telemetry is not None:
+            course.add(telemetry)
+            on_progress(gone_s, telemetry)
+    return course
+
+
+def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
+    """How one loop did: the keys of ``fitctl demo --json``."""
+    ticks = course.ticks.get(loop_name, [])
+    end_s = ticks[-1].mid_exposure_s if ticks else math.nan
+    start_s = max(course.vernier_since_s.get(loop_name, math.nan), end_s - JUDGED_S)
+    judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
+    errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
+    measured = np.sqrt(np.mean(errors**2, axis=0)) if judged else np.full(2, np.nan)
+    truth = _truth(rig, running, loop_name, start_s, end_s)
+    arcsec = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
+    timing = [t for (name, _), t in course.timing.items() if name == loop_name]
+    last = course.last
+    return {
+        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
+        "vernier_s": _since(running, course, loop_name, Mode.VERNIER),
+        "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
+        "measured_rms_px": {"az": float(measured[0]), "el": float(measured[1])},
+        "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
+        "judged_s": max(0.0, end_s - start_s) if judged else 0.0,
+        "frames": len(ticks),
+        "frames_lost": ticks[-1].frames_lost if ticks else 0,
+        "late_ticks": sum(tick.late for tick in ticks),
+        "machine_stalls": sum(t.stalls for t in timing),
+        "worst_stall_s": max((t.worst_stall_s for t in timing), default=0.0),
+        "records_lost": 0 if last is None else last.records_lost + _recorder_lost(last),
+        "log": "" if last is None or last.recorder is None else last.recorder.path,
+    }
+
+
+def _truth(rig: Rig, running: Instrument, name: str, start_s: float, end_s: float) -> Residual:
+    if not start_s < end_s:
+        return Residual(math.nan, math.nan, 0)
+    target = rig.loops[name].target_px
+    return ask_bench(
+        running.bench_port, ResidualQuestion(name, start_s, end_s, target.az, target.el)
+    )
+
+
+def _since(running: Instrument, course: Course, loop_name: str, mode: Mode) -> float:
+    """Seconds from the demo's start to the first time in `mode`, nan if never."""
+    return course.reached_s.get((loop_name, mode.name), math.nan) - running.started_s
+
+
+def _recorder_lost(telemetry: Telemetry) -> int:
+    return 0 if telemetry.recorder is None else telemetry.recorder.lost
+
+
+def to_json(result: dict[str, Any]) -> str:
+    """One line; what was not reached is null."""
+    return msgspec.json.encode(result).decode()
+
+
+# ---------------------------------------------------------------- parts
+
+
+def _set(overrides: Sequence[str]) -> list[str]:
+    return [part for override in overrides for part in ("--set", override)]
+
+
+def _first_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """The endpoints that the mock testbed prints once it listens."""
+    assert process.stdout is not None  # noqa: S101  (for the type checker: it was started with a pipe)
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        line = process.stdout.readline() if selector.select(_START_TIMEOUT_S) else b""
+    if not line:
+        end_process(process, 1.0)
+        msg = f"the mock testbed did not start (status {process.returncode}); its message is above"
+        raise DemoError(msg)
+    return json.loads(line)
+
+
+def _command(running: Instrument, command: AnyCommand) -> None:
+    reply = running.client.send(command)
+    if not reply.accepted:
+        msg = f"{type(command).__name__.lower()} was refused: {reply.text}"
+        raise DemoError(msg)
+
+
+def _wait(running: Instrument, reached: Callable[[Telemetry], bool], what: str) -> None:
+    deadline_s = time.monotonic() + _START_TIMEOUT_S
+    while time.monotonic() < deadline_s:
+        telemetry = running.client.receive(0.5)
+        running.check()
+        if telemetry is not None:
+            errors = [event.message for event in telemetry.events if event.severity == "error"]
+            if errors:
+                raise DemoError(errors[0])
+            if reached(telemetry):
+                return
+    msg = f"{what} did not come within {_START_TIMEOUT_S:g} s"
+    raise DemoError(msg)
+
+
+def _end(client: Client, processes: list[subprocess.Popen[bytes]]) -> None:
+    """Supervisor first, so that it can still bring the mirror to its bias; then the mocks."""
+    try:
+        if len(processes) > 1 and processes[1].poll() is None:
+            client.send(Shutdown())
+            processes[1].wait(_END_TIMEOUT_S)
+    except (ConnectionError, subprocess.TimeoutExpired):
+        pass  # end_process insists
+    finally:
+        client.close()
+        for process in reversed(processes):
+            end_process(process, _END_TIMEOUT_S)

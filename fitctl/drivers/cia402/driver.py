@@ -1,0 +1,331 @@
+"""The siderostat's two amplifiers: a CiA 402 drive in cyclic synchronous (or profile) velocity mode.
+
+Three frames a servo period: an RPDO with both target velocities, the SYNC that makes the drive act on it
+and latch its encoders, and the TPDO with both positions. Statuswords come in a TPDO of their own, on
+change and ten times a second. While the amplifiers are enabled the drive watches our heartbeat, which
+:meth:`Cia402Amplifiers.exchange` sends: it must be called at least every `master_heartbeat_timeout_s`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Siderostat
+from fitctl.drivers.cia402 import protocol
+from fitctl.drivers.cia402.protocol import NmtCommand, State
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceFault,
+    DeviceIdentity,
+    DeviceProtocolError,
+    DeviceUnreachable,
+    ServoReading,
+)
+
+if TYPE_CHECKING:
+    from fitctl.drivers.cia402.node import Node
+
+_POLL_S = 0.001
+_PAIR = struct.Struct("<ii")
+_STATUS_PAIR = struct.Struct("<HH")
+
+_TOWARDS_ENABLED = {
+    State.SWITCH_ON_DISABLED: protocol.CW_SHUTDOWN,
+    State.READY_TO_SWITCH_ON: protocol.CW_SWITCH_ON,
+    State.SWITCHED_ON: protocol.CW_ENABLE_OPERATION,
+    State.QUICK_STOP_ACTIVE: protocol.CW_DISABLE_VOLTAGE,
+}
+_TOWARDS_DISABLED = dict.fromkeys(
+    (
+        State.READY_TO_SWITCH_ON,
+        State.SWITCHED_ON,
+        State.OPERATION_ENABLED,
+        State.QUICK_STOP_ACTIVE,
+    ),
+    protocol.CW_DISABLE_VOLTAGE,
+)
+_OUT_OF_FAULT = {State.FAULT: protocol.CW_FAULT_RESET}
+_ENABLED = frozenset({State.OPERATION_ENABLED})
+_DISABLED = frozenset({State.NOT_READY, State.SWITCH_ON_DISABLED, State.FAULT})
+_NOT_FAULT = frozenset(State) - protocol.FAULT_STATES
+
+
+class Cia402Amplifiers:
+    """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
+
+    Parameters
+    ----------
+    siderostat : Siderostat
+        Encoder, servo rate and device settings of the rig.
+    """
+
+    def __init__(self, siderostat: Siderostat) -> None:
+        self._device = siderostat.device
+        self._period_s = 1.0 / siderostat.servo.rate_hz
+        self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
+        self._node: Node | None = None
+        self._rpdo_id = protocol.RPDO1_BASE + self._device.node_id
+        self._counts: tuple[int, int] | None = None
+        self._statuswords = [0, 0]
+
+    def open(self) -> DeviceIdentity:
+        """Connect, check and configure the drive, start the node; nothing moves, no motor has current.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout
+            No adapter; no drive behind it.
+        DeviceMismatch
+            Not a CiA 402 drive with two axes and a velocity mode.
+        DeviceRefused
+            The drive does not take a setting.
+        """
+        # Here, because python-can costs 140 ms that a command without hardware need not wait for.
+        from fitctl.drivers.cia402.configure import configure
+        from fitctl.drivers.cia402.link import CanLink
+        from fitctl.drivers.cia402.node import Node
+
+        self.close()
+        link = CanLink(self._device)
+        try:
+            self._node = Node(link, self._device)
+            identity = configure(self._node, self._device)
+            self._node.handlers |= {
+                protocol.TPDO1_BASE + self._device.node_id: self._on_positions,
+                protocol.TPDO2_BASE + self._device.node_id: self._on_statuswords,
+            }
+            self._node.start()
+            for axis in range(2):
+                self._state(axis)
+        except BaseException:
+            self._node = None
+            link.close()
+            raise
+        return identity
+
+    def enable(self) -> None:
+        """Give both motors current, at zero velocity, with the drive watching our heartbeat.
+
+        Raises
+        ------
+        DeviceFault
+            An axis is in fault or does not come up in time; then neither has current.
+        """
+        node = self._opened()
+        node.guard(on=True)
+        try:
+            self._stand_still()
+            for axis in range(2):
+                self._walk(axis, _TOWARDS_ENABLED, _ENABLED, refused=protocol.FAULT_STATES)
+        except DeviceError:
+            with contextlib.suppress(DeviceError):
+                self.disable()
+            raise
+
+    def disable(self) -> None:
+        """Command zero velocity, then take current from both motors; a latched fault stays.
+
+        Raises
+        ------
+        DeviceFault
+            An axis does not let go in time; the other one has been disabled all the same.
+        """
+        node = self._opened()
+        self._stand_still()
+        stuck: DeviceFault | None = None
+        for axis in range(2):
+            try:
+                self._walk(axis, _TOWARDS_DISABLED, _DISABLED)
+            except DeviceFault as fault:
+                stuck = stuck or fault
+        if stuck:
+            raise stuck
+        node.guard(on=False)
+
+    def reset_fault(self) -> None:
+        """Disable both axes and clear a latched fault of either; no motor has current afterwards.
+
+        Raises
+        ------
+        DeviceFault
+            The fault stays, because its cause does.
+        """
+        node = self._opened()
+        # Also ends the drive's watch on us, which a pause before enable() would trip again.
+        self.disable()
+        for axis in range(2):
+            if self._state(axis) in protocol.FAULT_STATES:
+                # The reset is an edge: an earlier one may have left the bit set.
+                self._write(axis, protocol.CONTROLWORD, "H", protocol.CW_DISABLE_VOLTAGE)
+                self._walk(axis, _OUT_OF_FAULT, _NOT_FAULT)
+                self._write(axis, protocol.CONTROLWORD, "H", protocol.CW_DISABLE_VOLTAGE)
+        node.drain()
+        node.error_code = 0
+
+    def exchange(self, velocity_rad_s: NDArray[np.float64]) -> ServoReading | None:
+        """One servo period: command both motors, read both encoders.
+
+        Parameters
+        ----------
+        velocity_rad_s : float array, shape (2,)
+            Motor velocities, azimuth and elevation.
+
+        Returns
+        -------
+        ServoReading or None
+            None when the positions did not come within one servo period. Positions that come later
+            are dropped at the next call.
+
+        Raises
+        ------
+        DeviceUnreachable
+            The link broke.
+        DeviceTimeout
+            The drive's heartbeat is missing.
+        DeviceFault
+            The drive left the operational state of CANopen. A fault of an axis does not raise: the
+            reading carries it.
+        ValueError
+            A velocity is not finite.
+        """
+        node = self._opened()
+        node.drain()
+        node.check_alive()
+        node.beat()
+        self._counts = None
+        self._send_velocities(velocity_rad_s[0], velocity_rad_s[1])
+        # The drive latches its encoders at SYNC; its sending is the nearest that the host can know.
+        sync_s = time.monotonic()
+        deadline_s = sync_s + self._period_s
+        while self._counts is None:
+            if not node.pump(max(0.0, deadline_s - time.monotonic())):
+                return None
+        return ServoReading(
+            time_s=sync_s,
+            position_rad=np.array(self._counts) * self._rad_per_count,
+            enabled=all(
+                protocol.state_of(word) is State.OPERATION_ENABLED for word in self._statuswords
+            ),
+            fault=self._fault_text(node.error_code),
+        )
+
+    def close(self) -> None:
+        """Disable if possible and disconnect; safe to call twice and after a failure."""
+        node = self._node
+        if node is None:
+            return
+        try:
+            self.disable()
+            node.command(NmtCommand.PRE_OPERATIONAL)
+        except DeviceError:
+            pass  # nothing answers, or it answers wrongly: the drive's own watch on us stops it
+        finally:
+            self._node = None
+            node.link.close()
+
+    # ------------------------------------------------------------ one axis
+    def _state(self, axis: int) -> State | None:
+        self._statuswords[axis] = self._read(axis, protocol.STATUSWORD, "H")
+        return protocol.state_of(self._statuswords[axis])
+
+    def _walk(
+        self,
+        axis: int,
+        steps: Mapping[State, int],
+        goals: frozenset[State],
+        *,
+        refused: frozenset[State] = frozenset(),
+    ) -> None:
+        """Send the controlword that each state asks for, until the axis is in one of `goals`."""
+        node = self._opened()
+        deadline_s = time.monotonic() + self._device.response_timeout_s
+        answered: State | None = None
+        while (state := self._state(axis)) not in goals:
+            if state in refused or time.monotonic() > deadline_s:
+                raise self._axis_fault(axis, goals)
+            if state is not None and state in steps and state is not answered:
+                self._write(axis, protocol.CONTROLWORD, "H", steps[state])
+                answered = state
+            else:
+                node.pump_until(lambda: False, _POLL_S)
+
+    def _read(self, axis: int, index: int, code: str) -> int:
+        return self._opened().read(index + axis * protocol.AXIS_OFFSET, 0, code)
+
+    def _write(self, axis: int, index: int, code: str, value: int) -> None:
+        self._opened().write(index + axis * protocol.AXIS_OFFSET, 0, code, value)
+
+    # ------------------------------------------------------------ process data
+    def _stand_still(self) -> None:
+        for axis in range(2):
+            self._write(axis, protocol.TARGET_VELOCITY, "i", 0)
+        self._send_velocities(0.0, 0.0)
+
+    def _send_velocities(self, az_rad_s: float, el_rad_s: float) -> None:
+        to_wire = protocol.velocity_to_wire
+        velocities = _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
+        self._opened().link.send((self._rpdo_id, velocities), (protocol.SYNC_ID, b""))
+
+    def _on_positions(self, data: bytes) -> None:
+        self._counts = _PAIR.unpack(self._sized(data, _PAIR.size, "both positions"))
+
+    def _on_statuswords(self, data: bytes) -> None:
+        sized = self._sized(data, _STATUS_PAIR.size, "both statuswords")
+        self._statuswords[:] = _STATUS_PAIR.unpack(sized)
+
+    # ------------------------------------------------------------ errors
+    def _opened(self) -> Node:
+        if self._node is None:
+            raise DeviceUnreachable(
+                protocol.DEVICE,
+                self._endpoint,
+                "an open connection",
+                "a closed one",
+                "open it first",
+            )
+        return self._node
+
+    @property
+    def _endpoint(self) -> str:
+        device = self._device
+        return f"{device.interface} {device.channel}, node {device.node_id}"
+
+    def _sized(self, data: bytes, size: int, what: str) -> bytes:
+        if len(data) != size:
+            expected = f"a TPDO of {size} bytes with {what}"
+            hint = "another CANopen master changed the mapping; recover"
+            raise DeviceProtocolError(
+                protocol.DEVICE, self._endpoint, expected, f"{len(data)}", hint
+            )
+        return data
+
+    def _axis_fault(self, axis: int, goals: frozenset[State]) -> DeviceFault:
+        statusword = self._statuswords[axis]
+        code = self._read(axis, protocol.ERROR_CODE, "H")
+        wanted = " or ".join(sorted(state.name.lower().replace("_", " ") for state in goals))
+        return DeviceFault(
+            protocol.DEVICE,
+            self._endpoint,
+            f"{protocol.AXES[axis]} in state {wanted}",
+            f"{protocol.state_name(statusword)} (statusword 0x{statusword:04X}), "
+            f"{protocol.error_text(code)}",
+            "remove the cause, then recover",
+        )
+
+    def _fault_text(self, error_code: int) -> str:
+        texts = [
+            f"{name}: {protocol.state_name(word)} (statusword 0x{word:04X})"
+            for name, word in zip(protocol.AXES, self._statuswords, strict=True)
+            if protocol.state_of(word) in protocol.FAULT_STATES
+        ]
+        if error_code:
+            texts.append(protocol.error_text(error_code))
+        return ", ".join(texts)

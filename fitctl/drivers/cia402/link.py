@@ -1,0 +1,176 @@
+"""The CAN bus as the driver uses it: frames by identifier, and every failure a ``DeviceUnreachable``.
+
+Any python-can interface serves. For ``slcan``, python-can 4.6 reads its port one byte at a time, three
+system calls each; :class:`BulkSlcanBus` reads what is there in one call, and is otherwise python-can's.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import socket
+import time
+from collections.abc import Sequence
+from typing import NoReturn
+
+import can
+from can.interfaces.slcan import slcanBus
+
+from fitctl.config import Cia402Device
+from fitctl.drivers.cia402.protocol import DEVICE
+from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
+
+_SEND_TIMEOUT_S = 0.1
+_END_OF_LINE = re.compile(rb"[\r\a]")
+_ACKNOWLEDGEMENTS = {b"\r", b"z\r", b"Z\r", b"\a"}
+
+
+class BulkSlcanBus(slcanBus):
+    """python-can's SLCAN bus, with reads in chunks, no Nagle delay, and a shutdown that always closes."""
+
+    # LAWICEL's S7 is 800 kbit/s; python-can lists 750.
+    _BITRATES = {**slcanBus._BITRATES, 800000: "S7"}  # noqa: RUF012 (overrides python-can's)
+
+    def __init__(self, channel: str, bitrate: int) -> None:
+        self._held: bytearray | None = None
+        super().__init__(channel, bitrate=bitrate, sleep_after_open=0)
+        self._descriptor = self.fileno()
+        if channel.startswith("socket://"):
+            link = socket.socket(fileno=self._descriptor)
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            link.detach()
+
+    def send_together(self, messages: Sequence[can.Message]) -> None:
+        """Send frames that belong together by one write: a write costs more than all the rest."""
+        self._held = bytearray()
+        try:
+            for message in messages:
+                self.send(message, _SEND_TIMEOUT_S)
+        finally:
+            held, self._held = self._held, None
+        with can.exceptions.error_check("Could not write to the adapter"):
+            self.serialPortOrig.write(held)
+
+    def _write(self, string: str) -> None:
+        if self._held is None:
+            super()._write(string)
+        else:
+            self._held += string.encode("ascii") + self.LINE_TERMINATOR
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; python-can's own waits by the wall clock, which may be set back."""
+        return self._recv_internal(timeout)[0]
+
+    def _read(self, timeout: float | None) -> str | None:
+        """The next line that is more than an acknowledgement, or None when none came in time.
+
+        A frame that the adapter refuses (BEL) shows as an answer of the drive that does not come.
+        """
+        deadline_s = None if timeout is None else time.monotonic() + timeout
+        while True:
+            while end := _END_OF_LINE.search(self._buffer):
+                line = bytes(self._buffer[: end.end()])
+                del self._buffer[: end.end()]
+                if line not in _ACKNOWLEDGEMENTS:
+                    return line.decode("ascii", "replace")
+            left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
+            try:
+                if not select.select([self._descriptor], [], [], left_s)[0]:
+                    return None
+                chunk = os.read(self._descriptor, 4096)
+            except (OSError, ValueError) as error:
+                raise can.CanOperationError(str(error)) from error
+            if not chunk:
+                msg = "the adapter closed the connection"
+                raise can.CanOperationError(msg)
+            self._buffer += chunk
+
+    def shutdown(self) -> None:
+        """Leave the bus; the port is closed even if the adapter is gone."""
+        try:
+            super().shutdown()
+        finally:
+            self.serialPortOrig.close()
+
+
+class CanLink:
+    """An open bus.
+
+    Parameters
+    ----------
+    device : Cia402Device
+        Interface, channel and bit rate.
+
+    Raises
+    ------
+    DeviceUnreachable
+        If the bus cannot be opened.
+    """
+
+    def __init__(self, device: Cia402Device) -> None:
+        self.endpoint = f"{device.interface} {device.channel}, node {device.node_id}"
+        try:
+            self._bus: can.BusABC = (
+                BulkSlcanBus(device.channel, device.bitrate)
+                if device.interface == "slcan"
+                else can.Bus(
+                    channel=device.channel,
+                    interface=device.interface,
+                    bitrate=device.bitrate,
+                    ignore_config=True,
+                )
+            )
+        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
+            raise DeviceUnreachable(
+                DEVICE,
+                self.endpoint,
+                "an open CAN bus",
+                str(error) or type(error).__name__,
+                "check that the adapter is on, and siderostat.device in the rig file",
+            ) from error
+
+    def send(self, *frames: tuple[int, bytes]) -> None:
+        """Put frames, each an 11-bit identifier and data, on the bus in this order."""
+        messages = [
+            can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+            for can_id, data in frames
+        ]
+        try:
+            if isinstance(self._bus, BulkSlcanBus):
+                self._bus.send_together(messages)
+            else:
+                for message in messages:
+                    self._bus.send(message, _SEND_TIMEOUT_S)
+        except (can.CanError, OSError) as error:
+            self._broken("frames to be sent", error)
+
+    def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
+        """The next frame's identifier and data; None when none came in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            try:
+                message = self._bus.recv(timeout_s)
+            except (can.CanError, OSError) as error:
+                self._broken("frames", error)
+            except (ValueError, IndexError) as error:
+                raise DeviceProtocolError(
+                    DEVICE, self.endpoint, "CAN frames", str(error), "check the adapter"
+                ) from error
+            if message is None:
+                return None
+            if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+                return message.arbitration_id, bytes(message.data)
+            timeout_s = max(0.0, deadline_s - time.monotonic())
+
+    def close(self) -> None:
+        """Leave the bus; never raises."""
+        try:
+            self._bus.shutdown()
+        except (can.CanError, OSError):
+            return  # the far end is gone already
+
+    def _broken(self, expected: str, error: Exception) -> NoReturn:
+        hint = "check the adapter and its cable, then recover"
+        got = str(error) or type(error).__name__
+        raise DeviceUnreachable(DEVICE, self.endpoint, expected, got, hint) from error

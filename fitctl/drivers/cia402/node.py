@@ -1,0 +1,271 @@
+"""One CANopen node as its master sees it: SDO, NMT, heartbeats both ways, EMCY.
+
+Everything runs on the caller's thread. That is why this is not python `canopen`: its SDO client waits for
+a Notifier thread, and a second thread must not run beside a 500 Hz servo; it also neither sends nor
+watches a heartbeat while it waits, and both must go on while the motors have current.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+
+from fitctl.config import Cia402Device
+from fitctl.drivers.cia402 import protocol
+from fitctl.drivers.cia402.link import CanLink
+from fitctl.drivers.cia402.protocol import DEVICE, NmtCommand, NmtState
+from fitctl.drivers.interface import (
+    DeviceFault,
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+)
+
+_MISSED_HEARTBEATS = 3
+_ABORT_TIMED_OUT = 0x0504_0000
+
+
+class Node:
+    """The drive's services.
+
+    Parameters
+    ----------
+    link : CanLink
+        The open bus.
+    device : Cia402Device
+        Node id and time limits.
+
+    Attributes
+    ----------
+    handlers : dict
+        Who takes the data of which identifier; PDOs are added by their owner.
+    error_code : int
+        Of the newest emergency message; 0 once the node says that the error is gone.
+    """
+
+    def __init__(self, link: CanLink, device: Cia402Device) -> None:
+        self.link = link
+        self.endpoint = link.endpoint
+        self.error_code = 0
+        self.nmt_state: int | None = None
+        self.handlers: dict[int, Callable[[bytes], None]] = {
+            protocol.HEARTBEAT_BASE + device.node_id: self._on_heartbeat,
+            protocol.EMCY_BASE + device.node_id: self._on_emcy,
+            protocol.SDO_RESPONSE_BASE + device.node_id: self._on_sdo,
+        }
+        self._device = device
+        self._heard_s = time.monotonic()
+        self._answer: bytes | None = None
+        self._guarded = False
+        self._beat_period_s = device.master_heartbeat_timeout_s / 3
+        self._next_beat_s = 0.0
+
+    # ------------------------------------------------------------ frames
+    def pump(self, timeout_s: float) -> bool:
+        """Take one frame from the bus and hand it to its handler; False when none came in time."""
+        frame = self.link.receive(timeout_s)
+        if frame is None:
+            return False
+        handler = self.handlers.get(frame[0])
+        if handler:
+            handler(frame[1])
+        return True
+
+    def drain(self) -> None:
+        """Take everything that has come in, without waiting."""
+        while self.pump(0.0):
+            pass
+
+    def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Take frames, and keep our heartbeat going, until `done` or the time limit."""
+        deadline_s = time.monotonic() + timeout_s
+        while not done():
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                return False
+            self.beat()
+            self.pump(min(left_s, self._beat_period_s))
+        return True
+
+    # ------------------------------------------------------------ heartbeats and NMT
+    def guard(self, *, on: bool) -> None:
+        """Let the drive watch our heartbeat, or not; it stops by itself when it misses ours."""
+        timeout_ms = round(self._device.master_heartbeat_timeout_s * 1e3) if on else 0
+        entry = self._master_id << 16 | timeout_ms
+        self._guarded = False
+        self.write(protocol.HEARTBEAT_CONSUMER, 1, "I", entry if on else 0)
+        self._guarded = on
+        self._next_beat_s = 0.0
+        self.beat()
+
+    def beat(self) -> None:
+        """Send our heartbeat if it is due."""
+        now_s = time.monotonic()
+        if self._guarded and now_s >= self._next_beat_s:
+            self._next_beat_s = now_s + self._beat_period_s
+            state = bytes([NmtState.OPERATIONAL])
+            self.link.send((protocol.HEARTBEAT_BASE + self._master_id, state))
+
+    def check_alive(self) -> None:
+        """See that the drive's heartbeat goes on and says OPERATIONAL.
+
+        Raises
+        ------
+        DeviceTimeout
+            If it is missing.
+        DeviceFault
+            If the drive has left OPERATIONAL: it restarted, or another master took it.
+        """
+        silent_s = time.monotonic() - self._heard_s
+        limit_s = _MISSED_HEARTBEATS * self._device.drive_heartbeat_s
+        if silent_s > limit_s:
+            raise DeviceTimeout(
+                DEVICE,
+                self.endpoint,
+                f"the drive's heartbeat within {limit_s:g} s",
+                f"none for {silent_s:.2f} s",
+                "check the drive's power and its bus cable, then recover",
+            )
+        if self.nmt_state != NmtState.OPERATIONAL:
+            raise DeviceFault(
+                DEVICE,
+                self.endpoint,
+                "the drive in NMT state operational",
+                f"NMT state 0x{self.nmt_state or 0:02X}",
+                "it restarted, or another CANopen master commands it; recover",
+            )
+
+    def command(self, command: NmtCommand) -> None:
+        """Send an NMT command to this node."""
+        self.link.send((protocol.NMT_ID, bytes([command, self._device.node_id])))
+
+    def start(self) -> None:
+        """Start the node, and wait for a heartbeat that says so.
+
+        Raises
+        ------
+        DeviceTimeout
+            If none comes.
+        """
+        self.drain()
+        self.nmt_state = None
+        self.command(NmtCommand.START)
+        timeout_s = self._device.response_timeout_s + self._device.drive_heartbeat_s
+        if not self.pump_until(lambda: self.nmt_state == NmtState.OPERATIONAL, timeout_s):
+            raise DeviceTimeout(
+                DEVICE,
+                self.endpoint,
+                f"a heartbeat in state operational within {timeout_s:g} s",
+                "none",
+                "check object 1017 and that no other master commands this drive",
+            )
+
+    # ------------------------------------------------------------ SDO
+    def read(self, index: int, subindex: int, code: str) -> int:
+        """An integer object; `code` is its `struct` code."""
+        data = self.upload(index, subindex)
+        size = struct.calcsize("<" + code)
+        if len(data) < size:
+            expected = f"{size} bytes of {index:04X}:{subindex:02X}"
+            raise DeviceProtocolError(DEVICE, self.endpoint, expected, f"{len(data)}")
+        (value,) = struct.unpack_from("<" + code, data)
+        return int(value)
+
+    def write(self, index: int, subindex: int, code: str, value: int) -> None:
+        """Set an integer object of up to four bytes."""
+        data = struct.pack("<" + code, value)
+        command = protocol.expedited_command(protocol.SDO_DOWNLOAD, len(data))
+        what = f"{index:04X}:{subindex:02X} = 0x{value & 0xFFFFFFFF:X}"
+        answer = self._request(protocol.encode_sdo(command, index, subindex, data), what)
+        self._expect(answer, protocol.SDO_DOWNLOADED, what)
+
+    def text(self, index: int) -> str:
+        """A text object; empty if the drive does not have it, which CiA 301 allows."""
+        try:
+            return self.upload(index, 0).rstrip(b"\0").decode("ascii", "replace")
+        except DeviceRefused:
+            return ""
+
+    def upload(self, index: int, subindex: int) -> bytes:
+        """An object's bytes, by an expedited or a segmented upload.
+
+        Raises
+        ------
+        DeviceTimeout, DeviceRefused, DeviceProtocolError
+            No answer in time; an SDO abort; an answer that is none.
+        """
+        what = f"{index:04X}:{subindex:02X}"
+        answer = self._request(protocol.encode_sdo(protocol.SDO_UPLOAD, index, subindex), what)
+        self._expect(answer, protocol.SDO_UPLOAD, what)
+        frame = protocol.decode_sdo(answer)
+        if frame.command & protocol.SDO_EXPEDITED:
+            return protocol.expedited_data(frame)
+        data, toggle, last = b"", 0, False
+        while not last:
+            request = protocol.encode_sdo(protocol.SDO_UPLOAD_SEGMENT | toggle, 0, 0)
+            answer = self._request(request, what, segment=True)
+            self._expect(answer, toggle, what, mask=protocol.SDO_SPECIFIER | protocol.SDO_TOGGLE)
+            chunk, last = protocol.decode_segment(answer)
+            data += chunk
+            toggle ^= protocol.SDO_TOGGLE
+        return data
+
+    @property
+    def _master_id(self) -> int:
+        return protocol.master_node_id(self._device.node_id)
+
+    def _request(self, request: bytes, what: str, *, segment: bool = False) -> bytes:
+        """One SDO round trip; late answers to earlier requests are passed over."""
+        self.drain()
+        self._answer = None
+        can_id = protocol.SDO_REQUEST_BASE + self._device.node_id
+        self.link.send((can_id, request))
+
+        def answered() -> bool:
+            return self._answer is not None and (segment or self._answer[1:4] == request[1:4])
+
+        if not self.pump_until(answered, self._device.response_timeout_s):
+            timed_out = struct.pack("<I", _ABORT_TIMED_OUT)
+            abort = bytes([protocol.SDO_ABORT]) + request[1:4] + timed_out
+            self.link.send((can_id, abort))
+            raise DeviceTimeout(
+                DEVICE,
+                self.endpoint,
+                f"an answer to SDO {what} within {self._device.response_timeout_s:g} s",
+                "none",
+                "check the drive's power, bit rate and node id",
+            )
+        answer, self._answer = self._answer, None
+        return answer or b""
+
+    def _expect(
+        self, answer: bytes, service: int, what: str, *, mask: int = protocol.SDO_SPECIFIER
+    ) -> None:
+        if len(answer) == 8 and answer[0] == protocol.SDO_ABORT:
+            (code,) = struct.unpack_from("<I", answer, 4)
+            raise DeviceRefused(
+                DEVICE,
+                self.endpoint,
+                f"SDO {what}",
+                protocol.abort_text(code),
+                "the drive does not take this setting; compare its manual with the rig file",
+            )
+        if len(answer) != 8 or answer[0] & mask != service:
+            raise DeviceProtocolError(
+                DEVICE, self.endpoint, f"an SDO answer to {what}", answer.hex(" ")
+            )
+
+    # ------------------------------------------------------------ handlers
+    def _on_heartbeat(self, data: bytes) -> None:
+        self._heard_s = time.monotonic()
+        self.nmt_state = data[0] & 0x7F if data else None
+
+    def _on_emcy(self, data: bytes) -> None:
+        try:
+            self.error_code, _ = protocol.decode_emcy(data)
+        except ValueError as error:
+            raise DeviceProtocolError(DEVICE, self.endpoint, "an EMCY", str(error)) from error
+
+    def _on_sdo(self, data: bytes) -> None:
+        self._answer = data

@@ -1,0 +1,242 @@
+"""A GigE Vision camera as the supervisor uses it."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import time
+
+from fitctl.config import Camera
+from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.features import Features
+from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
+from fitctl.drivers.gige.heartbeat import Heartbeat
+from fitctl.drivers.gige.protocol import Register
+from fitctl.drivers.gige.stream import CompleteFrame, FrameAssembler
+from fitctl.drivers.gige.ticks import CameraTime
+from fitctl.drivers.interface import (
+    CameraCounts,
+    DeviceError,
+    DeviceIdentity,
+    DeviceMismatch,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+    Frame,
+)
+
+RECEIVE_BUFFER_BYTES = 4 << 20  # the kernel grants what net.core.rmem_max allows
+_PACKET_BYTES_MAX = 65536
+
+
+class GigeCamera:
+    """Driver of one camera; ``open``, ``start``, ``next_frame`` and the rest from one thread.
+
+    Parameters
+    ----------
+    camera : Camera
+        The rig file's section.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._channel: ControlChannel | None = None
+        self._features: Features | None = None
+        self._stream: socket.socket | None = None
+        self._assembler: FrameAssembler | None = None
+        self._time: CameraTime | None = None
+        self._exposure_s = camera.exposure_s
+        self._streaming = False
+        self._packet = bytearray(_PACKET_BYTES_MAX)
+        self._poll = select.poll()
+        self._heartbeat: Heartbeat | None = None
+
+    def open(self) -> DeviceIdentity:
+        """Take control, set the camera as the rig file says, and keep control from then on.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout
+            If nothing answers.
+        DeviceRefused
+            If another program has control.
+        DeviceMismatch
+            If the camera cannot be set as the rig file says.
+        """
+        self.close()
+        device = self._camera.device
+        channel = ControlChannel(device.address, device.gvcp_port, device.response_timeout_s)
+        self._channel = channel
+        try:
+            _take_control(channel, device.heartbeat_s)
+            identity = DeviceIdentity(
+                maker=channel.read_text(protocol.MAKER),
+                model=channel.read_text(protocol.MODEL),
+                serial=channel.read_text(protocol.SERIAL_NUMBER),
+                firmware=channel.read_text(protocol.DEVICE_VERSION),
+            )
+            self._features = Features(channel)
+            self._features.stop()  # whatever the last program has left running
+            self._exposure_s = self._features.configure(self._camera)
+            self._time = CameraTime(channel)
+            self._heartbeat = Heartbeat(channel, self._time, device.heartbeat_s)
+            self._poll = select.poll()
+            self._poll.register(self._open_stream(channel), select.POLLIN)
+            self._poll.register(self._heartbeat.wake_fd, select.POLLIN)
+        except BaseException:
+            self.close()
+            raise
+        return identity
+
+    def start(self) -> None:
+        """Start the stream; frame numbers and counts begin anew."""
+        channel, features, stream = self._opened()
+        while _receive(stream, self._packet):
+            pass  # left over from before
+        self._assembler = FrameAssembler(
+            self._camera.width_px,
+            self._camera.height_px,
+            self._camera.device.packet_size_bytes,
+            channel.endpoint,
+            channel.request_resend,
+        )
+        features.start()
+        self._streaming = True
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        """The next complete frame, oldest first; None when none came in time.
+
+        Raises
+        ------
+        DeviceUnreachable
+            If the camera no longer answers, or has taken control away.
+        """
+        channel, _features, stream = self._opened()
+        assembler, camera_time, heartbeat = self._assembler, self._time, self._heartbeat
+        if assembler is None or camera_time is None or heartbeat is None:
+            raise DeviceMismatch(
+                DEVICE, channel.endpoint, "a started stream", "none", "call start() first"
+            )
+        deadline_s = time.monotonic() + timeout_s
+        view = memoryview(self._packet)
+        while True:
+            while length := _receive(stream, self._packet):
+                complete = assembler.add(view[:length])
+                if complete is not None:
+                    return self._dated(complete, camera_time)
+            if heartbeat.error is not None:
+                raise heartbeat.error
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                return None
+            self._poll.poll(left_s * 1000)
+
+    def counts(self) -> CameraCounts:
+        """Frames and losses so far; may be called from any thread."""
+        assembler = self._assembler
+        if assembler is None:
+            return CameraCounts(0, 0, 0)
+        return CameraCounts(assembler.frames, assembler.lost, assembler.packets_lost)
+
+    def stop(self) -> None:
+        """Stop the stream if it runs; a camera that has gone is no error here."""
+        streaming, self._streaming = self._streaming, False
+        if streaming and self._features is not None and not self._link_lost():
+            with contextlib.suppress(DeviceUnreachable, DeviceTimeout):
+                self._features.stop()
+
+    def close(self) -> None:
+        """Stop, give up control, close the sockets; safe to call twice and after a failure."""
+        with contextlib.suppress(DeviceError):
+            self.stop()
+        link_lost = self._link_lost()
+        heartbeat, self._heartbeat = self._heartbeat, None
+        if heartbeat is not None:
+            heartbeat.stop()
+        self._features = None  # before its channel
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            if not link_lost:
+                with contextlib.suppress(DeviceError):
+                    channel.write_register(Register.STREAM_PORT, 0)
+                    channel.write_register(Register.CONTROL_PRIVILEGE, 0)
+            channel.close()
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+        self._time = None
+        self._assembler = None
+
+    def _link_lost(self) -> bool:
+        return self._heartbeat is not None and self._heartbeat.error is not None
+
+    def _dated(self, complete: CompleteFrame, camera_time: CameraTime) -> Frame:
+        """A frame with its times; from a camera without a clock, as old as the rig file says."""
+        received_s = time.monotonic()
+        if camera_time.runs:
+            start_s = camera_time.host_s(complete.leader.timestamp_ticks)
+            mid_exposure_s = start_s + 0.5 * self._exposure_s
+        else:
+            mid_exposure_s = received_s - self._camera.frame_delay_s
+        return Frame(complete.number, mid_exposure_s, received_s, complete.image)
+
+    def _opened(self) -> tuple[ControlChannel, Features, socket.socket]:
+        if self._channel is None or self._features is None or self._stream is None:
+            device = self._camera.device
+            endpoint = f"{device.address}:{device.gvcp_port}"
+            raise DeviceUnreachable(DEVICE, endpoint, "an open camera", "a closed one", "open() it")
+        return self._channel, self._features, self._stream
+
+    def _open_stream(self, channel: ControlChannel) -> socket.socket:
+        stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._stream = stream
+        stream.setblocking(False)
+        stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        stream.bind((channel.local_address, 0))
+        host, port = stream.getsockname()
+        _set_packet_size(channel, self._camera.device.packet_size_bytes)
+        address = int.from_bytes(socket.inet_aton(host), "big")
+        channel.write_register(Register.STREAM_DESTINATION, address)
+        channel.write_register(Register.STREAM_PORT, port)
+        return stream
+
+
+def _receive(stream: socket.socket, packet: bytearray) -> int:
+    """The length of the packet received, 0 when there is none."""
+    try:
+        return stream.recv_into(packet)
+    except BlockingIOError:
+        return 0
+
+
+def _take_control(channel: ControlChannel, heartbeat_s: float) -> None:
+    try:
+        channel.write_register(Register.CONTROL_PRIVILEGE, protocol.CONTROL)
+    except DeviceRefused as error:
+        raise DeviceRefused(
+            DEVICE,
+            channel.endpoint,
+            "control of the camera",
+            error.got,
+            "another program has it: end that, or wait for its heartbeat to lapse",
+        ) from error
+    channel.write_register(Register.HEARTBEAT_TIMEOUT_MS, round(heartbeat_s * 1000))
+
+
+def _set_packet_size(channel: ControlChannel, size_bytes: int) -> None:
+    flagged = size_bytes | protocol.PACKET_SIZE_DO_NOT_FRAGMENT
+    try:
+        channel.write_register(Register.STREAM_PACKET_SIZE, flagged)
+        value = channel.read_register(Register.STREAM_PACKET_SIZE)
+        got = f"{value & protocol.PACKET_SIZE_MASK} bytes"
+    except DeviceRefused as error:
+        got = error.got
+    if got != f"{size_bytes} bytes":
+        raise DeviceMismatch(
+            DEVICE,
+            channel.endpoint,
+            f"packets of {size_bytes} bytes",
+            got,
+            "correct camera.device.packet_size_bytes in the rig file; a multiple of 4 is usual",
+        )

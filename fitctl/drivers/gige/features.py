@@ -1,0 +1,205 @@
+"""The camera's features by name, through its own GenICam description."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import zipfile
+from typing import Any
+
+from fitctl.config import Camera
+from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
+from fitctl.drivers.gige.protocol import MalformedPacketError, Register
+from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError, DeviceRefused
+
+RATE_TOLERANCE = 1e-3  # cameras round the frame rate to their own clock
+EXPOSURE_TOLERANCE = 1e-2  # and the exposure to rows or microseconds
+
+# Set where a camera has them, before anything else: free running, nothing automatic.
+_FREE_RUNNING = (
+    ("AcquisitionMode", "Continuous"),
+    ("TriggerMode", "Off"),
+    ("ExposureAuto", "Off"),
+    ("GainAuto", "Off"),
+    ("AcquisitionFrameRateEnable", True),
+)
+_EXPOSURE = ("ExposureTime", "ExposureTimeAbs")  # microseconds; the second name is SFNC 1
+_FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+
+
+class Features:
+    """A camera's GenICam node map over its control channel.
+
+    Parameters
+    ----------
+    channel : ControlChannel
+        Connected, and with control of the camera for anything that writes.
+
+    Raises
+    ------
+    DeviceMismatch
+        If the camera keeps no usable description in its memory.
+    """
+
+    def __init__(self, channel: ControlChannel) -> None:
+        # Loads a large shared library: here, so that commands without a camera start fast.
+        genapi: Any = importlib.import_module("genicam.genapi")
+
+        class Port(genapi.AbstractPort):
+            """Gives the node map the camera's registers; errors pass through it as they are."""
+
+            def read(self, address: int, length: int) -> bytes:
+                if length == 4:
+                    return protocol.encode_words(channel.read_register(address))
+                return channel.read_memory(address, length)
+
+            def write(self, address: int, data: bytes) -> None:
+                if len(data) == 4:
+                    channel.write_register(address, int.from_bytes(data, "big"))
+                else:
+                    channel.write_memory(address, bytes(data))
+
+            def get_access_mode(self) -> int:
+                return int(genapi.EAccessMode.RW)
+
+            def is_open(self) -> bool:
+                return True
+
+        self._endpoint = channel.endpoint
+        self._errors: type[Exception] = genapi.GenericException
+        self._writable = {genapi.EAccessMode.RW, genapi.EAccessMode.WO}
+        self._port = Port()  # the node map does not keep it alive
+        self._nodes = genapi.NodeMap()
+        xml = _download_xml(channel)
+        try:
+            self._nodes.load_xml_from_string(xml)
+            self._nodes.connect(self._port, "Device")
+        except self._errors as error:
+            raise self._mismatch("a GenICam description", str(error)) from error
+
+    def configure(self, camera: Camera) -> float:
+        """Set what the rig file says and check that the camera took it.
+
+        Returns
+        -------
+        float
+            The exposure in seconds, as the camera has rounded it.
+
+        Raises
+        ------
+        DeviceMismatch
+            If the camera lacks a feature or will not have the value.
+        """
+        for name, value in _FREE_RUNNING:
+            if self._nodes.has_node(name):
+                self._set_if_writable(name, value)
+        self._set_if_writable("OffsetX", 0)
+        self._set_if_writable("OffsetY", 0)
+        for name, wanted in (("Width", camera.width_px), ("Height", camera.height_px)):
+            self._set(name, wanted)
+            self._expect(name, wanted, self._get(name), tolerance=0.0)
+        self._set("PixelFormat", "Mono16")
+        payload_bytes = 2 * camera.width_px * camera.height_px
+        self._expect("PayloadSize", payload_bytes, self._get("PayloadSize"), tolerance=0.0)
+        return self._set_timing(camera)
+
+    def start(self) -> None:
+        """Lock the transport parameters and start the acquisition."""
+        self._set_if_writable("TLParamsLocked", 1)
+        self._execute("AcquisitionStart")
+
+    def stop(self) -> None:
+        """Stop the acquisition and unlock the transport parameters."""
+        self._execute("AcquisitionStop")
+        self._set_if_writable("TLParamsLocked", 0)
+
+    def _set_timing(self, camera: Camera) -> float:
+        """Exposure and frame rate limit each other: go first the way that always fits."""
+        exposure = self._first(_EXPOSURE)
+        rate = self._first(_FRAME_RATE)
+        exposure_us = camera.exposure_s * 1e6
+        steps = [(exposure, exposure_us), (rate, camera.frame_rate_hz)]
+        if exposure_us > self._get(exposure):
+            steps.reverse()
+        for name, value in steps:
+            self._set(name, value)
+        actual_us = float(self._get(exposure))
+        self._expect(exposure, exposure_us, actual_us, EXPOSURE_TOLERANCE)
+        self._expect(rate, camera.frame_rate_hz, self._get(rate), RATE_TOLERANCE)
+        return actual_us / 1e6
+
+    def _first(self, names: tuple[str, ...]) -> str:
+        for name in names:
+            if self._nodes.has_node(name):
+                return name
+        raise self._mismatch(f"feature {names[0]}", "a camera without it")
+
+    def _get(self, name: str) -> Any:
+        """The value in the camera, not the one that the node map remembers."""
+        try:
+            return self._nodes.get_node(name).get_value(False, True)
+        except self._errors as error:
+            raise self._mismatch(f"feature {name} to be readable", str(error)) from error
+
+    def _set(self, name: str, value: float | str | bool) -> None:
+        try:
+            self._nodes.get_node(name).value = value
+        except (self._errors, DeviceRefused) as error:
+            raise self._mismatch(f"{name} = {value}", str(error)) from error
+
+    def _set_if_writable(self, name: str, value: int | str | bool) -> None:
+        """Set a feature that not every camera has, or has fixed."""
+        if self._nodes.has_node(name):
+            node = self._nodes.get_node(name)
+            if node.get_access_mode() in self._writable:
+                self._set(name, value)
+
+    def _execute(self, name: str) -> None:
+        try:
+            self._nodes.get_node(name).execute()
+        except self._errors as error:
+            raise self._mismatch(f"command {name}", str(error)) from error
+
+    def _expect(self, name: str, wanted: float, actual: float, tolerance: float) -> None:
+        if abs(actual - wanted) > tolerance * abs(wanted):
+            raise self._mismatch(f"{name} = {wanted:g}", f"{actual:g}")
+
+    def _mismatch(self, expected: str, got: str) -> DeviceMismatch:
+        return DeviceMismatch(
+            DEVICE, self._endpoint, expected, got, "correct [camera] in the rig file to this camera"
+        )
+
+
+def _download_xml(channel: ControlChannel) -> str:
+    """The description from the camera's memory, by its first URL or else its second."""
+    urls = []
+    for register in (Register.XML_URL_1, Register.XML_URL_2):
+        text = channel.read_text(protocol.TextRegister(register, protocol.XML_URL_BYTES))
+        urls.append(text)
+        try:
+            location = protocol.decode_xml_url(text)
+        except MalformedPacketError:
+            continue
+        data = channel.read_memory(location.address, location.length)
+        return _unpacked(data, channel.endpoint)
+    raise DeviceMismatch(
+        DEVICE,
+        channel.endpoint,
+        "a GenICam description in the camera's memory, Local:NAME;ADDRESS;LENGTH",
+        " and ".join(repr(url) for url in urls),
+        "this camera keeps its description elsewhere, which fitctl cannot read yet",
+    )
+
+
+def _unpacked(data: bytes, endpoint: str) -> str:
+    """Most real cameras send a zip archive that holds the one file."""
+    try:
+        if data.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                data = archive.read(archive.namelist()[0])
+        return data.decode("utf-8")
+    except (zipfile.BadZipFile, IndexError, UnicodeDecodeError) as error:
+        raise DeviceProtocolError(
+            DEVICE, endpoint, "a readable GenICam description", str(error), "update its firmware"
+        ) from error

@@ -1,0 +1,210 @@
+"""The control channel: GVCP commands with answers, retries and PENDING_ACK."""
+
+from __future__ import annotations
+
+import itertools
+import select
+import socket
+import threading
+import time
+
+from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.protocol import Command, MalformedPacketError
+from fitctl.drivers.interface import (
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
+
+DEVICE = "camera"
+ATTEMPTS = 3
+PENDING_LIMIT_S = 5.0  # a device that asks for more time than this is treated as silent
+_MAX_ANSWER_BYTES = 2048
+
+
+class ControlChannel:
+    """One UDP socket to a camera's GVCP port. May be used from several threads: commands queue.
+
+    Parameters
+    ----------
+    address : str
+        The camera's IP address.
+    port : int
+        Its GVCP port.
+    timeout_s : float
+        Time for one command, all attempts together.
+    """
+
+    def __init__(self, address: str, port: int, timeout_s: float) -> None:
+        self.endpoint = f"{address}:{port}"
+        self.answered_s = time.monotonic()
+        self._timeout_s = timeout_s
+        self._lock = threading.Lock()
+        self._counter = itertools.count()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.connect((address, port))
+        except OSError as error:
+            self._socket.close()
+            raise self._unreachable(error) from error
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
+
+    @property
+    def local_address(self) -> str:
+        """The host's address on the way to the camera."""
+        return str(self._socket.getsockname()[0])
+
+    def close(self) -> None:
+        """Close the socket; safe to call twice."""
+        with self._lock:
+            self._socket.close()
+
+    def read_register(self, address: int) -> int:
+        """Read one 32-bit register."""
+        payload = self.exchange(Command.READREG, protocol.encode_words(address))
+        if len(payload) != 4:
+            raise self._protocol_error("one register", f"{len(payload)} bytes")
+        return protocol.decode_words(payload)[0]
+
+    def write_register(self, address: int, value: int) -> None:
+        """Write one 32-bit register."""
+        self.exchange(Command.WRITEREG, protocol.encode_words(address, value))
+
+    def read_memory(self, address: int, length: int) -> bytes:
+        """Read `length` bytes, in as many commands as it takes."""
+        data = bytearray()
+        end = address + length
+        for start in range(address, end, protocol.MEMORY_CHUNK_BYTES):
+            count = min(-(-(end - start) // 4) * 4, protocol.MEMORY_CHUNK_BYTES)
+            payload = self.exchange(Command.READMEM, protocol.encode_readmem(start, count))
+            if len(payload) != 4 + count:
+                raise self._protocol_error(f"{count} bytes of memory", f"{len(payload) - 4}")
+            data += payload[4:]
+        return bytes(data[:length])
+
+    def write_memory(self, address: int, data: bytes) -> None:
+        """Write `data`, in as many commands as it takes; its length is a multiple of 4."""
+        for offset in range(0, len(data), protocol.MEMORY_CHUNK_BYTES):
+            chunk = data[offset : offset + protocol.MEMORY_CHUNK_BYTES]
+            self.exchange(Command.WRITEMEM, protocol.encode_words(address + offset) + chunk)
+
+    def read_text(self, register: protocol.TextRegister) -> str:
+        """Read a string register."""
+        data = self.read_memory(*register)
+        return data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
+
+    def request_resend(self, request: protocol.Resend) -> None:
+        """Ask for stream packets again; there is no answer, and no other command delays this.
+
+        Raises
+        ------
+        DeviceUnreachable
+            If the host learned that nothing listens at the endpoint any more.
+        """
+        payload = protocol.encode_resend(request)
+        self._send(protocol.encode_command(Command.PACKETRESEND, self._next_id(), payload, flags=0))
+
+    def exchange(self, command: Command, payload: bytes) -> bytes:
+        """Send a command and return the payload of its answer.
+
+        Raises
+        ------
+        DeviceUnreachable
+            If nothing listens at the endpoint.
+        DeviceTimeout
+            If no answer came to any attempt.
+        DeviceRefused
+            If the answer is an error status.
+        DeviceProtocolError
+            If the answer belongs to another command.
+        """
+        with self._lock:
+            answer = self._answer(command, payload)
+        what = f"{command.name} 0x{payload[:4].hex().upper()}"
+        if protocol.is_error(answer.status):
+            raise DeviceRefused(
+                DEVICE,
+                self.endpoint,
+                f"{what} to succeed",
+                protocol.status_name(answer.status),
+                "the camera does not have this register or does not allow it now",
+            )
+        if answer.command != command + 1:
+            raise self._protocol_error(
+                f"acknowledge 0x{command + 1:04X} of {what}", f"0x{answer.command:04X}"
+            )
+        return answer.payload
+
+    def _answer(self, command: Command, payload: bytes) -> protocol.AnswerPacket:
+        request_id = self._next_id()
+        packet = protocol.encode_command(command, request_id, payload)
+        for _attempt in range(ATTEMPTS):
+            self._send(packet)
+            answer = self._receive(request_id, self._timeout_s / ATTEMPTS)
+            if answer is not None:
+                self.answered_s = time.monotonic()
+                return answer
+        raise DeviceTimeout(
+            DEVICE,
+            self.endpoint,
+            f"an answer to {command.name} within {self._timeout_s:g} s",
+            f"none to {ATTEMPTS} attempts",
+            "check power, cable and camera.device.address in the rig file",
+        )
+
+    def _receive(self, request_id: int, timeout_s: float) -> protocol.AnswerPacket | None:
+        """The answer to one attempt; late answers to earlier commands are passed over."""
+        deadline_s = time.monotonic() + timeout_s
+        pending_until_s = deadline_s + PENDING_LIMIT_S
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            if not self._poll.poll(left_s * 1000):
+                continue
+            try:
+                answer = protocol.decode_answer(self._socket.recv(_MAX_ANSWER_BYTES))
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise self._unreachable(error) from error
+            except MalformedPacketError as error:
+                raise self._protocol_error("a GVCP answer", str(error)) from error
+            if answer.request_id != request_id:
+                continue
+            if answer.command != protocol.PENDING_ACK:
+                return answer
+            more_s = self._pending_s(answer.payload)
+            deadline_s = min(time.monotonic() + more_s + timeout_s, pending_until_s)
+        return None
+
+    def _pending_s(self, payload: bytes) -> float:
+        try:
+            return protocol.decode_pending_s(payload)
+        except MalformedPacketError as error:
+            raise self._protocol_error("a PENDING_ACK", str(error)) from error
+
+    def _send(self, packet: bytes) -> None:
+        try:
+            self._socket.send(packet)
+        except BlockingIOError:
+            pass  # as if the network had lost it: the next attempt sends it again
+        except OSError as error:
+            raise self._unreachable(error) from error
+
+    def _next_id(self) -> int:
+        return next(self._counter) % 0xFFFF + 1
+
+    def _unreachable(self, error: OSError) -> DeviceUnreachable:
+        return DeviceUnreachable(
+            DEVICE,
+            self.endpoint,
+            "a GigE Vision camera",
+            str(error),
+            "check power, cable and camera.device in the rig file; for a mock rig, start the mocks",
+        )
+
+    def _protocol_error(self, expected: str, got: str) -> DeviceProtocolError:
+        return DeviceProtocolError(
+            DEVICE, self.endpoint, expected, got, "is this a GigE Vision camera?"
+        )

@@ -1,0 +1,1 @@
+"""Thorlabs MDT693A and MDT693B piezo amplifiers."""

@@ -1,0 +1,271 @@
+"""The MDT693 driver: asks what the amplifier measures and how it is set, and changes nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NoReturn, TypeVar
+
+import numpy as np
+import serial
+from numpy.typing import NDArray
+
+from fitctl.config import Mdt693Device
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceIdentity,
+    DeviceMismatch,
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
+from fitctl.drivers.mdt693.protocol import (
+    ANSWER_BYTES_MAX,
+    MODEL_A,
+    MODEL_B,
+    TERMINATOR,
+    Answer,
+    Commands,
+    is_complete,
+    parse_answer,
+    parse_identity,
+    parse_limit_switch,
+    parse_three_volts,
+    parse_volts,
+)
+
+_NAME = "piezo amplifier"
+_CHANNEL_NAMES = ("x", "y", "z")
+_POLL_S = 0.02  # how long one read waits; the time limits are counted above it
+# An answer without a prompt is complete after this silence. A slow command takes 0.15 s, a stall of
+# the machine 0.1 s.
+_QUIET_S = 0.25
+_LIMIT_TOLERANCE_V = 1.0
+
+_T = TypeVar("_T")
+
+
+class Mdt693:
+    """An MDT693A or MDT693B; a :class:`~fitctl.drivers.interface.PiezoAmplifier`.
+
+    At :meth:`open` it finds out which model answers, whether it echoes, and whether it can give three
+    voltages in one answer; it takes the device as it is and leaves it so. A question takes at most
+    `response_timeout_s`, and twice that after one that went wrong. Through ``socket://``, pyserial
+    itself allows 5 s to connect and takes 0.3 s to close.
+
+    Parameters
+    ----------
+    piezo : Mdt693Device
+        A serial port or ``socket://host:port``, and the limit that the amplifier must be set to.
+    """
+
+    def __init__(self, piezo: Mdt693Device) -> None:
+        self._piezo = piezo
+        self._port: serial.Serial | None = None
+        self._commands: Commands = MODEL_B
+        self._echoes = False
+        self._in_step = False
+        self._all_at_once = False
+
+    def open(self) -> DeviceIdentity:
+        """Connect, find the dialect, and check every voltage limit against the rig file.
+
+        Raises
+        ------
+        DeviceMismatch
+            If the voltage-limit switch or a channel's own high limit is not `limit_v`, within 1 V.
+        DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
+        """
+        self.close()
+        try:
+            self._port = serial.serial_for_url(
+                self._piezo.port,
+                baudrate=self._piezo.baud_rate,
+                timeout=_POLL_S,
+                write_timeout=self._piezo.response_timeout_s,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise DeviceUnreachable(
+                _NAME,
+                self._piezo.port,
+                "a serial port",
+                str(error),
+                "check its cable and power, who else has the port open, and piezo.port",
+            ) from error
+        try:
+            identity = self._identify()
+            self._check_limits()
+        except DeviceError:
+            self.close()
+            raise
+        return identity
+
+    def stack_volts(self) -> NDArray[np.float64]:
+        """Measured output voltages at the stacks.
+
+        Returns
+        -------
+        float array, shape (3,)
+            Stack 1 (channel x) first.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
+        """
+        if self._all_at_once:
+            return np.array(self._value(self._commands.all_voltages, parse_three_volts))
+        return np.array([self._value(command, parse_volts) for command in self._commands.voltages])
+
+    def limit_v(self) -> float:
+        """The voltage-limit switch as the device reports it: 75, 100 or 150 V.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
+        """
+        return self._value(self._commands.limit, parse_limit_switch)
+
+    def close(self) -> None:
+        """Let go of the port; safe to call twice and after a failure."""
+        self._in_step = False
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _identify(self) -> DeviceIdentity:
+        """Find model and dialect; the A refuses what the B is asked first."""
+        self._commands = MODEL_B
+        answer = self._ask(MODEL_B.identity)
+        if answer.refused:
+            self._commands = MODEL_A
+            answer = self._ask(MODEL_A.identity)
+        self._echoes = answer.echoed
+        try:
+            model, firmware = parse_identity(answer.body)
+        except ValueError as error:
+            self._nonsense("the name of an MDT693", str(error))
+        together = self._commands.all_voltages
+        self._all_at_once = bool(together) and not self._ask(together).refused
+        number = self._ask(self._commands.serial).body if self._commands.serial else ""
+        return DeviceIdentity("Thorlabs", model, number, firmware)
+
+    def _check_limits(self) -> None:
+        expected_v = self._piezo.limit_v
+        read = {"the voltage-limit switch": self.limit_v()}
+        for name, command in zip(_CHANNEL_NAMES, self._commands.high_limits, strict=True):
+            read[f"channel {name}'s high limit"] = self._value(command, parse_volts)
+        for what, volts in read.items():
+            if abs(volts - expected_v) > _LIMIT_TOLERANCE_V:
+                raise DeviceMismatch(
+                    _NAME,
+                    self._piezo.port,
+                    f"{what} at {expected_v:g} V",
+                    f"{volts:g} V",
+                    f"set {what} on the amplifier, or correct piezo.limit_v in the rig file "
+                    "if the stacks allow it",
+                )
+
+    def _value(self, command: str, parse: Callable[[str], _T]) -> _T:
+        """Ask for a value and insist on one, in the dialect found at open."""
+        answer = self._ask(command)
+        if answer.refused:
+            raise DeviceRefused(
+                _NAME,
+                self._piezo.port,
+                f"an answer to {command}",
+                "an error",
+                "check that this is an MDT693A or MDT693B and see its manual for this command",
+            )
+        if answer.echoed != self._echoes:
+            self._nonsense(
+                f"{command} {'echoed' if self._echoes else 'not echoed'}, as at open", "otherwise"
+            )
+        try:
+            return parse(answer.body)
+        except ValueError as error:
+            self._nonsense(f"an answer to {command}", str(error))
+
+    def _ask(self, command: str) -> Answer:
+        if not self._in_step:
+            # An empty command ends what an earlier client left half typed, and by the silence after
+            # its answer, an error, whatever still came late has come too.
+            self._send("")
+            self._collect("", until_quiet=True)
+        self._in_step = False
+        self._send(command)
+        data = self._collect(command)
+        if not data:
+            self._silence(f"an answer to {command}")
+        try:
+            answer = parse_answer(command, data)
+        except ValueError as error:
+            self._nonsense(f"an answer to {command}", f"{data[:80]!r} ({error})")
+        self._in_step = True
+        return answer
+
+    def _send(self, command: str) -> None:
+        port = self._opened()
+        try:
+            port.write(command.encode("ascii") + TERMINATOR)
+        except serial.SerialTimeoutException:
+            self._silence(f"{command or 'CR'} to be taken")
+        except OSError as error:
+            self._broken(f"{command or 'CR'} to be taken", error)
+
+    def _collect(self, command: str, *, until_quiet: bool = False) -> bytes:
+        """What comes after `command`, up to a prompt, a silence after something came, or the limit."""
+        port = self._opened()
+        data = bytearray()
+        heard_s = time.monotonic()
+        deadline_s = heard_s + self._piezo.response_timeout_s
+        try:
+            while heard_s < deadline_s and len(data) < ANSWER_BYTES_MAX:
+                chunk = port.read(max(1, port.in_waiting))
+                now_s = time.monotonic()
+                if chunk:
+                    data += chunk
+                    heard_s = now_s
+                    if not until_quiet and is_complete(command, bytes(data)):
+                        break
+                elif now_s > (heard_s + _QUIET_S if data else deadline_s):
+                    break
+        except OSError as error:
+            self._broken(f"an answer to {command or 'CR'}", error)
+        return bytes(data)
+
+    def _opened(self) -> serial.Serial:
+        if self._port is None:
+            raise DeviceUnreachable(
+                _NAME, self._piezo.port, "an open port", "none", "open it again"
+            )
+        return self._port
+
+    def _broken(self, expected: str, error: OSError) -> NoReturn:
+        self.close()
+        raise DeviceUnreachable(
+            _NAME,
+            self._piezo.port,
+            expected,
+            f"a broken link ({error})",
+            "check its power and its cable, then recover",
+        ) from error
+
+    def _silence(self, expected: str) -> NoReturn:
+        raise DeviceTimeout(
+            _NAME,
+            self._piezo.port,
+            f"{expected} within {self._piezo.response_timeout_s:g} s",
+            "none",
+            "check that it is switched on, that the port is the right one, and piezo.baud_rate",
+        )
+
+    def _nonsense(self, expected: str, got: str) -> NoReturn:
+        raise DeviceProtocolError(
+            _NAME,
+            self._piezo.port,
+            expected,
+            got,
+            "check piezo.baud_rate, and that no other program uses the port",
+        )

@@ -1,0 +1,191 @@
+"""What an MDT693A or MDT693B says on the wire, in every variant that public sources report.
+
+A command ends in CR. The answer is, where echo is on, the command itself; then, in some firmware, a
+``*``; then the body; then CR and a prompt: ``>``, ``> `` or ``*``. An error is ``CMD_NOT_DEFINED>``
+or ``!``. LF means nothing. Volts come with and without brackets, with one decimal or two, and the
+voltage-limit switch as volts or as a position.
+
+Sources: Thorlabs MDT693A and MDT693B manuals (commands), a recorded session of an MDT693B with
+firmware 1.05 (echo, leading ``*``, bodies), public drivers (errors, prompts, limit codes).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+TERMINATOR = b"\r"
+NOT_DEFINED = "CMD_NOT_DEFINED>"
+REFUSED = "!"
+ACKNOWLEDGED = "*"
+
+LIMIT_SWITCH_V = (75, 100, 150)  # by position: 0, 1, 2
+LIMIT_MARGIN_V = 0.5  # the highest output is this much above what the switch says
+ANSWER_BYTES_MAX = 4096  # the longest real one is the help text of the B, below 2 kB
+
+
+@dataclass(frozen=True, slots=True)
+class Commands:
+    """How one model is asked for the things that fitctl wants to know; channels in order x, y, z."""
+
+    identity: str
+    limit: str
+    high_limits: tuple[str, str, str]
+    voltages: tuple[str, str, str]
+    all_voltages: str  # empty where the model has none
+    serial: str
+
+
+MODEL_A = Commands("I", "%", ("XH?", "YH?", "ZH?"), ("XR?", "YR?", "ZR?"), "", "")
+MODEL_B = Commands(
+    "id?",
+    "vlimit?",
+    ("xmax?", "ymax?", "zmax?"),
+    ("xvoltage?", "yvoltage?", "zvoltage?"),
+    "xyzvoltage?",
+    "serial?",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One answer without its frame.
+
+    Attributes
+    ----------
+    body : str
+        What was said; lines are separated by CR.
+    refused : bool
+        The device does not know the command, or not with this value.
+    echoed : bool
+        The command came back before the answer.
+    """
+
+    body: str
+    refused: bool
+    echoed: bool
+
+
+_COMPLETE = re.compile(rf"{REFUSED}$|CMD_[A-Z_]+\s*[>*] ?$|[^\s>*]\s*\r\s*[>*] ?$")
+_ERROR = re.compile(r"CMD_[A-Z_]+")
+_NUMBER = r"-?\d{1,4}(?:\.\d{1,3})?"
+_VOLTS = re.compile(rf"\[\s*({_NUMBER})\s*\]|({_NUMBER})")
+_THREE = re.compile(rf"({_NUMBER})\s*,\s*({_NUMBER})\s*,\s*({_NUMBER})")
+_SWITCH = re.compile(r"\[\s*(\d{2,3})\s*\]|(\d{1,3})")
+
+
+def is_complete(command: str, data: bytes) -> bool:
+    """Whether `data`, received after `command`, ends as an answer ends.
+
+    Some firmware sends no prompt after some answers; those are complete when nothing more comes.
+    """
+    text, _ = _without_echo(command, data.decode("ascii", "replace"))
+    return _COMPLETE.search(text) is not None
+
+
+def parse_answer(command: str, data: bytes) -> Answer:
+    """Take the frame off an answer.
+
+    Raises
+    ------
+    ValueError
+        If there is anything but ASCII in it, or neither body, error nor prompt.
+    """
+    text, echoed = _without_echo(command, data.decode("ascii"))
+    if _ERROR.search(text) or text.strip("\r >*") == REFUSED:
+        return Answer("", refused=True, echoed=echoed)
+    body = text.lstrip("\r >*!")
+    body = re.sub(r"\r\s*[>*] ?$", "", body).strip("\r ")
+    if not body and not text.strip("\r "):
+        msg = "neither answer nor prompt"
+        raise ValueError(msg)
+    if any(not character.isprintable() for character in body.replace("\r", "")):
+        msg = "control characters"
+        raise ValueError(msg)
+    return Answer(body, refused=False, echoed=echoed)
+
+
+def parse_volts(body: str) -> float:
+    """One voltage, such as ``[  24.8]`` or ``100.5``.
+
+    Raises
+    ------
+    ValueError
+        If it is anything else.
+    """
+    match = _VOLTS.fullmatch(body)
+    if match is None:
+        msg = f"{body!r} is not a voltage"
+        raise ValueError(msg)
+    return float(match[1] or match[2])
+
+
+def parse_three_volts(body: str) -> list[float]:
+    """Three voltages, such as ``[ 75.0, 75.0, 75.0]``, brackets or not.
+
+    Raises
+    ------
+    ValueError
+        If it is anything else.
+    """
+    bracketed = body.startswith("[") and body.endswith("]")
+    match = _THREE.fullmatch((body[1:-1] if bracketed else body).strip())
+    if match is None:
+        msg = f"{body!r} is not three voltages"
+        raise ValueError(msg)
+    return [float(text) for text in match.groups()]
+
+
+def parse_limit_switch(body: str) -> float:
+    """The voltage-limit switch, in volts: ``[ 100]``, ``100``, or its position 0, 1 or 2.
+
+    Raises
+    ------
+    ValueError
+        If it is no voltage that the switch has.
+    """
+    match = _SWITCH.fullmatch(body)
+    value = int(match[1] or match[2]) if match is not None else -1
+    if match is not None and match[2] and value < len(LIMIT_SWITCH_V):
+        value = LIMIT_SWITCH_V[value]
+    if value not in LIMIT_SWITCH_V:
+        msg = f"{body!r} is not a position of the voltage-limit switch"
+        raise ValueError(msg)
+    return float(value)
+
+
+def parse_identity(body: str) -> tuple[str, str]:
+    """Model and firmware from the lines that ``id?`` and ``I`` give.
+
+    Raises
+    ------
+    ValueError
+        If no MDT69x model is named.
+    """
+    model = re.search(r"MDT69\d[AB]?", body, re.IGNORECASE)
+    if model is None:
+        msg = f"no MDT693 in {body!r}"
+        raise ValueError(msg)
+    firmware = re.search(r"(?:Firmware|Software)\s*(?:Version)?\s*:?\s*([\w.]+)", body)
+    return model[0].upper(), firmware[1] if firmware else ""
+
+
+def format_volts(volts: float) -> str:
+    """A measured voltage as the device shows it: 0.1 V, in brackets."""
+    return f"[{volts:6.1f}]"
+
+
+def format_three_volts(volts: Sequence[float]) -> str:
+    """Three measured voltages in one answer."""
+    return f"[{', '.join(f'{value:5.1f}' for value in volts)}]"
+
+
+def _without_echo(command: str, text: str) -> tuple[str, bool]:
+    """Take off LFs and the echo of the command; tell whether it was there."""
+    # The space of a ``> `` may come after the answer that it ends has been taken as complete.
+    text = text.replace("\n", "").lstrip(" ")
+    echo = f"{command}\r"
+    if text.lower().startswith(echo.lower()):
+        return text[len(echo) :], True
+    return text, False

@@ -1,0 +1,246 @@
+"""Reading logs back, finished or cut off.
+
+A recorder that was killed leaves a file without its index and with a torn end; that is read from the
+start for as far as it makes sense, which is at least its last flush.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+from array import array
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import google.protobuf.message
+import numpy as np
+import zstandard
+from google.protobuf.descriptor import FieldDescriptor
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+from mcap_protobuf.decoder import DecoderFactory
+from numpy.typing import NDArray
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.records import Tick
+from fitctl.logging.schemas import TOPICS
+
+# What a torn or damaged file makes the reader and its decompressors raise (lz4: RuntimeError).
+_DAMAGE = (
+    McapError,
+    struct.error,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    google.protobuf.message.DecodeError,
+    zstandard.ZstdError,
+)
+# How a field is gathered (a type code of the array module; texts in a list) and what it becomes.
+_COLUMNS: dict[int, tuple[str, Any]] = {
+    FieldDescriptor.CPPTYPE_DOUBLE: ("d", np.float64),
+    FieldDescriptor.CPPTYPE_INT64: ("q", np.int64),
+    FieldDescriptor.CPPTYPE_BOOL: ("b", np.bool_),
+    FieldDescriptor.CPPTYPE_STRING: ("", np.str_),
+}
+
+
+class LogMessage(NamedTuple):
+    """One message of a log; times are nanoseconds since 1970.
+
+    Attributes
+    ----------
+    topic : str
+    message : google.protobuf.message.Message
+        Protobuf; fields as in :mod:`fitctl.logging.records`, or Foxglove's RawImage and Log.
+    log_time_ns : int
+        When the recorder had it.
+    publish_time_ns : int
+        The record's own time.
+    sequence : int
+        The number of the tick or frame; otherwise counts the topic's messages from 1.
+    """
+
+    topic: str
+    message: google.protobuf.message.Message
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogInfo:
+    """What a log holds.
+
+    Attributes
+    ----------
+    path : Path
+    finished : bool
+        False if the recorder did not come to write the index: killed, or still recording.
+    start_s, end_s : float
+        Wall times of the first and the last message, seconds since 1970; NaN without messages.
+    counts : dict
+        Messages by topic.
+    metadata : dict
+        The run's description by name: rig, versions, scheduling, clock.
+    """
+
+    path: Path
+    finished: bool
+    start_s: float
+    end_s: float
+    counts: dict[str, int]
+    metadata: dict[str, dict[str, str]]
+
+    @property
+    def duration_s(self) -> float:
+        """From the first message to the last."""
+        return self.end_s - self.start_s
+
+
+def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
+    """All messages in the order in which they were written, or those of some topics.
+
+    Raises
+    ------
+    LogError
+        If the file is missing, no MCAP log, or finished and yet damaged.
+    """
+    with _opened(path) as (stream, finished), _up_to_the_tear(path, finished):
+        kind = SeekingReader if finished else NonSeekingReader
+        reader = kind(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        # Not ordered by log time: it is already, and sorting a cut file gives nothing at all.
+        for _, channel, header, message in reader.iter_decoded_messages(
+            topics, log_time_order=False
+        ):
+            yield LogMessage(
+                channel.topic, message, header.log_time, header.publish_time, header.sequence
+            )
+
+
+def tick_arrays(path: Path, loop: str) -> dict[str, NDArray[Any]]:
+    """Every field of one loop's ticks as an array over ticks.
+
+    Returns
+    -------
+    dict of str to array, shape (ticks,)
+        Named as in :class:`~fitctl.logging.records.Tick`: float64, int64 or bool, and text for the mode.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, or has no ticks of this loop.
+    """
+    columns: dict[str, array[Any] | list[str]] = {}
+    dtypes: dict[str, Any] = {}
+    for entry in read_records(path, [TOPICS[Tick].format(loop=loop)]):
+        if not columns:  # the file says which fields it has; it may be older than this program
+            for field in entry.message.DESCRIPTOR.fields:
+                code, dtypes[field.name] = _COLUMNS[field.cpp_type]
+                columns[field.name] = array(code) if code else []
+        for name, column in columns.items():
+            column.append(getattr(entry.message, name))
+    if not columns:
+        topics = ", ".join(sorted(log_info(path).counts)) or "none"
+        msg = f"{path}: has no ticks of loop {loop!r}; topics in this log: {topics}"
+        raise LogError(msg)
+    return {name: np.array(column, dtype=dtypes[name]) for name, column in columns.items()}
+
+
+def log_info(path: Path) -> LogInfo:
+    """What a log holds, from its index, or from reading it through if it has none.
+
+    Raises
+    ------
+    LogError
+        If the file is missing, no MCAP log, or finished and yet damaged.
+    """
+    with _opened(path) as (stream, finished):
+        counts: Counter[str] = Counter()
+        metadata: dict[str, dict[str, str]] = {}
+        span_ns: list[int] = []  # of the first message, of the last
+        with _up_to_the_tear(path, finished):
+            if finished:
+                span_ns = _read_index(SeekingReader(stream), counts, metadata)
+            else:
+                _scan(stream, counts, metadata, span_ns)
+    return LogInfo(
+        path=path,
+        finished=finished,
+        start_s=span_ns[0] / 1e9 if span_ns else math.nan,
+        end_s=span_ns[-1] / 1e9 if span_ns else math.nan,
+        counts=dict(counts),
+        metadata=metadata,
+    )
+
+
+def _read_index(
+    reader: SeekingReader, counts: Counter[str], metadata: dict[str, dict[str, str]]
+) -> list[int]:
+    summary = reader.get_summary()
+    if summary is None or summary.statistics is None:
+        msg = "its index has no statistics"
+        raise McapError(msg)
+    statistics = summary.statistics
+    for channel, number in statistics.channel_message_counts.items():
+        counts[summary.channels[channel].topic] += number
+    metadata.update((entry.name, entry.metadata) for entry in reader.iter_metadata())
+    if not statistics.message_count:
+        return []
+    return [statistics.message_start_time, statistics.message_end_time]
+
+
+def _scan(
+    stream: IO[bytes],
+    counts: Counter[str],
+    metadata: dict[str, dict[str, str]],
+    span_ns: list[int],
+) -> None:
+    topics: dict[int, str] = {}
+    for entry in StreamReader(stream, validate_crcs=True).records:
+        if isinstance(entry, Channel):
+            topics[entry.id] = entry.topic
+        elif isinstance(entry, Metadata):
+            metadata[entry.name] = entry.metadata
+        elif isinstance(entry, Message):
+            counts[topics[entry.channel_id]] += 1
+            span_ns[1:] = [entry.log_time]  # the first one stays
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[IO[bytes], bool]]:
+    """The file, and whether it was finished."""
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        msg = f"{path}: cannot be opened: {error.strerror}; logs are *.mcap in the rig's logging.folder"
+        raise LogError(msg) from error
+    with stream:
+        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            msg = f"{path}: is not an MCAP log; name a file that fitctl recorded"
+            raise LogError(msg)
+        start = stream.tell()
+        stream.seek(max(start, path.stat().st_size - len(MCAP0_MAGIC)))
+        finished = stream.read() == MCAP0_MAGIC
+        stream.seek(0)
+        yield stream, finished
+
+
+@contextlib.contextmanager
+def _up_to_the_tear(path: Path, finished: bool) -> Iterator[None]:
+    """Damage ends a cut file; in a finished file it is an error."""
+    try:
+        yield
+    except _DAMAGE as error:
+        if finished:
+            msg = (
+                f"{path}: is damaged: {error}; `pymcap-cli doctor` tells where and "
+                "`pymcap-cli recover` saves the rest"
+            )
+            raise LogError(msg) from error

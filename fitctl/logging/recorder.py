@@ -1,0 +1,242 @@
+"""The recorder process: receives every record, writes the log, says how it goes.
+
+It shares nothing with the supervisor but the queue's socket, because flushing a chunk may take as long
+as a whole frame period.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from fitctl.config import Logging
+from fitctl.logging.errors import LogError
+from fitctl.logging.queue import RecordReceiver
+from fitctl.logging.records import (
+    RECORD_VERSION,
+    AnyRecord,
+    Envelope,
+    Event,
+    RecorderStatus,
+    RunInfo,
+)
+from fitctl.logging.writer import LogWriter
+
+STATUS_PERIOD_S = 1.0
+DRAIN_S = 2.0
+_POLL_S = 0.1  # how soon a stop or a dead parent is noticed
+_QUIET_S = 0.2  # the queue counts as drained when nothing came for this long
+
+_decode = msgspec.msgpack.Decoder(Envelope).decode
+
+
+def record(
+    endpoint: str,
+    rig_logging: Logging,
+    *,
+    rig_name: str,
+    folder: Path,
+    stop: threading.Event,
+    on_status: Callable[[RecorderStatus], None] | None = None,
+    parent_pid: int | None = None,
+) -> None:
+    """Record until `stop` is set or the parent process dies; then drain the queue and finish the file.
+
+    Parameters
+    ----------
+    endpoint : str
+        The supervisor's :class:`~fitctl.logging.queue.RecordQueue`.
+    rig_logging : Logging
+        Chunks, compression, how often to flush.
+    rig_name : str
+        Begins the file's name.
+    folder : Path
+        Where the file goes; made if missing.
+    stop : threading.Event
+        Set by the caller, from a signal handler for example.
+    on_status : callable, optional
+        Called about once a second, and at the end.
+    parent_pid : int, optional
+        The parent as the caller knows it; without it, whoever is the parent now.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be written, or the endpoint is no address.
+    """
+    parent = os.getppid() if parent_pid is None else parent_pid
+    path = new_log_path(folder, rig_name, datetime.now(UTC))
+    with LogWriter(path, rig_logging) as writer:
+        receiver = RecordReceiver(endpoint)
+        try:
+            recording = _Recording(writer, receiver, rig_logging, on_status)
+            while not stop.is_set() and os.getppid() == parent:
+                recording.step(_POLL_S)
+            deadline_s = time.monotonic() + DRAIN_S
+            while time.monotonic() < deadline_s and recording.step(_QUIET_S):
+                pass
+            recording.report()
+            writer.close()
+            recording.confirm()
+        finally:
+            receiver.close()
+
+
+def new_log_path(folder: Path, rig_name: str, start: datetime) -> Path:
+    """``<rig>_<UTC yyyymmddThhmmssZ>.mcap`` in `folder`, with ``_2``, ``_3``... if it exists already.
+
+    Raises
+    ------
+    LogError
+        If the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = (
+            f"{folder}: cannot be made: {error.strerror}; name another folder for logs "
+            "(key logging.folder of the rig file)"
+        )
+        raise LogError(msg) from error
+    stem = f"{rig_name}_{start.astimezone(UTC):%Y%m%dT%H%M%SZ}"
+    names = (stem if number == 1 else f"{stem}_{number}" for number in count(1))
+    return next(path for name in names if not (path := folder / f"{name}.mcap").exists())
+
+
+class _Recording:
+    """One log in the making: what came, what is missing, when to flush and when to report."""
+
+    def __init__(
+        self,
+        writer: LogWriter,
+        receiver: RecordReceiver,
+        settings: Logging,
+        on_status: Callable[[RecorderStatus], None] | None,
+    ) -> None:
+        self._writer = writer
+        self._receiver = receiver
+        self._flush_s = settings.flush_s
+        # The queue keeps what is not confirmed, so confirm well before it is full.
+        self._flush_records = max(1, settings.queue_records // 4)
+        self._on_status = on_status
+        # One offset for the whole log, the run's once it is known: log times never go back and
+        # compare with the records' own times, even if somebody sets the wall clock meanwhile.
+        self._wall_minus_monotonic_s = time.time() - time.monotonic()
+        self._last_sequence: int | None = None
+        self._unconfirmed = 0
+        self._lost = 0
+        self._lost_reported = 0
+        self._malformed = 0
+        self._malformed_reported = 0
+        self._malformed_why = ""
+        self._next_flush_s = time.monotonic() + self._flush_s
+        self._next_status_s = time.monotonic() + STATUS_PERIOD_S
+
+    def step(self, timeout_s: float) -> bool:
+        """Receive and write one record, then whatever is due; False when none came in time."""
+        data = self._receiver.receive(timeout_s)
+        if data is not None:
+            self._take(data)
+        now_s = time.monotonic()
+        if now_s >= self._next_status_s:
+            self._next_status_s = now_s + STATUS_PERIOD_S
+            self.report()
+        if now_s >= self._next_flush_s or self._unconfirmed >= self._flush_records:
+            self._next_flush_s = now_s + self._flush_s
+            self._writer.flush()
+            self.confirm()
+        return data is not None
+
+    def confirm(self) -> None:
+        """Tell the queue what is in the file."""
+        if self._last_sequence is not None and self._unconfirmed:
+            self._receiver.confirm(self._last_sequence)
+        self._unconfirmed = 0
+
+    def report(self) -> None:
+        """Write a status record, and a warning if records were lost or not understood since the last."""
+        now_s = time.monotonic()
+        if self._lost > self._lost_reported:
+            self._say(
+                "warning",
+                f"{self._lost - self._lost_reported} records were lost on their way to the log "
+                f"({self._lost} in all); the disk or the machine is too slow",
+            )
+            self._lost_reported = self._lost
+        if self._malformed > self._malformed_reported:
+            self._say(
+                "error",
+                f"{self._malformed - self._malformed_reported} messages were no records "
+                f"({self._malformed} in all); the last: {self._malformed_why}",
+            )
+            self._malformed_reported = self._malformed
+        status = RecorderStatus(
+            time_s=now_s,
+            path=str(self._writer.path),
+            records=self._writer.records,
+            lost=self._lost,
+            bytes_written=self._writer.bytes_written,
+        )
+        self._write(status)
+        if self._on_status is not None:
+            self._on_status(status)
+
+    def _take(self, data: bytes) -> None:
+        self._unconfirmed += 1
+        try:
+            envelope = _understood(data)
+            self._count_gap(envelope.sequence)
+            if isinstance(envelope.record, RunInfo):
+                self._wall_minus_monotonic_s = envelope.record.wall_minus_monotonic_s
+            self._write(envelope.record)
+        except (msgspec.DecodeError, ValueError) as error:
+            self._malformed += 1
+            self._malformed_why = str(error)
+
+    def _count_gap(self, sequence: int) -> None:
+        if self._last_sequence is not None:
+            self._lost += max(0, sequence - self._last_sequence - 1)
+        self._last_sequence = sequence
+
+    def _write(self, record: AnyRecord) -> None:
+        self._writer.write(record, time.monotonic() + self._wall_minus_monotonic_s)
+
+    def _say(self, severity: Literal["info", "warning", "error"], message: str) -> None:
+        event = Event(
+            time_s=time.monotonic(), severity=severity, source="recorder", message=message
+        )
+        self._write(event)
+
+
+def _understood(data: bytes) -> Envelope:
+    """Decode an envelope of this version.
+
+    Raises
+    ------
+    msgspec.DecodeError, ValueError
+        If it is damaged, or of another version.
+    """
+    try:
+        envelope = _decode(data)
+    except msgspec.ValidationError:  # msgpack, but not our envelope: perhaps another version's
+        _check_version(msgspec.msgpack.decode(data))
+        raise
+    _check_version([envelope.version])
+    return envelope
+
+
+def _check_version(content: object) -> None:
+    if isinstance(content, list) and content and content[0] != RECORD_VERSION:
+        msg = (
+            f"a record of version {content[0]}, but this recorder knows version {RECORD_VERSION}; "
+            "start supervisor and recorder from the same installation of fitctl"
+        )
+        raise ValueError(msg)

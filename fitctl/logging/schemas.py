@@ -1,0 +1,174 @@
+"""Where each record goes in a log, and as which protobuf message.
+
+The messages are built at import from the structs of :mod:`fitctl.logging.records`, so a field is
+defined once. Frames and events take Foxglove's own messages, which viewers know how to show.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable
+from typing import Any, Literal, Union, get_args, get_origin
+
+import msgspec
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from fitctl.logging.records import (
+    AnyRecord,
+    DeviceHealth,
+    Event,
+    FrameRecord,
+    LoopTiming,
+    ModeChange,
+    PiezoReading,
+    RecorderStatus,
+    RunInfo,
+    Tick,
+)
+
+TOPICS: dict[type[AnyRecord], str] = {
+    Tick: "/fit/{loop}/tick",
+    FrameRecord: "/fit/camera/frame",
+    ModeChange: "/fit/{loop}/mode",
+    Event: "/fit/events",
+    LoopTiming: "/fit/{loop}/timing",
+    PiezoReading: "/fit/{loop}/piezo",
+    DeviceHealth: "/fit/devices/health",
+    RecorderStatus: "/fit/recorder/status",
+}
+"""RunInfo is missing because it is kept as metadata: see :func:`run_metadata`."""
+
+_FIELD_TYPES = {
+    float: FieldDescriptorProto.TYPE_DOUBLE,
+    int: FieldDescriptorProto.TYPE_INT64,
+    bool: FieldDescriptorProto.TYPE_BOOL,
+    str: FieldDescriptorProto.TYPE_STRING,
+    bytes: FieldDescriptorProto.TYPE_BYTES,
+}
+_LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
+_BYTES_PER_PIXEL = 2
+
+
+def topic_of(record: AnyRecord) -> str:
+    """The topic of a record; ``{loop}`` stands for the record's own loop."""
+    return TOPICS[type(record)].format(loop=getattr(record, "loop", ""))
+
+
+def to_message(record: AnyRecord, wall_ns: int) -> Message:
+    """The protobuf message of a record.
+
+    Parameters
+    ----------
+    record : AnyRecord
+        Anything but a RunInfo.
+    wall_ns : int
+        The record's own time as nanoseconds since 1970; Foxglove's messages carry it.
+    """
+    convert = _FOXGLOVE.get(type(record))
+    if convert is not None:
+        return convert(record, wall_ns)
+    return _MESSAGES[type(record)](**msgspec.structs.asdict(record))
+
+
+def run_metadata(info: RunInfo) -> dict[str, dict[str, str]]:
+    """A run's description as MCAP metadata: name to texts. Floats read back exactly."""
+    metadata = {
+        "rig": {"name": info.rig_name, "json": info.rig_json},
+        "versions": dict(info.versions),
+        "scheduling": {"policy": info.scheduling},
+        "clock": {
+            "wall_minus_monotonic_s": repr(info.wall_minus_monotonic_s),
+            "run_start_monotonic_s": repr(info.time_s),
+        },
+    }
+    if info.random_seed is not None:
+        metadata["random_seed"] = {"value": str(info.random_seed)}
+    return metadata
+
+
+def message_class(record_type: type[msgspec.Struct], pool: DescriptorPool) -> type[Message]:
+    """Build the protobuf message ``fitctl.<name>`` of a struct, field by field, into `pool`.
+
+    A field that may be None becomes optional, so that None is told from zero.
+
+    Raises
+    ------
+    TypeError
+        If a field has no protobuf counterpart here.
+    """
+    file = FileDescriptorProto(
+        name=f"fitctl/{record_type.__name__}.proto", package="fitctl", syntax="proto3"
+    )
+    message = file.message_type.add(name=record_type.__name__)
+    for number, struct_field in enumerate(msgspec.structs.fields(record_type), start=1):
+        python_type, optional = _plain_type(struct_field.type)
+        if python_type not in _FIELD_TYPES:
+            msg = f"{record_type.__name__}.{struct_field.name}: {struct_field.type} has no protobuf type"
+            raise TypeError(msg)
+        field = message.field.add(
+            name=struct_field.name,
+            number=number,
+            type=_FIELD_TYPES[python_type],
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+        )
+        if optional:  # proto3 wants a one-member "oneof" beside each optional field
+            field.proto3_optional = True
+            field.oneof_index = len(message.oneof_decl)
+            message.oneof_decl.add(name=f"_{struct_field.name}")
+    pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(f"fitctl.{record_type.__name__}"))
+
+
+def _plain_type(annotation: Any) -> tuple[Any, bool]:
+    """``X`` and whether None is allowed, of ``X | None``; a Literal is the type of its values."""
+    optional = False
+    if get_origin(annotation) in {Union, types.UnionType}:
+        options = [option for option in get_args(annotation) if option is not types.NoneType]
+        optional = len(options) < len(get_args(annotation))
+        annotation = options[0] if len(options) == 1 else annotation
+    if get_origin(annotation) is Literal:
+        annotation = type(get_args(annotation)[0])
+    return annotation, optional
+
+
+def _timestamp(wall_ns: int) -> Timestamp:
+    return Timestamp(seconds=wall_ns // 1_000_000_000, nanos=wall_ns % 1_000_000_000)
+
+
+def _raw_image(frame: FrameRecord, wall_ns: int) -> RawImage:
+    return RawImage(
+        timestamp=_timestamp(wall_ns),
+        frame_id=frame.camera,
+        width=frame.width_px,
+        height=frame.height_px,
+        encoding="mono16",
+        step=frame.width_px * _BYTES_PER_PIXEL,
+        data=frame.data,
+    )
+
+
+def _log(event: Event, wall_ns: int) -> Log:
+    return Log(
+        timestamp=_timestamp(wall_ns),
+        level=_LEVELS[event.severity],
+        message=event.message,
+        name=event.source,
+    )
+
+
+_FOXGLOVE: dict[type[AnyRecord], Callable[[Any, int], Message]] = {
+    FrameRecord: _raw_image,
+    Event: _log,
+}
+_POOL = DescriptorPool()
+_MESSAGES: dict[type[AnyRecord], type[Message]] = {
+    record_type: message_class(record_type, _POOL)
+    for record_type in TOPICS
+    if record_type not in _FOXGLOVE
+}

@@ -1,0 +1,67 @@
+"""Timers of the mock drive, on the running event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+
+class Periodic:
+    """Calls `action` every so often while its period is above zero; a missed turn is skipped."""
+
+    def __init__(self, action: Callable[[], None]) -> None:
+        self._action = action
+        self._period_s = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+
+    def set_period(self, period_s: float) -> None:
+        """Start anew with this period; 0 stops."""
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
+        self._period_s = period_s
+        if period_s > 0:
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_later(period_s, self._turn, loop.time() + period_s)
+
+    def _turn(self, due_s: float) -> None:
+        loop = asyncio.get_running_loop()
+        due_s = max(due_s + self._period_s, loop.time())
+        self._timer = loop.call_at(due_s, self._turn, due_s)
+        self._action()
+
+
+class Watchdog:
+    """Calls `expired` once when it was fed, and then not again for its timeout.
+
+    Feeding is a store and a clock reading, whatever the rate; the timer moves only when it fires.
+    """
+
+    def __init__(self, expired: Callable[[], None]) -> None:
+        self._expired = expired
+        self._timeout_s = 0.0
+        self._fed_s = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+
+    def set_timeout(self, timeout_s: float) -> None:
+        """Wait for the first feeding, with this timeout; 0 switches off."""
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
+        self._timeout_s = timeout_s
+
+    def feed(self) -> None:
+        """Put off the end; the first feeding arms."""
+        loop = asyncio.get_running_loop()
+        self._fed_s = loop.time()
+        if self._timer is None and self._timeout_s > 0:
+            self._timer = loop.call_later(self._timeout_s, self._look)
+
+    def _look(self) -> None:
+        loop = asyncio.get_running_loop()
+        left_s = self._fed_s + self._timeout_s - loop.time()
+        if left_s > 0:
+            self._timer = loop.call_later(left_s, self._look)
+        else:
+            self._timer = None
+            self._expired()

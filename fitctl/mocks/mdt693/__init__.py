@@ -1,0 +1,1 @@
+"""A mock Thorlabs MDT693A or MDT693B."""

@@ -1,0 +1,1 @@
+"""A mock Modbus/TCP D/A converter."""

@@ -1,0 +1,82 @@
+"""Stack hysteresis: 13 play operators in parallel (Eq. 6, Figs. 3-4), a Prandtl-Ishlinskii model.
+
+The model is static and exact and needs no small step: one evaluation is a clamp for each element and a
+dot product. Arrays may have any leading axes (runs, stacks).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Fsm, Hysteresis
+
+Floats = NDArray[np.float64]
+
+
+def gains_from_slopes(slopes_m_per_v: Floats) -> Floats:
+    """Eq. 6 inverted: element gains k of the local slopes s = L k of a full-scale ramp.
+
+    Parameters
+    ----------
+    slopes_m_per_v : array, shape (n,)
+        Slopes between the breakpoints, low voltage first.
+
+    Returns
+    -------
+    array, shape (n,)
+        Output gain of each element, metres per volt.
+    """
+    return np.diff(slopes_m_per_v, prepend=0.0)
+
+
+def play(state: Floats, value: Floats, half_width: Floats) -> Floats:
+    """One evaluation of the play (backlash) operator: the new output, shapes broadcast."""
+    return np.maximum(value - half_width, np.minimum(value + half_width, state))
+
+
+def hysteresis_output(state: Floats, gains: Floats) -> Floats:
+    """Displacement of the parallel elements: state has shape (..., n), gains (n,)."""
+    return state @ gains
+
+
+def swept_stroke(half_width_v: Floats, gains: Floats, full_scale_v: float) -> float:
+    """Output swing of a full sweep up and down, once the virgin curve has been left."""
+    return float(gains @ np.maximum(full_scale_v - 2 * half_width_v, 0.0))
+
+
+def swept_loop_width(half_width_v: Floats, gains: Floats, full_scale_v: float) -> float:
+    """Vertical width of the full loop at mid scale.
+
+    A play of half width r still rests on its other flank at mid scale when 2r passes half the swing.
+    """
+    gap = np.minimum(2 * half_width_v, full_scale_v - 2 * half_width_v)
+    return float(gains @ np.maximum(gap, 0.0))
+
+
+def stack_gains(settings: Hysteresis, fsm: Fsm) -> Floats:
+    """Element gains of a stack with the rig's stroke and loop width, swept over the D/A's full scale.
+
+    Slopes rise in proportion to the distance between breakpoints, so that the loop bends most where the
+    breakpoints are densest; how much they rise sets the loop's width.
+
+    Raises
+    ------
+    ValueError
+        If no such stack exists: the loop is wider than these breakpoints allow.
+    """
+    half_width_v = np.asarray(settings.breakpoints_v)
+    full_scale_v = fsm.dac.full_scale_v
+    rise = np.diff(half_width_v, prepend=0.0)
+    linear = (half_width_v == 0).astype(float)
+    # width = fraction * stroke is linear in the strength of the rise.
+    fraction = settings.loop_width_fraction
+    stroke_linear = swept_stroke(half_width_v, linear, full_scale_v)
+    rise_excess = swept_loop_width(half_width_v, rise, full_scale_v) - fraction * swept_stroke(
+        half_width_v, rise, full_scale_v
+    )
+    if rise_excess <= 0:
+        msg = f"loop_width_fraction {fraction} is wider than the breakpoints allow; lower it"
+        raise ValueError(msg)
+    gains = linear + rise * (fraction * stroke_linear / rise_excess)
+    return gains * settings.full_swing_stroke_m / swept_stroke(half_width_v, gains, full_scale_v)

@@ -1,0 +1,131 @@
+"""Optics and geometry: from motors and stacks to pixels, Eq. 1-5 and Table 1 of the FIT paper.
+
+Angles are small. ``az`` is along the camera's x (columns), ``el`` along y (rows); arrays keep the pair
+on their last axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ARCSEC_PER_RAD, Loop, Rig
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Scales:
+    """How far one unit of each stage moves the star on the focal plane.
+
+    Attributes
+    ----------
+    sky_px_per_rad : float
+        Beam angle on the sky, before the compressor, to focal plane: k_comp f_i / pixel.
+    motor_sky_rad_per_rad : float
+        Siderostat motor to beam on the sky: 2 p / (GR_spur r_arm).
+    motor_px_per_rad : float
+        Siderostat motor to focal plane: 1.437e-4 m/rad on FIT.
+    mirror_px_per_rad : float
+        Fast steering mirror to focal plane: k_FSM f_i / pixel.
+    pixel_size_m : float
+        One pixel.
+    """
+
+    sky_px_per_rad: float
+    motor_sky_rad_per_rad: float
+    motor_px_per_rad: float
+    mirror_px_per_rad: float
+    pixel_size_m: float
+
+    @property
+    def sky_arcsec_per_px(self) -> float:
+        """Beam angle on the sky of one pixel."""
+        return ARCSEC_PER_RAD / self.sky_px_per_rad
+
+    @property
+    def motor_sky_arcsec_per_rad(self) -> float:
+        """Beam angle on the sky of one radian of motor."""
+        return self.motor_sky_rad_per_rad * ARCSEC_PER_RAD
+
+
+def scales(rig: Rig, loop: Loop) -> Scales:
+    """Scales of one loop of a rig (Table 1)."""
+    pixel_size_m = rig.camera.pixel_size_m
+    siderostat = loop.siderostat
+    sky_px_per_rad = rig.optics.compressor_ratio * rig.optics.focal_length_m / pixel_size_m
+    # The siderostat is a mirror: its beam turns by twice its own angle.
+    motor_sky = (
+        2 * siderostat.ball_screw_m_per_rad / siderostat.spur_gear_ratio / siderostat.lever_arm_m
+    )
+    return Scales(
+        sky_px_per_rad=sky_px_per_rad,
+        motor_sky_rad_per_rad=motor_sky,
+        motor_px_per_rad=motor_sky * sky_px_per_rad,
+        mirror_px_per_rad=loop.fsm.beam_per_mirror * rig.optics.focal_length_m / pixel_size_m,
+        pixel_size_m=pixel_size_m,
+    )
+
+
+def stack_matrix(stack_radius_m: float) -> Floats:
+    """S of Eq. 1, shape (3, 2): stack displacement in metres per radian of mirror."""
+    return stack_radius_m * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+
+
+def stack_volts(
+    mirror_rad: Floats, stack_radius_m: float, stack_scale_m_per_v: float, bias_v: float
+) -> Floats:
+    """Eq. 1: D/A voltages, shape (..., 3), of wanted mirror angles, shape (..., 2)."""
+    return mirror_rad @ stack_matrix(stack_radius_m).T / stack_scale_m_per_v + bias_v
+
+
+def mirror_angles(
+    volts: Floats, stack_radius_m: float, stack_scale_m_per_v: float, bias_v: float
+) -> Floats:
+    """Eq. 5: least-squares mirror angles, shape (..., 2), of D/A voltages, shape (..., 3)."""
+    s = stack_matrix(stack_radius_m)
+    return (volts - bias_v) * stack_scale_m_per_v @ np.linalg.solve(s.T @ s, s.T).T
+
+
+def mirror_from_stacks(displacement_m: Floats, stack_radius_m: float) -> Floats:
+    """Mirror angles, shape (..., 2), of three stack displacements about mid stroke, shape (..., 3).
+
+    The plane through the three points of Eq. 2, for small angles; piston does not enter.
+    """
+    d1, d2, d3 = displacement_m[..., 0], displacement_m[..., 1], displacement_m[..., 2]
+    return np.stack([d2 - d3, d1 - d2], axis=-1) / (2 * stack_radius_m)
+
+
+def mirror_normal(displacement_m: Floats, stack_radius_m: float) -> Floats:
+    """Eq. 3: unit normal, shape (..., 3), of the mirror on three displaced stacks, shape (..., 3)."""
+    v1, v2, v3 = _stack_points(displacement_m, stack_radius_m)
+    normal = np.cross(v3 - v2, v1 - v2)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def piston_m(displacement_m: Floats, stack_radius_m: float) -> Floats:
+    """Eq. 4: distance along z from the origin to the mirror surface, shape (...)."""
+    normal = mirror_normal(displacement_m, stack_radius_m)
+    _, _, v3 = _stack_points(displacement_m, stack_radius_m)
+    return np.sum(normal * v3, axis=-1) / normal[..., 2]
+
+
+def _stack_points(displacement_m: Floats, r: float) -> tuple[Floats, Floats, Floats]:
+    """Eq. 2: the three points where the stacks hold the mirror."""
+    corners = np.array([[-r, r], [-r, -r], [r, -r]])
+    points = np.empty((*displacement_m.shape, 3))
+    points[..., :2] = corners
+    points[..., 2] = displacement_m
+    return points[..., 0, :], points[..., 1, :], points[..., 2, :]
+
+
+def saturate_diamond(mirror_rad: Floats, range_rad: float) -> Floats:
+    """Scale a pair of mirror angles, shape (..., 2), into |az| + |el| <= range, keeping its direction.
+
+    Two axes share three stacks, so what can be reached is a diamond; clipping each axis by itself
+    would overdrive a stack and turn the motion.
+    """
+    reach = np.sum(np.abs(mirror_rad), axis=-1, keepdims=True)
+    return mirror_rad * np.minimum(1.0, range_rad / np.maximum(reach, 1e-300))

@@ -1,0 +1,72 @@
+"""fitctl's own processes: starting one, ending one, and noticing that a parent has gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager, suppress
+from typing import IO, Iterator
+
+_PARENT_CHECK_S = 0.25
+
+
+def start_process(
+    arguments: Sequence[str], *, stdout: int | IO[bytes] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start ``fitctl ARGUMENTS`` in a session of its own, so that Ctrl-C reaches only its parent."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "fitctl", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=stdout if stdout is not None else subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:
+    """Ask a process to end, and insist when it does not within `timeout_s`."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+@contextmanager
+def ended_by_signals(end: Callable[[], None]) -> Iterator[None]:
+    """Call `end` at SIGINT and SIGTERM, instead of what they do by themselves."""
+
+    def handler(_signal: int, _frame: object) -> None:
+        end()
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, action in before.items():
+            signal.signal(number, action)
+
+
+def end_with_parent(parent_pid: int | None) -> None:
+    """Send SIGTERM to this process once its parent has gone; None means that nobody minds.
+
+    A parent that was killed cannot end its children; this leaves none behind.
+    """
+    if parent_pid is None:
+        return
+
+    def watch() -> None:
+        gone = threading.Event()
+        while os.getppid() == parent_pid:
+            gone.wait(_PARENT_CHECK_S)
+        with suppress(ProcessLookupError):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()

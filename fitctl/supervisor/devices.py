@@ -1,0 +1,31 @@
+"""The devices of a rig, made from its file: one table from driver name to driver."""
+
+from __future__ import annotations
+
+from fitctl.config import Rig
+from fitctl.drivers.cia402.driver import Cia402Amplifiers
+from fitctl.drivers.gige.driver import GigeCamera
+from fitctl.drivers.interface import Devices, LoopDevices
+from fitctl.drivers.mdt693.driver import Mdt693
+from fitctl.drivers.modbus_dac.driver import ModbusDac
+
+
+CAMERAS = {"gige": GigeCamera}
+AMPLIFIERS = {"cia402": Cia402Amplifiers}
+DACS = {"modbus_dac": ModbusDac}
+PIEZOS = {"mdt693": Mdt693}
+
+
+def rig_devices(rig: Rig) -> Devices:
+    """Drivers for every device that the rig file names; none is opened yet."""
+    return Devices(
+        camera=CAMERAS[rig.camera.device.driver](rig.camera),
+        loops={
+            name: LoopDevices(
+                amplifiers=AMPLIFIERS[loop.siderostat.device.driver](loop.siderostat),
+                dac=DACS[loop.fsm.dac.driver](loop.fsm.dac),
+                piezo=PIEZOS[loop.fsm.piezo.driver](loop.fsm.piezo),
+            )
+            for name, loop in rig.loops.items()
+        },
+    )

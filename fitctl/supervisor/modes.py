@@ -1,0 +1,116 @@
+"""The modes of a stellar loop, and the one table of what leads from each to which.
+
+The table is data: the machine, the console's diagram, the documentation and the exhaustive test all
+read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Mode(IntEnum):
+    """What a loop is doing; the number is what logs carry."""
+
+    OFF = 0
+    STANDBY = 1
+    ACQUISITION = 2
+    COARSE = 3
+    VERNIER = 4
+    SAFE = 5
+
+
+MEANING = {
+    Mode.OFF: "devices let go, nothing powered",
+    Mode.STANDBY: "devices ready, siderostat held where it is, mirror at its bias",
+    Mode.ACQUISITION: "the siderostat searches for the star along a spiral",
+    Mode.COARSE: "star found; the siderostat pulls it in",
+    Mode.VERNIER: "the fast steering mirror holds the star, the siderostat takes what lasts",
+    Mode.SAFE: "mirror to its bias, siderostat stopped, amplifiers disabled after a time",
+}
+
+TRACKING = frozenset({Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER})
+
+
+class Trigger(IntEnum):
+    """What can lead from one mode to another: commands of people, then findings of the loop."""
+
+    STANDBY = 0
+    ACQUIRE = 1
+    HOLD = 2
+    STOP = 3
+    RECOVER = 4
+    OFF = 5
+    STAR_FOUND = 6
+    IN_REACH = 7
+    OUT_OF_REACH = 8
+    STAR_LOST = 9
+    SEARCH_EXHAUSTED = 10
+    FAULT = 11
+
+
+COMMANDS = frozenset(
+    {
+        Trigger.STANDBY,
+        Trigger.ACQUIRE,
+        Trigger.HOLD,
+        Trigger.STOP,
+        Trigger.RECOVER,
+        Trigger.OFF,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One row of the table."""
+
+    source: Mode
+    trigger: Trigger
+    target: Mode
+    condition: str
+
+
+def _from(sources: tuple[Mode, ...], trigger: Trigger, target: Mode, condition: str) -> list[Transition]:
+    return [Transition(source, trigger, target, condition) for source in sources]
+
+
+_POWERED = (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
+
+TRANSITIONS: tuple[Transition, ...] = (
+    *_from((Mode.OFF,), Trigger.STANDBY, Mode.STANDBY, "all devices open, checked and enabled"),
+    *_from((Mode.STANDBY,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for"),
+    *_from((Mode.ACQUISITION,), Trigger.STAR_FOUND, Mode.COARSE, "star on found_frames frames in a row"),
+    *_from((Mode.ACQUISITION,), Trigger.SEARCH_EXHAUSTED, Mode.STANDBY, "whole search radius seen"),
+    *_from((Mode.COARSE,), Trigger.IN_REACH, Mode.VERNIER, "error in the mirror's reach for reach_frames"),
+    *_from((Mode.COARSE, Mode.VERNIER), Trigger.STAR_LOST, Mode.ACQUISITION, "no star for lost_frames"),
+    *_from((Mode.VERNIER,), Trigger.OUT_OF_REACH, Mode.COARSE, "error beyond the mirror's range for reach_frames"),
+    *_from((Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER), Trigger.HOLD, Mode.STANDBY, "asked for"),
+    *_from((*_POWERED, Mode.OFF), Trigger.STOP, Mode.SAFE, "asked for, at once"),
+    *_from(_POWERED, Trigger.FAULT, Mode.SAFE, "any device fault"),
+    *_from((Mode.SAFE,), Trigger.RECOVER, Mode.STANDBY, "all devices reopened, checked and enabled"),
+    *_from((Mode.STANDBY, Mode.SAFE), Trigger.OFF, Mode.OFF, "asked for; amplifiers disabled, devices closed"),
+)
+
+_TABLE = {(row.source, row.trigger): row for row in TRANSITIONS}
+
+
+def transition(mode: Mode, trigger: Trigger) -> Transition | None:
+    """The row for a trigger in a mode, or None where it means nothing."""
+    return _TABLE.get((mode, trigger))
+
+
+def usable_commands(mode: Mode) -> list[Trigger]:
+    """The commands that mean something in a mode, in the order of the table."""
+    return [row.trigger for row in TRANSITIONS if row.source is mode and row.trigger in COMMANDS]
+
+
+def mermaid() -> str:
+    """The table as a Mermaid state diagram, for the documentation."""
+    lines = ["stateDiagram-v2", "    [*] --> OFF"]
+    lines += [
+        f"    {row.source.name} --> {row.target.name}: {row.trigger.name.lower().replace('_', ' ')}"
+        for row in TRANSITIONS
+    ]
+    return "\n".join(lines)

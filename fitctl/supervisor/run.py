@@ -1,0 +1,192 @@
+"""The supervisor process: real clock, real devices, threads for servos and service, a recorder beside it."""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import importlib.metadata
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from fitctl.clock import MonotonicClock
+from fitctl.config import ConfigError, Rig
+from fitctl.logging.queue import RecordQueue
+from fitctl.logging.records import Record, RunInfo
+from fitctl.processes import end_process, ended_by_signals, start_process
+from fitctl.supervisor.devices import rig_devices
+from fitctl.supervisor.endpoints import (
+    COMMAND_SOCKET,
+    RECORDS_SOCKET,
+    TELEMETRY_SOCKET,
+    make_service_folder,
+)
+from fitctl.supervisor.realtime import (
+    become_realtime,
+    collect_young,
+    lock_memory,
+    quiet_interpreter,
+)
+from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
+from fitctl.supervisor.servo import ServoThread
+from fitctl.supervisor.supervisor import Supervisor
+
+_HOUSEKEEPING_S = 1.0
+_WIND_DOWN_S = 1.0
+_RECORDER_END_S = 5.0
+_VERSIONED = ("fitctl", "numpy", "scipy", "control", "pyzmq", "mcap", "python-can", "pymodbus", "genicam")
+
+
+class Recorder:
+    """The recorder process, started again when it dies."""
+
+    def __init__(self, arguments: Sequence[str], note: Callable[[str, str, str], None]) -> None:
+        self._arguments = arguments
+        self._note = note
+        self._process = start_process(arguments)
+
+    def check(self) -> None:
+        """Start it again if it has died."""
+        code = self._process.poll()
+        if code is None:
+            return
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+        self._note("error", "recorder", f"the recorder {how}; a new one begins a new file")
+        self._process = start_process(self._arguments)
+
+    def end(self) -> None:
+        """Let it write what it has and end."""
+        end_process(self._process, _RECORDER_END_S)
+
+
+@contextmanager
+def only_supervisor(folder: Path) -> Iterator[None]:
+    """Hold the rig's lock; a second supervisor on the same rig is refused.
+
+    Raises
+    ------
+    ConfigError
+        If another holds it; the text names its process.
+    """
+    path = folder / "lock"
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
+            msg = (
+                f"{folder}: another supervisor (process {owner}) has this rig; attach to it with "
+                "`fitctl console`, or end it first"
+            )
+            raise ConfigError(msg) from None
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+        yield
+        os.ftruncate(descriptor, 0)
+    finally:
+        os.close(descriptor)
+
+
+def run_supervisor(
+    rig: Rig, recorder_arguments: Sequence[str], on_ready: Callable[[Path], None]
+) -> None:
+    """Supervise a rig until told to shut down, by a command or a signal.
+
+    Parameters
+    ----------
+    rig : Rig
+    recorder_arguments : sequence of str
+        How to start the recorder: ``fitctl`` arguments that describe the same rig.
+    on_ready : callable
+        Called with the socket folder once commands are answered.
+
+    Raises
+    ------
+    ConfigError
+        If the socket folder cannot be used, or another supervisor has this rig.
+    """
+    folder = make_service_folder(rig)
+    with ExitStack() as stack:
+        stack.enter_context(only_supervisor(folder))
+        for name in (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET):
+            stack.callback((folder / name).unlink, missing_ok=True)
+        clock = MonotonicClock()
+        queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
+        stack.callback(queue.close)  # in case what follows fails
+        buffer = TelemetryBuffer()
+
+        def record(record: Record) -> None:
+            queue.offer(record)
+            buffer.add(record)
+
+        executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
+        supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
+        recorder = Recorder(recorder_arguments, supervisor.note)
+        stack.callback(recorder.end)
+        scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
+        info = run_info(rig, scheduling, clock.now_s())
+        record(info)
+        state = ServiceState(
+            pid=os.getpid(),
+            wall_minus_monotonic_s=info.wall_minus_monotonic_s,
+            scheduling=scheduling,
+            records_lost=lambda: queue.lost,
+        )
+        service = Service(supervisor, buffer, folder, state, clock)
+        servos = [ServoThread(servo, clock) for servo in supervisor.servos.values()]
+        service.start()
+        for servo in servos:
+            servo.start()
+        quiet_interpreter()
+        on_ready(folder)
+        try:
+            _loop(supervisor, queue, recorder, executor, clock)
+        finally:
+            gc.enable()
+            for servo in servos:
+                servo.stop()
+            service.stop()
+            queue.close()  # while the recorder, which the stack ends, still listens
+
+
+def _loop(
+    supervisor: Supervisor,
+    queue: RecordQueue,
+    recorder: Recorder,
+    executor: ThreadPoolExecutor,
+    clock: MonotonicClock,
+) -> None:
+    housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
+    with ended_by_signals(supervisor.ask_shutdown):
+        while not supervisor.shutdown_wanted:
+            supervisor.step()
+            if clock.now_s() >= housekeeping_s:
+                housekeeping_s += _HOUSEKEEPING_S
+                queue.pump()
+                collect_young()
+                executor.submit(recorder.check)
+        supervisor.stop("shutting down")
+        end_s = clock.now_s() + _WIND_DOWN_S
+        while clock.now_s() < end_s and not supervisor.at_rest():
+            supervisor.step()
+        supervisor.close()
+
+
+def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
+    """What is needed to understand this run's records."""
+    versions = {name: importlib.metadata.version(name) for name in _VERSIONED}
+    return RunInfo(
+        time_s=now_s,
+        wall_minus_monotonic_s=time.time() - time.monotonic(),
+        rig_name=rig.name,
+        rig_json=rig.model_dump_json(indent=1),
+        versions=versions | {"python": platform.python_version()},
+        scheduling=scheduling,
+    )
+
+

@@ -1,0 +1,264 @@
+"""The siderostat under its position servo: one period at a time, on a thread of its own at 500 Hz.
+
+Everything that speaks to the amplifiers happens inside :meth:`SiderostatServo.period`, so that one thread
+only uses the driver; the other threads leave wishes (a set-point, a stop, a request) and read results.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.clock import Clock
+from fitctl.config import Loop
+from fitctl.controllers.position_servo import PositionServo
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceFault,
+    DeviceIdentity,
+    DeviceTimeout,
+    ServoAmplifiers,
+)
+from fitctl.supervisor.realtime import become_realtime
+
+Floats = NDArray[np.float64]
+_HISTORY_S = 0.3
+_REQUEST_TIMEOUT_S = 15.0
+
+
+class ServoTiming(NamedTuple):
+    """Lateness of servo periods since last asked: for timing reports."""
+
+    late_s: list[float]
+    missed_readings: int
+
+
+class SiderostatServo:
+    """One loop's siderostat.
+
+    Parameters
+    ----------
+    name : str
+        Loop name, for errors.
+    loop : Loop
+    amplifiers : ServoAmplifiers
+    clock : Clock
+    setpoint_period_s : float
+        Time between calls of :meth:`move_to`: the frame period.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        loop: Loop,
+        amplifiers: ServoAmplifiers,
+        clock: Clock,
+        setpoint_period_s: float,
+    ) -> None:
+        siderostat = loop.siderostat
+        self.name = name
+        self.endpoint = siderostat.device.channel
+        self.period_s = 1.0 / siderostat.servo.rate_hz
+        self.fault: DeviceError | None = None
+        self.enabled = False
+        self.opened = False
+        self.threaded = False
+        self.position_rad = np.zeros(2)
+        self.setpoint_rad = np.zeros(2)
+        self._settings = siderostat.servo
+        self._amplifiers = amplifiers
+        self._clock = clock
+        self._servo = PositionServo(
+            siderostat.servo.gain_per_s,
+            siderostat.velocity_limit_rad_s,
+            siderostat.acceleration_limit_rad_s2,
+            self.period_s,
+            setpoint_period_s,
+        )
+        self._stopped = True
+        self._wish_rad: Floats | None = None
+        self._requests: deque[tuple[Callable[[], DeviceIdentity | None], Future]] = deque()
+        self._history: deque[tuple[float, Floats]] = deque(maxlen=round(_HISTORY_S / self.period_s))
+        self._last_reading_s = 0.0
+        self._missed_readings = 0
+        self.late_s: deque[float] = deque(maxlen=4096)
+
+    # ------------------------------------------------------------ from any thread
+
+    def move_to(self, setpoint_rad: Floats) -> None:
+        """Wanted motor angles one set-point period from now, shape (2,)."""
+        self.setpoint_rad = setpoint_rad
+        self._wish_rad = setpoint_rad
+
+    def stop(self) -> None:
+        """Velocity zero from the next period on, until :meth:`hold`."""
+        self._stopped = True
+        self._wish_rad = None
+
+    def hold(self) -> None:
+        """Servo about where the motors are now."""
+        self.move_to(self.position_rad)
+        self._stopped = False
+
+    def position_at(self, time_s: float) -> Floats:
+        """Motor angles at a recent time, shape (2,), interpolated between readings."""
+        history = list(self._history)
+        for (t0, p0), (t1, p1) in zip(reversed(history[:-1]), reversed(history[1:]), strict=True):
+            if t0 <= time_s:
+                part = min(1.0, (time_s - t0) / (t1 - t0)) if t1 > t0 else 1.0
+                return p0 + part * (p1 - p0)
+        return history[0][1] if history else self.position_rad
+
+    def open(self) -> DeviceIdentity:
+        """Connect, clear a latched fault and enable, holding where the motors are."""
+        return self._ask(self._open)
+
+    def disable(self) -> None:
+        """Take power from the motors, without waiting for it; a failure shows as a fault."""
+        if self.opened and self.enabled:
+            self._post(self._disable)
+
+    def close(self) -> None:
+        """Disable and disconnect."""
+        self._ask(self._close)
+
+    def take_timing(self) -> ServoTiming:
+        """Lateness and missed readings since the last call."""
+        late = [self.late_s.popleft() for _ in range(len(self.late_s))]
+        missed, self._missed_readings = self._missed_readings, 0
+        return ServoTiming(late, missed)
+
+    # ------------------------------------------------------------ on the servo's thread
+
+    def period(self) -> None:
+        """One servo period: requests, then command and read both axes."""
+        while self._requests:
+            action, future = self._requests.popleft()
+            try:
+                future.set_result(action())
+            except DeviceError as error:
+                future.set_exception(error)
+        if not self.opened or self.fault is not None:
+            return
+        try:
+            self._exchange()
+        except DeviceError as error:
+            self._stopped = True
+            self.fault = error
+
+    def _exchange(self) -> None:
+        wish, self._wish_rad = self._wish_rad, None
+        if self._stopped or not self.enabled:
+            self._servo.reset(self.position_rad)
+            velocity_rad_s = np.zeros(2)
+        else:
+            if wish is not None:
+                self._servo.move_to(wish)
+            velocity_rad_s = self._servo.step(self.position_rad)
+        reading = self._amplifiers.exchange(velocity_rad_s)
+        now_s = self._clock.now_s()
+        if reading is None:
+            self._missed_readings += 1
+            if now_s - self._last_reading_s > self._settings.reading_timeout_s:
+                raise DeviceTimeout(
+                    self._device,
+                    self.endpoint,
+                    f"an encoder reading within {self._settings.reading_timeout_s:g} s",
+                    "none",
+                    "check the drive's power and link, then recover",
+                )
+            return
+        self._last_reading_s = now_s
+        self.position_rad = reading.position_rad
+        self._history.append((reading.time_s, reading.position_rad))
+        if reading.fault:
+            raise DeviceFault(
+                self._device, self.endpoint, "no fault", reading.fault, "remove its cause, then recover"
+            )
+        if self.enabled and not reading.enabled:
+            raise DeviceFault(
+                self._device, self.endpoint, "both axes enabled", "an axis disabled itself", "recover"
+            )
+        following = np.abs(self._servo.reference_rad - reading.position_rad)
+        if not self._stopped and np.any(following > self._settings.following_error_limit_rad):
+            raise DeviceFault(
+                self._device,
+                self.endpoint,
+                f"following error below {self._settings.following_error_limit_rad:g} rad",
+                f"{following.max():.2f} rad",
+                "look for a stuck axis, then recover",
+            )
+
+    @property
+    def _device(self) -> str:
+        return f"siderostat {self.name}"
+
+    def _open(self) -> DeviceIdentity:
+        self._stopped = True
+        self.fault = None
+        identity = self._amplifiers.open()
+        self._amplifiers.reset_fault()
+        self._amplifiers.enable()
+        self.opened = self.enabled = True
+        self._last_reading_s = self._clock.now_s()
+        return identity
+
+    def _disable(self) -> None:
+        self._stopped = True
+        self.enabled = False
+        self._amplifiers.disable()
+
+    def _close(self) -> None:
+        self._stopped = True
+        self.opened = self.enabled = False
+        self._amplifiers.close()
+
+    def _post(self, action: Callable[[], DeviceIdentity | None]) -> Future:
+        future: Future = Future()
+        self._requests.append((action, future))
+        return future
+
+    def _ask(self, action: Callable[[], DeviceIdentity | None]) -> DeviceIdentity:
+        future = self._post(action)
+        if not self.threaded:
+            self.period()
+        return future.result(timeout=_REQUEST_TIMEOUT_S)
+
+
+class ServoThread:
+    """Runs a servo at its rate with absolute deadlines; a missed deadline is skipped, never made up."""
+
+    def __init__(self, servo: SiderostatServo, clock: Clock) -> None:
+        self._servo = servo
+        self._clock = clock
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"servo-{servo.name}", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._servo.threaded = True
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread after the period it is in."""
+        self._ending.set()
+        self._thread.join(timeout=5.0)
+        self._servo.threaded = False
+
+    def _run(self) -> None:
+        become_realtime(priority=60)
+        period_s = self._servo.period_s
+        deadline_s = self._clock.now_s() + period_s
+        while not self._ending.is_set():
+            self._clock.sleep_until(deadline_s)
+            late_s = self._clock.now_s() - deadline_s
+            self._servo.late_s.append(late_s)
+            self._servo.period()
+            passed = max(1, int((self._clock.now_s() - deadline_s) / period_s) + 1)
+            deadline_s += passed * period_s

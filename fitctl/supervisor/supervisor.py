@@ -1,0 +1,454 @@
+"""The supervisor: frames in, ticks of every loop out, commands and device work in between.
+
+:meth:`Supervisor.step` is the whole of it, run once a frame by the process (:mod:`fitctl.supervisor.run`)
+on the machine's clock and by the simulation (:mod:`fitctl.supervisor.simulate`) on the virtual one. What
+may take longer than a tick (opening, closing and polling devices) is handed to `executor`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from fitctl.clock import Clock
+from fitctl.config import Loop, Rig
+from fitctl.controllers.centroid import HALF_WINDOW_PX
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceIdentity,
+    Devices,
+    DeviceTimeout,
+    Frame,
+    LoopDevices,
+)
+from fitctl.logging.records import (
+    DeviceHealth,
+    Event,
+    FrameRecord,
+    PiezoReading,
+    Record,
+)
+from fitctl.supervisor.loop import StellarLoop
+from fitctl.supervisor.messages import (
+    Acquire,
+    AnyCommand,
+    Hold,
+    Off,
+    Recover,
+    Reply,
+    SetTarget,
+    Shutdown,
+    Standby,
+    Stop,
+)
+from fitctl.supervisor.modes import Mode, Trigger, usable_commands
+from fitctl.supervisor.servo import SiderostatServo
+from fitctl.supervisor.timing import TimingBook
+
+CAMERA = "camera"
+_COMMANDS: dict[type[AnyCommand], Trigger] = {
+    Standby: Trigger.STANDBY,
+    Acquire: Trigger.ACQUIRE,
+    Hold: Trigger.HOLD,
+    Stop: Trigger.STOP,
+    Recover: Trigger.RECOVER,
+    Off: Trigger.OFF,
+}
+_POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
+
+
+class Opened(NamedTuple):
+    """What opening the devices found."""
+
+    identities: dict[str, DeviceIdentity]
+    stack_v: dict[str, np.ndarray]
+
+
+class Job(NamedTuple):
+    """Device work under way, and what is to be done when it ends."""
+
+    future: Future
+    done: Callable[[Future], None]
+
+
+class Supervisor:
+    """One rig under control.
+
+    Parameters
+    ----------
+    rig : Rig
+    devices : Devices
+    clock : Clock
+    executor : Executor
+        Runs device work; must run one piece at a time.
+    record : callable
+        Takes every record (log and consoles); must not block.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        devices: Devices,
+        clock: Clock,
+        executor: Executor,
+        record: Callable[[Record], None],
+    ) -> None:
+        self.rig = rig
+        self.servos = {
+            name: SiderostatServo(
+                name, loop, devices.loops[name].amplifiers, clock, rig.camera.period_s
+            )
+            for name, loop in rig.loops.items()
+        }
+        self.loops = {
+            name: StellarLoop(name, rig, servo, devices.loops[name].dac, clock, record)
+            for name, servo in self.servos.items()
+        }
+        self.shutdown_wanted = False
+        self._devices = devices
+        self._clock = clock
+        self._executor = executor
+        self._record = record
+        self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
+        self._notes: deque[tuple[str, str, str]] = deque()
+        self._job: Job | None = None
+        self._poll: Job | None = None
+        self._polled_s = clock.now_s()
+        self._camera_ready = False
+        self._last_frame_s = clock.now_s()
+        self._identities: dict[str, DeviceIdentity] = {}
+        self._timing = TimingBook(clock, rig, record)
+
+    # ------------------------------------------------------------ from any thread
+
+    def post(self, command: AnyCommand, reply: Callable[[Reply], None]) -> None:
+        """Leave a command for the next step; `reply` is called from there.
+
+        A stop takes the velocity from the siderostats here and now; the rest follows at the next step.
+        """
+        if isinstance(command, Stop):
+            for name in self._named(command):
+                self.servos[name].stop()
+        self._commands.append((command, reply))
+
+    def note(self, severity: str, source: str, message: str) -> None:
+        """Leave an event for the next step, from any thread."""
+        self._notes.append((severity, source, message))
+
+    def ask_shutdown(self) -> None:
+        """End soon; the process winds down from there."""
+        self.shutdown_wanted = True
+
+    # ------------------------------------------------------------ once a frame
+
+    def step(self) -> None:
+        """Wait for the next frame, no longer than a frame period, and act on it."""
+        frame = self._next_frame()
+        self._finish_jobs()
+        while self._commands:
+            command, reply = self._commands.popleft()
+            reply(self._obey(command))
+        while self._notes:
+            self._event(*self._notes.popleft())
+        lost = self._devices.camera.counts().lost if self._camera_ready else 0
+        for loop in self.loops.values():
+            was_safe = loop.mode is Mode.SAFE
+            tick = loop.tick(frame, lost)
+            if frame is not None or loop.mode is not Mode.OFF:
+                self._record(tick)
+            self._timing.add(tick)
+            if was_safe:
+                self._make_safer(loop)
+        if frame is not None:
+            self._record(
+                FrameRecord(
+                    time_s=frame.mid_exposure_s,
+                    camera=CAMERA,
+                    number=frame.number,
+                    width_px=frame.image.shape[1],
+                    height_px=frame.image.shape[0],
+                    data=frame.image.tobytes(),
+                )
+            )
+        if self._clock.now_s() - self._polled_s >= 1.0:
+            self._once_a_second()
+
+    def stop(self, reason: str) -> None:
+        """Every loop to SAFE."""
+        for loop in self.loops.values():
+            loop.fire(Trigger.STOP, reason)
+
+    def at_rest(self) -> bool:
+        """Every mirror that can still be commanded is at its bias."""
+        return all(not loop.dac_ready or loop.at_bias() for loop in self.loops.values())
+
+    def close(self) -> None:
+        """Disable and let go of everything, whatever state it is in."""
+        for loop in self.loops.values():
+            loop.dac_ready = False
+        self._camera_ready = False
+        self._executor.submit(self._close_devices, list(self.loops)).result(timeout=30.0)
+
+    # ------------------------------------------------------------ frames
+
+    def _next_frame(self) -> Frame | None:
+        deadline_s = self._clock.now_s() + self.rig.camera.period_s
+        if not self._camera_ready:
+            self._clock.sleep_until(deadline_s)
+            return None
+        try:
+            frame = self._devices.camera.next_frame(self.rig.camera.period_s)
+        except DeviceError as error:
+            self._camera_lost(error)
+            return None
+        now_s = self._clock.now_s()
+        if frame is not None:
+            self._last_frame_s = now_s
+        elif now_s - self._last_frame_s > self.rig.supervisor.frame_timeout_s:
+            device = self.rig.camera.device
+            self._camera_lost(
+                DeviceTimeout(
+                    CAMERA,
+                    f"{device.address}:{device.gvcp_port}",
+                    f"a frame within {self.rig.supervisor.frame_timeout_s:g} s",
+                    "none",
+                    "check the camera's power and link, then recover",
+                )
+            )
+        return frame
+
+    def _camera_lost(self, error: DeviceError) -> None:
+        self._camera_ready = False
+        for loop in self.loops.values():
+            loop.fire(Trigger.FAULT, str(error))
+
+    # ------------------------------------------------------------ commands
+
+    def _named(self, command: AnyCommand) -> list[str]:
+        return [name for name in self.loops if command.loop in {"", name}]
+
+    def _obey(self, command: AnyCommand) -> Reply:
+        names = self._named(command)
+        if not names:
+            return _refusal(f"no loop is named {command.loop}; there are {', '.join(self.loops)}")
+        if isinstance(command, Shutdown):
+            self.shutdown_wanted = True
+            return Reply(accepted=True, text="shutting down")
+        if isinstance(command, SetTarget):
+            return self._set_target(command, names)
+        trigger = _COMMANDS.get(type(command))
+        if trigger is None:
+            return _refusal(f"{type(command).__name__} is not for the supervisor")
+        usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
+        if not usable:
+            return _refusal(self._why_not(trigger, names))
+        if self._job is not None and trigger is not Trigger.STOP:
+            return _refusal("devices are being opened or closed; wait for the event that says so")
+        if trigger in _POWER_UP:
+            self._open(usable, trigger)
+        elif trigger is Trigger.OFF:
+            self._turn_off(usable)
+        else:
+            for name in usable:
+                self.loops[name].fire(trigger, "operator")
+        return Reply(accepted=True)
+
+    def _why_not(self, trigger: Trigger, names: list[str]) -> str:
+        mode = self.loops[names[0]].mode
+        can = ", ".join(t.name.lower() for t in usable_commands(mode))
+        return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
+
+    def _set_target(self, command: SetTarget, names: list[str]) -> Reply:
+        camera = self.rig.camera
+        wanted = np.array([command.az_px, command.el_px])
+        most = np.array([camera.width_px, camera.height_px]) - 1 - HALF_WINDOW_PX
+        if not np.all((wanted >= HALF_WINDOW_PX) & (wanted <= most)):
+            return _refusal(
+                f"target must lie in {HALF_WINDOW_PX}..{most[0]} px az and "
+                f"{HALF_WINDOW_PX}..{most[1]} px el, so that the window fits"
+            )
+        for name in names:
+            self.loops[name].target_px = wanted
+        return Reply(accepted=True)
+
+    # ------------------------------------------------------------ device work
+
+    def _open(self, names: list[str], trigger: Trigger) -> None:
+        for name in names:
+            self.loops[name].dac_ready = False
+        self._camera_ready = False
+        self._event("info", "supervisor", "opening and checking all devices")
+        future = self._executor.submit(self._open_devices, names)
+        self._job = Job(future, partial(self._opened, names, trigger))
+        self._finish_jobs()
+
+    def _open_devices(self, names: list[str]) -> Opened:
+        """Open everything anew. Limits are checked first; nothing moves before all of it is well."""
+        self._close_devices(names)
+        identities: dict[str, DeviceIdentity] = {}
+        stack_v: dict[str, np.ndarray] = {}
+        for name in names:
+            loop = self._devices.loops[name]
+            identities[f"{name} piezo"] = loop.piezo.open()
+            identities[f"{name} D/A"] = loop.dac.open()
+            stack_v[name] = loop.dac.read_v()
+        identities[CAMERA] = self._devices.camera.open()
+        for name in names:
+            identities[f"{name} siderostat"] = self.servos[name].open()
+        self._devices.camera.start()
+        return Opened(identities, stack_v)
+
+    def _opened(self, names: list[str], trigger: Trigger, future: Future) -> None:
+        error = future.exception()
+        if error is not None:
+            if not isinstance(error, DeviceError):
+                raise error
+            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {error}")
+            self._executor.submit(self._close_devices, names)
+            return
+        opened: Opened = future.result()
+        self._identities.update(opened.identities)
+        self._camera_ready = True
+        self._last_frame_s = self._clock.now_s()
+        for name in names:
+            loop = self.loops[name]
+            loop.start_from(opened.stack_v[name])
+            # A stop while the devices were being opened has the last word.
+            loop.fire(trigger, "all devices open, checked and enabled")
+
+    def _turn_off(self, names: list[str]) -> None:
+        for name in names:
+            self.loops[name].dac_ready = False
+            self.loops[name].fire(Trigger.OFF, "operator")
+        self._camera_ready = any(loop.mode is not Mode.OFF for loop in self.loops.values())
+        self._job = Job(self._executor.submit(self._close_devices, names), Future.result)
+
+    def _close_devices(self, names: list[str]) -> None:
+        for name in names:
+            self.servos[name].close()
+            self._devices.loops[name].dac.close()
+            self._devices.loops[name].piezo.close()
+        if not self._camera_ready:
+            self._devices.camera.close()
+
+    def _make_safer(self, loop: StellarLoop) -> None:
+        if self._clock.now_s() - loop.mode_since_s > self.rig.supervisor.safe_disable_after_s:
+            loop.servo.disable()
+
+    def _finish_jobs(self) -> None:
+        job = self._job
+        if job is not None and job.future.done():
+            self._job = None
+            job.done(job.future)
+        poll = self._poll
+        if poll is not None and poll.future.done():
+            self._poll = None
+            poll.done(poll.future)
+
+    # ------------------------------------------------------------ once a second
+
+    def _once_a_second(self) -> None:
+        self._polled_s = self._clock.now_s()
+        self._timing.report(self.servos)
+        for record in self._health():
+            self._record(record)
+        names = [name for name, loop in self.loops.items() if loop.dac_ready]
+        if names and self._poll is None and self._job is None:
+            future = self._executor.submit(self._poll_piezos, names)
+            self._poll = Job(future, self._polled)
+
+    def _poll_piezos(self, names: list[str]) -> list[PiezoReading]:
+        readings = []
+        for name in names:
+            piezo = self._devices.loops[name].piezo
+            volts, limit_v = piezo.stack_volts(), piezo.limit_v()
+            readings.append(
+                PiezoReading(
+                    time_s=self._clock.now_s(),
+                    loop=name,
+                    stack1_v=float(volts[0]),
+                    stack2_v=float(volts[1]),
+                    stack3_v=float(volts[2]),
+                    limit_v=limit_v,
+                )
+            )
+        return readings
+
+    def _polled(self, future: Future) -> None:
+        error = future.exception()
+        if error is None:
+            for reading in future.result():
+                self._record(reading)
+        elif isinstance(error, DeviceError):
+            for loop in self.loops.values():
+                loop.fire(Trigger.FAULT, str(error))
+        else:
+            raise error
+
+    def _health(self) -> list[DeviceHealth]:
+        camera = self.rig.camera.device
+        counts = self._devices.camera.counts()
+        rows = [
+            self._device_health(
+                CAMERA,
+                f"{camera.address}:{camera.gvcp_port}",
+                self._camera_ready,
+                f"{counts.frames} frames, {counts.lost} lost",
+            )
+        ]
+        for name, settings in self.rig.loops.items():
+            rows += self._loop_health(name, settings, self._devices.loops[name])
+        return rows
+
+    def _loop_health(self, name: str, settings: Loop, _devices: LoopDevices) -> list[DeviceHealth]:
+        servo, loop = self.servos[name], self.loops[name]
+        powered = "enabled" if servo.enabled else "disabled"
+        siderostat = self._device_health(
+            f"{name} siderostat",
+            settings.siderostat.device.channel,
+            servo.opened,
+            str(servo.fault) if servo.fault else powered,
+            fault=servo.fault is not None,
+        )
+        dac = self._device_health(
+            f"{name} D/A",
+            f"{settings.fsm.dac.host}:{settings.fsm.dac.port}",
+            loop.dac_ready,
+            "written every tick" if loop.dac_ready else "not written",
+        )
+        piezo = self._device_health(
+            f"{name} piezo", settings.fsm.piezo.port, loop.dac_ready, "read once a second"
+        )
+        return [siderostat, dac, piezo]
+
+    def _device_health(
+        self, device: str, endpoint: str, is_open: bool, detail: str, *, fault: bool = False
+    ) -> DeviceHealth:
+        identity = self._identities.get(device)
+        return DeviceHealth(
+            time_s=self._clock.now_s(),
+            device=device,
+            endpoint=endpoint,
+            state="fault" if fault else "ok" if is_open else "closed",
+            identity="" if identity is None else f"{identity.model} {identity.serial}".strip(),
+            detail=detail,
+        )
+
+    def _event(self, severity: str, source: str, message: str) -> None:
+        self._record(
+            Event(
+                time_s=self._clock.now_s(),
+                severity=severity,  # type: ignore[arg-type]
+                source=source,
+                message=message,
+            )
+        )
+
+
+def _refusal(text: str) -> Reply:
+    return Reply(accepted=False, text=text)

@@ -1,0 +1,47 @@
+"""The command palette's one command with numbers: ``target AZ EL``."""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import partial
+from typing import TYPE_CHECKING, cast
+
+from textual.command import DiscoveryHit, Hit, Hits, Provider
+
+from fitctl.supervisor.messages import SetTarget
+
+if TYPE_CHECKING:
+    from fitctl.tui.app import ConsoleApp
+
+_NUMBER = r"[+-]?\d+(?:\.\d*)?"
+_TARGET = re.compile(rf"\s*target\s+({_NUMBER})[\s,]+({_NUMBER})\s*", re.IGNORECASE)
+
+
+def parse_target(query: str) -> SetTarget | None:
+    """The command in a text such as ``target 24 19.5``, in px; None when it is something else."""
+    match = _TARGET.fullmatch(query)
+    if match is None:
+        return None
+    az_px, el_px = (float(group) for group in match.groups())
+    if not (math.isfinite(az_px) and math.isfinite(el_px)):
+        return None
+    return SetTarget(az_px=az_px, el_px=el_px)
+
+
+class TargetProvider(Provider):
+    """Offers to move the shown loop's target as soon as two numbers are typed."""
+
+    async def discover(self) -> Hits:
+        """Tell that the command exists."""
+        yield DiscoveryHit(
+            "target AZ EL", lambda: None, help="Type it with two numbers, in px: target 24 19.5"
+        )
+
+    async def search(self, query: str) -> Hits:
+        """Match a complete target."""
+        command = parse_target(query)
+        if command is not None:
+            label = f"Move the target to az {command.az_px:g}, el {command.el_px:g} px"
+            app = cast("ConsoleApp", self.app)
+            yield Hit(1.0, label, partial(app.give, command), help="Through the prefilter")

@@ -1,0 +1,157 @@
+"""What the console remembers of the telemetry: the newest of everything, and a short past of each loop."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.logging.records import Event, LoopTiming, ModeChange, PiezoReading, Tick
+from fitctl.supervisor.messages import LoopState, Telemetry
+
+TRACE_S = 20.0
+RMS_S = 10.0
+STALE_S = 1.0
+EVENTS_KEPT = 500
+
+
+@dataclass
+class LoopView:
+    """One loop: its newest state, and its ticks of the last `TRACE_S`."""
+
+    state: LoopState
+    ticks: deque[Tick] = field(default_factory=deque)
+    change: ModeChange | None = None
+    timing: LoopTiming | None = None
+    piezo: PiezoReading | None = None
+
+    @property
+    def tick(self) -> Tick | None:
+        """The newest tick."""
+        return self.ticks[-1] if self.ticks else None
+
+    def errors(self) -> NDArray[np.float64]:
+        """Time in s and errors az, el in px, one row a tick; shape (ticks, 3), oldest first."""
+        rows = [(tick.time_s, tick.error_az_px, tick.error_el_px) for tick in self.ticks]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+    def sky_arcsec_per_px(self) -> float:
+        """Plate scale on the sky; not-a-number from a supervisor that does not tell it."""
+        return float(getattr(self.state, "sky_arcsec_per_px", math.nan))
+
+
+@dataclass
+class Rms:
+    """Root mean square of the pointing error about the target, both axes, over `span_s` of data."""
+
+    az_px: float
+    el_px: float
+    span_s: float
+
+
+def error_rms(errors: NDArray[np.float64], now_s: float) -> Rms:
+    """RMS of the last `RMS_S`; ticks without a star do not count, and none at all gives not-a-number."""
+    recent = errors[(errors[:, 0] > now_s - RMS_S) & np.isfinite(errors[:, 1:]).all(axis=1)]
+    if len(recent) < 2:
+        return Rms(math.nan, math.nan, 0.0)
+    az_px, el_px = np.sqrt(np.mean(recent[:, 1:] ** 2, axis=0))
+    return Rms(float(az_px), float(el_px), float(recent[-1, 0] - recent[0, 0]))
+
+
+class ConsoleState:
+    """Everything that the panels draw from. It belongs to the console's own thread.
+
+    Attributes
+    ----------
+    newest : Telemetry or None
+        The last message.
+    received_s : float
+        When it came, by the console's clock; before the first one, when the console started.
+    loops : dict of LoopView
+        By name, in the supervisor's order.
+    events : deque of Event
+        Newest first.
+    shown : str
+        Name of the loop on the screen.
+    rate_hz : float
+        Messages a second, smoothed.
+    """
+
+    def __init__(self, started_s: float) -> None:
+        self.newest: Telemetry | None = None
+        self.received_s = started_s
+        self.now_s = started_s
+        self.loops: dict[str, LoopView] = {}
+        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.shown = ""
+        self.rate_hz = 0.0
+
+    def accept(self, message: Telemetry, now_s: float) -> None:
+        """Take in one message that came at `now_s`."""
+        if self.newest is not None and self.newest.pid != message.pid:
+            self.loops.clear()  # another supervisor: its past is not this one's
+            self.newest = None
+        if self.newest is not None and now_s > self.received_s:
+            smoothing = 0.1
+            self.rate_hz += smoothing * (1.0 / (now_s - self.received_s) - self.rate_hz)
+        else:
+            self.rate_hz = 0.0
+        self.newest, self.received_s = message, now_s
+        views = self.loops
+        self.loops = {loop.name: views.get(loop.name, LoopView(loop)) for loop in message.loops}
+        for loop in message.loops:
+            self.loops[loop.name].state = loop
+        self.events.extendleft(message.events)
+        for tick in message.ticks:
+            if tick.loop in self.loops:
+                self.loops[tick.loop].ticks.append(tick)
+        for change in message.mode_changes:
+            if change.loop in self.loops:
+                self.loops[change.loop].change = change
+        for timing in message.timing:
+            if timing.loop in self.loops:
+                self.loops[timing.loop].timing = timing
+        for piezo in message.piezo:
+            if piezo.loop in self.loops:
+                self.loops[piezo.loop].piezo = piezo
+        for view in self.loops.values():
+            while view.ticks and view.ticks[0].time_s < message.time_s - TRACE_S:
+                view.ticks.popleft()
+        if self.shown not in self.loops:
+            self.shown = next(iter(self.loops), "")
+
+    @property
+    def loop(self) -> LoopView | None:
+        """The loop on the screen."""
+        return self.loops.get(self.shown)
+
+    @property
+    def silent_s(self) -> float:
+        """How long nothing has come, at `now_s`."""
+        return max(0.0, self.now_s - self.received_s)
+
+    @property
+    def stale(self) -> bool:
+        """What is on the screen is old, or there is nothing yet."""
+        return self.newest is None or self.silent_s > STALE_S
+
+    @property
+    def records_lost(self) -> int:
+        """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
+        if self.newest is None:
+            return 0
+        recorder = self.newest.recorder
+        return max(self.newest.records_lost, recorder.lost if recorder else 0)
+
+    def show_next_loop(self) -> None:
+        """Cycle through the loops."""
+        names = list(self.loops)
+        if names:
+            self.shown = names[(names.index(self.shown) + 1) % len(names)]
+
+    def wall_s(self, time_s: float) -> float:
+        """Unix time of a monotonic time; not-a-number before anything came."""
+        return time_s + self.newest.wall_minus_monotonic_s if self.newest else math.nan

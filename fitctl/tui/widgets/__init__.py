@@ -1,0 +1,1 @@
+"""The panels of the console's one screen, a module each."""

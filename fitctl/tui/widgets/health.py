@@ -1,0 +1,162 @@
+"""Whether the parts are well: devices, the loop's timing, the recorder."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import PurePath
+
+from fitctl.logging.records import DeviceHealth, LoopTiming
+from fitctl.tui.look import (
+    DEVICES,
+    DIM,
+    GREEN,
+    INK,
+    ORANGE,
+    PAPER,
+    RED,
+    Line,
+    shorten,
+    spread,
+    text,
+    width,
+)
+from fitctl.tui.widgets.panel import Panel
+
+TABLE_FROM_ROWS = 7
+
+
+class Devices(Panel):
+    """One device a row; where rows are short, the well ones share rows and the ill ones keep their own."""
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """Ill devices first when not all have a row of their own."""
+        devices = self.state.newest.devices if self.state.newest else []
+        if len(devices) <= rows:
+            names = max((len(device.device) for device in devices), default=0)
+            spare = rows - len(devices)
+            lines: list[Line] = []
+            for device in devices:
+                told = _device(device, names, columns, 1 + spare)
+                spare -= len(told) - 1
+                lines += told
+            return lines
+        ill = [device for device in devices if device.state != "ok"]
+        well = [device for device in devices if device.state == "ok"]
+        lines = [_device(device, len(device.device), columns, 1)[0] for device in ill]
+        return lines + _packed(well, columns)
+
+
+def _device(device: DeviceHealth, name_columns: int, columns: int, rows: int) -> list[Line]:
+    look = DEVICES[device.state]
+    line = [
+        text(f"{look.symbol} ", look.colour, bold=True),
+        text(device.device.ljust(name_columns), INK),
+    ]
+    ill = device.state != "ok"
+    if ill:
+        line.append(text(f" {device.state}", look.colour, bold=True))
+    detail = device.detail or device.identity or device.endpoint
+    indent = name_columns + 3
+    pieces = textwrap.wrap(detail, max(10, columns - indent)) if ill and rows > 1 else []
+    if 0 < len(pieces) < rows:
+        return [line, *([text(" " * indent + piece, DIM)] for piece in pieces)]
+    room = columns - width(line) - 1
+    return [[*line, text(" " + shorten(detail, room), DIM)] if room > 3 else line]
+
+
+def _packed(devices: list[DeviceHealth], columns: int) -> list[Line]:
+    lines: list[Line] = [[]]
+    for device in devices:
+        look = DEVICES[device.state]
+        piece = [text(look.symbol, look.colour, bold=True), text(f" {device.device}  ", INK)]
+        if lines[-1] and width(lines[-1]) + width(piece) - 2 > columns:
+            lines.append([])
+        lines[-1] += piece
+    return lines
+
+
+class Timing(Panel):
+    """Median and worst times, what was late or lost, the scheduling reached, and the log file."""
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """A table where there is room for one, else two dense lines; the log in the last line."""
+        newest, loop = self.state.newest, self.state.loop
+        if newest is None or loop is None:
+            return []
+        recorder = self._recorder(columns)
+        if loop.timing is None:
+            return [[text("no timing yet", DIM)], recorder]
+        if rows < TABLE_FROM_ROWS:
+            return [*_dense(loop.timing, newest.scheduling, columns), recorder]
+        table = _table(loop.timing)
+        notes = textwrap.wrap(newest.scheduling, columns)[: rows - len(table) - 1]
+        return [*table, *([text(note, DIM)] for note in notes), recorder]
+
+    def _recorder(self, columns: int) -> Line:
+        newest, lost = self.state.newest, self.state.records_lost
+        assert newest is not None
+        if lost:
+            return [text(f" ✗ {lost:,} RECORDS LOST ".replace(",", " "), PAPER, on=RED, bold=True)]
+        recorder = newest.recorder
+        if recorder is None:
+            return [text("○", ORANGE, bold=True), text(" not recording", ORANGE)]
+        size = f"{recorder.bytes_written / 1e6:.1f} MB"
+        count = f"{recorder.records:,} rec, lost 0".replace(",", " ") if columns >= 60 else size
+        name = shorten(PurePath(recorder.path).name, columns - len(count) - 4)
+        return spread([text("● ", GREEN), text(name, INK)], [text(count, DIM)], columns)
+
+
+def _dense(timing: LoopTiming, scheduling: str, columns: int) -> list[Line]:
+    pairs = (
+        ("tick", timing.compute_median_s, timing.compute_worst_s),
+        ("age", timing.frame_age_median_s, timing.frame_age_worst_s),
+        ("servo", timing.servo_late_median_s, timing.servo_late_worst_s),
+    )
+    times: Line = []
+    for name, median_s, worst_s in pairs:
+        times += [text(f"{name} ", DIM), text(f"{_short_ms(median_s)}/{_short_ms(worst_s)} ", INK)]
+    counts = _counts(timing)
+    room = columns - width(counts) - 1
+    return [[*times, text("ms", DIM)], spread(counts, [text(shorten(scheduling, room), DIM)], columns)]
+
+
+def _table(timing: LoopTiming) -> list[Line]:
+    rows = (
+        ("compute", timing.compute_median_s, timing.compute_worst_s),
+        ("frame age", timing.frame_age_median_s, timing.frame_age_worst_s),
+        ("servo late", timing.servo_late_median_s, timing.servo_late_worst_s),
+    )
+    lines: list[Line] = [[text(f"{'ms':<12}{'median':>8}{'worst':>8}", DIM)]]
+    for name, median_s, worst_s in rows:
+        lines.append([
+            text(f"{name:<12}", DIM),
+            text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK),
+        ])
+    return [*lines, _counts(timing)]
+
+
+def _counts(timing: LoopTiming) -> Line:
+    line: Line = []
+    for name, count in (
+        ("late", timing.late_ticks),
+        ("lost", timing.frames_lost),
+        ("miss", timing.servo_missed),
+        ("stall", timing.stalls),
+    ):
+        line += [
+            text(f"{name} ", DIM),
+            text(f"{count}{'!' if count else ''} ", ORANGE if count else INK, bold=count > 0),
+        ]
+    return line
+
+
+def _ms(seconds: float) -> str:
+    milliseconds = 1e3 * seconds
+    return f"{milliseconds:.2f}" if milliseconds < 10 else f"{milliseconds:.1f}"
+
+
+def _short_ms(seconds: float) -> str:
+    milliseconds = 1e3 * seconds
+    if milliseconds < 0.995:
+        return f"{milliseconds:.2f}".removeprefix("0")
+    return f"{milliseconds:.1f}" if milliseconds < 9.95 else f"{milliseconds:.0f}"

@@ -1,0 +1,57 @@
+"""The base of all panels: lines drawn by hand, and only those that changed sent to the terminal."""
+
+from __future__ import annotations
+
+from textual.geometry import Region
+from textual.strip import Strip
+from textual.widget import Widget
+
+from fitctl.tui.look import Line
+from fitctl.tui.state import ConsoleState
+
+
+class Panel(Widget, can_focus=False):
+    """A part of the screen that draws itself from the console's state.
+
+    Parameters
+    ----------
+    state : ConsoleState
+        Read at every redraw; never changed here.
+    title : str
+        Shown in the panel's upper border, where the layout gives it one.
+    """
+
+    def __init__(self, state: ConsoleState, title: str = "") -> None:
+        super().__init__(id=type(self).__name__.lower())
+        self.state = state
+        self.border_title = title
+        self._strips: list[Strip] = []
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """Lines of the whole content, uppermost first; what is too long is cut."""
+        raise NotImplementedError
+
+    def redraw(self) -> None:
+        """Draw anew, and ask for a repaint of the lines that differ."""
+        columns, rows = self.content_size
+        if not columns or not rows:
+            return
+        old = self._strips
+        self._strips = [Strip(line) for line in self.draw(columns, rows)[:rows]]
+        changed = [y for y, strip in enumerate(self._strips) if y >= len(old) or strip != old[y]]
+        changed.extend(range(len(self._strips), len(old)))
+        if changed:
+            self.refresh(*(Region(0, y, columns, 1) for y in changed))
+
+    def on_resize(self) -> None:
+        """Fill the new size."""
+        self._strips = []
+        self.redraw()
+        self.refresh()
+
+    def render_line(self, y: int) -> Strip:
+        """One line for Textual's compositor."""
+        base = self.rich_style
+        if y >= len(self._strips):
+            return Strip.blank(self.content_size.width, base)
+        return self._strips[y].adjust_cell_length(self.content_size.width).apply_style(base)

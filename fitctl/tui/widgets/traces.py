@@ -1,0 +1,168 @@
+"""The pointing error of both axes over the last seconds, against the requirement."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.segment import Segment
+
+from fitctl.tui.draw import braille
+from fitctl.tui.look import (
+    DIM,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    RED,
+    SKY,
+    Line,
+    number,
+    spread,
+    style,
+    text,
+)
+from fitctl.tui.state import RMS_S, TRACE_S, LoopView, Rms, error_rms
+from fitctl.tui.widgets.panel import Panel
+
+AXIS_COLUMNS = 6
+STEPS = (1.0, 2.0, 5.0)
+TIME_AXIS_FROM_ROWS = 12
+LONG_HEADINGS_FROM_COLUMNS = 68
+
+
+class Traces(Panel):
+    """Azimuth above elevation: value now, RMS against the requirement, and the trace."""
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """Both axes with equal room, and a time axis where it does not cost too much."""
+        loop = self.state.loop
+        if loop is None or self.state.newest is None:
+            return []
+        now_s = self.state.newest.time_s
+        errors = loop.errors()
+        rms = error_rms(errors, now_s)
+        time_axis = rows >= TIME_AXIS_FROM_ROWS
+        trace_rows = max(1, (rows - 2 - time_axis) // 2)
+        scale_px = axis_limit_px(errors[:, 1:], loop.state.requirement_px)
+        lines: list[Line] = []
+        for index, (name, colour, rms_px) in enumerate(
+            (("az", SKY, rms.az_px), ("el", ORANGE, rms.el_px)), start=1
+        ):
+            lines.append(_heading(name, colour, errors[:, index], rms_px, rms, loop, columns))
+            lines += trace_lines(
+                errors[:, 0],
+                errors[:, index],
+                now_s=now_s,
+                limit_px=scale_px,
+                requirement_px=loop.state.requirement_px,
+                colour=colour,
+                columns=columns,
+                rows=trace_rows,
+            )
+        if time_axis:
+            lines.append(_time_axis(columns))
+        return lines
+
+
+def axis_limit_px(errors_px: NDArray[np.float64], requirement_px: float) -> float:
+    """Half height of the traces: the least 1, 2 or 5 times a power of ten that holds all errors.
+
+    Never less than twice the requirement, so that its band always shows.
+    """
+    finite = errors_px[np.isfinite(errors_px)]
+    need = max(2 * requirement_px, 1.05 * float(np.abs(finite).max(initial=0.0)))
+    decade = 10.0 ** math.floor(math.log10(need))
+    return next(s * decade for s in (*STEPS, 10.0) if s * decade >= need * (1 - 1e-9))
+
+
+def trace_lines(
+    times_s: NDArray[np.float64],
+    errors_px: NDArray[np.float64],
+    *,
+    now_s: float,
+    limit_px: float,
+    requirement_px: float,
+    colour: str,
+    columns: int,
+    rows: int,
+) -> list[Line]:
+    """One trace with its scale at the left and dotted lines at zero and at ± the requirement."""
+    width = columns - AXIS_COLUMNS - 1
+    if width < 1:
+        return [[] for _ in range(rows)]
+    trace = braille.empty(rows, width)
+    braille.envelope(
+        trace, times_s, errors_px, now_s=now_s, span_s=TRACE_S, limit=limit_px
+    )
+    guides = braille.empty(rows, width)
+    braille.guide(guides, 0.0, limit_px, 6)
+    for sign in (-1, 1):
+        braille.guide(guides, sign * requirement_px, limit_px, 2)
+    has_trace = (braille.cells(trace) != braille.cells(braille.empty(rows, width))).tolist()
+    codes = braille.cells(trace | guides).tolist()
+    labels = _axis_labels(rows, limit_px, requirement_px)
+    lines: list[Line] = []
+    for y in range(rows):
+        line = [text(labels[y].rjust(AXIS_COLUMNS - 1), DIM), text("▕", FAINT)]
+        start = 0
+        for x in range(1, width + 1):
+            if x == width or has_trace[y][x] != has_trace[y][start]:
+                run = "".join(map(chr, codes[y][start:x]))
+                line.append(Segment(run, style(colour if has_trace[y][start] else GREEN)))
+                start = x
+        lines.append(line)
+    return lines
+
+
+def _axis_labels(rows: int, limit_px: float, requirement_px: float) -> list[str]:
+    labels = [""] * rows
+    wanted = [(limit_px, "+"), (-limit_px, "−"), (0.0, "")]
+    if requirement_px < 0.8 * limit_px:
+        wanted += [(requirement_px, "+"), (-requirement_px, "−")]
+    for value, sign in wanted:
+        y = min(rows - 1, int((1 - value / limit_px) / 2 * rows))
+        if not labels[y]:
+            labels[y] = f"{sign}{abs(value):g}"
+    return labels
+
+
+def _heading(
+    name: str,
+    colour: str,
+    errors_px: NDArray[np.float64],
+    rms_px: float,
+    rms: Rms,
+    loop: LoopView,
+    columns: int,
+) -> Line:
+    now_px = float(errors_px[-1]) if len(errors_px) else math.nan
+    requirement_px = loop.state.requirement_px
+    line = [text(f"{name} ", colour, bold=True), text(f"{number(now_px, '+.3f')} px", INK, bold=True)]
+    if math.isnan(rms_px):
+        return spread(line, [text("no star, no RMS", DIM)], columns)
+    good = rms_px <= requirement_px
+    sign = text("✓" if good else "✗", GREEN if good else RED, bold=True)
+    ratio = f"{100 * rms_px / requirement_px:.0f} %"
+    sky = loop.sky_arcsec_per_px()
+    on_sky = "" if math.isnan(sky) else f"{1000 * sky * rms_px:.0f} mas"
+    if columns < LONG_HEADINGS_FROM_COLUMNS:
+        right = [text("rms ", DIM), text(f"{rms_px:.3f}", INK, bold=True), text(f" {ratio} ", INK)]
+        return spread(line, [*right, sign, text(f" {on_sky}" if on_sky else "", DIM)], columns)
+    span = "" if rms.span_s > 0.95 * RMS_S else f" of {RMS_S:.0f}"
+    right = [
+        text(f"RMS {min(round(rms.span_s), RMS_S):.0f}{span} s  ", DIM),
+        text(f"{rms_px:.3f} px", INK, bold=True),
+        text(f" = {ratio} of {requirement_px:g} px ", INK),
+        sign,
+        text(f"  {on_sky} on the sky" if on_sky else "", DIM),
+    ]
+    return spread(line, right, columns)
+
+
+def _time_axis(columns: int) -> Line:
+    width = columns - AXIS_COLUMNS
+    left, middle, right = f"−{TRACE_S:.0f} s", f"−{TRACE_S / 2:.0f} s", "now"
+    row = left + middle.center(width - len(left) - len(right)) + right
+    return [text(" " * AXIS_COLUMNS + row, DIM)]

@@ -1,0 +1,71 @@
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+
+from fitctl import config
+from fitctl.mocks.cia402.drive import Cia402DriveMock
+
+
+class IntegratingMotors:
+    """Two ideal motors: the angle is the time integral of the velocity command."""
+
+    def __init__(self) -> None:
+        self.velocity_rad_s = [0.0, 0.0]
+        self.enabled = [False, False]
+        self._angle_rad = [0.0, 0.0]
+        self._at_s = time.monotonic()
+
+    def position_rad(self) -> list[float]:
+        now_s = time.monotonic()
+        for axis, velocity in enumerate(self.velocity_rad_s):
+            self._angle_rad[axis] += velocity * (now_s - self._at_s)
+        self._at_s = now_s
+        return list(self._angle_rad)
+
+    def command_velocity_rad_s(self, az: float, el: float) -> None:
+        self.position_rad()
+        self.velocity_rad_s = [az, el]
+
+    def set_enabled(self, axis: int, enabled: bool) -> None:
+        self.enabled[axis] = enabled
+
+
+class Bench:
+    """The mock drive in an event loop of its own thread."""
+
+    def __init__(self, siderostat: config.Siderostat, **options: int) -> None:
+        self.motors = IntegratingMotors()
+        self.mock = Cia402DriveMock(siderostat, self.motors, port=0, **options)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread.start()
+        self.port = self._run(self.mock.start())
+        channel = f"socket://127.0.0.1:{self.port}"
+        self.siderostat = siderostat.model_copy(
+            update={"device": siderostat.device.model_copy(update={"channel": channel})}
+        )
+
+    def _run(self, coroutine):
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(5)
+
+    def call(self, action: Callable[..., None], *args, **kwargs) -> None:
+        """Run a plain function of the mock in its own thread."""
+
+        async def run() -> None:
+            action(*args, **kwargs)
+
+        self._run(run())
+
+    def close(self) -> None:
+        self._run(self.mock.stop())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(5)
+        self._loop.close()
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 3.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "did not happen in time"
+        time.sleep(0.005)

@@ -1,0 +1,27 @@
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import pytest
+from cia402_bench import Bench
+from serial.urlhandler import protocol_socket
+
+from fitctl import config
+
+
+@pytest.fixture(autouse=True)
+def _no_pause_after_close(monkeypatch):
+    # pyserial sleeps 0.3 s after closing a socket, for servers that are slow to accept again.
+    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda _seconds: None))
+
+
+@pytest.fixture
+def siderostat() -> config.Siderostat:
+    rig = config.load_rig(config.default_rig_path())
+    return rig.loops["right"].siderostat
+
+
+@pytest.fixture
+def bench(siderostat) -> Iterator[Bench]:
+    bench = Bench(siderostat)
+    yield bench
+    bench.close()

@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from gige_served import IMAGE, Served, camera_settings
+from numpy.typing import NDArray
+
+from fitctl.config import Camera
+from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.driver import GigeCamera
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceMismatch,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+    Frame,
+)
+
+Serve = Callable[..., Served]
+Connect = Callable[..., GigeCamera]
+
+
+def frames(camera: GigeCamera, count: int) -> list[Frame]:
+    received = [camera.next_frame(2.0) for _ in range(count)]
+    return [frame for frame in received if frame is not None]
+
+
+def drain(camera: GigeCamera) -> None:
+    while camera.next_frame(5.0):
+        pass
+
+
+def test_the_image_arrives_bit_for_bit(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve())
+    camera.start()
+    (frame,) = frames(camera, 1)
+    np.testing.assert_array_equal(frame.image, IMAGE)
+    assert frame.image.dtype == np.uint16
+
+
+def test_an_image_of_many_packets_arrives_bit_for_bit(serve: Serve, connect: Connect) -> None:
+    size = {"width_px": 200, "height_px": 123}
+    image = np.random.default_rng(2).integers(0, 65536, (123, 200), dtype=np.uint16)
+    camera = connect(serve(lambda _: image, **size), packet_size_bytes=576, **size)
+    camera.start()
+    (frame,) = frames(camera, 1)
+    np.testing.assert_array_equal(frame.image, image)
+
+
+def test_the_frame_carries_the_middle_of_its_exposure(serve: Serve, connect: Connect) -> None:
+    rendered: list[float] = []
+
+    def render(mid_exposure_s: float) -> NDArray[np.uint16]:
+        rendered.append(mid_exposure_s)
+        return IMAGE
+
+    camera = connect(serve(render))
+    camera.start()
+    received = frames(camera, 10)
+    for frame in received:
+        assert frame.mid_exposure_s == pytest.approx(rendered[frame.number - 1], abs=1e-3)
+        assert frame.received_s - frame.mid_exposure_s >= 0.034  # frame_delay_s, less the clocks
+    assert [b.number - a.number for a, b in pairwise(received)] == [1] * 9
+
+
+def test_frames_of_a_camera_without_a_clock_are_as_old_as_the_rig_file_says(
+    serve: Serve, connect: Connect
+) -> None:
+    served = serve()
+    served.mock._clock.ticks = lambda _host_s: 0
+    camera = connect(served, frame_delay_s=0.03)
+    camera.start()
+    (frame,) = frames(camera, 1)
+    assert frame.received_s - frame.mid_exposure_s == pytest.approx(0.03)
+
+
+def test_the_identity_is_what_the_camera_says(serve: Serve) -> None:
+    camera = GigeCamera(camera_settings(gvcp_port=serve().port))
+    identity = camera.open()
+    camera.close()
+    assert (identity.maker, identity.model, identity.serial) == ("FIT", "MockCamera", "FIT01")
+
+
+def test_a_lost_packet_is_healed_by_a_resend(serve: Serve, connect: Connect) -> None:
+    served = serve()
+    to_lose = {(3, 0), (3, 2), (5, 3)}
+
+    def lose(block_id: int, packet_id: int) -> bool:
+        once = (block_id, packet_id) in to_lose
+        to_lose.discard((block_id, packet_id))
+        return once
+
+    served.mock.acquisition.lose = lose
+    camera = connect(served)
+    camera.start()
+    received = frames(camera, 6)
+    assert [frame.number for frame in received] == [1, 2, 3, 4, 5, 6]
+    for frame in received:
+        np.testing.assert_array_equal(frame.image, IMAGE)
+    assert (camera.counts().lost, camera.counts().packets_lost) == (0, 3)
+
+
+def test_a_lost_frame_is_counted_and_leaves_a_gap(serve: Serve, connect: Connect) -> None:
+    served = serve()
+    served.mock.acquisition.lose = lambda block_id, packet_id: (
+        block_id == 3 or (block_id, packet_id) == (5, 1)
+    )
+    camera = connect(served)
+    camera.start()
+    received = frames(camera, 4)
+    assert [frame.number for frame in received] == [1, 2, 4, 6]
+    assert (camera.counts().frames, camera.counts().lost) == (4, 2)
+
+
+def test_no_frame_in_time_is_none(serve: Serve, connect: Connect) -> None:
+    served = serve()
+    served.mock.acquisition.lose = lambda _block, _packet: True
+    camera = connect(served)
+    camera.start()
+    assert camera.next_frame(0.1) is None
+
+
+def test_frames_after_a_new_start_are_new(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve())
+    for _ in range(2):
+        camera.start()
+        started_s = time.monotonic()
+        (frame,) = frames(camera, 1)
+        assert frame.number == 1
+        assert frame.mid_exposure_s > started_s - 0.05
+        camera.stop()
+
+
+def test_a_second_program_is_refused_until_the_first_lets_go(
+    serve: Serve, connect: Connect
+) -> None:
+    served = serve()
+    first = connect(served)
+    with pytest.raises(DeviceRefused, match=r"control of the camera.*0x8006 ACCESS_DENIED"):
+        connect(served)
+    first.close()
+    connect(served)
+
+
+def test_control_lapses_and_the_stream_ends_without_a_heartbeat(serve: Serve) -> None:
+    served = serve()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(2)
+        client.connect(("127.0.0.1", served.port))
+        for register, value in (
+            (protocol.Register.CONTROL_PRIVILEGE, protocol.CONTROL),
+            (protocol.Register.HEARTBEAT_TIMEOUT_MS, 500),
+            (0xA01C, 1),  # acquisition start
+        ):
+            words = protocol.encode_words(register, value)
+            client.send(protocol.encode_command(protocol.Command.WRITEREG, 1, words))
+            assert protocol.decode_answer(client.recv(2048)).status == protocol.Status.SUCCESS
+    assert served.call(lambda: served.mock.acquisition.running)
+    deadline_s = time.monotonic() + 5
+    while served.call(lambda: served.mock.acquisition.running):
+        assert time.monotonic() < deadline_s
+        threading.Event().wait(0.02)
+    camera = GigeCamera(camera_settings(gvcp_port=served.port))
+    camera.open()  # control is free again
+    camera.close()
+
+
+def test_the_driver_keeps_control_for_longer_than_a_heartbeat(
+    serve: Serve, connect: Connect
+) -> None:
+    camera = connect(serve(), heartbeat_s=0.5)
+    camera.start()
+    assert len(frames(camera, 50)) == 50
+
+
+def test_a_camera_that_has_gone_is_noticed_at_once(serve: Serve, connect: Connect) -> None:
+    served = serve()
+    camera = connect(served)
+    camera.start()
+    frames(camera, 2)
+    served.stop()
+    gone_s = time.monotonic()
+    with pytest.raises(DeviceUnreachable, match=f"camera at 127.0.0.1:{served.port}"):
+        drain(camera)
+    assert time.monotonic() - gone_s < 0.5
+    camera.stop()
+    camera.close()
+    camera.close()
+
+
+def test_control_taken_away_is_noticed(serve: Serve, connect: Connect) -> None:
+    served = serve()
+    camera = connect(served)
+    camera.start()
+    served.call(served.mock._release_control)
+    with pytest.raises(DeviceUnreachable, match="the camera took it away"):
+        drain(camera)
+
+
+def test_a_camera_can_be_opened_again_after_it_came_back(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve())
+    camera.close()
+    camera.open()
+    camera.start()
+    assert len(frames(camera, 2)) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width_px": 64}, "Width = 64"),
+        ({"height_px": 48}, "Height = 48"),
+        ({"packet_size_bytes": 1501}, "packets of 1501 bytes, got 0x8002"),
+    ],
+)
+def test_a_camera_that_cannot_be_what_the_rig_file_says_is_named(
+    serve: Serve, connect: Connect, changes: dict[str, int], message: str
+) -> None:
+    served = serve()
+    with pytest.raises(DeviceMismatch, match=message):
+        connect(served, **changes)
+    connect(served)  # and the failed attempt has let go of control
+
+
+@pytest.mark.parametrize(("rate_hz", "exposure_s"), [(5.0, 0.2), (500.0, 0.002), (2000.0, 1e-4)])
+def test_exposure_and_rate_are_set_whichever_limits_the_other(
+    serve: Serve, connect: Connect, rate_hz: float, exposure_s: float
+) -> None:
+    camera = connect(serve(), frame_rate_hz=rate_hz, exposure_s=exposure_s)
+    camera.start()
+    first, second = frames(camera, 2)
+    step_s = (second.mid_exposure_s - first.mid_exposure_s) / (second.number - first.number)
+    assert step_s == pytest.approx(1 / rate_hz, abs=1e-3)
+
+
+def test_nobody_at_the_endpoint_is_unreachable() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    camera = GigeCamera(camera_settings(gvcp_port=port))
+    with pytest.raises(DeviceUnreachable, match="start the mocks"):
+        camera.open()
+    camera.close()
+
+
+def test_silence_at_the_endpoint_is_a_timeout() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        settings = camera_settings(gvcp_port=silent.getsockname()[1], response_timeout_s=0.15)
+        with pytest.raises(DeviceTimeout, match="none to 3 attempts"):
+            GigeCamera(settings).open()
+
+
+def test_a_closed_camera_gives_no_frames() -> None:
+    camera = GigeCamera(camera_settings())
+    with pytest.raises(DeviceError, match="open"):
+        camera.next_frame(0.0)
+    camera.stop()
+    camera.close()
+    assert camera.counts().frames == 0
+
+
+def test_nothing_is_left_behind(serve: Serve) -> None:
+    settings: Camera = camera_settings(gvcp_port=serve().port)
+    before = threading.active_count()
+    camera = GigeCamera(settings)
+    camera.open()
+    camera.start()
+    camera.close()
+    assert threading.active_count() == before

@@ -1,0 +1,80 @@
+"""Programs that are not ours accept our logs: pymcap-cli (Python) and rerun (Rust)."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from log_samples import RUN_INFO, SETTINGS, one_of_each, tick
+
+from fitctl.logging.writer import LogWriter
+
+BIN = Path(sys.executable).parent
+CONTENTS = {
+    "full": [RUN_INFO, *one_of_each(), *(tick(n) for n in range(2, 200))],
+    "no run info": [tick(1, time_s=1.0)],
+    "empty": [],
+}
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a tool away from the user's home: rerun's usage reports stay off."""
+    environment = os.environ | {
+        name: str(tmp_path / "home") for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")
+    }
+
+    def run(tool, *arguments):
+        command = [BIN / tool, *arguments]
+        result = subprocess.run(
+            command, env=environment, check=False, capture_output=True, text=True, timeout=60
+        )
+        assert result.returncode == 0, result.stdout + result.stderr
+        return result.stdout
+
+    run("rerun", "analytics", "disable")
+    return run
+
+
+def written(tmp_path, content, compression="zstd"):
+    settings = SETTINGS.model_copy(update={"compression": compression, "chunk_bytes": 4096})
+    with LogWriter(tmp_path / "log.mcap", settings) as writer:
+        for number, record in enumerate(CONTENTS[content]):
+            writer.write(record, 4e9 + 0.02 * number)
+    return writer.path
+
+
+@pytest.mark.parametrize(
+    ("content", "compression"),
+    [("full", "zstd"), ("full", "lz4"), ("no run info", "none"), ("empty", "zstd")],
+)
+def test_pymcap_doctor_finds_nothing_wrong(tmp_path, run, content, compression):
+    printed = run(
+        "pymcap-cli", "doctor", "--format", "jsonl", written(tmp_path, content, compression)
+    )
+    summary = json.loads(printed.splitlines()[-1])
+    assert (summary["errors"], summary["warnings"], summary["complete"]) == (0, 0, True), printed
+
+
+def test_rerun_check_finds_every_topic_in_order(tmp_path, run):
+    printed = run("rerun", "mcap", "check", "--full", written(tmp_path, "full"))
+    rows = [line.split() for line in printed.splitlines() if " /fit/" in line]
+    assert len(rows) == len(one_of_each())
+    assert {row[0] for row in rows} == {"ok"}
+
+
+def test_rerun_converts_every_topic_with_its_types(tmp_path, run):
+    converted = tmp_path / "log.rrd"
+    run("rerun", "mcap", "convert", written(tmp_path, "full"), "-o", converted)
+    printed = run("rerun", "rrd", "print", "-vvv", converted)
+    for content in (
+        '"star_az_px": non-null Float64',
+        '"mode": non-null Utf8',
+        '"mode_number": non-null Int64',
+        '"fsm_saturated": non-null Boolean',
+        "Image:buffer",
+        "TextLog:text",
+    ):
+        assert content in printed

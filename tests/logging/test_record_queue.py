@@ -1,0 +1,196 @@
+import time
+
+import msgspec
+import pytest
+import zmq
+from log_samples import RUN_INFO, tick, wait_until
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.queue import RecordQueue, RecordReceiver
+from fitctl.logging.records import RECORD_VERSION, Envelope
+
+SIZE = 20
+decode = msgspec.msgpack.Decoder(Envelope).decode
+
+
+@pytest.fixture
+def endpoint(tmp_path):
+    return f"ipc://{tmp_path}/records"
+
+
+@pytest.fixture
+def queue(endpoint):
+    queue = RecordQueue(endpoint, SIZE)
+    yield queue
+    queue.close(timeout_s=0.05)
+
+
+@pytest.fixture
+def recorders(endpoint):
+    """Starts recorders; all are closed at the end."""
+    started = []
+
+    def start():
+        started.append(RecordReceiver(endpoint))
+        return started[-1]
+
+    yield start
+    for receiver in started:
+        receiver.close()
+
+
+def next_of(queue, receiver, number):
+    """The next envelopes to arrive, while the queue goes on as in its loop."""
+    envelopes = []
+
+    def arrived():
+        queue.pump()
+        while (data := receiver.receive(0)) is not None:
+            envelopes.append(decode(data))
+        return len(envelopes) >= number
+
+    wait_until(arrived)
+    return envelopes
+
+
+def sequences(envelopes):
+    return [envelope.sequence for envelope in envelopes]
+
+
+def waiting(queue):
+    queue.pump()
+    return queue.waiting
+
+
+def test_records_arrive_numbered_and_in_order(queue, recorders):
+    recorder = recorders()
+    for number in range(4):
+        assert queue.offer(tick(number))
+    assert next_of(queue, recorder, 4) == [
+        Envelope(RECORD_VERSION, number, tick(number)) for number in range(4)
+    ]
+
+
+def test_what_is_offered_before_the_recorder_comes_is_kept_up_to_the_size(queue, recorders):
+    assert [queue.offer(tick(n)) for n in range(SIZE + 5)] == [True] * SIZE + [False] * 5
+    assert queue.lost == 5
+    assert sequences(next_of(queue, recorders(), SIZE)) == list(range(SIZE))
+
+
+def test_refused_records_leave_a_gap_that_the_recorder_sees(queue, recorders):
+    for number in range(SIZE + 5):
+        queue.offer(tick(number))
+    recorder = recorders()
+    next_of(queue, recorder, SIZE)
+    recorder.confirm(SIZE - 1)
+    wait_until(lambda: waiting(queue) == 0)
+    queue.offer(tick(99))
+    assert sequences(next_of(queue, recorder, 1)) == [SIZE + 5]
+
+
+def test_a_record_stays_until_it_is_confirmed(queue, recorders):
+    for number in range(10):
+        queue.offer(tick(number))
+    recorder = recorders()
+    next_of(queue, recorder, 10)
+    assert queue.waiting == 10
+    recorder.confirm(6)
+    wait_until(lambda: waiting(queue) == 3)
+
+
+def test_a_new_recorder_is_sent_the_run_and_what_none_has_confirmed(queue, recorders):
+    queue.offer(RUN_INFO)
+    for number in range(1, 10):
+        queue.offer(tick(number))
+    first = recorders()
+    next_of(queue, first, 10)
+    first.confirm(6)
+    wait_until(lambda: waiting(queue) == 3)
+    first.close()
+
+    envelopes = next_of(queue, recorders(), 4)
+
+    assert envelopes[0].record == RUN_INFO
+    assert sequences(envelopes) == [6, 7, 8, 9]
+
+
+def test_records_of_the_time_between_two_recorders_are_kept(queue, recorders):
+    first = recorders()
+    queue.offer(tick(0))
+    next_of(queue, first, 1)
+    first.confirm(0)
+    wait_until(lambda: waiting(queue) == 0)
+    first.close()
+    for number in range(1, 6):
+        assert queue.offer(tick(number))
+    assert sequences(next_of(queue, recorders(), 5)) == [1, 2, 3, 4, 5]
+
+
+def test_only_the_newest_recorder_is_spoken_to(queue, recorders):
+    old = recorders()
+    queue.offer(tick(0))
+    next_of(queue, old, 1)
+    new = recorders()
+    next_of(queue, new, 1)
+    queue.offer(tick(1))
+    assert sequences(next_of(queue, new, 1)) == [1]
+    assert old.receive(0.1) is None
+
+
+def test_a_recorder_that_hangs_costs_records_but_never_time(queue, recorders):
+    recorder = recorders()
+    queue.offer(tick(0))
+    next_of(queue, recorder, 1)
+    costs_s = []
+    for number in range(3000):
+        start_s = time.perf_counter()
+        queue.offer(tick(number))
+        costs_s.append(time.perf_counter() - start_s)
+    assert queue.lost == 3001 - SIZE
+    assert sorted(costs_s)[len(costs_s) // 2] < 1e-3
+
+
+def test_closing_without_a_recorder_counts_what_was_never_sent(endpoint):
+    queue = RecordQueue(endpoint, SIZE)
+    queue.offer(tick(0))
+    queue.offer(tick(1))
+    queue.close(timeout_s=0.05)
+    queue.close()
+    assert queue.lost == 2
+
+
+def test_closing_sends_what_is_still_there(endpoint, recorders):
+    queue = RecordQueue(endpoint, SIZE)
+    for number in range(SIZE):
+        queue.offer(tick(number))
+    recorder = recorders()
+    queue.close(timeout_s=5.0)
+    arrived = [decode(recorder.receive(1.0)).sequence for _ in range(SIZE)]
+    assert arrived == list(range(SIZE))
+    assert queue.lost == 0
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(LogError, match=r"ipc://.*/none/records: cannot be bound"):
+        RecordQueue(f"ipc://{tmp_path}/none/records", SIZE)
+
+
+def test_what_is_no_address_is_named():
+    with pytest.raises(LogError, match="nowhere: cannot be connected to"):
+        RecordReceiver("nowhere")
+
+
+@pytest.mark.parametrize(
+    "answer", [b"", b"hello", b"\xc1", msgspec.msgpack.encode(2**62), b"\xff" * 9]
+)
+def test_an_answer_of_someone_else_changes_nothing(queue, recorders, endpoint, answer):
+    recorder = recorders()
+    queue.offer(tick(0))
+    next_of(queue, recorder, 1)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as stranger:
+        stranger.connect(endpoint)
+        stranger.send(answer)
+        time.sleep(0.05)
+        queue.offer(tick(1))
+        assert sequences(next_of(queue, recorder, 1)) == [1]
+    assert queue.waiting == 2

@@ -1,0 +1,350 @@
+"""A supervisor that never was: deterministic telemetry of a plausible scenario, and links that deliver it.
+
+Times are fixed: the monotonic clock reads `START_S` at the first message, wall time is a winter night.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+import numpy as np
+
+from fitctl.logging.records import (
+    DeviceHealth,
+    Event,
+    FrameRecord,
+    LoopTiming,
+    ModeChange,
+    PiezoReading,
+    RecorderStatus,
+    Tick,
+)
+from fitctl.supervisor.messages import AnyCommand, LoopState, Reply, Telemetry
+
+START_S = 1000.0
+WALL_MINUS_MONOTONIC_S = 1796021000.0
+MESSAGE_S = 0.05
+FRAME_S = 0.02
+SIZE_PX = 40
+BIAS_DN = 1000.0
+NOISE_DN = 20.0
+SPOT_SIGMA_PX = 0.75
+TARGET_PX = (24.0, 19.5)
+MODE_NUMBERS = {"OFF": 0, "STANDBY": 1, "ACQUISITION": 2, "COARSE": 3, "VERNIER": 4, "SAFE": 5}
+USABLE = {
+    "OFF": ["Standby"],
+    "STANDBY": ["Acquire", "Off"],
+    "ACQUISITION": ["Hold"],
+    "COARSE": ["Hold"],
+    "VERNIER": ["Hold"],
+    "SAFE": ["Recover", "Off"],
+}
+
+
+def spot_image(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -> np.ndarray:
+    """A frame with Gaussian spots, each az px, el px, whole flux in DN; shape (40, 40)."""
+    el, az = np.mgrid[0:SIZE_PX, 0:SIZE_PX]
+    image = BIAS_DN + NOISE_DN * rng.standard_normal((SIZE_PX, SIZE_PX))
+    for spot_az, spot_el, flux in spots:
+        distance2 = (az - spot_az) ** 2 + (el - spot_el) ** 2
+        peak = flux / (2 * np.pi * SPOT_SIGMA_PX**2)
+        image += peak * np.exp(-distance2 / (2 * SPOT_SIGMA_PX**2))
+    return np.clip(image, 0, 65535).astype("<u2")
+
+
+class FakeSupervisor:
+    """Makes one telemetry message after another.
+
+    In VERNIER the error is a first-order Gauss-Markov process of `error_px` RMS with a correlation of
+    0.2 s about zero; the mirror carries a slow drift. In ACQUISITION there is no star yet.
+    """
+
+    def __init__(
+        self,
+        mode: str = "VERNIER",
+        *,
+        loops: tuple[str, ...] = ("right",),
+        error_px: float = 0.034,
+        seed: int = 7,
+        pid: int = 4242,
+    ) -> None:
+        self.mode = mode
+        self.loops = loops
+        self.error_px = error_px
+        self.pid = pid
+        self.rng = np.random.default_rng(seed)
+        self.error = {loop: error_px * self.rng.standard_normal(2) for loop in loops}
+        self.number = 0
+        self.sequence = 0
+        self.faulty: dict[str, str] = {}
+        self.records_lost = 0
+
+    @property
+    def time_s(self) -> float:
+        return START_S + self.number * FRAME_S
+
+    def messages(self, count: int) -> list[Telemetry]:
+        return [self.message() for _ in range(count)]
+
+    def message(self) -> Telemetry:
+        """The next message: all ticks of `MESSAGE_S`, events and changes in the very first one."""
+        first = self.sequence == 0
+        self.sequence += 1
+        ticks: list[Tick] = []
+        while self.time_s <= START_S + self.sequence * MESSAGE_S:
+            ticks += [self._tick(loop) for loop in self.loops]
+            self.number += 1
+        now_s = ticks[-1].time_s
+        return Telemetry(
+            sequence=self.sequence,
+            time_s=now_s,
+            wall_minus_monotonic_s=WALL_MINUS_MONOTONIC_S,
+            rig_name="fit-mock",
+            pid=self.pid,
+            loops=[self._state(loop) for loop in self.loops],
+            ticks=ticks,
+            events=_events() if first else [],
+            mode_changes=[self._change(loop) for loop in self.loops] if first else [],
+            frame=self._frame(now_s),
+            devices=self._devices(),
+            piezo=[_piezo(loop, now_s) for loop in self.loops],
+            timing=[_timing(loop, now_s) for loop in self.loops],
+            recorder=RecorderStatus(
+                time_s=now_s,
+                path="logs/fit-mock-20261130T031500Z.mcap",
+                records=60 * self.number,
+                lost=0,
+                bytes_written=9000 * self.number,
+            ),
+            records_lost=self.records_lost,
+            scheduling="SCHED_OTHER: real-time priority not permitted",
+        )
+
+    def _state(self, loop: str) -> LoopState:
+        state = LoopState(
+            name=loop,
+            mode=self.mode,
+            since_s=START_S - 133.0,
+            requirement_px=0.1,
+            usable_commands=["Stop", *USABLE[self.mode]],
+            **({"sky_arcsec_per_px": 2.708} if _tells_scale() else {}),
+        )
+        return state
+
+    def _change(self, loop: str) -> ModeChange:
+        modes = list(MODE_NUMBERS)
+        source = modes[max(0, modes.index(self.mode) - 1)]
+        return ModeChange(
+            time_s=START_S - 133.0,
+            loop=loop,
+            source=source,
+            target=self.mode,
+            target_number=MODE_NUMBERS[self.mode],
+            trigger="IN_REACH",
+            reason="5 frames within 50 % of the range",
+        )
+
+    def _tick(self, loop: str) -> Tick:
+        seen = self.mode in {"COARSE", "VERNIER"}
+        memory = np.exp(-FRAME_S / 0.2)
+        kick = self.error_px * np.sqrt(1 - memory**2)
+        self.error[loop] = memory * self.error[loop] + kick * self.rng.standard_normal(2)
+        error_az, error_el = self.error[loop] if seen else (np.nan, np.nan)
+        star_az, star_el = TARGET_PX[0] - error_az, TARGET_PX[1] - error_el
+        phase = self.number * FRAME_S / 7
+        fsm_az, fsm_el = 5e-5 * np.sin(phase), 3e-5 * np.cos(1.3 * phase)
+        return Tick(
+            time_s=self.time_s,
+            loop=loop,
+            number=self.number,
+            mode=self.mode,
+            mode_number=MODE_NUMBERS[self.mode],
+            mid_exposure_s=self.time_s - 0.035,
+            frame_age_s=0.035,
+            compute_s=2.1e-4,
+            late=False,
+            frames_lost=0,
+            star_visible=seen,
+            star_az_px=float(star_az),
+            star_el_px=float(star_el),
+            star_flux_dn=27900.0 + 100 * float(self.rng.standard_normal()) if seen else float("nan"),
+            window_az_px=round(star_az) if seen else 20,
+            window_el_px=round(star_el) if seen else 20,
+            target_az_px=TARGET_PX[0],
+            target_el_px=TARGET_PX[1],
+            error_az_px=float(error_az),
+            error_el_px=float(error_el),
+            fsm_az_rad=float(fsm_az),
+            fsm_el_rad=float(fsm_el),
+            fsm_range_fraction=float((abs(fsm_az) + abs(fsm_el)) / 1.772e-4),
+            fsm_saturated=False,
+            stack1_v=5.0 + 2e4 * float(fsm_az),
+            stack2_v=5.0 - 2e4 * float(fsm_az),
+            stack3_v=5.0 + 2e4 * float(fsm_el),
+            siderostat_az_rad=21.31,
+            siderostat_el_rad=-9.47,
+            siderostat_setpoint_az_rad=21.3104,
+            siderostat_setpoint_el_rad=-9.4702,
+            siderostat_az_sky_arcsec=123.4,
+            siderostat_el_sky_arcsec=-54.8,
+            search_progress=0.37 if self.mode == "ACQUISITION" else float("nan"),
+        )
+
+    def _frame(self, now_s: float) -> FrameRecord:
+        error_az, error_el = self.error[self.loops[0]]
+        star = (TARGET_PX[0] - error_az, TARGET_PX[1] - error_el, 28000.0)
+        fringe = (star[0] - 12, star[1], 11000.0)
+        seen = self.mode in {"COARSE", "VERNIER"}
+        image = spot_image(self.rng, [star, fringe] if seen else [])
+        return FrameRecord(
+            time_s=now_s - 0.035,
+            camera="camera",
+            number=self.number,
+            width_px=SIZE_PX,
+            height_px=SIZE_PX,
+            data=image.tobytes(),
+        )
+
+    def _devices(self) -> list[DeviceHealth]:
+        known = {
+            "camera": ("127.0.0.1:3956", "FIT mock camera 1.0", "50.0 Hz, no packet lost"),
+            "siderostat": ("socket://127.0.0.1:29536", "FIT mock CiA 402", "enabled, both axes"),
+            "D/A": ("127.0.0.1:29502", "FIT mock Modbus D/A", "1 204 writes, none late"),
+            "piezo": ("socket://127.0.0.1:29693", "Thorlabs MDT693B 1.05", "limit switch 150 V"),
+        }
+        return [
+            DeviceHealth(
+                time_s=self.time_s,
+                device=device,
+                endpoint=endpoint,
+                state="fault" if device in self.faulty else "ok",
+                identity=identity,
+                detail=self.faulty.get(device, detail),
+            )
+            for device, (endpoint, identity, detail) in known.items()
+        ]
+
+
+def _tells_scale() -> bool:
+    return "sky_arcsec_per_px" in LoopState.__struct_fields__
+
+
+def _piezo(loop: str, now_s: float) -> PiezoReading:
+    return PiezoReading(
+        time_s=now_s, loop=loop, stack1_v=79.4, stack2_v=70.1, stack3_v=77.2, limit_v=150.5
+    )
+
+
+def _timing(loop: str, now_s: float) -> LoopTiming:
+    return LoopTiming(
+        time_s=now_s,
+        loop=loop,
+        ticks=50,
+        late_ticks=0,
+        frames_lost=0,
+        compute_median_s=2.1e-4,
+        compute_worst_s=8.4e-4,
+        frame_age_median_s=0.0381,
+        frame_age_worst_s=0.0412,
+        servo_periods=500,
+        servo_late_median_s=2.1e-5,
+        servo_late_worst_s=1.2e-3,
+        servo_missed=0,
+        stalls=0,
+        worst_stall_s=0.0,
+    )
+
+
+def _events() -> list[Event]:
+    return [
+        Event(time_s=START_S - 141.0, severity="info", source="supervisor", message="all devices enabled"),
+        Event(
+            time_s=START_S - 140.2,
+            severity="warning",
+            source="camera",
+            message="1 packet resent in frame 208",
+        ),
+        Event(
+            time_s=START_S - 136.5,
+            severity="info",
+            source="right",
+            message="star found at 31.20, 8.75 px, 27 900 DN",
+        ),
+        Event(
+            time_s=START_S - 133.0,
+            severity="info",
+            source="right",
+            message="handed over to the mirror after 3.5 s",
+        ),
+    ]
+
+
+class FakeLink:
+    """Delivers what a test puts in, keeps what was sent, and answers as the test says."""
+
+    def __init__(self, answer: Callable[[AnyCommand], Reply] | None = None) -> None:
+        self.incoming: queue.Queue[Telemetry] = queue.Queue()
+        self.sent: list[AnyCommand] = []
+        self.closed = False
+        self._answer = answer or (lambda _command: Reply(accepted=True))
+
+    def deliver(self, messages: list[Telemetry]) -> None:
+        for message in messages:
+            self.incoming.put(message)
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        try:
+            return self.incoming.get(timeout=min(timeout_s, 0.02))
+        except queue.Empty:
+            return None
+
+    def send(self, command: AnyCommand) -> Reply:
+        self.sent.append(command)
+        return self._answer(command)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class LiveLink(FakeLink):
+    """The fake supervisor in real time, through the codec as over a socket: for looking and measuring."""
+
+    def __init__(self, supervisor: FakeSupervisor) -> None:
+        super().__init__()
+        self._messages = self._paced(supervisor)
+        self._lock = threading.Lock()
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        with self._lock:
+            return next(self._messages)
+
+    def _paced(self, supervisor: FakeSupervisor) -> Iterator[Telemetry]:
+        decoder = msgspec.msgpack.Decoder(Telemetry)
+        ready = [msgspec.msgpack.encode(message) for message in supervisor.messages(600)]
+        shift_s = time.monotonic() - START_S
+        due_s = time.monotonic()
+        while True:
+            for encoded in ready:
+                due_s += MESSAGE_S
+                time.sleep(max(0.0, due_s - time.monotonic()))
+                yield _shifted(decoder.decode(encoded), shift_s)
+            shift_s += len(ready) * MESSAGE_S
+
+
+def _shifted(message: Telemetry, shift_s: float) -> Telemetry:
+    replace = msgspec.structs.replace
+    return replace(
+        message,
+        time_s=message.time_s + shift_s,
+        wall_minus_monotonic_s=message.wall_minus_monotonic_s - shift_s,
+        loops=[replace(loop, since_s=loop.since_s + shift_s) for loop in message.loops],
+        ticks=[replace(tick, time_s=tick.time_s + shift_s) for tick in message.ticks],
+        events=[replace(event, time_s=event.time_s + shift_s) for event in message.events],
+        mode_changes=[
+            replace(change, time_s=change.time_s + shift_s) for change in message.mode_changes
+        ],
+    )
