@@ -32,7 +32,9 @@ SetOption = Annotated[
         "--set", metavar="KEY=VALUE", help="Replace a value of the rig file; may be repeated."
     ),
 ]
-SeedOption = Annotated[int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")]
+SeedOption = Annotated[
+    int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
 WithParentOption = Annotated[
     bool, typer.Option("--with-parent", hidden=True, help="End when the parent process ends.")

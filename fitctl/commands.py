@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from fitctl.supervisor.messages import Telemetry
 FAILED = 1
 _REPORT_TIMEOUT_S = 0.5
 
-COMMANDS: dict[str, type[messages.Command]] = {
+COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
     "standby": messages.Standby,
     "acquire": messages.Acquire,
     "hold": messages.Hold,
@@ -99,9 +99,7 @@ def _demo_with_console(running: demos.Instrument) -> int:
     return 0
 
 
-def _demo_headless(
-    rig: Rig, running: demos.Instrument, duration_s: float, *, as_json: bool
-) -> int:
+def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as_json: bool) -> int:
     demos.acquire(running)
     with _progress() as progress:
         task = progress.add_task("starting", total=duration_s)
@@ -113,9 +111,7 @@ def _demo_headless(
     results = {name: demos.summary(rig, running, course, name) for name in rig.loops}
     if as_json:
         # One loop: its summary. Several: one for each, by name.
-        typer.echo(
-            demos.to_json(next(iter(results.values())) if len(results) == 1 else results)
-        )
+        typer.echo(demos.to_json(next(iter(results.values())) if len(results) == 1 else results))
     else:
         for name, result in results.items():
             typer.echo(_summary_text(name, result))
@@ -160,9 +156,7 @@ def _summary_text(name: str, result: dict[str, Any]) -> str:
 # ---------------------------------------------------------------- processes
 
 
-def run_mocks(
-    rig: Rig, seed: int, *, as_json: bool, free_ports: bool, with_parent: bool
-) -> None:
+def run_mocks(rig: Rig, seed: int, *, as_json: bool, free_ports: bool, with_parent: bool) -> None:
     """Serve the mock testbed until a signal comes."""
     if free_ports:
         rig = _with_free_ports(rig)
@@ -317,5 +311,3 @@ def show_log(path: Path) -> None:
     width = max(map(len, info.counts), default=0)
     for topic, count in sorted(info.counts.items()):
         typer.echo(f"  {topic:<{width}}  {count}")
-
-

@@ -506,7 +506,8 @@ def _allowed_keys(location: Sequence[str]) -> list[str]:
         elif get_origin(annotation) in {dict, list}:
             annotation = get_args(annotation)[-1]
         annotation = _without_none(annotation)
-    return sorted(annotation.model_fields) if isinstance(annotation, type) else []
+    is_settings = isinstance(annotation, type) and issubclass(annotation, Settings)
+    return sorted(annotation.model_fields) if is_settings else []
 
 
 def _without_none(annotation: Any) -> Any:

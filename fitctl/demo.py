@@ -1,4 +1,4 @@
-"""``fitctl demo``: mock testbed, supervisor and recorder as processes of their own, and a look at how it went."""
+"""``fitctl demo``: mock testbed, supervisor and recorder as processes, and how it went."""
 
 from __future__ import annotations
 

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class _Axis:
+    """One axis in plain floats: on two numbers they are several times quicker than arrays."""
+
+    target_rad: float
+    reference_rad: float
+    step_rad: float = 0.0
+    velocity_rad_s: float = 0.0
 
 
 class PositionServo:
@@ -42,27 +54,43 @@ class PositionServo:
 
     def reset(self, position_rad: Floats) -> None:
         """Rest at `position_rad`, shape (2,)."""
-        self.reference_rad = np.array(position_rad, dtype=float)
-        self._target_rad = self.reference_rad
-        self._step_rad = np.zeros(2)
-        self._velocity_rad_s = np.zeros(2)
+        self._axes = [_Axis(position, position) for position in position_rad.tolist()]
 
     def move_to(self, target_rad: Floats) -> None:
         """Be at `target_rad`, shape (2,), one set-point period from now, or as soon as the limit allows."""
-        self._target_rad = np.array(target_rad, dtype=float)
         most = self._velocity_limit * self._period_s
-        step = (self._target_rad - self.reference_rad) / self._periods_per_setpoint
-        self._step_rad = np.clip(step, -most, most)
+        for axis, target in zip(self._axes, target_rad.tolist(), strict=True):
+            axis.target_rad = target
+            step = (target - axis.reference_rad) / self._periods_per_setpoint
+            axis.step_rad = _limited(step, most)
 
     def step(self, position_rad: Floats) -> Floats:
         """One servo period: velocity command, shape (2,), for the measured motor angles."""
-        left = self._target_rad - self.reference_rad
-        arrives = np.abs(left) <= np.abs(self._step_rad)
-        self.reference_rad = np.where(
-            arrives, self._target_rad, self.reference_rad + self._step_rad
+        return np.array(
+            [
+                self._velocity_rad_s(axis, position)
+                for axis, position in zip(self._axes, position_rad.tolist(), strict=True)
+            ]
         )
-        wanted = self._gain_per_s * (self.reference_rad - position_rad)
-        wanted = np.clip(wanted, -self._velocity_limit, self._velocity_limit)
-        change = np.clip(wanted - self._velocity_rad_s, -self._velocity_step, self._velocity_step)
-        self._velocity_rad_s = self._velocity_rad_s + change
-        return self._velocity_rad_s
+
+    def following_error_rad(self, position_rad: Floats) -> float:
+        """How far the motors are from the moving reference; the larger of the axes."""
+        return max(
+            abs(axis.reference_rad - position)
+            for axis, position in zip(self._axes, position_rad.tolist(), strict=True)
+        )
+
+    def _velocity_rad_s(self, axis: _Axis, position_rad: float) -> float:
+        if abs(axis.target_rad - axis.reference_rad) <= abs(axis.step_rad):
+            axis.reference_rad = axis.target_rad
+        else:
+            axis.reference_rad += axis.step_rad
+        wanted = _limited(
+            self._gain_per_s * (axis.reference_rad - position_rad), self._velocity_limit
+        )
+        axis.velocity_rad_s += _limited(wanted - axis.velocity_rad_s, self._velocity_step)
+        return axis.velocity_rad_s
+
+
+def _limited(value: float, most: float) -> float:
+    return min(max(value, -most), most)

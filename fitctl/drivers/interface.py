@@ -174,7 +174,10 @@ class ServoAmplifiers(Protocol):
     def exchange(self, velocity_rad_s: NDArray[np.float64]) -> ServoReading | None:
         """One servo period: command both motors, read both encoders.
 
-        Returns None when no reading came within the period; the caller judges how often it may.
+        Returns None when no reading came within the period; the caller judges how often it may. Once
+        enabled it must be called every period: it is also what keeps the master's heartbeat, without
+        which a drive stops by itself. Raises DeviceError when the link or the drive is lost; a fault
+        of an axis comes in the reading.
         """
         ...
 

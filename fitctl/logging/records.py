@@ -19,7 +19,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, tag=True):
     time_s: float
 
 
-class RunInfo(Record):
+class RunInfo(Record, frozen=True, kw_only=True):
     """The first record of a run: what is needed to understand all others."""
 
     wall_minus_monotonic_s: float
@@ -30,7 +30,7 @@ class RunInfo(Record):
     random_seed: int | None = None
 
 
-class Tick(Record):
+class Tick(Record, frozen=True, kw_only=True):
     """One tick of one loop: a frame came (or did not), and a command was made from it."""
 
     loop: str
@@ -68,7 +68,7 @@ class Tick(Record):
     search_progress: float
 
 
-class FrameRecord(Record):
+class FrameRecord(Record, frozen=True, kw_only=True):
     """One whole camera frame; ``data`` is little-endian 16 bit, row by row. ``time_s`` is mid-exposure."""
 
     camera: str
@@ -78,7 +78,7 @@ class FrameRecord(Record):
     data: bytes
 
 
-class ModeChange(Record):
+class ModeChange(Record, frozen=True, kw_only=True):
     """A loop went from one mode to another."""
 
     loop: str
@@ -89,7 +89,7 @@ class ModeChange(Record):
     reason: str
 
 
-class Event(Record):
+class Event(Record, frozen=True, kw_only=True):
     """Something that an operator should read."""
 
     severity: Literal["info", "warning", "error"]
@@ -97,7 +97,7 @@ class Event(Record):
     message: str
 
 
-class DeviceHealth(Record):
+class DeviceHealth(Record, frozen=True, kw_only=True):
     """How one device is, about once a second."""
 
     device: str
@@ -107,7 +107,7 @@ class DeviceHealth(Record):
     detail: str
 
 
-class PiezoReading(Record):
+class PiezoReading(Record, frozen=True, kw_only=True):
     """Measured stack voltages, about once a second."""
 
     loop: str
@@ -117,7 +117,7 @@ class PiezoReading(Record):
     limit_v: float
 
 
-class LoopTiming(Record):
+class LoopTiming(Record, frozen=True, kw_only=True):
     """Timing over the last second: frame loop and position servo."""
 
     loop: str
@@ -136,7 +136,7 @@ class LoopTiming(Record):
     worst_stall_s: float
 
 
-class RecorderStatus(Record):
+class RecorderStatus(Record, frozen=True, kw_only=True):
     """What the recorder has done so far."""
 
     path: str

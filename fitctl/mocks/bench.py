@@ -20,7 +20,7 @@ _TIMEOUT_MS = 5000
 
 
 class ResidualQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How far was the star from a target, from one host time to another?"""
+    """Asks how far the star was from a target, from one host time to another."""
 
     loop: str
     start_s: float

@@ -39,20 +39,18 @@ class Scene:
         """Noiseless frame, shape (..., height, width), of spots at (..., spots, 2) in (az, el)."""
         across = self._pixel_fractions(self._edges_x, positions_px[..., 0])
         down = self._pixel_fractions(self._edges_y, positions_px[..., 1])
-        return self._bias_dn + np.einsum(
-            "...sy,...sx->...yx", down * self._flux_dn[:, None], across, optimize=False
-        )
+        return self._bias_dn + (down * self._flux_dn[:, None]).swapaxes(-1, -2) @ across
 
     def frame(self, positions_px: Floats, random: np.random.Generator) -> NDArray[np.uint16]:
         """One frame with pixel noise, shape (height, width), of spots at (spots, 2)."""
         noisy = self.expected(positions_px)
         noisy += self._noise_dn * random.standard_normal(self._shape)
-        np.clip(np.rint(noisy, out=noisy), 0, FULL_WELL_DN, out=noisy)
-        return noisy.astype(np.uint16)
+        return np.clip(np.rint(noisy), 0, FULL_WELL_DN).astype(np.uint16)
 
     def _pixel_fractions(self, edges: Floats, centre_px: Floats) -> Floats:
         """Part of a spot's light that falls on each column (or row), shape (..., spots, pixels)."""
-        return np.diff(ndtr((edges - centre_px[..., None]) / self._sigma_px[:, None]), axis=-1)
+        below = ndtr((edges - centre_px[..., None]) / self._sigma_px[:, None])
+        return np.asarray(below[..., 1:] - below[..., :-1])
 
 
 def centroid_noise_px(camera: Camera, flux_dn: float, window_px: int) -> float:

@@ -9,7 +9,6 @@ from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.drivers.mdt693.driver import Mdt693
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 
-
 CAMERAS = {"gige": GigeCamera}
 AMPLIFIERS = {"cia402": Cia402Amplifiers}
 DACS = {"modbus_dac": ModbusDac}

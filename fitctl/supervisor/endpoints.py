@@ -20,7 +20,11 @@ def service_folder(rig: Rig) -> Path:
     if rig.service.folder:
         return Path(rig.service.folder).expanduser().absolute()
     runtime = os.environ.get("XDG_RUNTIME_DIR")
-    base = Path(runtime) / "fitctl" if runtime else Path(tempfile.gettempdir()) / f"fitctl-{os.getuid()}"
+    base = (
+        Path(runtime) / "fitctl"
+        if runtime
+        else Path(tempfile.gettempdir()) / f"fitctl-{os.getuid()}"
+    )
     return base / rig.name
 
 

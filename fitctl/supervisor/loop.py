@@ -23,7 +23,7 @@ from fitctl.controllers.prefilter import Prefilter
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.controllers.vernier import Vernier
 from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
-from fitctl.logging.records import Event, ModeChange, Record, Tick
+from fitctl.logging.records import AnyRecord, Event, ModeChange, Tick
 from fitctl.model.optics import mirror_angles, saturate_diamond, scales, stack_volts
 from fitctl.supervisor.modes import TRACKING, Mode, Trigger, transition
 from fitctl.supervisor.servo import SiderostatServo
@@ -80,7 +80,7 @@ class StellarLoop:
         servo: SiderostatServo,
         dac: MirrorDac,
         clock: Clock,
-        report: Callable[[Record], None],
+        report: Callable[[AnyRecord], None],
     ) -> None:
         loop = rig.loops[name]
         self.name = name
@@ -107,9 +107,7 @@ class StellarLoop:
         self._coarse = CoarseIntegrator(
             loop.coarse.gain_rad_per_m, self._scale.pixel_size_m, self._period_s
         )
-        self._vernier = Vernier(
-            self._period_s, self._scale.mirror_px_per_rad, loop.fsm.range_rad
-        )
+        self._vernier = Vernier(self._period_s, self._scale.mirror_px_per_rad, loop.fsm.range_rad)
         self._range_px = self._scale.mirror_px_per_rad * loop.fsm.range_rad
         self._travel_rad = loop.siderostat.travel_sky_arcsec / self._scale.motor_sky_arcsec_per_rad
         self._at_travel_limit = False

@@ -25,52 +25,54 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknow
     loop: str = ""
 
 
-class Standby(Command):
+class Standby(Command, frozen=True, kw_only=True):
     """From OFF: connect and enable all devices, then STANDBY."""
 
 
-class Acquire(Command):
+class Acquire(Command, frozen=True, kw_only=True):
     """Search for the star, pull it in, hold it."""
 
 
-class Hold(Command):
+class Hold(Command, frozen=True, kw_only=True):
     """Stop tracking where the stages are: STANDBY."""
 
 
-class Stop(Command):
+class Stop(Command, frozen=True, kw_only=True):
     """SAFE, at once, from every mode."""
 
 
-class Recover(Command):
+class Recover(Command, frozen=True, kw_only=True):
     """From SAFE: reconnect what is lost, reset faults, then STANDBY."""
 
 
-class Off(Command):
+class Off(Command, frozen=True, kw_only=True):
     """From STANDBY or SAFE: disable the amplifiers and let go of the devices."""
 
 
-class SetTarget(Command):
+class SetTarget(Command, frozen=True, kw_only=True):
     """Move the point where the star is held, through the prefilter."""
 
     az_px: float
     el_px: float
 
 
-class Status(Command):
+class Status(Command, frozen=True, kw_only=True):
     """Ask for one telemetry message."""
 
 
-class Shutdown(Command):
+class Shutdown(Command, frozen=True, kw_only=True):
     """SAFE, OFF, then end the supervisor process."""
 
 
-class RecorderReport(Command):
+class RecorderReport(Command, frozen=True, kw_only=True):
     """The recorder tells what it has written."""
 
     status: RecorderStatus
 
 
-AnyCommand = Standby | Acquire | Hold | Stop | Recover | Off | SetTarget | Status | Shutdown | RecorderReport
+AnyCommand = (
+    Standby | Acquire | Hold | Stop | Recover | Off | SetTarget | Status | Shutdown | RecorderReport
+)
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
@@ -92,7 +94,10 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
-    """Sent `telemetry_hz` times a second. Ticks, events and mode changes since the last one; the rest is newest."""
+    """Sent `telemetry_hz` times a second.
+
+    Ticks, events and mode changes are those since the last message; of everything else it has the newest.
+    """
 
     version: int = PROTOCOL_VERSION
     sequence: int
@@ -111,4 +116,3 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     recorder: RecorderStatus | None
     records_lost: int
     scheduling: str
-

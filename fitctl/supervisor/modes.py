@@ -72,7 +72,9 @@ class Transition:
     condition: str
 
 
-def _from(sources: tuple[Mode, ...], trigger: Trigger, target: Mode, condition: str) -> list[Transition]:
+def _from(
+    sources: tuple[Mode, ...], trigger: Trigger, target: Mode, condition: str
+) -> list[Transition]:
     return [Transition(source, trigger, target, condition) for source in sources]
 
 
@@ -81,16 +83,37 @@ _POWERED = (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
 TRANSITIONS: tuple[Transition, ...] = (
     *_from((Mode.OFF,), Trigger.STANDBY, Mode.STANDBY, "all devices open, checked and enabled"),
     *_from((Mode.STANDBY,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for"),
-    *_from((Mode.ACQUISITION,), Trigger.STAR_FOUND, Mode.COARSE, "star on found_frames frames in a row"),
+    *_from(
+        (Mode.ACQUISITION,), Trigger.STAR_FOUND, Mode.COARSE, "star on found_frames frames in a row"
+    ),
     *_from((Mode.ACQUISITION,), Trigger.SEARCH_EXHAUSTED, Mode.STANDBY, "whole search radius seen"),
-    *_from((Mode.COARSE,), Trigger.IN_REACH, Mode.VERNIER, "error in the mirror's reach for reach_frames"),
-    *_from((Mode.COARSE, Mode.VERNIER), Trigger.STAR_LOST, Mode.ACQUISITION, "no star for lost_frames"),
-    *_from((Mode.VERNIER,), Trigger.OUT_OF_REACH, Mode.COARSE, "error beyond the mirror's range for reach_frames"),
+    *_from(
+        (Mode.COARSE,),
+        Trigger.IN_REACH,
+        Mode.VERNIER,
+        "error in the mirror's reach for reach_frames",
+    ),
+    *_from(
+        (Mode.COARSE, Mode.VERNIER), Trigger.STAR_LOST, Mode.ACQUISITION, "no star for lost_frames"
+    ),
+    *_from(
+        (Mode.VERNIER,),
+        Trigger.OUT_OF_REACH,
+        Mode.COARSE,
+        "error beyond its range for reach_frames",
+    ),
     *_from((Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER), Trigger.HOLD, Mode.STANDBY, "asked for"),
-    *_from((*_POWERED, Mode.OFF), Trigger.STOP, Mode.SAFE, "asked for, at once"),
+    *_from(tuple(Mode), Trigger.STOP, Mode.SAFE, "asked for, at once"),
     *_from(_POWERED, Trigger.FAULT, Mode.SAFE, "any device fault"),
-    *_from((Mode.SAFE,), Trigger.RECOVER, Mode.STANDBY, "all devices reopened, checked and enabled"),
-    *_from((Mode.STANDBY, Mode.SAFE), Trigger.OFF, Mode.OFF, "asked for; amplifiers disabled, devices closed"),
+    *_from(
+        (Mode.SAFE,), Trigger.RECOVER, Mode.STANDBY, "all devices reopened, checked and enabled"
+    ),
+    *_from(
+        (Mode.STANDBY, Mode.SAFE),
+        Trigger.OFF,
+        Mode.OFF,
+        "asked for; amplifiers disabled, devices closed",
+    ),
 )
 
 _TABLE = {(row.source, row.trigger): row for row in TRANSITIONS}

@@ -16,7 +16,7 @@ from pathlib import Path
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
 from fitctl.logging.queue import RecordQueue
-from fitctl.logging.records import Record, RunInfo
+from fitctl.logging.records import AnyRecord, RunInfo
 from fitctl.processes import end_process, ended_by_signals, start_process
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
@@ -38,7 +38,17 @@ from fitctl.supervisor.supervisor import Supervisor
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _RECORDER_END_S = 5.0
-_VERSIONED = ("fitctl", "numpy", "scipy", "control", "pyzmq", "mcap", "python-can", "pymodbus", "genicam")
+_VERSIONED = (
+    "fitctl",
+    "numpy",
+    "scipy",
+    "control",
+    "pyzmq",
+    "mcap",
+    "python-can",
+    "pymodbus",
+    "genicam",
+)
 
 
 class Recorder:
@@ -120,7 +130,7 @@ def run_supervisor(
         stack.callback(queue.close)  # in case what follows fails
         buffer = TelemetryBuffer()
 
-        def record(record: Record) -> None:
+        def record(record: AnyRecord) -> None:
             queue.offer(record)
             buffer.add(record)
 
@@ -163,18 +173,20 @@ def _loop(
 ) -> None:
     housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
     with ended_by_signals(supervisor.ask_shutdown):
-        while not supervisor.shutdown_wanted:
-            supervisor.step()
-            if clock.now_s() >= housekeeping_s:
-                housekeeping_s += _HOUSEKEEPING_S
-                queue.pump()
-                collect_young()
-                executor.submit(recorder.check)
-        supervisor.stop("shutting down")
-        end_s = clock.now_s() + _WIND_DOWN_S
-        while clock.now_s() < end_s and not supervisor.at_rest():
-            supervisor.step()
-        supervisor.close()
+        try:
+            while not supervisor.shutdown_wanted:
+                supervisor.step()
+                if clock.now_s() >= housekeeping_s:
+                    housekeeping_s += _HOUSEKEEPING_S
+                    queue.pump()
+                    collect_young()
+                    executor.submit(recorder.check)
+            supervisor.stop("shutting down")
+            end_s = clock.now_s() + _WIND_DOWN_S
+            while clock.now_s() < end_s and not supervisor.at_rest():
+                supervisor.step()
+        finally:
+            supervisor.close()
 
 
 def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
@@ -188,5 +200,3 @@ def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
         versions=versions | {"python": platform.python_version()},
         scheduling=scheduling,
     )
-
-

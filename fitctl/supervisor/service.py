@@ -220,9 +220,7 @@ class Service(threading.Thread):
         elif isinstance(command, Status):
             self._answer(identity, tag, Reply(accepted=True, text=self._status_text()))
         else:
-            self._supervisor.post(
-                command, lambda reply: self._replies.put((identity, tag, reply))
-            )
+            self._supervisor.post(command, lambda reply: self._replies.put((identity, tag, reply)))
 
     def _status_text(self) -> str:
         return ", ".join(

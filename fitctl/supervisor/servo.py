@@ -6,6 +6,7 @@ only uses the driver; the other threads leave wishes (a set-point, a stop, a req
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -109,7 +110,7 @@ class SiderostatServo:
     def position_at(self, time_s: float) -> Floats:
         """Motor angles at a recent time, shape (2,), interpolated between readings."""
         history = list(self._history)
-        for (t0, p0), (t1, p1) in zip(reversed(history[:-1]), reversed(history[1:]), strict=True):
+        for (t1, p1), (t0, p0) in itertools.pairwise(reversed(history)):
             if t0 <= time_s:
                 part = min(1.0, (time_s - t0) / (t1 - t0)) if t1 > t0 else 1.0
                 return p0 + part * (p1 - p0)
@@ -179,19 +180,27 @@ class SiderostatServo:
         self._history.append((reading.time_s, reading.position_rad))
         if reading.fault:
             raise DeviceFault(
-                self._device, self.endpoint, "no fault", reading.fault, "remove its cause, then recover"
+                self._device,
+                self.endpoint,
+                "no fault",
+                reading.fault,
+                "remove its cause, then recover",
             )
         if self.enabled and not reading.enabled:
             raise DeviceFault(
-                self._device, self.endpoint, "both axes enabled", "an axis disabled itself", "recover"
+                self._device,
+                self.endpoint,
+                "both axes enabled",
+                "an axis disabled itself",
+                "recover",
             )
-        following = np.abs(self._servo.reference_rad - reading.position_rad)
-        if not self._stopped and np.any(following > self._settings.following_error_limit_rad):
+        following_rad = self._servo.following_error_rad(reading.position_rad)
+        if not self._stopped and following_rad > self._settings.following_error_limit_rad:
             raise DeviceFault(
                 self._device,
                 self.endpoint,
                 f"following error below {self._settings.following_error_limit_rad:g} rad",
-                f"{following.max():.2f} rad",
+                f"{following_rad:.2f} rad",
                 "look for a stuck axis, then recover",
             )
 
@@ -228,7 +237,16 @@ class SiderostatServo:
         future = self._post(action)
         if not self.threaded:
             self.period()
-        return future.result(timeout=_REQUEST_TIMEOUT_S)
+        try:
+            return future.result(timeout=_REQUEST_TIMEOUT_S)
+        except TimeoutError:
+            raise DeviceTimeout(
+                self._device,
+                self.endpoint,
+                f"to be done within {_REQUEST_TIMEOUT_S:g} s",
+                "nothing",
+                "check the drive and its link, then recover",
+            ) from None
 
 
 class ServoThread:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any, NamedTuple
@@ -18,8 +17,15 @@ from numpy.typing import NDArray
 
 from fitctl.clock import VirtualClock
 from fitctl.config import Rig
-from fitctl.drivers.interface import CameraCounts, DeviceIdentity, Devices, Frame, LoopDevices, ServoReading
-from fitctl.logging.records import ModeChange, Record, Tick
+from fitctl.drivers.interface import (
+    CameraCounts,
+    DeviceIdentity,
+    Devices,
+    Frame,
+    LoopDevices,
+    ServoReading,
+)
+from fitctl.logging.records import AnyRecord, ModeChange, Tick
 from fitctl.model.plant import Plant
 from fitctl.model.scene import Scene
 from fitctl.supervisor.messages import Acquire, AnyCommand, Reply, Standby
@@ -42,7 +48,7 @@ class InlineExecutor(Executor):
         future: Future = Future()
         try:
             future.set_result(fn(*args, **kwargs))
-        except Exception as error:  # noqa: BLE001  (an executor hands every exception on)
+        except Exception as error:
             future.set_exception(error)
         return future
 
@@ -220,7 +226,7 @@ class Simulation:
         seed: int,
         *,
         star_offset_px: Floats | None = None,
-        record: Callable[[Record], None] | None = None,
+        record: Callable[[AnyRecord], None] | None = None,
     ) -> None:
         self.rig = rig
         self.clock = VirtualClock()
@@ -248,7 +254,7 @@ class Simulation:
             (servo.period_s, servo.period) for servo in self.supervisor.servos.values()
         ]
 
-    def _take(self, record: Record) -> None:
+    def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Tick):
             self.ticks.append(record)
         elif isinstance(record, ModeChange):

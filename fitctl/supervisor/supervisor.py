@@ -27,11 +27,11 @@ from fitctl.drivers.interface import (
     LoopDevices,
 )
 from fitctl.logging.records import (
+    AnyRecord,
     DeviceHealth,
     Event,
     FrameRecord,
     PiezoReading,
-    Record,
 )
 from fitctl.supervisor.loop import StellarLoop
 from fitctl.supervisor.messages import (
@@ -51,6 +51,7 @@ from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
 CAMERA = "camera"
+_CLOSE_TIMEOUT_S = 30.0
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Standby: Trigger.STANDBY,
     Acquire: Trigger.ACQUIRE,
@@ -96,7 +97,7 @@ class Supervisor:
         devices: Devices,
         clock: Clock,
         executor: Executor,
-        record: Callable[[Record], None],
+        record: Callable[[AnyRecord], None],
     ) -> None:
         self.rig = rig
         self.servos = {
@@ -117,6 +118,7 @@ class Supervisor:
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
         self._notes: deque[tuple[str, str, str]] = deque()
         self._job: Job | None = None
+        self._abandoned = False
         self._poll: Job | None = None
         self._polled_s = clock.now_s()
         self._camera_ready = False
@@ -192,7 +194,8 @@ class Supervisor:
         for loop in self.loops.values():
             loop.dac_ready = False
         self._camera_ready = False
-        self._executor.submit(self._close_devices, list(self.loops)).result(timeout=30.0)
+        names = list(self.loops)
+        self._executor.submit(self._close_devices, names, True).result(timeout=_CLOSE_TIMEOUT_S)
 
     # ------------------------------------------------------------ frames
 
@@ -242,8 +245,11 @@ class Supervisor:
         if isinstance(command, SetTarget):
             return self._set_target(command, names)
         trigger = _COMMANDS.get(type(command))
-        if trigger is None:
-            return _refusal(f"{type(command).__name__} is not for the supervisor")
+        if trigger is not None:
+            return self._fire(trigger, names)
+        return _refusal(f"{type(command).__name__} is not for the supervisor")
+
+    def _fire(self, trigger: Trigger, names: list[str]) -> Reply:
         usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
         if not usable:
             return _refusal(self._why_not(trigger, names))
@@ -254,6 +260,8 @@ class Supervisor:
         elif trigger is Trigger.OFF:
             self._turn_off(usable)
         else:
+            # A stop while devices are being opened has the last word.
+            self._abandoned = self._abandoned or (trigger is Trigger.STOP and self._job is not None)
             for name in usable:
                 self.loops[name].fire(trigger, "operator")
         return Reply(accepted=True)
@@ -281,15 +289,16 @@ class Supervisor:
     def _open(self, names: list[str], trigger: Trigger) -> None:
         for name in names:
             self.loops[name].dac_ready = False
-        self._camera_ready = False
+        self._abandoned = False
         self._event("info", "supervisor", "opening and checking all devices")
-        future = self._executor.submit(self._open_devices, names)
-        self._job = Job(future, partial(self._opened, names, trigger))
+        with_camera = not self._camera_ready
+        future = self._executor.submit(self._open_devices, names, with_camera)
+        self._job = Job(future, partial(self._opened, names, with_camera, trigger))
         self._finish_jobs()
 
-    def _open_devices(self, names: list[str]) -> Opened:
+    def _open_devices(self, names: list[str], with_camera: bool) -> Opened:
         """Open everything anew. Limits are checked first; nothing moves before all of it is well."""
-        self._close_devices(names)
+        self._close_devices(names, with_camera)
         identities: dict[str, DeviceIdentity] = {}
         stack_v: dict[str, np.ndarray] = {}
         for name in names:
@@ -297,19 +306,27 @@ class Supervisor:
             identities[f"{name} piezo"] = loop.piezo.open()
             identities[f"{name} D/A"] = loop.dac.open()
             stack_v[name] = loop.dac.read_v()
-        identities[CAMERA] = self._devices.camera.open()
+        if with_camera:
+            identities[CAMERA] = self._devices.camera.open()
         for name in names:
             identities[f"{name} siderostat"] = self.servos[name].open()
-        self._devices.camera.start()
+        if with_camera:
+            self._devices.camera.start()
         return Opened(identities, stack_v)
 
-    def _opened(self, names: list[str], trigger: Trigger, future: Future) -> None:
+    def _opened(
+        self, names: list[str], with_camera: bool, trigger: Trigger, future: Future
+    ) -> None:
         error = future.exception()
         if error is not None:
+            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {error}")
+            self._close(names, with_camera)
             if not isinstance(error, DeviceError):
                 raise error
-            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {error}")
-            self._executor.submit(self._close_devices, names)
+            return
+        if self._abandoned:
+            self._event("warning", "supervisor", "stopped while opening; devices let go")
+            self._close(names, with_camera)
             return
         opened: Opened = future.result()
         self._identities.update(opened.identities)
@@ -318,22 +335,28 @@ class Supervisor:
         for name in names:
             loop = self.loops[name]
             loop.start_from(opened.stack_v[name])
-            # A stop while the devices were being opened has the last word.
             loop.fire(trigger, "all devices open, checked and enabled")
 
     def _turn_off(self, names: list[str]) -> None:
         for name in names:
             self.loops[name].dac_ready = False
             self.loops[name].fire(Trigger.OFF, "operator")
-        self._camera_ready = any(loop.mode is not Mode.OFF for loop in self.loops.values())
-        self._job = Job(self._executor.submit(self._close_devices, names), Future.result)
+        # The camera serves all loops; the last one out turns it off.
+        with_camera = all(loop.mode is Mode.OFF for loop in self.loops.values())
+        self._camera_ready = self._camera_ready and not with_camera
+        self._close(names, with_camera)
 
-    def _close_devices(self, names: list[str]) -> None:
+    def _close(self, names: list[str], with_camera: bool) -> None:
+        self._job = Job(
+            self._executor.submit(self._close_devices, names, with_camera), Future.result
+        )
+
+    def _close_devices(self, names: list[str], with_camera: bool) -> None:
         for name in names:
             self.servos[name].close()
             self._devices.loops[name].dac.close()
             self._devices.loops[name].piezo.close()
-        if not self._camera_ready:
+        if with_camera:
             self._devices.camera.close()
 
     def _make_safer(self, loop: StellarLoop) -> None:

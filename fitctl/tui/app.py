@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
+from pathlib import Path
 from typing import ClassVar
 
 import msgspec
@@ -32,7 +33,8 @@ from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.traces import Traces
 
 RECEIVE_TIMEOUT_S = 0.2
-EXIT_WAIT_S = 1.5
+EXIT_WAIT_S = 2.5
+UNREADABLE_PAUSE_S = 10.0
 DRAW_PERIODS_S: dict[type[Panel], float] = {
     FocalPlane: 0.1,
     Header: 0.1,
@@ -51,6 +53,14 @@ class Received(Message):
     def __init__(self, telemetry: Telemetry) -> None:
         super().__init__()
         self.telemetry = telemetry
+
+
+class Unreadable(Message):
+    """Something came that is not telemetry as this console knows it."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__()
+        self.problem = problem
 
 
 class Answered(Message):
@@ -76,7 +86,7 @@ class ConsoleApp(App[None]):
         Monotonic time in s, the supervisor's own when it runs on this machine.
     """
 
-    CSS_PATH = "console.tcss"
+    CSS_PATH = Path(__file__).with_name("console.tcss")
     TITLE = "fitctl"
     ENABLE_COMMAND_PALETTE = True
     COMMANDS = App.COMMANDS | {TargetProvider}
@@ -88,7 +98,7 @@ class ConsoleApp(App[None]):
             for command in OPERATOR_COMMANDS
             if command.name != "Stop"
         ),
-        Binding("l,tab", "next_loop", "Loop", show=False),
+        Binding("l", "next_loop", "Loop", show=False),
         Binding("e", "events", "Events", show=False),
         Binding("question_mark", "help", "Help", show=False),
         Binding("q", "quit", "Quit", show=False),
@@ -158,7 +168,12 @@ class ConsoleApp(App[None]):
 
     def _read(self) -> None:
         while not self._ended.is_set():
-            telemetry = self.link.receive(RECEIVE_TIMEOUT_S)
+            try:
+                telemetry = self.link.receive(RECEIVE_TIMEOUT_S)
+            except (ConnectionError, msgspec.MsgspecError) as error:
+                self.post_message(Unreadable(str(error)))
+                self._ended.wait(UNREADABLE_PAUSE_S)
+                continue
             if telemetry is not None and not self._ended.is_set():
                 self.post_message(Received(telemetry))
 
@@ -170,6 +185,16 @@ class ConsoleApp(App[None]):
         after = self.state.loop.state.mode if self.state.loop else ""
         if before != after or was_stale:
             self.draw_all()
+
+    def on_unreadable(self, message: Unreadable) -> None:
+        """Say that telemetry comes but cannot be used."""
+        self.notify(
+            f"{message.problem}\nAre console and supervisor of one version?",
+            title="✗ telemetry unreadable",
+            severity="error",
+            timeout=UNREADABLE_PAUSE_S,
+            markup=False,
+        )
 
     def _draw(self, period_s: float) -> None:
         self.state.now_s = self.clock()
@@ -216,13 +241,16 @@ class ConsoleApp(App[None]):
             text = f"Nobody answered: {message.problem}"
             if name == "Stop":
                 text += "\nThe instrument may still move. Press STOP again, or cut its power."
-            self.notify(text, title=f"✗ {name} not confirmed", severity="error", timeout=20)
+            self.notify(
+                text, title=f"✗ {name} not confirmed", severity="error", timeout=20, markup=False
+            )
         elif not message.reply.accepted:
             self.notify(
                 message.reply.text or "no reason given",
                 title=f"▲ {name} refused",
                 severity="warning",
                 timeout=8,
+                markup=False,
             )
         elif name == "Stop":
             self.notify("all loops go to SAFE", title="■ STOP confirmed", timeout=3)
@@ -260,6 +288,8 @@ class ConsoleApp(App[None]):
             partial(self.give, Shutdown()),
         )
         yield SystemCommand(
-            "Screenshot", "Save the screen as SVG", lambda: self.set_timer(0.1, self.deliver_screenshot)
+            "Screenshot",
+            "Save the screen as SVG",
+            lambda: self.set_timer(0.1, self.deliver_screenshot),
         )
         yield SystemCommand("Quit", "Leave the console", self.action_quit)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fitctl.supervisor.messages import Acquire, AnyCommand, Hold, Off, Recover, Standby, Stop
+from fitctl.supervisor.messages import Acquire, Hold, Off, Recover, Standby, Stop
+
+KeyCommand = Standby | Acquire | Hold | Stop | Recover | Off
 
 
 class OperatorCommand(NamedTuple):
@@ -12,7 +14,7 @@ class OperatorCommand(NamedTuple):
 
     key: str
     label: str
-    make: type[AnyCommand]
+    make: type[KeyCommand]
     help: str
 
     @property

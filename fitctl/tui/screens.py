@@ -21,7 +21,7 @@ from fitctl.tui.widgets.events import event_lines
 
 _OTHER_KEYS = (
     ("space ^s", "STOP as well; ^s stops while you type in the palette, too"),
-    ("l tab", "show the next loop, if there are several"),
+    ("l", "show the next loop, if there are several"),
     ("e", "events at full length"),
     ("^p", "command palette: every command, and `target AZ EL` in px"),
     ("? esc", "open and close this help"),
@@ -30,7 +30,10 @@ _SIGNS = (
     ("+ in a box", "centroid in its 7×7 px window; the four blue lines point at the target"),
     ("dotted lines", "zero and ± the requirement; RMS is of the last 10 s, about the target"),
     ("diamond", "the mirror's range, |az| + |el|; ✗ when saturated"),
-    ("sider.", "the siderostat on the sky, az and el, in arcsec; to go: to its set-point, at the motors"),
+    (
+        "sider.",
+        "the siderostat on the sky, az and el, in arcsec; to go: to its set-point, at the motors",
+    ),
     ("median/worst", "of the last second, in ms: compute time, frame age, servo lateness"),
 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,18 @@ STALE_S = 1.0
 EVENTS_KEPT = 500
 
 
+class _OfLoop(Protocol):
+    @property
+    def loop(self) -> str: ...
+
+
+RecordT = TypeVar("RecordT", bound=_OfLoop)
+
+
+def _last_of(loop: str, records: list[RecordT]) -> RecordT | None:
+    return next((record for record in reversed(records) if record.loop == loop), None)
+
+
 @dataclass
 class LoopView:
     """One loop: its newest state, and its ticks of the last `TRACE_S`."""
@@ -28,6 +41,17 @@ class LoopView:
     timing: LoopTiming | None = None
     piezo: PiezoReading | None = None
 
+    def accept(self, state: LoopState, message: Telemetry) -> None:
+        """Take what a message holds of this loop, and forget what is older than the traces."""
+        name = state.name
+        self.state = state
+        self.ticks.extend(tick for tick in message.ticks if tick.loop == name)
+        while self.ticks and self.ticks[0].time_s < message.time_s - TRACE_S:
+            self.ticks.popleft()
+        self.change = _last_of(name, message.mode_changes) or self.change
+        self.timing = _last_of(name, message.timing) or self.timing
+        self.piezo = _last_of(name, message.piezo) or self.piezo
+
     @property
     def tick(self) -> Tick | None:
         """The newest tick."""
@@ -37,10 +61,6 @@ class LoopView:
         """Time in s and errors az, el in px, one row a tick; shape (ticks, 3), oldest first."""
         rows = [(tick.time_s, tick.error_az_px, tick.error_el_px) for tick in self.ticks]
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
-
-    def sky_arcsec_per_px(self) -> float:
-        """Plate scale on the sky; not-a-number from a supervisor that does not tell it."""
-        return float(getattr(self.state, "sky_arcsec_per_px", math.nan))
 
 
 @dataclass
@@ -100,26 +120,11 @@ class ConsoleState:
         else:
             self.rate_hz = 0.0
         self.newest, self.received_s = message, now_s
+        self.events.extendleft(message.events)
         views = self.loops
         self.loops = {loop.name: views.get(loop.name, LoopView(loop)) for loop in message.loops}
         for loop in message.loops:
-            self.loops[loop.name].state = loop
-        self.events.extendleft(message.events)
-        for tick in message.ticks:
-            if tick.loop in self.loops:
-                self.loops[tick.loop].ticks.append(tick)
-        for change in message.mode_changes:
-            if change.loop in self.loops:
-                self.loops[change.loop].change = change
-        for timing in message.timing:
-            if timing.loop in self.loops:
-                self.loops[timing.loop].timing = timing
-        for piezo in message.piezo:
-            if piezo.loop in self.loops:
-                self.loops[piezo.loop].piezo = piezo
-        for view in self.loops.values():
-            while view.ticks and view.ticks[0].time_s < message.time_s - TRACE_S:
-                view.ticks.popleft()
+            self.loops[loop.name].accept(loop, message)
         if self.shown not in self.loops:
             self.shown = next(iter(self.loops), "")
 

@@ -125,15 +125,14 @@ class FakeSupervisor:
         )
 
     def _state(self, loop: str) -> LoopState:
-        state = LoopState(
+        return LoopState(
             name=loop,
             mode=self.mode,
             since_s=START_S - 133.0,
             requirement_px=0.1,
             usable_commands=["Stop", *USABLE[self.mode]],
-            **({"sky_arcsec_per_px": 2.708} if _tells_scale() else {}),
+            sky_arcsec_per_px=2.708,
         )
-        return state
 
     def _change(self, loop: str) -> ModeChange:
         modes = list(MODE_NUMBERS)
@@ -171,7 +170,9 @@ class FakeSupervisor:
             star_visible=seen,
             star_az_px=float(star_az),
             star_el_px=float(star_el),
-            star_flux_dn=27900.0 + 100 * float(self.rng.standard_normal()) if seen else float("nan"),
+            star_flux_dn=27900.0 + 100 * float(self.rng.standard_normal())
+            if seen
+            else float("nan"),
             window_az_px=round(star_az) if seen else 20,
             window_el_px=round(star_el) if seen else 20,
             target_az_px=TARGET_PX[0],
@@ -229,10 +230,6 @@ class FakeSupervisor:
         ]
 
 
-def _tells_scale() -> bool:
-    return "sky_arcsec_per_px" in LoopState.__struct_fields__
-
-
 def _piezo(loop: str, now_s: float) -> PiezoReading:
     return PiezoReading(
         time_s=now_s, loop=loop, stack1_v=79.4, stack2_v=70.1, stack3_v=77.2, limit_v=150.5
@@ -261,7 +258,12 @@ def _timing(loop: str, now_s: float) -> LoopTiming:
 
 def _events() -> list[Event]:
     return [
-        Event(time_s=START_S - 141.0, severity="info", source="supervisor", message="all devices enabled"),
+        Event(
+            time_s=START_S - 141.0,
+            severity="info",
+            source="supervisor",
+            message="all devices enabled",
+        ),
         Event(
             time_s=START_S - 140.2,
             severity="warning",

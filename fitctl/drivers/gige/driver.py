@@ -21,13 +21,13 @@ from fitctl.drivers.interface import (
     DeviceIdentity,
     DeviceMismatch,
     DeviceRefused,
-    DeviceTimeout,
     DeviceUnreachable,
     Frame,
 )
 
 RECEIVE_BUFFER_BYTES = 4 << 20  # the kernel grants what net.core.rmem_max allows
 _PACKET_BYTES_MAX = 65536
+_DRAIN_S = 0.05  # how far past its time limit a call goes on while packets keep coming
 
 
 class GigeCamera:
@@ -47,7 +47,6 @@ class GigeCamera:
         self._assembler: FrameAssembler | None = None
         self._time: CameraTime | None = None
         self._exposure_s = camera.exposure_s
-        self._streaming = False
         self._packet = bytearray(_PACKET_BYTES_MAX)
         self._poll = select.poll()
         self._heartbeat: Heartbeat | None = None
@@ -79,11 +78,9 @@ class GigeCamera:
             self._features = Features(channel)
             self._features.stop()  # whatever the last program has left running
             self._exposure_s = self._features.configure(self._camera)
+            _set_packet_size(channel, device.packet_size_bytes)
             self._time = CameraTime(channel)
             self._heartbeat = Heartbeat(channel, self._time, device.heartbeat_s)
-            self._poll = select.poll()
-            self._poll.register(self._open_stream(channel), select.POLLIN)
-            self._poll.register(self._heartbeat.wake_fd, select.POLLIN)
         except BaseException:
             self.close()
             raise
@@ -91,9 +88,15 @@ class GigeCamera:
 
     def start(self) -> None:
         """Start the stream; frame numbers and counts begin anew."""
-        channel, features, stream = self._opened()
-        while _receive(stream, self._packet):
-            pass  # left over from before
+        self.stop()
+        channel, features, heartbeat = self._opened()
+        stream = _open_stream(
+            channel
+        )  # on a port of its own: no packet of an earlier stream gets in
+        self._stream = stream
+        self._poll = select.poll()
+        self._poll.register(stream, select.POLLIN)
+        self._poll.register(heartbeat.wake_fd, select.POLLIN)
         self._assembler = FrameAssembler(
             self._camera.width_px,
             self._camera.height_px,
@@ -102,7 +105,6 @@ class GigeCamera:
             channel.request_resend,
         )
         features.start()
-        self._streaming = True
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         """The next complete frame, oldest first; None when none came in time.
@@ -112,21 +114,23 @@ class GigeCamera:
         DeviceUnreachable
             If the camera no longer answers, or has taken control away.
         """
-        channel, _features, stream = self._opened()
-        assembler, camera_time, heartbeat = self._assembler, self._time, self._heartbeat
-        if assembler is None or camera_time is None or heartbeat is None:
+        channel, _features, heartbeat = self._opened()
+        stream, assembler = self._stream, self._assembler
+        if stream is None or assembler is None:
             raise DeviceMismatch(
                 DEVICE, channel.endpoint, "a started stream", "none", "call start() first"
             )
         deadline_s = time.monotonic() + timeout_s
         view = memoryview(self._packet)
         while True:
+            if heartbeat.error is not None:
+                raise heartbeat.error
             while length := _receive(stream, self._packet):
                 complete = assembler.add(view[:length])
                 if complete is not None:
-                    return self._dated(complete, camera_time)
-            if heartbeat.error is not None:
-                raise heartbeat.error
+                    return self._dated(complete)
+                if time.monotonic() > deadline_s + _DRAIN_S:
+                    return None
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 return None
@@ -140,66 +144,65 @@ class GigeCamera:
         return CameraCounts(assembler.frames, assembler.lost, assembler.packets_lost)
 
     def stop(self) -> None:
-        """Stop the stream if it runs; a camera that has gone is no error here."""
-        streaming, self._streaming = self._streaming, False
-        if streaming and self._features is not None and not self._link_lost():
-            with contextlib.suppress(DeviceUnreachable, DeviceTimeout):
-                self._features.stop()
+        """Stop the stream if it runs; a camera that has gone or was taken away is no error here."""
+        stream, self._stream = self._stream, None
+        if stream is None:
+            return
+        stream.close()
+        channel, features, heartbeat = self._opened()
+        if heartbeat.error is None:
+            with contextlib.suppress(DeviceError):
+                features.stop()
+                channel.write_register(Register.STREAM_PORT, 0)
 
     def close(self) -> None:
         """Stop, give up control, close the sockets; safe to call twice and after a failure."""
         with contextlib.suppress(DeviceError):
             self.stop()
-        link_lost = self._link_lost()
         heartbeat, self._heartbeat = self._heartbeat, None
         if heartbeat is not None:
             heartbeat.stop()
         self._features = None  # before its channel
         channel, self._channel = self._channel, None
         if channel is not None:
-            if not link_lost:
+            if heartbeat is None or heartbeat.error is None:
                 with contextlib.suppress(DeviceError):
-                    channel.write_register(Register.STREAM_PORT, 0)
                     channel.write_register(Register.CONTROL_PRIVILEGE, 0)
             channel.close()
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
-        self._time = None
-        self._assembler = None
 
-    def _link_lost(self) -> bool:
-        return self._heartbeat is not None and self._heartbeat.error is not None
-
-    def _dated(self, complete: CompleteFrame, camera_time: CameraTime) -> Frame:
+    def _dated(self, complete: CompleteFrame) -> Frame:
         """A frame with its times; from a camera without a clock, as old as the rig file says."""
         received_s = time.monotonic()
-        if camera_time.runs:
-            start_s = camera_time.host_s(complete.leader.timestamp_ticks)
+        if self._time is not None and self._time.runs:
+            start_s = self._time.host_s(complete.leader.timestamp_ticks)
             mid_exposure_s = start_s + 0.5 * self._exposure_s
         else:
             mid_exposure_s = received_s - self._camera.frame_delay_s
         return Frame(complete.number, mid_exposure_s, received_s, complete.image)
 
-    def _opened(self) -> tuple[ControlChannel, Features, socket.socket]:
-        if self._channel is None or self._features is None or self._stream is None:
+    def _opened(self) -> tuple[ControlChannel, Features, Heartbeat]:
+        if self._channel is None or self._features is None or self._heartbeat is None:
             device = self._camera.device
             endpoint = f"{device.address}:{device.gvcp_port}"
             raise DeviceUnreachable(DEVICE, endpoint, "an open camera", "a closed one", "open() it")
-        return self._channel, self._features, self._stream
+        return self._channel, self._features, self._heartbeat
 
-    def _open_stream(self, channel: ControlChannel) -> socket.socket:
-        stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._stream = stream
+
+def _open_stream(channel: ControlChannel) -> socket.socket:
+    """A socket that the camera sends its stream to."""
+    stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
         stream.setblocking(False)
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         stream.bind((channel.local_address, 0))
         host, port = stream.getsockname()
-        _set_packet_size(channel, self._camera.device.packet_size_bytes)
         address = int.from_bytes(socket.inet_aton(host), "big")
         channel.write_register(Register.STREAM_DESTINATION, address)
         channel.write_register(Register.STREAM_PORT, port)
-        return stream
+    except BaseException:
+        stream.close()
+        raise
+    return stream
 
 
 def _receive(stream: socket.socket, packet: bytearray) -> int:

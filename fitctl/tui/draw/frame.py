@@ -13,9 +13,19 @@ from rich.segment import Segment
 from fitctl.tui.look import WHITE, Line, style
 
 # Anchors of the "inferno" map of matplotlib (CC0): even steps of lightness, safe for colour blindness.
-_INFERNO = (
-    "#000004 #160b39 #420a68 #6a176e #932667 #bc3754 #dd513a #f37819 #fca50a #f6d746 #fcffa4".split()
-)
+_INFERNO = [
+    "#000004",
+    "#160b39",
+    "#420a68",
+    "#6a176e",
+    "#932667",
+    "#bc3754",
+    "#dd513a",
+    "#f37819",
+    "#fca50a",
+    "#f6d746",
+    "#fcffa4",
+]
 LEVELS = 32
 
 
@@ -25,7 +35,9 @@ def colour_map() -> tuple[str, ...]:
     anchors = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in _INFERNO])
     places = np.linspace(0, len(anchors) - 1, LEVELS)
     channels = [np.interp(places, np.arange(len(anchors)), anchors[:, i]) for i in range(3)]
-    return tuple(f"#{int(r):02x}{int(g):02x}{int(b):02x}" for r, g, b in zip(*channels, strict=True))
+    return tuple(
+        f"#{int(r):02x}{int(g):02x}{int(b):02x}" for r, g, b in zip(*channels, strict=True)
+    )
 
 
 def stretch(image: NDArray[np.uint16]) -> NDArray[np.int64]:
@@ -132,7 +144,9 @@ def reticle_marks(column: float, row: float, gap: tuple[int, int], colour: str) 
     """
     x, y = math.floor(column), math.floor(row)
     across = "▔─▁"[min(2, int((row - y) * 3))]
-    marks = {(x + sign * (gap[0] + i), y): Mark(across, colour) for sign in (-1, 1) for i in (0, 1, 2)}
+    marks = {
+        (x + sign * (gap[0] + i), y): Mark(across, colour) for sign in (-1, 1) for i in (0, 1, 2)
+    }
     return marks | {
         (x, y + sign * (gap[1] + i)): Mark("│", colour) for sign in (-1, 1) for i in (0, 1)
     }

@@ -32,6 +32,10 @@ def event_lines(event: Event, wall_s: float, columns: int) -> list[Line]:
     room = max(10, columns - STAMP_COLUMNS)
     pieces = textwrap.wrap(f"{event.source}: {event.message}", room) or [""]
     lines: list[Line] = [
-        [text(f"{at} ", DIM), text(f"{look.symbol} ", look.colour, bold=True), text(pieces[0], look.colour)]
+        [
+            text(f"{at} ", DIM),
+            text(f"{look.symbol} ", look.colour, bold=True),
+            text(pieces[0], look.colour),
+        ]
     ]
     return lines + [[text(" " * STAMP_COLUMNS), text(piece, look.colour)] for piece in pieces[1:]]

@@ -81,7 +81,10 @@ def _caption(frame: FrameRecord, tick: Tick | None) -> Line:
 
 
 def _written_over(line: Line, left: int, row: int) -> Marks:
-    colour = {segment: (segment.style.color.name if segment.style and segment.style.color else INK) for segment in line}
+    colour = {
+        segment: (segment.style.color.name if segment.style and segment.style.color else INK)
+        for segment in line
+    }
     marks: Marks = {}
     column = left
     for segment in line:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from datetime import UTC, datetime
 
+from rich.segment import Segment
+
 from fitctl.tui.look import (
     DIM,
     FAINT,
@@ -19,15 +21,12 @@ from fitctl.tui.look import (
     WHITE,
     Line,
     duration,
-    pad,
     shorten,
     spread,
-    style,
     text,
     width,
 )
 from fitctl.tui.widgets.panel import Panel
-from rich.segment import Segment
 
 BADGE_COLUMNS = 19
 BADGE_FROM_COLUMNS = 100
@@ -110,12 +109,10 @@ class Header(Panel):
         if state.stale:
             old = "; what you see is old" if state.newest else "; is the supervisor running?"
             message = f" ✗ NO DATA for {state.silent_s:.0f} s{old}; reconnecting"
-            return pad([text(message, PAPER, on=RED, bold=True)], columns)[:1] + [
-                Segment(" " * max(0, columns - len(message)), style(None, RED))
-            ]
+            return [text(message.ljust(columns), PAPER, on=RED, bold=True)]
         change = state.loop.change if state.loop else None
         if change is None:
-            return [text("no change of mode yet", DIM)]
+            return [text("no change of mode since this console began to listen", DIM)]
         at = datetime.fromtimestamp(state.wall_s(change.time_s), UTC).strftime("%H:%M:%S")
         line = [
             text(f"{at} ", DIM),

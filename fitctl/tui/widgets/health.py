@@ -6,6 +6,7 @@ import textwrap
 from pathlib import PurePath
 
 from fitctl.logging.records import DeviceHealth, LoopTiming
+from fitctl.supervisor.messages import Telemetry
 from fitctl.tui.look import (
     DEVICES,
     DIM,
@@ -83,7 +84,7 @@ class Timing(Panel):
         newest, loop = self.state.newest, self.state.loop
         if newest is None or loop is None:
             return []
-        recorder = self._recorder(columns)
+        recorder = _recorder(newest, self.state.records_lost, columns)
         if loop.timing is None:
             return [[text("no timing yet", DIM)], recorder]
         if rows < TABLE_FROM_ROWS:
@@ -92,18 +93,17 @@ class Timing(Panel):
         notes = textwrap.wrap(newest.scheduling, columns)[: rows - len(table) - 1]
         return [*table, *([text(note, DIM)] for note in notes), recorder]
 
-    def _recorder(self, columns: int) -> Line:
-        newest, lost = self.state.newest, self.state.records_lost
-        assert newest is not None
-        if lost:
-            return [text(f" ✗ {lost:,} RECORDS LOST ".replace(",", " "), PAPER, on=RED, bold=True)]
-        recorder = newest.recorder
-        if recorder is None:
-            return [text("○", ORANGE, bold=True), text(" not recording", ORANGE)]
-        size = f"{recorder.bytes_written / 1e6:.1f} MB"
-        count = f"{recorder.records:,} rec, lost 0".replace(",", " ") if columns >= 60 else size
-        name = shorten(PurePath(recorder.path).name, columns - len(count) - 4)
-        return spread([text("● ", GREEN), text(name, INK)], [text(count, DIM)], columns)
+
+def _recorder(newest: Telemetry, lost: int, columns: int) -> Line:
+    if lost:
+        return [text(f" ✗ {lost:,} RECORDS LOST ".replace(",", " "), PAPER, on=RED, bold=True)]
+    recorder = newest.recorder
+    if recorder is None:
+        return [text("○", ORANGE, bold=True), text(" not recording", ORANGE)]
+    size = f"{recorder.bytes_written / 1e6:.1f} MB"
+    count = f"{recorder.records:,} rec, lost 0".replace(",", " ") if columns >= 60 else size
+    name = shorten(PurePath(recorder.path).name, columns - len(count) - 4)
+    return spread([text("● ", GREEN), text(name, INK)], [text(count, DIM)], columns)
 
 
 def _dense(timing: LoopTiming, scheduling: str, columns: int) -> list[Line]:
@@ -117,7 +117,10 @@ def _dense(timing: LoopTiming, scheduling: str, columns: int) -> list[Line]:
         times += [text(f"{name} ", DIM), text(f"{_short_ms(median_s)}/{_short_ms(worst_s)} ", INK)]
     counts = _counts(timing)
     room = columns - width(counts) - 1
-    return [[*times, text("ms", DIM)], spread(counts, [text(shorten(scheduling, room), DIM)], columns)]
+    return [
+        [*times, text("ms", DIM)],
+        spread(counts, [text(shorten(scheduling, room), DIM)], columns),
+    ]
 
 
 def _table(timing: LoopTiming) -> list[Line]:
@@ -128,10 +131,12 @@ def _table(timing: LoopTiming) -> list[Line]:
     )
     lines: list[Line] = [[text(f"{'ms':<12}{'median':>8}{'worst':>8}", DIM)]]
     for name, median_s, worst_s in rows:
-        lines.append([
-            text(f"{name:<12}", DIM),
-            text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK),
-        ])
+        lines.append(
+            [
+                text(f"{name:<12}", DIM),
+                text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK),
+            ]
+        )
     return [*lines, _counts(timing)]
 
 

@@ -17,7 +17,10 @@ class Keys(Panel):
         line: Line = []
         for command in OPERATOR_COMMANDS:
             if command.name == "Stop":
-                line += [text(f" {command.key} {command.label} ", PAPER, on=RED, bold=True), text(" ")]
+                line += [
+                    text(f" {command.key} {command.label} ", PAPER, on=RED, bold=True),
+                    text(" "),
+                ]
             else:
                 line += _cap(command.key, command.label, usable=command.name in usable)
         others = [("l", "Loop")] if len(self.state.loops) > 1 else []

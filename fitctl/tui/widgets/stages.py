@@ -77,11 +77,13 @@ def diamond_lines(tick: Tick, rows: int) -> list[Line]:
         row = "".join(map(chr, codes))
         if y == point[1]:
             before, after = row[: point[0]], row[point[0] + 1 :]
-            lines.append([
-                Segment(before, style(DIM)),
-                text(look[0], look[1], bold=True),
-                Segment(after, style(DIM)),
-            ])
+            lines.append(
+                [
+                    Segment(before, style(DIM)),
+                    text(look[0], look[1], bold=True),
+                    Segment(after, style(DIM)),
+                ]
+            )
         else:
             lines.append([Segment(row, style(DIM))])
     return lines
@@ -97,7 +99,7 @@ def _numbers(loop: LoopView, tick: Tick, columns: int, rows: int) -> list[Line]:
         tick.siderostat_setpoint_az_rad - tick.siderostat_az_rad,
         tick.siderostat_setpoint_el_rad - tick.siderostat_el_rad,
     )
-    behind = _row("to go", _pair(*(1e3 * rad for rad in behind_rad), "+.1f"), "mrad")
+    behind = _row("to go", _pair(1e3 * behind_rad[0], 1e3 * behind_rad[1], "+.1f"), "mrad")
     last = _search_bar(tick, columns) if tick.mode == "ACQUISITION" else behind
     if rows <= 4:
         return [mirror, stacks, siderostat, last]

@@ -22,6 +22,7 @@ from fitctl.tui.look import (
     spread,
     style,
     text,
+    width,
 )
 from fitctl.tui.state import RMS_S, TRACE_S, LoopView, Rms, error_rms
 from fitctl.tui.widgets.panel import Panel
@@ -89,26 +90,24 @@ def trace_lines(
     rows: int,
 ) -> list[Line]:
     """One trace with its scale at the left and dotted lines at zero and at ± the requirement."""
-    width = columns - AXIS_COLUMNS - 1
-    if width < 1:
+    across = columns - AXIS_COLUMNS - 1
+    if across < 1:
         return [[] for _ in range(rows)]
-    trace = braille.empty(rows, width)
-    braille.envelope(
-        trace, times_s, errors_px, now_s=now_s, span_s=TRACE_S, limit=limit_px
-    )
-    guides = braille.empty(rows, width)
+    trace = braille.empty(rows, across)
+    braille.envelope(trace, times_s, errors_px, now_s=now_s, span_s=TRACE_S, limit=limit_px)
+    guides = braille.empty(rows, across)
     braille.guide(guides, 0.0, limit_px, 6)
     for sign in (-1, 1):
         braille.guide(guides, sign * requirement_px, limit_px, 2)
-    has_trace = (braille.cells(trace) != braille.cells(braille.empty(rows, width))).tolist()
+    has_trace = (braille.cells(trace) != braille.cells(braille.empty(rows, across))).tolist()
     codes = braille.cells(trace | guides).tolist()
     labels = _axis_labels(rows, limit_px, requirement_px)
     lines: list[Line] = []
     for y in range(rows):
         line = [text(labels[y].rjust(AXIS_COLUMNS - 1), DIM), text("▕", FAINT)]
         start = 0
-        for x in range(1, width + 1):
-            if x == width or has_trace[y][x] != has_trace[y][start]:
+        for x in range(1, across + 1):
+            if x == across or has_trace[y][x] != has_trace[y][start]:
                 run = "".join(map(chr, codes[y][start:x]))
                 line.append(Segment(run, style(colour if has_trace[y][start] else GREEN)))
                 start = x
@@ -139,30 +138,40 @@ def _heading(
 ) -> Line:
     now_px = float(errors_px[-1]) if len(errors_px) else math.nan
     requirement_px = loop.state.requirement_px
-    line = [text(f"{name} ", colour, bold=True), text(f"{number(now_px, '+.3f')} px", INK, bold=True)]
+    line = [
+        text(f"{name} ", colour, bold=True),
+        text(f"{number(now_px, '+.3f')} px", INK, bold=True),
+    ]
     if math.isnan(rms_px):
         return spread(line, [text("no star, no RMS", DIM)], columns)
     good = rms_px <= requirement_px
     sign = text("✓" if good else "✗", GREEN if good else RED, bold=True)
     ratio = f"{100 * rms_px / requirement_px:.0f} %"
-    sky = loop.sky_arcsec_per_px()
-    on_sky = "" if math.isnan(sky) else f"{1000 * sky * rms_px:.0f} mas"
+    on_sky = f"{1000 * loop.state.sky_arcsec_per_px * rms_px:.0f} mas"
     if columns < LONG_HEADINGS_FROM_COLUMNS:
-        right = [text("rms ", DIM), text(f"{rms_px:.3f}", INK, bold=True), text(f" {ratio} ", INK)]
-        return spread(line, [*right, sign, text(f" {on_sky}" if on_sky else "", DIM)], columns)
-    span = "" if rms.span_s > 0.95 * RMS_S else f" of {RMS_S:.0f}"
+        short = f"rms {rms.span_s:.0f} s " if rms.span_s < 0.9 * RMS_S else "rms "
+        right = [
+            text(short, DIM),
+            text(f"{rms_px:.3f}", INK, bold=True),
+            text(f" {ratio} ", INK),
+            sign,
+        ]
+        room = columns - width(line) - width(right) - 1
+        if len(on_sky) < room:
+            right.append(text(f" {on_sky}", DIM))
+        return spread(line, right, columns)
     right = [
-        text(f"RMS {min(round(rms.span_s), RMS_S):.0f}{span} s  ", DIM),
+        text(f"RMS {rms.span_s:.0f} s  ", DIM),
         text(f"{rms_px:.3f} px", INK, bold=True),
         text(f" = {ratio} of {requirement_px:g} px ", INK),
         sign,
-        text(f"  {on_sky} on the sky" if on_sky else "", DIM),
+        text(f"  {on_sky} on the sky", DIM),
     ]
     return spread(line, right, columns)
 
 
 def _time_axis(columns: int) -> Line:
-    width = columns - AXIS_COLUMNS
+    room = columns - AXIS_COLUMNS
     left, middle, right = f"−{TRACE_S:.0f} s", f"−{TRACE_S / 2:.0f} s", "now"
-    row = left + middle.center(width - len(left) - len(right)) + right
+    row = left + middle.center(room - len(left) - len(right)) + right
     return [text(" " * AXIS_COLUMNS + row, DIM)]

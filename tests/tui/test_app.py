@@ -1,0 +1,265 @@
+"""The console as an operator uses it: keys in, commands out, and what the screen says meanwhile."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Awaitable, Callable
+
+import msgspec
+import pytest
+from textual.command import CommandPalette
+from textual.pilot import Pilot
+
+from fitctl.supervisor.messages import Acquire, Hold, Off, Recover, Reply, SetTarget, Standby, Stop
+from fitctl.tui.app import ConsoleApp
+from fitctl.tui.screens import Reader
+from fitctl.tui.widgets.header import Header
+from tests.tui.fake import START_S, FakeLink, FakeSupervisor
+
+DEADLINE_S = 10.0
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = START_S
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+async def until(pilot: Pilot, condition: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not come true in time"
+        await asyncio.sleep(0.01)
+        await pilot.pause()
+
+
+def run(
+    scenario: Callable[[ConsoleApp, Pilot, FakeLink], Awaitable[None]],
+    *,
+    link: FakeLink | None = None,
+    supervisor: FakeSupervisor | None = None,
+    clock: Clock | None = None,
+) -> FakeLink:
+    """Run a console with two messages of telemetry already on the screen, and a scenario on it."""
+    link = link or FakeLink()
+
+    async def main() -> None:
+        app = ConsoleApp(link, clock=clock or Clock())
+        async with app.run_test(size=(100, 30), notifications=True) as pilot:
+            link.deliver((supervisor or FakeSupervisor()).messages(2))
+            await until(pilot, lambda: app.state.newest and app.state.newest.sequence == 2)
+            await scenario(app, pilot, link)
+
+    asyncio.run(main())
+    return link
+
+
+def header_text(app: ConsoleApp) -> str:
+    app.draw_all()
+    header = app.query_one(Header)
+    return "\n".join(header.render_line(y).text for y in range(3))
+
+
+def notifications(app: ConsoleApp) -> str:
+    return "\n".join(f"{note.title}: {note.message}" for note in app._notifications)
+
+
+@pytest.mark.parametrize(
+    ("key", "command"),
+    [
+        ("a", Acquire(loop="right")),
+        ("h", Hold(loop="right")),
+        ("r", Recover(loop="right")),
+        ("b", Standby(loop="right")),
+        ("o", Off(loop="right")),
+        ("s", Stop()),
+        ("space", Stop()),
+        ("ctrl+s", Stop()),
+    ],
+)
+def test_every_command_is_one_key(key, command):
+    async def scenario(app, pilot, link):
+        await pilot.press(key)
+        await until(pilot, lambda: link.sent)
+
+    assert run(scenario).sent == [command]
+
+
+@pytest.mark.parametrize("key", ["s", "space", "ctrl+s"])
+@pytest.mark.parametrize("opener", ["question_mark", "e"])
+def test_stop_works_from_every_dialog(opener, key):
+    async def scenario(app, pilot, link):
+        await pilot.press(opener)
+        assert isinstance(app.screen, Reader)
+        await pilot.press(key)
+        await until(pilot, lambda: link.sent)
+
+    assert run(scenario).sent == [Stop()]
+
+
+def test_stop_works_from_the_palette_and_s_is_a_letter_there():
+    async def scenario(app, pilot, link):
+        await pilot.press("ctrl+p")
+        await until(pilot, lambda: isinstance(app.screen, CommandPalette))
+        await pilot.press("s", "space")
+        assert not link.sent
+        await pilot.press("ctrl+s")
+        await until(pilot, lambda: link.sent)
+
+    assert run(scenario).sent == [Stop()]
+
+
+def test_other_commands_do_not_reach_through_a_dialog():
+    async def scenario(app, pilot, link):
+        await pilot.press("question_mark", "a", "o")
+        await pilot.press("escape", "h")
+        await until(pilot, lambda: link.sent)
+
+    assert run(scenario).sent == [Hold(loop="right")]
+
+
+def test_stop_does_not_wait_for_commands_without_an_answer():
+    answers = threading.Event()
+
+    def answer(command):
+        if not isinstance(command, Stop):
+            answers.wait(DEADLINE_S)
+        return Reply(accepted=True)
+
+    async def scenario(app, pilot, link):
+        await pilot.press(*"ahrb" * 5)
+        await until(pilot, lambda: len(link.sent) == 20)
+        await pilot.press("s")
+        await until(pilot, lambda: "STOP confirmed" in notifications(app))
+        answers.set()
+
+    assert run(scenario, link=FakeLink(answer)).sent[-1] == Stop()
+
+
+def test_a_stop_just_before_quitting_is_still_sent():
+    async def scenario(app, pilot, link):
+        await pilot.press("s", "q")
+
+    link = run(scenario)
+    assert Stop() in link.sent
+    assert link.closed
+
+
+def test_a_refused_command_is_told_with_its_reason():
+    async def scenario(app, pilot, link):
+        await pilot.press("a")
+        await until(pilot, lambda: notifications(app))
+        assert "Acquire refused: devices are off; press b first" in notifications(app)
+
+    refusal = Reply(accepted=False, text="devices are off; press b first")
+    run(scenario, link=FakeLink(lambda _command: refusal), supervisor=FakeSupervisor("OFF"))
+
+
+def test_a_stop_that_nobody_answers_is_told_as_a_danger():
+    def nobody(_command):
+        raise ConnectionError("no answer in 1 s")
+
+    async def scenario(app, pilot, link):
+        await pilot.press("s")
+        await until(pilot, lambda: notifications(app))
+        assert "Stop not confirmed" in notifications(app)
+        assert "may still move" in notifications(app)
+
+    run(scenario, link=FakeLink(nobody))
+
+
+def test_old_data_are_said_to_be_old_and_new_data_end_it():
+    clock = Clock()
+    supervisor = FakeSupervisor()
+
+    async def scenario(app, pilot, link):
+        clock.now_s += 0.5
+        assert "live" in header_text(app)
+        clock.now_s += 2.5
+        assert "NO DATA for 3 s" in header_text(app)
+        assert app.screen.has_class("stale")
+        link.deliver([supervisor.message()])
+        await until(pilot, lambda: "live" in header_text(app))
+        assert not app.screen.has_class("stale")
+
+    run(scenario, clock=clock, supervisor=supervisor)
+
+
+def test_a_console_without_a_supervisor_says_so():
+    clock = Clock()
+
+    async def main():
+        app = ConsoleApp(FakeLink(), clock=clock)
+        async with app.run_test(size=(80, 24)):
+            clock.now_s += 4.0
+            assert "connecting" in header_text(app)
+            assert "NO DATA for 4 s; is the supervisor running?" in header_text(app)
+
+    asyncio.run(main())
+
+
+def test_telemetry_that_cannot_be_read_is_told():
+    class Garbled(FakeLink):
+        def receive(self, timeout_s):
+            if self.incoming.empty():
+                return super().receive(timeout_s)
+            self.incoming.get()
+            raise msgspec.ValidationError("Object missing required field `sky`")
+
+    async def main():
+        link = Garbled()
+        app = ConsoleApp(link, clock=Clock())
+        async with app.run_test(notifications=True) as pilot:
+            link.deliver([FakeSupervisor().message()])
+            await until(pilot, lambda: "telemetry unreadable" in notifications(app))
+
+    asyncio.run(main())
+
+
+def test_loops_are_cycled_and_commands_go_to_the_shown_one():
+    async def scenario(app, pilot, link):
+        assert "right 1/2" in header_text(app)
+        await pilot.press("l")
+        assert "left 2/2" in header_text(app)
+        await pilot.press("h")
+        await until(pilot, lambda: link.sent)
+
+    assert run(scenario, supervisor=FakeSupervisor(loops=("right", "left"))).sent == [
+        Hold(loop="left")
+    ]
+
+
+@pytest.mark.parametrize("closing", ["escape", "question_mark", "q"])
+def test_help_names_every_key_and_closes(closing):
+    async def scenario(app, pilot, link):
+        await pilot.press("question_mark")
+        assert isinstance(app.screen, Reader)
+        await pilot.press(closing)
+        await until(pilot, lambda: not isinstance(app.screen, Reader))
+
+    run(scenario)
+
+
+def test_a_target_is_given_through_the_palette():
+    async def scenario(app, pilot, link):
+        await pilot.press("ctrl+p")
+        await until(pilot, lambda: isinstance(app.screen, CommandPalette))
+        await pilot.press(*"target", "space", *"20", "space", *"19.5")
+        await until(pilot, lambda: app.screen.query("OptionList").first().option_count == 1)
+        await pilot.press("enter")
+        await until(pilot, lambda: link.sent or not isinstance(app.screen, CommandPalette))
+        if not link.sent:
+            await until(pilot, lambda: link.sent)
+
+    assert run(scenario).sent == [SetTarget(loop="right", az_px=20.0, el_px=19.5)]
+
+
+def test_quitting_leaves_no_thread_and_closes_the_link():
+    async def scenario(app, pilot, link):
+        await pilot.press("h")
+        await pilot.press("q")
+
+    assert run(scenario).closed
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("console-")]
