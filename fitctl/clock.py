@@ -40,6 +40,7 @@ class MonotonicClock:
 
     def sleep_until(self, deadline_s: float) -> None:
         """Sleep to an absolute deadline, so that oversleeping once does not shift the next."""
+        deadline_s = max(deadline_s, 0.0)  # the system call refuses negative times
         seconds = int(deadline_s)
         spec = _Timespec(seconds, int((deadline_s - seconds) * 1e9))
         while True:

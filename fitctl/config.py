@@ -39,9 +39,9 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Settings(BaseModel):
-    """A part of a rig file: frozen, and unknown keys are errors."""
+    """A part of a rig file: frozen; unknown keys are errors, and so are numbers given as text."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class AxisPair(Settings):

@@ -12,6 +12,7 @@ from fitctl.config import Camera, Loop
 HALF_WINDOW_PX = 3
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 _MAX_CANDIDATES = 6
+_LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
 
 
 class Star(NamedTuple):
@@ -63,14 +64,15 @@ class StarSensor:
         search = image.astype(np.float64)
         for _ in range(_MAX_CANDIDATES):
             el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
-            if search[el_px, az_px] - self._bias_dn < self._threshold_dn:
+            peak_dn = search[el_px, az_px] - self._bias_dn
+            if peak_dn < self._threshold_dn:
                 return None
             candidate = self._centroid(image, az_px, el_px)
             if candidate is not None:
                 # Once more about its own centre, so that the window does not cut the spot.
                 candidate = self._centroid(image, candidate.az_px, candidate.el_px)
             star = self._accepted(candidate)
-            if star is not None and self._is_centred(star):
+            if star is not None and self._is_centred(star) and self._is_spread(star, peak_dn):
                 return star
             search[
                 max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
@@ -109,3 +111,6 @@ class StarSensor:
             abs(star.az_px - star.window_az_px) <= 1.0
             and abs(star.el_px - star.window_el_px) <= 1.0
         )
+
+    def _is_spread(self, star: Star, peak_dn: float) -> bool:
+        return peak_dn <= _LARGEST_PEAK * star.flux_dn

@@ -33,7 +33,8 @@ class SpiralPlan:
     acceleration_px_s2 : float
         The path is slower near its middle, so as not to pass this.
     radius_px : float
-        Where the search ends.
+        Where the search ends: half a turn's distance beyond the farthest star, or a star there could
+        pass outside the last turn.
     field_radius_px : float
         Circle in which a star is certain to be seen.
     """
@@ -63,13 +64,14 @@ def plan_spiral(rig: Rig, loop_name: str) -> SpiralPlan:
         HALF_WINDOW_PX / camera.exposure_s,
         0.5 * loop.siderostat.velocity_limit_rad_s * scale.motor_px_per_rad,
     )
+    pitch_px = math.sqrt(2) * reach_px
     return SpiralPlan(
-        pitch_px=math.sqrt(2) * reach_px,
+        pitch_px=pitch_px,
         speed_px_s=speed_px_s,
         acceleration_px_s2=0.25
         * loop.siderostat.acceleration_limit_rad_s2
         * scale.motor_px_per_rad,
-        radius_px=acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px,
+        radius_px=acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px + pitch_px / 2,
         field_radius_px=field_px,
     )
 

@@ -133,7 +133,8 @@ class StellarLoop:
         started_s = self._clock.now_s()
         star = self._sense(frame) if frame is not None else None
         self._judge(frame, star)
-        self._laws[self.mode](star)
+        if frame is not None or self.mode not in TRACKING:  # no frame: the stages wait where they are
+            self._laws[self.mode](star)
         self._write()
         done_s = self._clock.now_s()
         return self._tick_record(frame, star, started_s, done_s, frames_lost)

@@ -12,11 +12,15 @@ _PR_SET_TIMERSLACK = 29
 
 
 def become_realtime(priority: int) -> str:
-    """Ask for FIFO scheduling of the calling thread; returns what was reached, for people."""
+    """Ask for FIFO scheduling of the calling thread; returns what was reached, for people.
+
+    Threads and processes that it starts do not inherit it: a recorder that starts up at this priority
+    would starve everything else.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except PermissionError:
         return "SCHED_OTHER: realtime not permitted (give the user an rtprio limit)"
     except OSError as error:

@@ -149,7 +149,7 @@ class Supervisor:
     # ------------------------------------------------------------ once a frame
 
     def step(self) -> None:
-        """Wait for the next frame, no longer than a frame period, and act on it."""
+        """Wait for the next frame, no longer than two frame periods, and act on it."""
         frame = self._next_frame()
         self._finish_jobs()
         while self._commands:
@@ -200,12 +200,12 @@ class Supervisor:
     # ------------------------------------------------------------ frames
 
     def _next_frame(self) -> Frame | None:
-        deadline_s = self._clock.now_s() + self.rig.camera.period_s
+        period_s = self.rig.camera.period_s
         if not self._camera_ready:
-            self._clock.sleep_until(deadline_s)
+            self._clock.sleep_until(self._clock.now_s() + period_s)
             return None
         try:
-            frame = self._devices.camera.next_frame(self.rig.camera.period_s)
+            frame = self._devices.camera.next_frame(2 * period_s)
         except DeviceError as error:
             self._camera_lost(error)
             return None

@@ -28,7 +28,10 @@ _OTHER_KEYS = (
 )
 _SIGNS = (
     ("+ in a box", "centroid in its 7×7 px window; the four blue lines point at the target"),
-    ("dotted lines", "zero and ± the requirement; RMS is of the last 10 s, about the target"),
+    (
+        "dotted lines",
+        "zero and ± the requirement; RMS is of the last 10 s in this mode, about the target",
+    ),
     ("diamond", "the mirror's range, |az| + |el|; ✗ when saturated"),
     (
         "sider.",

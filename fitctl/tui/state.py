@@ -17,6 +17,7 @@ TRACE_S = 20.0
 RMS_S = 10.0
 STALE_S = 1.0
 EVENTS_KEPT = 500
+RATE_MESSAGES = 60
 
 
 class _OfLoop(Protocol):
@@ -72,9 +73,13 @@ class Rms:
     span_s: float
 
 
-def error_rms(errors: NDArray[np.float64], now_s: float) -> Rms:
-    """RMS of the last `RMS_S`; ticks without a star do not count, and none at all gives not-a-number."""
-    recent = errors[(errors[:, 0] > now_s - RMS_S) & np.isfinite(errors[:, 1:]).all(axis=1)]
+def error_rms(errors: NDArray[np.float64], now_s: float, since_s: float) -> Rms:
+    """RMS of the last `RMS_S`, but not from before `since_s`, when the present mode began.
+
+    Ticks without a star do not count, and none at all gives not-a-number.
+    """
+    first_s = max(now_s - RMS_S, since_s)
+    recent = errors[(errors[:, 0] >= first_s) & np.isfinite(errors[:, 1:]).all(axis=1)]
     if len(recent) < 2:
         return Rms(math.nan, math.nan, 0.0)
     az_px, el_px = np.sqrt(np.mean(recent[:, 1:] ** 2, axis=0))
@@ -96,8 +101,6 @@ class ConsoleState:
         Newest first.
     shown : str
         Name of the loop on the screen.
-    rate_hz : float
-        Messages a second, smoothed.
     """
 
     def __init__(self, started_s: float) -> None:
@@ -107,18 +110,22 @@ class ConsoleState:
         self.loops: dict[str, LoopView] = {}
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.shown = ""
-        self.rate_hz = 0.0
+        self._arrivals_s: deque[float] = deque(maxlen=RATE_MESSAGES)
+
+    @property
+    def rate_hz(self) -> float:
+        """Messages a second, over the last few."""
+        arrivals_s = self._arrivals_s
+        span_s = arrivals_s[-1] - arrivals_s[0] if arrivals_s else 0.0
+        return (len(arrivals_s) - 1) / span_s if span_s > 0 else 0.0
 
     def accept(self, message: Telemetry, now_s: float) -> None:
         """Take in one message that came at `now_s`."""
         if self.newest is not None and self.newest.pid != message.pid:
             self.loops.clear()  # another supervisor: its past is not this one's
             self.newest = None
-        if self.newest is not None and now_s > self.received_s:
-            smoothing = 0.1
-            self.rate_hz += smoothing * (1.0 / (now_s - self.received_s) - self.rate_hz)
-        else:
-            self.rate_hz = 0.0
+            self._arrivals_s.clear()
+        self._arrivals_s.append(now_s)
         self.newest, self.received_s = message, now_s
         self.events.extendleft(message.events)
         views = self.loops

@@ -211,12 +211,25 @@ class FakeSupervisor:
         )
 
     def _devices(self) -> list[DeviceHealth]:
-        known = {
-            "camera": ("127.0.0.1:3956", "FIT mock camera 1.0", "50.0 Hz, no packet lost"),
-            "siderostat": ("socket://127.0.0.1:29536", "FIT mock CiA 402", "enabled, both axes"),
-            "D/A": ("127.0.0.1:29502", "FIT mock Modbus D/A", "1 204 writes, none late"),
-            "piezo": ("socket://127.0.0.1:29693", "Thorlabs MDT693B 1.05", "limit switch 150 V"),
-        }
+        known = {"camera": ("127.0.0.1:3956", "FIT mock camera 1.0", "50.0 Hz, no packet lost")}
+        for loop in self.loops:
+            known |= {
+                f"{loop} siderostat": (
+                    "socket://127.0.0.1:29536",
+                    "FIT mock CiA 402",
+                    "enabled, both axes",
+                ),
+                f"{loop} D/A": (
+                    "127.0.0.1:29502",
+                    "FIT mock Modbus D/A",
+                    "1 204 writes, none late",
+                ),
+                f"{loop} piezo": (
+                    "socket://127.0.0.1:29693",
+                    "Thorlabs MDT693B 1.05",
+                    "limit switch 150 V",
+                ),
+            }
         return [
             DeviceHealth(
                 time_s=self.time_s,

@@ -144,15 +144,23 @@ def test_without_a_star_only_the_target_is_marked():
 
 def test_an_ill_device_keeps_a_row_of_its_own_and_comes_first():
     supervisor = FakeSupervisor()
-    supervisor.faulty = {"piezo": "no answer in 1 s"}
+    supervisor.faulty = {"right piezo": "no answer in 1 s"}
     lines = plain(Devices(shown(supervisor)).draw(39, 2))
     assert lines[0].startswith("✗ piezo fault no answer in 1 s")
     assert lines[1].split() == ["✓", "camera", "✓", "siderostat", "✓", "D/A"]
 
 
+def test_short_of_rows_the_well_devices_of_other_loops_are_left_out():
+    supervisor = FakeSupervisor(loops=("right", "left"))
+    supervisor.faulty = {"left piezo": "no answer in 1 s"}
+    lines = plain(Devices(shown(supervisor)).draw(39, 2))
+    assert lines[0].startswith("✗ left piezo fault")
+    assert lines[1].split() == ["✓", "camera", "✓", "siderostat", "✓", "D/A", "✓", "piezo"]
+
+
 def test_a_fault_is_told_in_full_where_there_is_room():
     supervisor = FakeSupervisor()
-    supervisor.faulty = {"piezo": "no answer in 1 s; check the cable, then Recover"}
+    supervisor.faulty = {"right piezo": "no answer in 1 s; check the cable, then Recover"}
     lines = plain(Devices(shown(supervisor)).draw(36, 8))
     told = " ".join(" ".join(lines).split())
     assert "no answer in 1 s; check the cable, then Recover" in told

@@ -54,7 +54,9 @@ def test_acquisition(snap_compare):
 
 def test_safe_with_a_fault_and_lost_records(snap_compare):
     supervisor = FakeSupervisor("SAFE")
-    supervisor.faulty = {"siderostat": "axis 2: following error; clear the cause, then Recover"}
+    supervisor.faulty = {
+        "right siderostat": "axis 2: following error; clear the cause, then Recover"
+    }
     supervisor.records_lost = 1234
     assert snap_compare(FixedApp(supervisor), terminal_size=(120, 40), run_before=looking())
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import textwrap
 from pathlib import PurePath
 
+import msgspec
+
 from fitctl.logging.records import DeviceHealth, LoopTiming
 from fitctl.supervisor.messages import Telemetry
 from fitctl.tui.look import (
@@ -24,14 +26,21 @@ from fitctl.tui.look import (
 from fitctl.tui.widgets.panel import Panel
 
 TABLE_FROM_ROWS = 7
+DETAIL_INDENT = 4
 
 
 class Devices(Panel):
-    """One device a row; where rows are short, the well ones share rows and the ill ones keep their own."""
+    """One device a row.
+
+    Where rows are short, ill devices keep rows of their own; the well ones of the loop on the screen
+    share the rest.
+    """
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """Ill devices first when not all have a row of their own."""
         devices = self.state.newest.devices if self.state.newest else []
+        if len(self.state.loops) == 1:
+            devices = [_without_loop(device, self.state.shown) for device in devices]
         if len(devices) <= rows:
             names = max((len(device.device) for device in devices), default=0)
             spare = rows - len(devices)
@@ -42,9 +51,19 @@ class Devices(Panel):
                 lines += told
             return lines
         ill = [device for device in devices if device.state != "ok"]
-        well = [device for device in devices if device.state == "ok"]
+        others = tuple(f"{name} " for name in self.state.loops if name != self.state.shown)
+        well = [
+            _without_loop(device, self.state.shown)
+            for device in devices
+            if device.state == "ok" and not device.device.startswith(others)
+        ]
         lines = [_device(device, len(device.device), columns, 1)[0] for device in ill]
         return lines + _packed(well, columns)
+
+
+def _without_loop(device: DeviceHealth, loop: str) -> DeviceHealth:
+    """Name a device without its loop, where there is no doubt which loop is meant."""
+    return msgspec.structs.replace(device, device=device.device.removeprefix(f"{loop} "))
 
 
 def _device(device: DeviceHealth, name_columns: int, columns: int, rows: int) -> list[Line]:
@@ -57,10 +76,9 @@ def _device(device: DeviceHealth, name_columns: int, columns: int, rows: int) ->
     if ill:
         line.append(text(f" {device.state}", look.colour, bold=True))
     detail = device.detail or device.identity or device.endpoint
-    indent = name_columns + 3
-    pieces = textwrap.wrap(detail, max(10, columns - indent)) if ill and rows > 1 else []
+    pieces = textwrap.wrap(detail, max(10, columns - DETAIL_INDENT)) if ill and rows > 1 else []
     if 0 < len(pieces) < rows:
-        return [line, *([text(" " * indent + piece, DIM)] for piece in pieces)]
+        return [line, *([text(" " * DETAIL_INDENT + piece, DIM)] for piece in pieces)]
     room = columns - width(line) - 1
     return [[*line, text(" " + shorten(detail, room), DIM)] if room > 3 else line]
 
@@ -69,7 +87,10 @@ def _packed(devices: list[DeviceHealth], columns: int) -> list[Line]:
     lines: list[Line] = [[]]
     for device in devices:
         look = DEVICES[device.state]
-        piece = [text(look.symbol, look.colour, bold=True), text(f" {device.device}  ", INK)]
+        piece = [
+            text(look.symbol, look.colour, bold=True),
+            text(f" {device.device}  ", INK),
+        ]
         if lines[-1] and width(lines[-1]) + width(piece) - 2 > columns:
             lines.append([])
         lines[-1] += piece

@@ -37,16 +37,21 @@ class Traces(Panel):
     """Azimuth above elevation: value now, RMS against the requirement, and the trace."""
 
     def draw(self, columns: int, rows: int) -> list[Line]:
-        """Both axes with equal room, and a time axis where it does not cost too much."""
+        """Both axes with equal room, and a time axis where it does not cost too much.
+
+        The scale is that of the present mode's errors; larger ones from before lie on the edge.
+        """
         loop = self.state.loop
         if loop is None or self.state.newest is None:
             return []
         now_s = self.state.newest.time_s
         errors = loop.errors()
-        rms = error_rms(errors, now_s)
+        since_s = loop.state.since_s
+        rms = error_rms(errors, now_s, since_s)
         time_axis = rows >= TIME_AXIS_FROM_ROWS
         trace_rows = max(1, (rows - 2 - time_axis) // 2)
-        scale_px = axis_limit_px(errors[:, 1:], loop.state.requirement_px)
+        in_mode_px = errors[errors[:, 0] >= since_s, 1:]
+        scale_px = axis_limit_px(in_mode_px, loop.state.requirement_px)
         lines: list[Line] = []
         for index, (name, colour, rms_px) in enumerate(
             (("az", SKY, rms.az_px), ("el", ORANGE, rms.el_px)), start=1
@@ -146,7 +151,8 @@ def _heading(
         return spread(line, [text("no star, no RMS", DIM)], columns)
     good = rms_px <= requirement_px
     sign = text("✓" if good else "✗", GREEN if good else RED, bold=True)
-    ratio = f"{100 * rms_px / requirement_px:.0f} %"
+    part = rms_px / requirement_px
+    ratio = f"{100 * part:.0f} %" if part < 10 else f"{part:.0f}×"
     on_sky = f"{1000 * loop.state.sky_arcsec_per_px * rms_px:.0f} mas"
     if columns < LONG_HEADINGS_FROM_COLUMNS:
         short = f"rms {rms.span_s:.0f} s " if rms.span_s < 0.9 * RMS_S else "rms "
@@ -163,7 +169,7 @@ def _heading(
     right = [
         text(f"RMS {rms.span_s:.0f} s  ", DIM),
         text(f"{rms_px:.3f} px", INK, bold=True),
-        text(f" = {ratio} of {requirement_px:g} px ", INK),
+        text(f" = {ratio} {'of ' if part < 10 else ''}{requirement_px:g} px ", INK),
         sign,
         text(f"  {on_sky} on the sky", DIM),
     ]

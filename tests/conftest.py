@@ -1,7 +1,20 @@
 import asyncio
 import threading
 
+import hypothesis
 import pytest
+
+from fitctl.config import Rig, default_rig_path, load_rig
+
+# The machine itself may stand still for 100 ms: an example's time says nothing about the code.
+hypothesis.settings.register_profile("fitctl", deadline=None)
+hypothesis.settings.load_profile("fitctl")
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    """The default rig; frozen, so all tests share it."""
+    return load_rig(default_rig_path())
 
 
 @pytest.fixture

@@ -1,0 +1,140 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm, solve_discrete_lyapunov
+from scipy.signal import welch
+
+from fitctl.model import air_path
+from fitctl.model.air_path import discretize, state_space, stationary_covariance, step_matrices
+from fitctl.model.plant import Plant
+
+steps_s = st.floats(1e-4, 1.0)
+
+
+@pytest.fixture(scope="module")
+def air(rig):
+    return rig.plant.loops["right"].air_path
+
+
+@pytest.fixture(scope="module")
+def dynamics(air):
+    a, b, _ = state_space(air)
+    return a, b @ b.T
+
+
+def psd_px2_per_hz(air, frequency_hz):
+    """One-sided spectrum of Eq. 9 under two-sided white noise of unit intensity."""
+    s = 2j * np.pi * frequency_hz
+    return 2 * np.abs(air.gain_px / (air.b1_s2 * s**2 + air.b2_s * s + 1)) ** 2
+
+
+def test_open_loop_motion_is_0_201_px(air):
+    assert air_path.rms_px(air) == pytest.approx(0.201, abs=5e-4)
+
+
+def test_the_spectrum_of_eq_9_holds_the_same_variance(air):
+    frequency_hz = np.linspace(0, 200, 400_001)
+    variance = np.trapezoid(psd_px2_per_hz(air, frequency_hz), frequency_hz)
+    assert math.sqrt(variance) == pytest.approx(air_path.rms_px(air), rel=1e-3)
+
+
+def test_noise_read_as_a_unit_sequence_at_50_hz_would_leave_nothing_to_control(air):
+    a, b, _ = state_space(air)
+    held = expm(np.block([[a, b], [np.zeros((1, 3))]]) * 0.02)
+    covariance = solve_discrete_lyapunov(held[:2, :2], held[:2, 2:] @ held[:2, 2:].T)
+    assert math.sqrt(covariance[0, 0]) == pytest.approx(0.028, abs=5e-4)
+
+
+# ---------------------------------------------------------------- exact discretization (Van Loan)
+
+
+def test_van_loan_agrees_with_fine_integration(dynamics):
+    a, intensity = dynamics
+    step_s, nodes = 0.3, 2000
+    fine = expm(a * step_s / nodes)
+    power, integrand = np.eye(2), []
+    for _ in range(nodes + 1):
+        integrand.append(power @ intensity @ power.T)
+        power = fine @ power
+    transition, covariance = discretize(a, intensity, step_s)
+    assert transition == pytest.approx(np.linalg.matrix_power(fine, nodes), rel=1e-9)
+    integral = np.trapezoid(np.array(integrand), dx=step_s / nodes, axis=0)
+    assert covariance == pytest.approx(integral, rel=1e-5)
+
+
+@given(step_s=steps_s)
+def test_two_half_steps_are_one_step(dynamics, step_s):
+    whole, covariance = discretize(*dynamics, step_s)
+    half, half_covariance = discretize(*dynamics, step_s / 2)
+    assert half @ half == pytest.approx(whole, rel=1e-9, abs=1e-12)
+    twice = half @ half_covariance @ half.T + half_covariance
+    assert twice == pytest.approx(covariance, rel=1e-9, abs=1e-12)
+
+
+@given(step_s=steps_s)
+def test_a_step_keeps_the_stationary_covariance(air, step_s):
+    transition, gain = step_matrices(air, step_s)
+    covariance = stationary_covariance(air)
+    after = transition @ covariance @ transition.T + gain @ gain.T
+    assert after == pytest.approx(covariance, rel=1e-9, abs=1e-12)
+
+
+def test_the_noise_gain_is_a_root_of_the_step_covariance(air, dynamics):
+    for step_s in (1e-6, 5e-4, 0.02):
+        _, gain = step_matrices(air, step_s)
+        _, covariance = discretize(*dynamics, step_s)
+        assert gain @ gain.T == pytest.approx(covariance, rel=1e-6, abs=1e-15)
+
+
+# ---------------------------------------------------------------- the plant's own motion
+
+
+@pytest.fixture(scope="module")
+def motion_px(rig):
+    """Pointing spot of resting stages at 50 Hz: shape (samples, runs and axes)."""
+    plant = Plant(rig, "right", range(8), star_offset_px=np.zeros((8, 2)))
+    target = rig.loops["right"].target_px
+    times_s = np.arange(1, 100 * 50 + 1) / 50
+    spots = np.array([plant.spots_px(time_s)[:, 0] for time_s in times_s])
+    return (spots - [target.az, target.el]).reshape(times_s.size, -1)
+
+
+def test_the_plant_moves_by_the_variance_of_eq_9(air, motion_px):
+    # A variance over T of a Gaussian signal with autocorrelation r scatters by sqrt(2 int r^2 / T).
+    lags_s = np.linspace(-20, 20, 4001)
+    a, _, _ = state_space(air)
+    covariance = stationary_covariance(air)
+    correlation = [(expm(a * abs(lag)) @ covariance)[0, 0] / covariance[0, 0] for lag in lags_s]
+    total_s = motion_px.size / 50
+    scatter = math.sqrt(2 * np.trapezoid(np.square(correlation), lags_s) / total_s)
+    assert np.var(motion_px) / covariance[0, 0] == pytest.approx(1.0, abs=4 * scatter)
+
+
+def test_the_plants_spectrum_is_that_of_eq_9(air, motion_px):
+    frequency_hz, measured = welch(motion_px, fs=50, nperseg=1000, axis=0)
+    ratio = measured.mean(axis=1) / psd_px2_per_hz(air, np.maximum(frequency_hz, 1e-9))
+    segments = 9 * motion_px.shape[1] / 1.5  # half-overlapped Hann segments are not independent
+    for low_hz, high_hz in [(0.1, 0.3), (0.3, 1.0), (1.0, 3.0), (3.0, 8.0)]:
+        band = (frequency_hz >= low_hz) & (frequency_hz < high_hz)
+        independent = segments * max(1.0, band.sum() / 1.5)  # so are neighbouring bins
+        # The window's leakage and aliasing at 50 Hz stay below 3 %.
+        assert ratio[band].mean() == pytest.approx(1.0, abs=4 / math.sqrt(independent) + 0.03)
+
+
+def test_axes_and_runs_move_independently(motion_px):
+    correlation = np.corrcoef(motion_px.T)
+    off_diagonal = correlation[~np.eye(len(correlation), dtype=bool)]
+    assert np.abs(off_diagonal).max() < 0.5  # about 4 sigma for 100 s of a 1.5 s correlation
+    assert np.abs(off_diagonal.mean()) < 0.1
+
+
+def test_the_fringe_spot_follows_the_pointing_spot_up_to_its_relative_motion(rig, air):
+    plant = Plant(rig, "right", range(64))
+    spots = np.concatenate([plant.spots_px(time_s) for time_s in np.arange(1, 11) * 3.0])
+    spot = rig.plant.loops["right"].spots[1]
+    apart = spots[:, 1] - spots[:, 0] - [spot.offset_px.az, spot.offset_px.el]
+    # 64 runs x 2 axes x 10 looks, each 3 s apart: near enough independent.
+    assert np.std(apart) == pytest.approx(air.relative_rms_px, rel=4 / math.sqrt(2 * 600))

@@ -1,0 +1,163 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fitctl.config import Hysteresis
+from fitctl.model import hysteresis
+from fitctl.model.hysteresis import gains_from_slopes, hysteresis_output, play, stack_gains
+
+HALF_WIDTH_V = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.0, 4.5, 4.9])
+FULL_V = 10.0
+volts = st.floats(-10, 10)
+histories = st.lists(volts, max_size=20)
+
+
+def states(voltages, start=None, half_width=HALF_WIDTH_V):
+    """Plays' outputs after each voltage, from a relaxed stack or from `start`."""
+    state = np.zeros_like(half_width) if start is None else start
+    trail = []
+    for voltage in voltages:
+        state = play(state, np.asarray(voltage), half_width)
+        trail.append(state)
+    return np.array(trail)
+
+
+def ramp(low_v, high_v, points=1001):
+    return np.linspace(low_v, high_v, points)
+
+
+# ---------------------------------------------------------------- the play operator
+
+
+@given(histories, volts)
+def test_a_plays_output_is_never_more_than_half_its_width_from_the_input(history, last):
+    final = states([*history, last])[-1]
+    # Rounding: (v + r) - v is r only to the last bit.
+    assert np.all(np.abs(final - last) <= HALF_WIDTH_V + 1e-14)
+
+
+@given(histories, volts, volts, st.integers(2, 50))
+def test_a_play_does_not_know_how_fast_it_was_driven(history, here, there, points):
+    at_once = states([*history, here, there])[-1]
+    slowly = states([*history, *ramp(here, there, points)])[-1]
+    assert slowly == pytest.approx(at_once, abs=1e-12)
+
+
+@given(histories, st.floats(0, 5))
+def test_a_larger_swing_wipes_out_all_smaller_ones(history, further):
+    largest = max(map(abs, history), default=0.0) + further
+    assert states([*history, largest])[-1].tolist() == states([largest])[-1].tolist()
+
+
+@given(st.floats(0, 10), st.floats(-1, 1), st.floats(-1, 1))
+def test_a_minor_loop_closes_where_it_left(peak, part, inner):
+    turn = part * peak
+    trail = states([peak, turn, turn + abs(inner) * (peak - turn), turn, peak])
+    assert trail[-1] == pytest.approx(trail[0], abs=1e-12)
+
+
+def test_a_play_stands_still_inside_its_width():
+    assert states([1.0, 0.9, 0.2, -0.9, 1.0], half_width=np.array([1.0])).tolist() == 5 * [[0.0]]
+
+
+# ---------------------------------------------------------------- Eq. 6
+
+slope_lists = st.lists(
+    st.floats(1e-8, 2e-6), min_size=HALF_WIDTH_V.size, max_size=HALF_WIDTH_V.size
+)
+
+
+def measured_slopes(voltages, start, breakpoints_v, gains):
+    """Slope between neighbouring breakpoints of the curve that a ramp traces."""
+    edges_v = np.append(breakpoints_v, FULL_V)
+    stroke = hysteresis_output(states(voltages, start), gains)
+    return np.diff(np.interp(edges_v, voltages, stroke)) / np.diff(edges_v)
+
+
+@given(slope_lists)
+def test_gains_from_slopes_reproduce_a_virgin_ramp(slopes):
+    gains = gains_from_slopes(np.array(slopes))
+    voltages = np.union1d(ramp(0, FULL_V, 50), HALF_WIDTH_V)
+    measured = measured_slopes(voltages, None, HALF_WIDTH_V, gains)
+    assert measured == pytest.approx(np.array(slopes), rel=1e-9, abs=1e-15)
+
+
+@given(slope_lists)
+def test_a_swept_ramp_bends_at_twice_the_breakpoints(slopes):
+    gains = gains_from_slopes(np.array(slopes))
+    swept = states([FULL_V, 0.0])[-1]
+    voltages = np.union1d(ramp(0, FULL_V, 50), 2 * HALF_WIDTH_V)
+    measured = measured_slopes(voltages, swept, 2 * HALF_WIDTH_V, gains)
+    assert measured == pytest.approx(np.array(slopes), rel=1e-9, abs=1e-15)
+
+
+# ---------------------------------------------------------------- the rig's stack
+
+
+@pytest.fixture
+def stack(rig):
+    """Breakpoints and gains of the default rig's stack."""
+    settings = rig.plant.loops["right"].hysteresis
+    return np.array(settings.breakpoints_v), stack_gains(settings, rig.loops["right"].fsm)
+
+
+def closed_loop(stack, low_v, high_v):
+    """Rising and falling branch, both on rising voltages, of a loop between two voltages."""
+    half_width, gains = stack
+    arrived = states([FULL_V, 0.0, high_v, low_v], half_width=half_width)[-1]
+    up = states(ramp(low_v, high_v), arrived, half_width)
+    down = states(ramp(high_v, low_v), up[-1], half_width)
+    return hysteresis_output(up, gains), hysteresis_output(down, gains)[::-1]
+
+
+def relative_width(branches):
+    rising, falling = branches
+    return (falling - rising)[rising.size // 2] / np.ptp(rising)
+
+
+def test_the_stack_has_the_configured_stroke_and_loop_width(rig, stack):
+    settings = rig.plant.loops["right"].hysteresis
+    rising, falling = closed_loop(stack, 0.0, FULL_V)
+    assert np.ptp(rising) == pytest.approx(settings.full_swing_stroke_m)
+    assert (falling - rising).max() <= settings.loop_width_fraction * np.ptp(rising) * 1.001
+    assert relative_width((rising, falling)) == pytest.approx(settings.loop_width_fraction)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.05, 0.2])
+def test_other_loop_widths_come_out_as_asked(rig, width):
+    settings = rig.plant.loops["right"].hysteresis.model_copy(
+        update={"loop_width_fraction": width}
+    )
+    gains = stack_gains(settings, rig.loops["right"].fsm)
+    branches = closed_loop((np.array(settings.breakpoints_v), gains), 0.0, FULL_V)
+    assert relative_width(branches) == pytest.approx(width, abs=1e-9)
+
+
+def test_minor_loops_are_slimmer_than_the_full_one(stack):
+    widths = [relative_width(closed_loop(stack, 5.0 - a, 5.0 + a)) for a in (0.2, 1.0, 2.0, 5.0)]
+    assert widths == sorted(widths)
+    assert widths[0] < 0.02
+
+
+def test_near_the_bias_the_stack_moves_by_its_scale_within_2_db(rig, stack):
+    rising, _ = closed_loop(stack, 4.8, 5.2)
+    slope_m_per_v = np.ptp(rising) / 0.4
+    assert abs(20 * np.log10(slope_m_per_v / rig.loops["right"].fsm.stack_scale_m_per_v)) < 2.0
+
+
+def test_every_element_of_the_stack_adds_to_its_motion(stack):
+    assert np.all(stack[1] > 0)
+
+
+def test_the_closed_formulas_are_what_a_sweep_measures(stack):
+    rising, falling = closed_loop(stack, 0.0, FULL_V)
+    assert hysteresis.swept_stroke(*stack, FULL_V) == pytest.approx(np.ptp(rising))
+    width_m = hysteresis.swept_loop_width(*stack, FULL_V)
+    assert width_m == pytest.approx((falling - rising)[rising.size // 2])
+
+
+def test_a_loop_wider_than_the_breakpoints_allow_is_refused(rig):
+    narrow = Hysteresis(full_swing_stroke_m=9e-6, loop_width_fraction=0.5, breakpoints_v=[0.0, 0.1])
+    with pytest.raises(ValueError, match=r"loop_width_fraction 0\.5 is wider .* lower it"):
+        stack_gains(narrow, rig.loops["right"].fsm)

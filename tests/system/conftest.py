@@ -1,0 +1,132 @@
+"""The real thing: every process, every wire, real time."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.messages import Acquire, Shutdown, Standby
+
+START_S = 60.0
+
+
+def fitctl(*arguments, **options):
+    """Start ``fitctl ARGUMENTS``."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "fitctl", *map(str, arguments)],
+        stdin=subprocess.DEVNULL,
+        text=True,
+        **options,
+    )
+
+
+def end(process, number=signal.SIGTERM, timeout_s=20.0):
+    """Send a signal and wait; returns the exit status."""
+    if process.poll() is None:
+        process.send_signal(number)
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        raise
+
+
+class Rig:
+    """Mock testbed and supervisor of a test, each of which the test may kill and start again."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.sockets = Path(f"/tmp/fitctl-test-{os.getpid()}-{time.monotonic_ns()}")
+        self.common = ["--set", f"logging.folder={folder}", "--set", f"service.folder={self.sockets}"]
+        self.mocks = self.supervisor = None
+        self.client = None
+
+    def start_mocks(self, *arguments):
+        self.mocks = fitctl("mocks", *self.common, "--json", *arguments, stdout=subprocess.PIPE)
+        self.endpoints = json.loads(self.mocks.stdout.readline())
+
+    def restart_mocks(self):
+        """New mock devices where the old ones listened."""
+        ports = {
+            "mocks.gvcp_port": self.endpoints["camera.device.gvcp_port"],
+            "mocks.bench_port": self.endpoints["mocks.bench_port"],
+            "mocks.loops.right.slcan_port": self._port("loops.right.siderostat.device.channel"),
+            "mocks.loops.right.modbus_port": self.endpoints["loops.right.fsm.dac.port"],
+            "mocks.loops.right.mdt693_port": self._port("loops.right.fsm.piezo.port"),
+        }
+        self.start_mocks(*(part for key, port in ports.items() for part in ("--set", f"{key}={port}")))
+
+    def _port(self, key):
+        return self.endpoints[key].rpartition(":")[2]
+
+    def start_supervisor(self):
+        devices = [
+            part
+            for key, value in self.endpoints.items()
+            if not key.startswith("mocks.")
+            for part in ("--set", f"{key}={value}")
+        ]
+        self.supervisor = fitctl("run", *self.common, *devices, stdout=subprocess.PIPE)
+        assert "supervising" in self.supervisor.stdout.readline()
+        self.client = Client(self.sockets)
+
+    def follow(self, reached, limit_s=START_S):
+        """Receive telemetry until `reached(telemetry)`; returns all of it."""
+        seen = []
+        end_s = time.monotonic() + limit_s
+        while time.monotonic() < end_s:
+            telemetry = self.client.receive(0.5)
+            if telemetry is not None:
+                seen.append(telemetry)
+                if reached(telemetry):
+                    return seen
+        mode = seen[-1].loops[0].mode if seen else "no telemetry"
+        events = [event.message for telemetry in seen for event in telemetry.events]
+        raise AssertionError(f"not reached within {limit_s} s; {mode}; {events}")
+
+    def follow_to(self, mode, limit_s=START_S):
+        return self.follow(lambda telemetry: telemetry.loops[0].mode == mode, limit_s)
+
+    def to_vernier(self):
+        assert self.client.send(Standby()).accepted
+        self.follow_to("STANDBY")
+        assert self.client.send(Acquire()).accepted
+        return self.follow_to("VERNIER")
+
+    def recorder(self):
+        """The recorder process."""
+        children = psutil.Process(self.supervisor.pid).children(recursive=True)
+        return next(child for child in children if "record" in child.cmdline())
+
+    def close(self):
+        if self.client is not None:
+            if self.supervisor.poll() is None:
+                self.client.send(Shutdown())
+            self.client.close()
+        for process in (self.supervisor, self.mocks):
+            if process is not None:
+                end(process)
+                process.stdout.close()
+
+
+@pytest.fixture
+def rig(tmp_path):
+    rig = Rig(tmp_path)
+    try:
+        rig.start_mocks("--free-ports")
+        rig.start_supervisor()
+        yield rig
+    finally:
+        rig.close()
+        for path in sorted(rig.sockets.glob("*")) if rig.sockets.exists() else []:
+            path.unlink()
+        if rig.sockets.exists():
+            rig.sockets.rmdir()

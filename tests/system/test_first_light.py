@@ -1,0 +1,185 @@
+"""From a command to a held star, and what becomes of it when parts are killed."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from fitctl.logging.reading import log_info, tick_arrays
+from fitctl.supervisor.messages import Recover
+
+from .conftest import end, fitctl
+
+pytestmark = pytest.mark.timeout(300)
+SUMMARY_KEYS = {
+    "acquired_s",
+    "vernier_s",
+    "rms_px",
+    "measured_rms_px",
+    "rms_arcsec",
+    "frames",
+    "frames_lost",
+    "late_ticks",
+    "log",
+}
+
+
+def demo(tmp_path, *arguments):
+    """Run a headless demo; returns its summary."""
+    process = fitctl(
+        "demo",
+        "--headless",
+        "--json",
+        "--set",
+        f"logging.folder={tmp_path}",
+        *arguments,
+        stdout=subprocess.PIPE,
+    )
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0
+    return json.loads(output.splitlines()[-1])
+
+
+def nothing_was_lost_without_a_stall(summary):
+    return summary["frames_lost"] == 0 or summary["machine_stalls"] > 0
+
+
+def test_the_demo_acquires_holds_and_sums_up(tmp_path):
+    summary = demo(tmp_path, "--duration", 35, "--seed", 3)
+
+    assert summary.keys() >= SUMMARY_KEYS
+    assert summary["acquired_s"] < summary["vernier_s"] < 30
+    assert max(summary["rms_px"].values()) < 0.05
+    assert nothing_was_lost_without_a_stall(summary)
+    assert summary["frames"] > 1000
+    assert log_info(Path(summary["log"])).finished
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_ten_demos_of_a_minute(tmp_path, seed):
+    summary = demo(tmp_path, "--duration", 60, "--seed", seed)
+
+    print(json.dumps(summary))
+    assert summary["vernier_s"] < 30
+    assert max(summary["rms_px"].values()) <= 0.030
+    assert nothing_was_lost_without_a_stall(summary)
+
+
+def test_killing_the_mocks_leads_to_safe_at_once_and_one_command_recovers(rig):
+    rig.to_vernier()
+    killed_s = time.monotonic()
+    rig.mocks.kill()
+    rig.mocks.wait()
+
+    seen = rig.follow_to("SAFE", limit_s=5.0)
+
+    change = next(c for t in seen for c in t.mode_changes if c.target == "SAFE")
+    timing = [t for telemetry in seen for t in telemetry.timing]
+    stalled_s = max((t.worst_stall_s for t in timing), default=0.0)
+    assert change.time_s - killed_s < 0.2 + stalled_s
+    errors = [e for t in seen for e in t.events if e.severity == "error"]
+    assert any("127.0.0.1" in e.message and "expected" in e.message for e in errors)
+
+    rig.mocks.stdout.close()
+    rig.restart_mocks()
+    assert rig.client.send(Recover()).accepted
+    rig.follow_to("STANDBY")
+
+
+def test_killing_the_recorder_costs_no_tick_and_its_file_stays_readable(rig):
+    seen = rig.to_vernier()
+    rig.follow(lambda t: t.recorder is not None and t.recorder.records > 500)
+    path = rig.client.receive(1.0).recorder.path
+    recorder = rig.recorder()
+    recorder.kill()
+
+    seen = rig.follow(lambda t: t.recorder is not None and t.recorder.path != path, limit_s=20.0)
+
+    ticks = [tick for telemetry in seen for tick in telemetry.ticks if tick.number >= 0]
+    lost = ticks[-1].frames_lost - ticks[0].frames_lost
+    assert ticks[-1].number - ticks[0].number == len(ticks) - 1 + lost
+    assert all(telemetry.loops[0].mode == "VERNIER" for telemetry in seen)
+    assert any("recorder was killed" in e.message for t in seen for e in t.events)
+    assert seen[-1].records_lost == 0
+    before = tick_arrays(Path(path), "right")
+    assert len(before["number"]) > 100
+    assert not log_info(Path(path)).finished
+
+
+def test_a_second_supervisor_on_the_same_rig_is_refused_and_told_who_has_it(rig):
+    second = fitctl("run", *rig.common, stderr=subprocess.PIPE)
+    _, error = second.communicate(timeout=30)
+
+    assert second.returncode == 2
+    assert str(rig.supervisor.pid) in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_send_gives_commands_from_a_shell(rig):
+    def send(command):
+        process = fitctl("send", command, *rig.common, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        output, error = process.communicate(timeout=30)
+        return process.returncode, (output + error).strip()
+
+    assert send("status") == (0, "right OFF")
+    code, text = send("acquire")
+    assert code == 1
+    assert "standby" in text
+    assert send("standby") == (0, "accepted")
+    rig.follow_to("STANDBY")
+    assert send("stop") == (0, "accepted")
+    assert send("status") == (0, "right SAFE")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, number):
+    process = fitctl(
+        "demo",
+        "--headless",
+        "--set",
+        f"logging.folder={tmp_path}",
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    family = wait_for_family(process, 3)
+    end(process, number, timeout_s=40)
+
+    gone, alive = psutil.wait_procs(family, timeout=10)
+    assert not alive
+    assert not list(tmp_path.glob("fitctl-demo-*"))
+
+
+def test_a_demo_killed_outright_takes_its_processes_with_it(tmp_path):
+    process = fitctl(
+        "demo",
+        "--headless",
+        "--set",
+        f"logging.folder={tmp_path}",
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    family = wait_for_family(process, 3)
+    process.kill()
+    process.wait()
+
+    gone, alive = psutil.wait_procs(family, timeout=20)
+    assert not alive
+
+
+def wait_for_family(process, size, limit_s=60.0):
+    """Wait until a demo has its testbed, supervisor and recorder; returns them."""
+    end_s = time.monotonic() + limit_s
+    while time.monotonic() < end_s:
+        family = psutil.Process(process.pid).children(recursive=True)
+        if len(family) >= size:
+            return family
+        psutil.wait_procs([psutil.Process(process.pid)], timeout=0.2)
+    raise AssertionError("the demo did not start its processes")
