@@ -98,7 +98,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
     target = np.array([loop.target_px.az, loop.target_px.el])
     spot_offset = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     backlash_rad = plant.backlash_sky_arcsec / ARCSEC_PER_RAD / scale.motor_sky_rad_per_rad
-    relative = plant.air_path.relative_rms_px
+    air_rms_px = air_path.rms_px(plant.air_path)
     return PlantConstants(
         step_s=truth.step_s,
         amplifier_decay=float(np.exp(-truth.step_s / lag_s)),
@@ -116,7 +116,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         participation=plant.structure.participation,
         air_transition=air_transition,
         air_noise=air_noise,
-        air_relative=relative / max(air_path.rms_px(plant.air_path), 1e-300),
+        air_relative=plant.air_path.relative_rms_px / air_rms_px if air_rms_px > 0 else 0.0,
         motor_px_per_rad=scale.motor_px_per_rad,
         mirror_px_per_rad=scale.mirror_px_per_rad,
         spot_origin_px=target + star_offset_px[:, None, :] + spot_offset,
@@ -216,7 +216,8 @@ class Plant:
         runs, spots = len(seeds), len(plant.spots)
         elements = len(plant.hysteresis.breakpoints_v)
         initial = np.linalg.cholesky(
-            air_path.stationary_covariance(plant.air_path) + 1e-18 * np.eye(2)
+            # The least that lets still air, whose covariance is zero, through.
+            air_path.stationary_covariance(plant.air_path) + 1e-300 * np.eye(2)
         )
         self.state = PlantState(
             motor_rad=np.zeros((runs, 2)),

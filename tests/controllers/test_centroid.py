@@ -1,0 +1,115 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fitctl.controllers.centroid import HALF_WINDOW_PX, StarSensor
+from fitctl.model.scene import Scene
+
+NOWHERE = (-500.0, -500.0)
+window_fits = st.tuples(st.floats(3.0, 36.0), st.floats(3.0, 36.0))
+
+
+@pytest.fixture(scope="module")
+def sensor(rig):
+    return StarSensor(rig.camera, rig.loops["right"])
+
+
+@pytest.fixture(scope="module")
+def expose(rig):
+    """Frames of the pointing spot, and of the fringe spot where one is asked for."""
+    scene = Scene(rig.camera, rig.plant.loops["right"].spots)
+
+    def frame(star, fringe=NOWHERE, seed=0):
+        return scene.frame(np.array([star, fringe]), np.random.default_rng(seed))
+
+    return frame
+
+
+# ---------------------------------------------------------------- Eq. 7
+
+
+def test_eq_7_by_hand(rig, sensor):
+    image = np.full((40, 40), rig.camera.bias_dn, dtype=np.uint16)
+    image[20, 10] += 14_000
+    image[20, 11] += 7_000
+    image[22, 10] += 7_000
+    star = sensor.measure(image, 10, 21)
+    assert star.flux_dn == 28_000
+    assert star.az_px == pytest.approx(10.25)
+    assert star.el_px == pytest.approx(20.5)
+    assert (star.window_az_px, star.window_el_px) == (10, 21)
+
+
+@given(place=window_fits, seed=st.integers(0, 1000))
+def test_the_star_is_measured_where_it_is(sensor, expose, place, seed):
+    star = sensor.measure(expose(place, seed=seed), *place)
+    # Five times the noise; a window half a pixel off centre cuts 0.01 px off the spot's wing.
+    assert (star.az_px, star.el_px) == pytest.approx(place, abs=0.06)
+
+
+@pytest.mark.parametrize("centre", [(-9.0, 12.0), (99.0, 99.0), (20.0, -3.0)])
+def test_a_window_asked_for_beyond_the_frame_is_moved_onto_it(sensor, expose, centre):
+    image = expose(NOWHERE)
+    star = sensor.measure(image, *centre)
+    assert star is None
+    nearest = np.clip(centre, HALF_WINDOW_PX, 36)
+    star = sensor.measure(expose(nearest), *centre)
+    assert (star.window_az_px, star.window_el_px) == tuple(nearest)
+
+
+def test_a_window_beside_the_star_measures_nothing(sensor, expose):
+    assert sensor.measure(expose((24.0, 19.5)), 12.0, 19.5) is None
+
+
+def test_a_spot_of_another_brightness_is_not_this_loops_star(sensor, expose):
+    image = expose(NOWHERE, fringe=(12.0, 19.5))
+    assert sensor.measure(image, 12.0, 19.5) is None
+    assert sensor.find(image) is None
+
+
+# ---------------------------------------------------------------- the finder
+
+
+@given(place=window_fits, seed=st.integers(0, 1000))
+def test_the_star_is_found_anywhere_that_the_window_fits(sensor, expose, place, seed):
+    star = sensor.find(expose(place, seed=seed))
+    assert (star.az_px, star.el_px) == pytest.approx(place, abs=0.06)
+
+
+@given(place=window_fits)
+def test_the_star_is_found_beside_its_fringe_spot(sensor, expose, place):
+    fringe = (place[0] - 12.0, place[1])
+    star = sensor.find(expose(place, fringe=fringe))
+    assert (star.az_px, star.el_px) == pytest.approx(place, abs=0.06)
+
+
+@pytest.mark.parametrize("hot_dn", [300, 8_000, 16_800, 28_000, 44_800, 64_000])
+@pytest.mark.parametrize("with_star", [True, False])
+def test_a_hot_pixel_is_not_the_star(sensor, expose, hot_dn, with_star):
+    image = expose((24.0, 19.5) if with_star else NOWHERE)
+    image[30, 8] += hot_dn
+    star = sensor.find(image)
+    if with_star:
+        assert (star.az_px, star.el_px) == pytest.approx((24.0, 19.5), abs=0.06)
+    else:
+        assert star is None
+
+
+def test_noise_alone_is_never_a_star(sensor, expose):
+    assert not any(sensor.find(expose(NOWHERE, seed=seed)) for seed in range(300))
+
+
+@given(
+    beyond=st.floats(-2.0, 1.5),
+    along=st.floats(0.0, 39.0),
+    edge=st.sampled_from(["left", "right", "bottom", "top"]),
+)
+def test_a_spot_cut_by_the_frames_edge_is_not_accepted(sensor, expose, beyond, along, edge):
+    place = {
+        "left": (beyond, along),
+        "right": (39.0 - beyond, along),
+        "bottom": (along, beyond),
+        "top": (along, 39.0 - beyond),
+    }[edge]
+    assert sensor.find(expose(place)) is None
