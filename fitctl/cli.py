@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+from typer.exceptions import TyperException
 
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+
+UNUSABLE = 2
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="fitctl",
     help="Points starlight: acquires a star, pulls it in and holds it to a fraction of a pixel.",
-    no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -168,12 +171,26 @@ def record(rig: RigOption = None, overrides: SetOption = None) -> None:
     run_recorder(_rig(rig, overrides))
 
 
-def main(arguments: list[str] | None = None) -> Any:
+def main(arguments: list[str] | None = None) -> None:
     """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
+    given = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
-        return app(arguments)
+        status = app(given, prog_name="fitctl", standalone_mode=False)
     except ConfigError as error:
         typer.echo(str(error), err=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+        status = UNUSABLE
+    except TyperException as error:
+        context = getattr(error, "ctx", None)
+        command = "fitctl" if context is None else context.command_path
+        typer.echo(f"{command}: {_message(error)} (see {command} --help)", err=True)
+        status = UNUSABLE
+    except (KeyboardInterrupt, typer.Abort):
+        status = INTERRUPTED
+    sys.exit(status)
+
+
+def _message(error: TyperException) -> str:
+    """The error as one line, with the option that it is about."""
+    format_message = getattr(error, "format_message", None)
+    text = str(error) if format_message is None else format_message()
+    return text.replace("\n", " ").rstrip(".")

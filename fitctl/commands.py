@@ -93,9 +93,9 @@ def _demo_with_console(running: demos.Instrument) -> int:
     thread = demos.acquire_in_background(running)
     ConsoleApp(Client(running.folder), quit_shuts_down=True).run()
     thread.join(timeout=5.0)
-    status = running.client.receive(1.0)
-    if status is not None and status.recorder is not None:
-        typer.echo(f"log: {status.recorder.path}")
+    newest = demos.newest_telemetry(running.folder)
+    if newest is not None and newest.recorder is not None:
+        typer.echo(f"log: {newest.recorder.path}")
     return 0
 
 

@@ -222,6 +222,15 @@ def _recorder_lost(telemetry: Telemetry) -> int:
     return 0 if telemetry.recorder is None else telemetry.recorder.lost
 
 
+def newest_telemetry(folder: Path) -> Telemetry | None:
+    """What the supervisor says now, or None if it says nothing for a second."""
+    client = Client(folder)
+    try:
+        return client.receive(1.0)
+    finally:
+        client.close()
+
+
 def to_json(result: dict[str, Any]) -> str:
     """One line; what was not reached is null."""
     return msgspec.json.encode(result).decode()

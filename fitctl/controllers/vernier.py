@@ -79,5 +79,5 @@ class Vernier:
         self._state = self._state @ self._a.T + seen_px[:, None] * self._b
         mirror_rad = saturate_diamond(wanted_px / self._mirror_px_per_rad, self._range_rad)
         self._excess_px = wanted_px - mirror_rad * self._mirror_px_per_rad
-        self.saturated = bool(np.any(np.abs(self._excess_px) > 1e-9))
+        self.saturated = bool((np.abs(self._excess_px) > 1e-9).any())
         return mirror_rad

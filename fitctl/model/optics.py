@@ -127,5 +127,5 @@ def saturate_diamond(mirror_rad: Floats, range_rad: float) -> Floats:
     Two axes share three stacks, so what can be reached is a diamond; clipping each axis by itself
     would overdrive a stack and turn the motion.
     """
-    reach = np.sum(np.abs(mirror_rad), axis=-1, keepdims=True)
+    reach = np.abs(mirror_rad).sum(axis=-1, keepdims=True)
     return mirror_rad * np.minimum(1.0, range_rad / np.maximum(reach, 1e-300))

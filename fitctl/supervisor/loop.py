@@ -88,6 +88,7 @@ class StellarLoop:
         self.servo = servo
         self.mode = Mode.OFF
         self.mode_since_s = clock.now_s()
+        self.last_change: ModeChange | None = None
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
         self.dac_ready = False
         self._rig = rig
@@ -133,7 +134,9 @@ class StellarLoop:
         started_s = self._clock.now_s()
         star = self._sense(frame) if frame is not None else None
         self._judge(frame, star)
-        if frame is not None or self.mode not in TRACKING:  # no frame: the stages wait where they are
+        if (
+            frame is not None or self.mode not in TRACKING
+        ):  # no frame: the stages wait where they are
             self._laws[self.mode](star)
         self._write()
         done_s = self._clock.now_s()
@@ -219,17 +222,16 @@ class StellarLoop:
         self.mode_since_s = self._clock.now_s()
         self._findings = Findings()
         self._enter(source)
-        self._report(
-            ModeChange(
-                time_s=self.mode_since_s,
-                loop=self.name,
-                source=source.name,
-                target=row.target.name,
-                target_number=int(row.target),
-                trigger=trigger.name,
-                reason=reason,
-            )
+        self.last_change = ModeChange(
+            time_s=self.mode_since_s,
+            loop=self.name,
+            source=source.name,
+            target=row.target.name,
+            target_number=int(row.target),
+            trigger=trigger.name,
+            reason=reason,
         )
+        self._report(self.last_change)
         severity = {Trigger.FAULT: "error", Trigger.STAR_LOST: "warning"}.get(trigger, "info")
         if trigger is Trigger.SEARCH_EXHAUSTED:
             severity = "warning"

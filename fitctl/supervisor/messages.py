@@ -91,6 +91,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     requirement_px: float
     sky_arcsec_per_px: float
     usable_commands: list[str]
+    last_change: ModeChange | None = None
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):

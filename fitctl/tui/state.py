@@ -49,7 +49,7 @@ class LoopView:
         self.ticks.extend(tick for tick in message.ticks if tick.loop == name)
         while self.ticks and self.ticks[0].time_s < message.time_s - TRACE_S:
             self.ticks.popleft()
-        self.change = _last_of(name, message.mode_changes) or self.change
+        self.change = state.last_change
         self.timing = _last_of(name, message.timing) or self.timing
         self.piezo = _last_of(name, message.piezo) or self.piezo
 

@@ -12,7 +12,7 @@ mirrors = st.tuples(*2 * [st.floats(-1.8e-4, 1.8e-4)]).map(np.array)
 places = st.tuples(*2 * [st.floats(-100, 140)]).map(np.array)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scale(rig):
     return scales(rig, rig.loops["right"])
 

@@ -126,9 +126,7 @@ def test_the_stack_has_the_configured_stroke_and_loop_width(rig, stack):
 
 @pytest.mark.parametrize("width", [0.0, 0.05, 0.2])
 def test_other_loop_widths_come_out_as_asked(rig, width):
-    settings = rig.plant.loops["right"].hysteresis.model_copy(
-        update={"loop_width_fraction": width}
-    )
+    settings = rig.plant.loops["right"].hysteresis.model_copy(update={"loop_width_fraction": width})
     gains = stack_gains(settings, rig.loops["right"].fsm)
     branches = closed_loop((np.array(settings.breakpoints_v), gains), 0.0, FULL_V)
     assert relative_width(branches) == pytest.approx(width, abs=1e-9)

@@ -171,13 +171,15 @@ def test_after_a_reversal_the_star_stands_still_for_the_width_of_the_backlash(ri
     plant.inputs.velocity_rad_s[0, 0] = 1.0
     plant.advance(1.0)
     plant.inputs.velocity_rad_s[0, 0] = -1.0
-    plant.advance(2.0)
-    star_px = plant.history_px(1.0, 2.0)[:, 0, 0, 0]
-    turned = int(np.flatnonzero(star_px < star_px.max() - 1e-9)[0])
-    motor_px_per_step = scale.motor_px_per_rad * 1.0 * plant.constants.step_s
-    # The amplifier's lag adds two lags' time to the reversal: about 1.6 ms.
-    stood_still_px = (turned - int(star_px.argmax())) * motor_px_per_step
-    assert stood_still_px == pytest.approx(1.0 / scale.sky_arcsec_per_px, abs=0.01)
+    motor_px, star_px = [], []
+    for time_s in np.arange(2000, 2400) * plant.constants.step_s:
+        star_px.append(from_target(plant, rig, time_s)[0, 0])
+        motor_px.append(scale.motor_px_per_rad * plant.state.motor_rad[0, 0])
+    at_rest = np.flatnonzero(np.array(star_px) == max(star_px))
+    stood_still_px = motor_px[at_rest[0]] - motor_px[at_rest[-1]]
+    backlash_px = rig.plant.loops["right"].backlash_sky_arcsec / scale.sky_arcsec_per_px
+    assert stood_still_px == pytest.approx(backlash_px, abs=2 * 1.0 * scale.motor_px_per_rad * 5e-4)
+    assert star_px[-1] < star_px[0]  # and then it follows
 
 
 def test_fringe_and_pointing_spot_move_together(rig):

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -43,11 +45,12 @@ def test_half_the_light_of_a_spot_on_the_frames_edge_is_lost(rig, spots, star_on
     assert image.sum() == pytest.approx(spots[0].flux_dn / 2, rel=1e-6)
 
 
-def test_a_spot_of_3_px_has_86_percent_of_its_light_within_its_diameter(rig, star_only):
+def test_a_spots_diameter_is_four_standard_deviations(rig, spots, star_only):
     image = light(rig, star_only.expected(np.array([[19.5, 19.5]])))
-    # 1/e^2 diameter: 95.45 % across each axis lies within it, 4 sigma; the spot spans 18 to 21 px.
-    assert image[:, 18:22].sum() / image.sum() == pytest.approx(0.9923, abs=1e-3)
-    assert image[:, 19:21].sum() / image.sum() == pytest.approx(0.8176, abs=1e-3)
+    sigma_px = spots[0].diameter_px / 4
+    for half in (1, 2, 3):  # columns within so many pixels of the spot
+        part = image[:, 20 - half : 20 + half].sum() / image.sum()
+        assert part == pytest.approx(math.erf(half / sigma_px / math.sqrt(2)), abs=1e-6)
 
 
 def test_spots_add_up(rig, spots, star_only):

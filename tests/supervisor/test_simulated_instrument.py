@@ -95,7 +95,9 @@ def test_two_runs_of_one_seed_are_equal_and_of_two_seeds_are_not(simulate_with):
 def test_a_star_anywhere_within_200_arcsec_is_found(simulate_with, place):
     random = np.random.default_rng(1234 + place)
     rig = load_rig(default_rig_path())
-    radius_px = 200 * math.sqrt(random.uniform()) / scales(rig, rig.loops["right"]).sky_arcsec_per_px
+    radius_px = (
+        200 * math.sqrt(random.uniform()) / scales(rig, rig.loops["right"]).sky_arcsec_per_px
+    )
     angle = random.uniform(0, 2 * math.pi)
     simulation = simulate_with(
         seed=place, star_offset_px=(radius_px * math.cos(angle), radius_px * math.sin(angle))
@@ -180,7 +182,9 @@ def test_a_target_whose_window_does_not_fit_is_refused(vernier):
     assert "3..36 px" in reply.text
 
 
-@pytest.mark.parametrize("mode", [Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.SAFE])
+@pytest.mark.parametrize(
+    "mode", [Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.SAFE]
+)
 def test_stop_works_from_every_mode(simulate_with, mode):
     simulation = simulate_with(star_offset_px=(55.0, 20.0))
     if mode is Mode.STANDBY:
@@ -358,6 +362,9 @@ def test_eq_20_for_ten_seeds_over_two_minutes(seed):
 def test_rms_helpers_say_nan_when_there_is_nothing_to_judge(simulate_with):
     simulation = simulate_with()
 
-    assert all(math.isnan(v) for v in pair(
-        true_residual_rms(simulation.plants["right"], np.zeros(2), math.nan, 1.0)
-    ).values())
+    assert all(
+        math.isnan(v)
+        for v in pair(
+            true_residual_rms(simulation.plants["right"], np.zeros(2), math.nan, 1.0)
+        ).values()
+    )

@@ -45,7 +45,12 @@ class Rig:
     def __init__(self, folder: Path):
         self.folder = folder
         self.sockets = Path(f"/tmp/fitctl-test-{os.getpid()}-{time.monotonic_ns()}")
-        self.common = ["--set", f"logging.folder={folder}", "--set", f"service.folder={self.sockets}"]
+        self.common = [
+            "--set",
+            f"logging.folder={folder}",
+            "--set",
+            f"service.folder={self.sockets}",
+        ]
         self.mocks = self.supervisor = None
         self.client = None
 
@@ -62,7 +67,9 @@ class Rig:
             "mocks.loops.right.modbus_port": self.endpoints["loops.right.fsm.dac.port"],
             "mocks.loops.right.mdt693_port": self._port("loops.right.fsm.piezo.port"),
         }
-        self.start_mocks(*(part for key, port in ports.items() for part in ("--set", f"{key}={port}")))
+        self.start_mocks(
+            *(part for key, port in ports.items() for part in ("--set", f"{key}={port}"))
+        )
 
     def _port(self, key):
         return self.endpoints[key].rpartition(":")[2]

@@ -123,7 +123,9 @@ def test_a_second_supervisor_on_the_same_rig_is_refused_and_told_who_has_it(rig)
 
 def test_send_gives_commands_from_a_shell(rig):
     def send(command):
-        process = fitctl("send", command, *rig.common, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        process = fitctl(
+            "send", command, *rig.common, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
         output, error = process.communicate(timeout=30)
         return process.returncode, (output + error).strip()
 
@@ -151,7 +153,7 @@ def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, number):
     family = wait_for_family(process, 3)
     end(process, number, timeout_s=40)
 
-    gone, alive = psutil.wait_procs(family, timeout=10)
+    _, alive = psutil.wait_procs(family, timeout=10)
     assert not alive
     assert not list(tmp_path.glob("fitctl-demo-*"))
 
@@ -170,7 +172,7 @@ def test_a_demo_killed_outright_takes_its_processes_with_it(tmp_path):
     process.kill()
     process.wait()
 
-    gone, alive = psutil.wait_procs(family, timeout=20)
+    _, alive = psutil.wait_procs(family, timeout=20)
     assert not alive
 
 

@@ -1,0 +1,200 @@
+"""The supervisor's door: what is answered, what is refused, and to whom it is open."""
+
+import os
+import stat
+import threading
+import time
+
+import msgspec
+import pytest
+import zmq
+
+from fitctl.clock import MonotonicClock
+from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.logging.records import RecorderStatus
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.endpoints import COMMAND_SOCKET, make_service_folder, service_folder
+from fitctl.supervisor.messages import (
+    Acquire,
+    RecorderReport,
+    Reply,
+    SetTarget,
+    Standby,
+    Status,
+    Stop,
+)
+from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
+from fitctl.supervisor.simulate import Simulation
+
+
+class Served:
+    """A simulated instrument behind a real service, stepped by a thread."""
+
+    def __init__(self, rig, folder):
+        self.folder = folder
+        self.buffer = TelemetryBuffer()
+        self.simulation = Simulation(rig, 0, star_offset_px=(9.0, 4.0), record=self.buffer.add)
+        state = ServiceState(
+            pid=os.getpid(), wall_minus_monotonic_s=0.0, scheduling="", records_lost=lambda: 7
+        )
+        self.service = Service(
+            self.simulation.supervisor, self.buffer, folder, state, MonotonicClock()
+        )
+        self.ending = threading.Event()
+        self.stepper = threading.Thread(target=self.step)
+        self.client = Client(folder)
+
+    def step(self):
+        while not self.ending.wait(0.002):
+            self.simulation.supervisor.step()
+
+    def close(self):
+        self.client.close()
+        self.ending.set()
+        self.stepper.join()
+        self.service.stop()
+
+    def follow(self, reached, limit_s=10.0):
+        end_s = time.monotonic() + limit_s
+        while time.monotonic() < end_s:
+            telemetry = self.client.receive(0.5)
+            if telemetry is not None and reached(telemetry):
+                return telemetry
+        raise AssertionError("not reached")
+
+    def raw(self, *parts):
+        """Send what no client of ours would; returns the reply, or None."""
+        context = zmq.Context()
+        try:
+            with context.socket(zmq.DEALER) as socket:
+                socket.setsockopt(zmq.LINGER, 0)
+                socket.connect(f"ipc://{self.folder / COMMAND_SOCKET}")
+                socket.send_multipart(parts)
+                if not socket.poll(500):
+                    return None
+                return msgspec.msgpack.decode(socket.recv_multipart()[1], type=Reply)
+        finally:
+            context.term()
+
+
+@pytest.fixture
+def served(tmp_path):
+    rig = load_rig(default_rig_path(), [f"service.folder={tmp_path / 's'}"])
+    served = Served(rig, make_service_folder(rig))
+    served.service.start()
+    served.stepper.start()
+    yield served
+    served.close()
+
+
+def test_commands_lead_through_the_modes_and_telemetry_shows_it(served):
+    assert served.client.send(Standby()).accepted
+    assert served.client.send(Acquire()).accepted
+    telemetry = served.follow(lambda t: t.loops[0].mode == "VERNIER")
+
+    loop = telemetry.loops[0]
+    assert loop.last_change.target == "VERNIER"
+    assert loop.usable_commands == ["Hold", "Stop"]
+    assert telemetry.frame.width_px * telemetry.frame.height_px * 2 == len(telemetry.frame.data)
+    assert telemetry.records_lost == 7
+    assert {device.device for device in telemetry.devices} == {
+        "camera",
+        "right siderostat",
+        "right D/A",
+        "right piezo",
+    }
+
+
+def test_every_tick_reaches_the_console_once(served):
+    served.client.send(Standby())
+    numbers = []
+    served.follow(
+        lambda t: numbers.extend(x.number for x in t.ticks if x.number >= 0) or len(numbers) > 100
+    )
+
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_stop_takes_the_velocity_before_the_loop_even_looks(served):
+    served.client.send(Standby())
+    served.client.send(Acquire())
+    served.ending.set()  # the loop hangs
+    served.stepper.join()
+
+    with pytest.raises(ConnectionError, match="no supervisor answers"):
+        served.client.send(Stop(), timeout_s=0.3)
+
+    assert served.simulation.supervisor.servos["right"]._stopped
+
+
+@pytest.mark.parametrize(
+    ("payload", "complaint"),
+    [
+        (b"", "truncated"),
+        (b"\xff\xff\xff", "not a command"),
+        (msgspec.msgpack.encode({"type": "Explode"}), "Explode"),
+        (msgspec.msgpack.encode({"type": "Stop", "colour": "red"}), "colour"),
+        (msgspec.msgpack.encode({"type": "SetTarget", "az_px": "far", "el_px": 1}), "az_px"),
+        (msgspec.msgpack.encode({"type": "Stop", "version": 99}), "version"),
+    ],
+)
+def test_what_is_no_command_is_refused_with_the_reason(served, payload, complaint):
+    reply = served.raw(b"tag", payload)
+
+    assert not reply.accepted
+    assert complaint in reply.text
+
+
+def test_messages_of_a_wrong_shape_or_size_do_not_disturb_the_service(served):
+    assert served.raw(b"only one part") is None
+    assert served.raw(b"a", b"b", b"c") is None
+    assert served.raw(b"tag", b"x" * 1_000_000) is None
+
+    assert served.client.send(Status()).text == "right OFF"
+
+
+def test_a_nonsense_target_is_refused(served):
+    assert not served.client.send(SetTarget(az_px=float("nan"), el_px=10.0)).accepted
+    assert not served.client.send(SetTarget(az_px=1e9, el_px=10.0)).accepted
+
+
+def test_the_recorders_report_is_shown(served):
+    status = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_written=9)
+
+    assert served.client.send(RecorderReport(status=status)).accepted
+
+    assert served.follow(lambda t: t.recorder is not None).recorder == status
+
+
+def test_sockets_are_in_a_folder_of_the_owner_alone(served):
+    assert stat.S_IMODE(served.folder.stat().st_mode) == 0o700
+
+
+def test_a_folder_open_to_others_is_refused(tmp_path):
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o755)
+    rig = load_rig(default_rig_path(), [f"service.folder={tmp_path / 'open'}"])
+
+    with pytest.raises(ConfigError, match="mode 0700"):
+        make_service_folder(rig)
+
+
+def test_a_folder_too_deep_for_a_socket_is_refused(tmp_path):
+    rig = load_rig(default_rig_path(), [f"service.folder={tmp_path / ('x' * 120)}"])
+
+    with pytest.raises(ConfigError, match="too long"):
+        make_service_folder(rig)
+
+
+def test_two_rigs_of_one_user_have_two_folders():
+    first = load_rig(default_rig_path())
+    second = load_rig(default_rig_path(), ["name=other"])
+
+    assert service_folder(first) != service_folder(second)
+
+
+def test_without_a_supervisor_a_command_says_so_in_time(tmp_path):
+    client = Client(tmp_path)
+    with pytest.raises(ConnectionError, match="fitctl run"):
+        client.send(Status(), timeout_s=0.2)
+    client.close()

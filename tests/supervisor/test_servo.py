@@ -1,0 +1,194 @@
+"""The siderostat's servo: what it commands, and when it calls a fault."""
+
+import numpy as np
+import pytest
+
+from fitctl.clock import VirtualClock
+from fitctl.config import default_rig_path, load_rig
+from fitctl.drivers.interface import DeviceFault, DeviceIdentity, DeviceTimeout, ServoReading
+from fitctl.supervisor.servo import ServoThread, SiderostatServo
+
+
+class Amplifiers:
+    """Ideal motors, 2 ms a period; attributes make them misbehave."""
+
+    def __init__(self, clock):
+        self.clock = clock
+        self.position_rad = np.zeros(2)
+        self.commands = []
+        self.enabled = self.silent = self.stuck = False
+        self.fault = ""
+
+    def open(self):
+        return DeviceIdentity("test", "motors", "", "")
+
+    def enable(self):
+        self.enabled = True
+
+    def disable(self):
+        self.enabled = False
+
+    def reset_fault(self):
+        self.fault = ""
+
+    def exchange(self, velocity_rad_s):
+        self.commands.append(velocity_rad_s.copy())
+        self.clock.sleep_until(self.clock.now_s() + 0.002)
+        if not self.stuck:
+            self.position_rad = self.position_rad + velocity_rad_s * 0.002
+        if self.silent:
+            return None
+        return ServoReading(self.clock.now_s(), self.position_rad, self.enabled, self.fault)
+
+    def close(self):
+        self.enabled = False
+
+
+@pytest.fixture
+def amplifiers():
+    return Amplifiers(VirtualClock())
+
+
+@pytest.fixture
+def servo(amplifiers):
+    rig = load_rig(default_rig_path())
+    servo = SiderostatServo("right", rig.loops["right"], amplifiers, amplifiers.clock, 0.02)
+    servo.open()
+    return servo
+
+
+def run(servo, periods):
+    for _ in range(periods):
+        servo.period()
+
+
+def test_enabling_moves_nothing(servo, amplifiers):
+    amplifiers.position_rad = np.array([3.0, -2.0])
+    run(servo, 50)
+    servo.hold()
+    run(servo, 50)
+
+    assert np.all(np.array(amplifiers.commands) == 0)
+
+
+def test_a_set_point_is_reached_and_held(servo, amplifiers):
+    servo.hold()
+    servo.move_to(np.array([0.5, -0.25]))
+    run(servo, 100)
+
+    assert amplifiers.position_rad == pytest.approx([0.5, -0.25], abs=1e-3)
+
+
+def test_velocity_and_acceleration_stay_within_the_rigs_limits(servo, amplifiers):
+    servo.hold()
+    for step in range(100):
+        servo.move_to(np.array([step * 1.0, 0.0]))
+        run(servo, 10)
+
+    commands = np.array(amplifiers.commands)
+    assert np.abs(commands).max() <= 60.0
+    assert np.abs(np.diff(commands, axis=0)).max() <= 6000.0 * 0.002 + 1e-9
+
+
+def test_stop_means_velocity_zero_in_the_very_next_period(servo, amplifiers):
+    servo.hold()
+    servo.move_to(np.array([1.0, 1.0]))
+    run(servo, 5)
+    assert np.any(amplifiers.commands[-1] != 0)
+
+    servo.stop()
+    servo.period()
+
+    assert np.all(amplifiers.commands[-1] == 0)
+
+
+def test_a_set_point_after_a_stop_does_nothing_until_hold(servo, amplifiers):
+    servo.hold()
+    servo.stop()
+    servo.move_to(np.array([1.0, 1.0]))
+    run(servo, 20)
+
+    assert np.all(np.array(amplifiers.commands[1:]) == 0)
+
+
+def test_a_missing_reading_is_bridged_and_many_are_a_fault(servo, amplifiers):
+    servo.hold()
+    amplifiers.silent = True
+    run(servo, 10)
+    assert servo.fault is None
+
+    run(servo, 200)
+
+    assert isinstance(servo.fault, DeviceTimeout)
+    assert servo.take_timing().missed_readings > 100
+
+
+def test_an_amplifier_fault_is_named(servo, amplifiers):
+    amplifiers.fault = "azimuth: over-current (2310h)"
+    servo.period()
+
+    assert isinstance(servo.fault, DeviceFault)
+    assert "over-current" in str(servo.fault)
+
+
+def test_an_axis_that_disables_itself_is_a_fault(servo, amplifiers):
+    amplifiers.enabled = False
+    servo.period()
+
+    assert "disabled itself" in str(servo.fault)
+
+
+def test_a_stuck_axis_shows_as_following_error(servo, amplifiers):
+    servo.hold()
+    amplifiers.stuck = True
+    servo.move_to(np.array([3.0, 0.0]))
+    run(servo, 60)
+
+    assert "following error" in str(servo.fault)
+
+
+def test_after_a_fault_nothing_is_commanded_until_opened_again(servo, amplifiers):
+    amplifiers.fault = "x"
+    servo.period()
+    count = len(amplifiers.commands)
+    run(servo, 10)
+    assert len(amplifiers.commands) == count
+
+    servo.open()
+    servo.period()
+
+    assert servo.fault is None
+    assert len(amplifiers.commands) > count
+
+
+def test_position_at_a_past_time_is_interpolated(servo, amplifiers):
+    servo.hold()
+    servo.move_to(np.array([0.5, 0.0]))
+    run(servo, 12)
+    times = [t for t, _ in servo._history]
+    middle_s = (times[-3] + times[-2]) / 2
+
+    position = servo.position_at(middle_s)
+
+    assert position[0] == pytest.approx((servo._history[-3][1][0] + servo._history[-2][1][0]) / 2)
+
+
+def test_the_thread_keeps_its_rate_and_ends(amplifiers):
+    from fitctl.clock import MonotonicClock
+
+    rig = load_rig(default_rig_path())
+    clock = MonotonicClock()
+    amplifiers.clock = VirtualClock()
+    servo = SiderostatServo("right", rig.loops["right"], amplifiers, clock, 0.02)
+    thread = ServoThread(servo, clock)
+    thread.start()
+    servo.open()
+    begun_s = clock.now_s()
+    clock.sleep_until(begun_s + 0.5)
+    periods = len(servo.take_timing().late_s)
+    gone_s = clock.now_s() - begun_s
+    servo.close()
+    thread.stop()
+
+    # A missed deadline is skipped, so there may be fewer periods than time for them, never more.
+    assert 0.3 * gone_s / 0.002 < periods <= gone_s / 0.002 + 20

@@ -1,0 +1,136 @@
+"""The commands as a stranger meets them: help, results on standard output, one line for what is wrong."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from fitctl.cli import app, main
+
+
+def fitctl(*arguments, timeout_s=60):
+    return subprocess.run(
+        [sys.executable, "-m", "fitctl", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=timeout_s,
+        check=False,
+    )
+
+
+def commands():
+    return [command.name or command.callback.__name__ for command in app.registered_commands]
+
+
+@pytest.mark.parametrize("command", commands())
+def test_every_command_has_a_help_text(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert "Usage" in text
+    assert len(text.splitlines()) > 5
+
+
+def test_help_does_not_import_what_is_slow():
+    slow = ("numpy", "scipy", "control", "textual", "zmq", "can")
+    probe = f"import sys, fitctl.cli; print([m for m in {slow} if m in sys.modules])"
+    result = subprocess.run(
+        [sys.executable, "-c", probe], capture_output=True, text=True, check=True
+    )
+
+    assert result.stdout.strip() == "[]"
+
+
+BAD_INPUT = {
+    "an unknown key": (["check", "--set", "camera.frame_rate=3"], "camera.frame_rate: unknown key"),
+    "a value out of range": (["check", "--set", "camera.frame_rate_hz=-3"], "camera.frame_rate_hz"),
+    "a value of a wrong type": (["check", "--set", "camera.width_px=wide"], "camera.width_px"),
+    "a missing rig file": (["check", "--rig", "no-such.toml"], "no-such.toml: no such rig file"),
+    "a --set without a value": (["check", "--set", "camera.width_px"], "expected key.path=value"),
+    "a log that is not there": (["log", "no-such.mcap"], "no-such.mcap"),
+    "a command that is none": (["send", "explode"], "explode is no command"),
+    "a negative duration": (["simulate", "--duration", "-3"], "duration"),
+    "a negative seed": (["simulate", "--seed", "-1"], "seed"),
+    "an option that is none": (["demo", "--fast"], "--fast"),
+    "a command that is not there": (["point"], "point"),
+    "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
+}
+
+
+@pytest.mark.parametrize("what", BAD_INPUT)
+def test_bad_input_gets_a_clear_line_and_status_2(what):
+    arguments, complaint = BAD_INPUT[what]
+    result = fitctl(*arguments)
+
+    assert result.returncode == 2
+    assert complaint in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert result.stdout == ""
+
+
+def test_a_rig_file_that_is_not_toml_or_not_text_gets_a_clear_line(tmp_path):
+    for content in (b"[camera\nwidth", b"\xff\xfe\x00"):
+        path = tmp_path / "bad.toml"
+        path.write_bytes(content)
+        result = fitctl("check", "--rig", path)
+
+        assert result.returncode == 2
+        assert str(path) in result.stderr
+        assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_simulate_prints_one_json_object_on_its_last_line():
+    result = fitctl("simulate", "--duration", 25, "--seed", 4, "--json")
+
+    summary = json.loads(result.stdout.splitlines()[-1])
+    assert result.returncode == 0
+    assert summary.keys() >= {"rms_px", "measured_rms_px", "mode_times", "speed_x"}
+    assert sum(summary["mode_times"].values()) == pytest.approx(25, abs=0.1)
+
+
+def test_simulate_that_finds_no_star_says_so_by_its_status_and_null():
+    result = fitctl(
+        "simulate", "--duration", 12, "--json", "--set", "loops.right.star_flux_dn=500000.0"
+    )
+
+    assert result.returncode == 1
+    assert json.loads(result.stdout.splitlines()[-1])["vernier_s"] is None
+
+
+def test_console_and_send_without_a_supervisor_say_how_to_start_one(tmp_path):
+    result = fitctl("send", "status", "--set", f"service.folder={tmp_path}")
+
+    assert result.returncode == 1
+    assert "fitctl run" in result.stderr
+
+
+def test_mocks_on_a_taken_port_say_so():
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        result = fitctl(
+            "mocks",
+            *(
+                part
+                for key in (
+                    "gvcp_port",
+                    "bench_port",
+                    "loops.right.slcan_port",
+                    "loops.right.mdt693_port",
+                )
+                for part in ("--set", f"mocks.{key}=0")
+            ),
+            "--set",
+            f"mocks.loops.right.modbus_port={port}",
+        )
+
+    assert result.returncode == 2
+    assert "port is taken" in result.stderr
+    assert "Traceback" not in result.stderr

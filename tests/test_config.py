@@ -1,0 +1,288 @@
+import copy
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_document
+
+RIGS = sorted((Path(__file__).parent.parent / "rigs").glob("*.toml"))
+DOCUMENT = tomllib.loads(default_rig_path().read_text(encoding="utf-8"))
+OPTIONAL = {"plant", "mocks"}  # a rig of real hardware leaves them out
+
+
+def keys_of(table, path=()):
+    """Every key of a rig file, as paths; names that a rig chooses itself are left out."""
+    items = enumerate(table) if isinstance(table, list) else table.items()
+    for key, value in items:
+        here = (*path, key)
+        chosen = isinstance(key, int) or (path and path[-1] == "loops")
+        if not chosen and key not in OPTIONAL:
+            yield here
+        if isinstance(value, dict) or (isinstance(value, list) and isinstance(value[0], dict)):
+            yield from keys_of(value, here)
+
+
+def value_at(document, path):
+    for key in path:
+        document = document[key]
+    return document
+
+
+def changed(path, value):
+    document = copy.deepcopy(DOCUMENT)
+    value_at(document, path[:-1])[path[-1]] = value
+    return document
+
+
+def dotted(path):
+    return ".".join(map(str, path))
+
+
+def complaint(document):
+    with pytest.raises(ConfigError) as caught:
+        rig_from_document(document, "my.toml")
+    assert caught.value.__cause__ is None  # people see lines, not a chain of tracebacks
+    return str(caught.value)
+
+
+KEYS = list(keys_of(DOCUMENT))
+FLOATS = [path for path in KEYS if isinstance(value_at(DOCUMENT, path), float)]
+NUMBERS = [path for path in KEYS if type(value_at(DOCUMENT, path)) in {float, int}]
+NUMBERS.remove(("schema_version",))  # a literal 1, and in Python True == 1
+
+
+# ---------------------------------------------------------------- rig files that load
+
+
+@pytest.mark.parametrize("path", RIGS, ids=lambda path: path.stem)
+def test_every_rig_file_loads_and_is_named_after_its_file(path):
+    assert load_rig(path).name == path.stem
+
+
+def test_the_default_rig_is_shipped(rig):
+    assert default_rig_path() in RIGS
+    assert rig.name == "fit-mock"
+
+
+def test_a_rig_of_real_hardware_needs_neither_plant_nor_mocks(rig):
+    document = {key: value for key, value in DOCUMENT.items() if key not in OPTIONAL}
+    real = rig_from_document(document, "real.toml")
+    with pytest.raises(ConfigError, match=r"fit-mock: sections plant and mocks are missing"):
+        real.mock_parts()
+    assert rig.mock_parts() == (rig.plant, rig.mocks)
+
+
+def test_a_loaded_rig_cannot_be_changed(rig):
+    with pytest.raises(ValidationError, match="frozen"):
+        rig.camera.frame_rate_hz = 100.0
+
+
+def test_the_period_follows_from_the_rate(rig):
+    assert rig.camera.period_s == pytest.approx(0.02)
+
+
+# ---------------------------------------------------------------- rig files that do not
+
+
+@pytest.mark.parametrize("path", KEYS, ids=dotted)
+def test_every_key_is_required(path):
+    document = copy.deepcopy(DOCUMENT)
+    del value_at(document, path[:-1])[path[-1]]
+    assert f"my.toml: {dotted(path)}: is missing; rigs/fit-mock.toml shows" in complaint(document)
+
+
+@pytest.mark.parametrize("path", FLOATS, ids=dotted)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "much"])
+def test_every_number_must_be_one(path, value):
+    assert complaint(changed(path, value)).startswith(f"my.toml: {dotted(path)}: must be ")
+
+
+@pytest.mark.parametrize("path", NUMBERS, ids=dotted)
+def test_a_number_in_quotes_or_a_truth_value_is_not_a_number(path):
+    for value in (str(value_at(DOCUMENT, path)), True):
+        assert f"my.toml: {dotted(path)}: " in complaint(changed(path, value))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "line"),
+    [
+        ("camera.frame_rate_hz", 0.5, "must be greater than or equal to 1 (is 0.5)"),
+        ("camera.pixel_noise_dn", 0.0, "must be greater than 0 (is 0.0)"),
+        ("camera.device.gvcp_port", 70000, "must be less than or equal to 65535 (is 70000)"),
+        ("camera.device.driver", "usb", "must be 'gige' (is 'usb')"),
+        ("logging.compression", "rar", "must be 'zstd', 'lz4' or 'none' (is 'rar')"),
+        ("loops.right.siderostat.device.node_id", 128, "must be less than or equal to 127"),
+        ("loops.right.fsm.dac.bits", 24, "must be less than or equal to 16 (is 24)"),
+        ("loops.right.acquisition.found_frames", 0, "must be greater than or equal to 1 (is 0)"),
+        ("loops.right.acquisition.found_frames", 2.5, "must be a valid integer"),
+        ("plant.loops.right.structure.mode_hz", [330.0], "should have at least 2 items"),
+        ("plant.loops.right.hysteresis.breakpoints_v", [0.0, 2.0, 1.0], "must start at 0 and ascend"),
+        ("plant.loops.right.hysteresis.breakpoints_v", [0.1, 2.0], "must start at 0 and ascend"),
+        ("schema_version", 2, "must be 1 (is 2)"),
+        ("name", "no spaces", "pattern"),
+    ],
+)  # fmt: skip
+def test_a_value_out_of_range_is_named_with_what_is_allowed(key, value, line):
+    text = complaint(changed(tuple(key.split(".")), value))
+    assert "\n" not in text
+    assert text.startswith("my.toml: ")
+    assert key.removesuffix(".breakpoints_v") in text
+    assert line in text
+
+
+def test_what_belongs_together_must_agree():
+    assert "exposure_s must not pass the frame period, 0.02 s" in complaint(
+        changed(("camera", "exposure_s"), 0.03)
+    )
+    assert "low must be below high" in complaint(
+        changed(("loops", "right", "flux_range", "low"), 2.0)
+    )
+    assert "the D/A gives 0 to 10 V; lower range_rad" in complaint(
+        changed(("loops", "right", "fsm", "range_rad"), 1.9e-4)
+    )
+    assert "loops.right.target_px lies outside the camera's 40x40 px" in complaint(
+        changed(("loops", "right", "target_px", "az"), 40.0)
+    )
+
+
+@pytest.mark.parametrize("section", ["plant", "mocks"])
+def test_plant_and_mocks_name_the_same_loops(section):
+    document = copy.deepcopy(DOCUMENT)
+    document[section]["loops"]["left"] = document[section]["loops"].pop("right")
+    text = complaint(document)
+    assert f"{section}.loops must name the same loops as loops: right" in text
+
+
+@pytest.mark.parametrize("section", ["loops", "plant", "mocks"])
+def test_there_must_be_a_loop(section):
+    path = (section,) if section == "loops" else (section, "loops")
+    assert "at least 1 item" in complaint(changed(path, {}))
+
+
+@pytest.mark.parametrize(
+    ("key", "hint"),
+    [
+        ("camera.frame_rate", "frame_rate_hz"),
+        ("loops.right.coarse.gain_rad_m", "gain_rad_per_m"),
+        ("loops.right.siderostat.device.chanel", "channel"),
+        ("plant.loops.right.hysteresis.loop_width", "loop_width_fraction"),
+        ("supervisr", "supervisor"),
+    ],
+)
+def test_an_unknown_key_is_named_with_the_likely_one(key, hint):
+    text = complaint(changed(tuple(key.split(".")), 1.0))
+    assert f"my.toml: {key}: unknown key; did you mean {hint}? (allowed here: " in text
+
+
+def test_an_unknown_key_in_a_list_of_tables_is_named_too():
+    text = complaint(changed(("plant", "loops", "right", "spots", 1, "flux"), 1.0))
+    assert "plant.loops.right.spots.1.flux: unknown key; did you mean flux_dn?" in text
+
+
+def test_an_unknown_key_like_no_other_has_no_hint():
+    text = complaint(changed(("optics", "zzz"), 1.0))
+    assert "optics.zzz: unknown key (allowed here: compressor_ratio, focal_length_m)" in text
+
+
+def test_everything_that_is_wrong_is_told_at_once():
+    document = changed(("camera", "width_px"), 1)
+    del document["optics"]["focal_length_m"]
+    document["logging"]["colour"] = "red"
+    lines = complaint(document).splitlines()
+    assert sorted(line.split(": ")[1] for line in lines) == [
+        "camera.width_px",
+        "logging.colour",
+        "optics.focal_length_m",
+    ]
+    assert all(line.startswith("my.toml: ") for line in lines)
+
+
+def complaint_or_nothing(document):
+    try:
+        rig_from_document(document, "my.toml")
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+@given(path=st.sampled_from(KEYS), value=st.none() | st.text(max_size=5) | st.lists(st.integers()))
+def test_no_value_whatever_ends_in_another_error(path, value):
+    lines = complaint_or_nothing(changed(path, value)).splitlines()
+    assert all(line.startswith("my.toml: ") for line in lines)
+
+
+# ---------------------------------------------------------------- files that are not rig files
+
+
+def test_no_such_file(tmp_path):
+    path = tmp_path / "gone.toml"
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+    expected = f"{path}: no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+    assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[camera\n", r"not TOML: .*\(at line 1, column 8\)"),
+        (b"name = 'a'\nname = 'b'\n", r"not TOML: .*line 2"),
+        (b"\xff\xfe\x00", "cannot be read: 'utf-8' codec"),
+        (b"", "schema_version: is missing"),
+    ],
+)
+def test_a_file_that_is_not_a_rig(tmp_path, content, said):
+    path = tmp_path / "odd.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"odd\.toml: {said}"):
+        load_rig(path)
+
+
+def test_a_folder_is_not_a_rig(tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot be read: .*Is a directory"):
+        load_rig(tmp_path)
+
+
+# ---------------------------------------------------------------- --set
+
+
+def test_overrides_replace_values_in_order():
+    rig = load_rig(
+        default_rig_path(),
+        [
+            "camera.frame_rate_hz=25",
+            "camera.frame_rate_hz = 40.0",
+            "logging.compression=lz4",
+            "loops.right.fsm.dac.host='10.0.0.9'",
+            "loops.right.target_px={ az = 20.0, el = 20.0 }",
+            "mocks.gvcp_port=0",
+        ],
+    )
+    assert rig.camera.frame_rate_hz == 40.0
+    assert rig.logging.compression == "lz4"
+    assert rig.loops["right"].fsm.dac.host == "10.0.0.9"
+    assert rig.loops["right"].target_px.az == 20.0
+    assert rig.mocks.gvcp_port == 0
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("camera.frame_rate_hz", r"--set camera\.frame_rate_hz: expected key\.path=value"),
+        ("=50", "expected key.path=value"),
+        ("camera..x=1", "expected key.path=value"),
+        ("camera.width_px.more=1", r"camera\.width_px is not a table"),
+        ("plant.loops.right.spots.0.flux_dn=1.0", r"plant\.loops\.right\.spots is not a table"),
+        ("camera.frame_rate=50", r"camera\.frame_rate: unknown key; did you mean frame_rate_hz\?"),
+        ("camera.frame_rate_hz=fast", r"camera\.frame_rate_hz: must be a valid number \(is 'fast'"),
+        ("camera.frame_rate_hz=0", r"camera\.frame_rate_hz: must be greater than or equal to 1"),
+    ],
+)
+def test_an_override_that_cannot_be_is_refused(override, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_rig(default_rig_path(), [override])
+    assert "\n" not in str(caught.value)
