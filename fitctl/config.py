@@ -86,8 +86,8 @@ class GigeDevice(Settings):
 class Camera(Settings):
     """The focal plane and the camera that reads it."""
 
-    width_px: Annotated[int, Field(ge=8, le=4096)]
-    height_px: Annotated[int, Field(ge=8, le=4096)]
+    width_px: Annotated[int, Field(ge=16, le=4096)]  # below, the search's field would vanish
+    height_px: Annotated[int, Field(ge=16, le=4096)]
     pixel_size_m: Annotated[float, Field(ge=1e-6, le=1e-3)]
     frame_rate_hz: Annotated[float, Field(ge=1, le=2000)]
     exposure_s: Positive

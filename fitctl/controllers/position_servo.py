@@ -35,6 +35,8 @@ class PositionServo:
         Of the motor.
     period_s, setpoint_period_s : float
         The servo's own, and the time between set-points.
+    resolution_rad : float
+        One encoder count. A smaller error is left alone: acting on it would hunt between two counts.
     """
 
     def __init__(
@@ -44,11 +46,13 @@ class PositionServo:
         acceleration_limit_rad_s2: float,
         period_s: float,
         setpoint_period_s: float,
+        resolution_rad: float = 0.0,
     ) -> None:
         self._gain_per_s = gain_per_s
         self._velocity_limit = velocity_limit_rad_s
         self._velocity_step = acceleration_limit_rad_s2 * period_s
         self._period_s = period_s
+        self._resolution_rad = resolution_rad
         self._periods_per_setpoint = max(1, round(setpoint_period_s / period_s))
         self.reset(np.zeros(2))
 
@@ -85,9 +89,10 @@ class PositionServo:
             axis.reference_rad = axis.target_rad
         else:
             axis.reference_rad += axis.step_rad
-        wanted = _limited(
-            self._gain_per_s * (axis.reference_rad - position_rad), self._velocity_limit
-        )
+        error_rad = axis.reference_rad - position_rad
+        if abs(error_rad) < self._resolution_rad:
+            error_rad = 0.0
+        wanted = _limited(self._gain_per_s * error_rad, self._velocity_limit)
         axis.velocity_rad_s += _limited(wanted - axis.velocity_rad_s, self._velocity_step)
         return axis.velocity_rad_s
 

@@ -7,6 +7,7 @@ only uses the driver; the other threads leave wishes (a set-point, a stop, a req
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -31,6 +32,7 @@ from fitctl.supervisor.realtime import become_realtime
 Floats = NDArray[np.float64]
 _HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
+_BLIND_MISSES = 2
 
 
 class ServoTiming(NamedTuple):
@@ -81,6 +83,7 @@ class SiderostatServo:
             siderostat.acceleration_limit_rad_s2,
             self.period_s,
             setpoint_period_s,
+            2 * math.pi / siderostat.encoder_counts_per_rev,
         )
         self._stopped = True
         self._wish_rad: Floats | None = None
@@ -88,6 +91,7 @@ class SiderostatServo:
         self._history: deque[tuple[float, Floats]] = deque(maxlen=round(_HISTORY_S / self.period_s))
         self._last_reading_s = 0.0
         self._missed_readings = 0
+        self._misses_in_a_row = 0
         self.late_s: deque[float] = deque(maxlen=4096)
 
     # ------------------------------------------------------------ from any thread
@@ -161,11 +165,14 @@ class SiderostatServo:
         else:
             if wish is not None:
                 self._servo.move_to(wish)
-            velocity_rad_s = self._servo.step(self.position_rad)
+            # Blind motors stand still, and the reference waits for them.
+            blind = self._misses_in_a_row >= _BLIND_MISSES
+            velocity_rad_s = np.zeros(2) if blind else self._servo.step(self.position_rad)
         reading = self._amplifiers.exchange(velocity_rad_s)
         now_s = self._clock.now_s()
         if reading is None:
             self._missed_readings += 1
+            self._misses_in_a_row += 1
             if now_s - self._last_reading_s > self._settings.reading_timeout_s:
                 raise DeviceTimeout(
                     self._device,
@@ -176,6 +183,7 @@ class SiderostatServo:
                 )
             return
         self._last_reading_s = now_s
+        self._misses_in_a_row = 0
         self.position_rad = reading.position_rad
         self._history.append((reading.time_s, reading.position_rad))
         if reading.fault:

@@ -26,6 +26,11 @@ def walk_px(rig, plan):
     return np.array(walk)
 
 
+def frames_in_a_row(walk_px, star_px, radius_px):
+    inside = np.linalg.norm(walk_px - star_px, axis=1) <= radius_px
+    return max((sum(run) for seen, run in itertools.groupby(inside.tolist()) if seen), default=0)
+
+
 @given(part=st.floats(0, 1), angle=st.floats(0, 2 * math.pi))
 def test_every_star_in_the_search_radius_is_in_the_field_on_enough_frames(
     rig, plan, walk_px, part, angle
@@ -34,9 +39,10 @@ def test_every_star_in_the_search_radius_is_in_the_field_on_enough_frames(
     arcsec_per_px = scales(rig, rig.loops["right"]).sky_arcsec_per_px
     radius_px = acquisition.search_radius_sky_arcsec / arcsec_per_px * math.sqrt(part)
     star_px = radius_px * np.array([math.cos(angle), math.sin(angle)])
-    seen = np.linalg.norm(walk_px - star_px, axis=1) <= plan.field_radius_px
-    in_a_row = max(sum(run) for visible, run in itertools.groupby(seen.tolist()) if visible)
-    assert in_a_row >= acquisition.found_frames
+    assert frames_in_a_row(walk_px, star_px, plan.field_radius_px) >= acquisition.found_frames
+    # With the overlap taken off the field there is still a look to spare.
+    reach_px = plan.field_radius_px * (1 - acquisition.field_overlap)
+    assert frames_in_a_row(walk_px, star_px, reach_px) > acquisition.found_frames
 
 
 def test_the_rim_of_the_search_is_seen_all_the_way_round(rig, plan, walk_px):
@@ -44,15 +50,19 @@ def test_the_rim_of_the_search_is_seen_all_the_way_round(rig, plan, walk_px):
     rim_px = plan.radius_px - plan.pitch_px / 2
     for angle in np.linspace(0, 2 * math.pi, 320):
         star_px = rim_px * np.array([math.cos(angle), math.sin(angle)])
-        seen = np.linalg.norm(walk_px - star_px, axis=1) <= plan.field_radius_px
-        assert seen.sum() >= rig.loops["right"].acquisition.found_frames
+        seen = frames_in_a_row(walk_px, star_px, plan.field_radius_px)
+        assert seen >= rig.loops["right"].acquisition.found_frames
 
 
-def test_the_walk_keeps_its_speed_and_acceleration(rig, plan, walk_px):
-    velocity_px_s = np.diff(walk_px, axis=0) / rig.camera.period_s
-    acceleration_px_s2 = np.diff(velocity_px_s, axis=0) / rig.camera.period_s
+def test_the_walk_keeps_its_speed_and_acceleration(rig, plan):
+    spiral = Spiral(plan)
+    period_s = 1 / rig.loops["right"].siderostat.servo.rate_hz
+    walk_px = np.array([spiral.advance(period_s) for _ in range(2000)])
+    velocity_px_s = np.diff(walk_px, axis=0) / period_s
+    acceleration_px_s2 = np.diff(velocity_px_s, axis=0) / period_s
     assert np.linalg.norm(velocity_px_s, axis=1).max() <= plan.speed_px_s * 1.001
-    assert np.linalg.norm(acceleration_px_s2, axis=1).max() <= plan.acceleration_px_s2
+    # The plan bounds the turning; gathering speed adds a few per cent.
+    assert np.linalg.norm(acceleration_px_s2, axis=1).max() <= plan.acceleration_px_s2 * 1.05
 
 
 def test_most_of_the_walk_is_at_full_speed(rig, plan, walk_px):
