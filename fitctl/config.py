@@ -382,13 +382,11 @@ class Rig(Settings):
     @model_validator(mode="after")
     def _names_agree(self) -> Rig:
         for name, loop in self.loops.items():
-            if not (
-                0 <= loop.target_px.az < self.camera.width_px
-                and 0 <= loop.target_px.el < self.camera.height_px
-            ):
+            most_az, most_el = self.camera.width_px - 4, self.camera.height_px - 4
+            if not (3 <= loop.target_px.az <= most_az and 3 <= loop.target_px.el <= most_el):
                 msg = (
-                    f"loops.{name}.target_px lies outside the camera's "
-                    f"{self.camera.width_px}x{self.camera.height_px} px"
+                    f"loops.{name}.target_px must lie in 3..{most_az} px az and 3..{most_el} px el, "
+                    "so that the 7x7 window fits on the frame"
                 )
                 raise ValueError(msg)
         for section, part in (("plant", self.plant), ("mocks", self.mocks)):
@@ -483,7 +481,7 @@ def _override(document: dict[str, Any], text: str) -> None:
 
 def _explain(origin: str, problem: Any) -> str:
     location = [str(part) for part in problem["loc"]]
-    key = ".".join(location) or "the whole file"
+    key = ".".join(location)
     if problem["type"] == "extra_forbidden":
         allowed = _allowed_keys(location[:-1])
         near = difflib.get_close_matches(location[-1], allowed, 1)
@@ -494,7 +492,9 @@ def _explain(origin: str, problem: Any) -> str:
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     given = problem.get("input")
     shown = f" (is {given!r})" if isinstance(given, str | int | float | list) else ""
-    return f"{origin}: {key}: {message}{shown}"
+    # What concerns the whole file names its key itself.
+    where = f"{origin}: {key}" if key else origin
+    return f"{where}: {message}{shown}"
 
 
 def _allowed_keys(location: Sequence[str]) -> list[str]:

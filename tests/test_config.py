@@ -145,7 +145,7 @@ def test_what_belongs_together_must_agree():
     assert "the D/A gives 0 to 10 V; lower range_rad" in complaint(
         changed(("loops", "right", "fsm", "range_rad"), 1.9e-4)
     )
-    assert "loops.right.target_px lies outside the camera's 40x40 px" in complaint(
+    assert "loops.right.target_px must lie in 3..36 px az" in complaint(
         changed(("loops", "right", "target_px", "az"), 40.0)
     )
 

@@ -132,21 +132,26 @@ class StellarLoop:
     def tick(self, frame: Frame | None, frames_lost: int) -> Tick:
         """One tick, with the newest frame or without one."""
         started_s = self._clock.now_s()
-        star = self._sense(frame) if frame is not None else None
-        self._judge(frame, star)
+        # Where the motors were when the frame was exposed: what it shows belongs to that.
+        motor_rad = (
+            self.servo.position_rad
+            if frame is None
+            else self.servo.position_at(frame.mid_exposure_s)
+        )
+        star = self._sense(frame, motor_rad) if frame is not None else None
+        self._judge(frame, star, motor_rad)
         if (
             frame is not None or self.mode not in TRACKING
         ):  # no frame: the stages wait where they are
             self._laws[self.mode](star)
         self._write()
         done_s = self._clock.now_s()
-        return self._tick_record(frame, star, started_s, done_s, frames_lost)
+        return self._tick_record(frame, star, motor_rad, started_s, done_s, frames_lost)
 
-    def _sense(self, frame: Frame) -> Star | None:
+    def _sense(self, frame: Frame, motor_rad: Floats) -> Star | None:
+        mirror_rad = self._mirror_at(frame.mid_exposure_s)
         if self.mode in {Mode.COARSE, Mode.VERNIER} and self._findings.lost == 0:
-            predicted = self._estimator.predict_px(
-                self.servo.position_at(frame.mid_exposure_s), self._mirror_at(frame.mid_exposure_s)
-            )
+            predicted = self._estimator.predict_px(motor_rad, mirror_rad)
             star = self._sensor.measure(frame.image, *predicted)
             # The estimate may be half a window off after a jump; then the whole frame decides.
             if star is None or self._near_edge(star):
@@ -154,29 +159,25 @@ class StellarLoop:
         else:
             star = self._sensor.find(frame.image)
         if star is not None and self.mode in TRACKING:
-            self._estimator.observe(
-                np.array([star.az_px, star.el_px]),
-                self.servo.position_at(frame.mid_exposure_s),
-                self._mirror_at(frame.mid_exposure_s),
-            )
+            self._estimator.observe(_position(star), motor_rad, mirror_rad)
         return star
 
-    def _judge(self, frame: Frame | None, star: Star | None) -> None:
+    def _judge(self, frame: Frame | None, star: Star | None, motor_rad: Floats) -> None:
         """Interlocks and findings: what leads to another mode."""
         if self.servo.fault is not None:
             self.fire(Trigger.FAULT, str(self.servo.fault))
         elif frame is not None and self.mode is Mode.ACQUISITION:
-            self._judge_search(frame, star)
+            self._judge_search(frame, star, motor_rad)
         elif frame is not None and self.mode in {Mode.COARSE, Mode.VERNIER}:
             self._judge_tracking(star)
 
-    def _judge_search(self, frame: Frame, star: Star | None) -> None:
+    def _judge_search(self, frame: Frame, star: Star | None, motor_rad: Floats) -> None:
         acquisition = self.settings.acquisition
         now_s = frame.mid_exposure_s
         sighting = self._sighting
         if sighting is None:
             if star is not None:
-                self._sighting = Sighting(self.servo.position_at(now_s), now_s)
+                self._sighting = Sighting(motor_rad, now_s)
             elif self._spiral.exhausted:
                 self.fire(
                     Trigger.SEARCH_EXHAUSTED,
@@ -381,17 +382,17 @@ class StellarLoop:
         self,
         frame: Frame | None,
         star: Star | None,
+        motor_rad: Floats,
         started_s: float,
         done_s: float,
         frames_lost: int,
     ) -> Tick:
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
-        position = self.servo.position_rad if frame is None else self.servo.position_at(exposed_s)
         command_px = self._prefilter.value_px
         star_px = _NOWHERE if star is None else _position(star)
         error_px = star_px - command_px
         mirror = self._commands.mirror_rad
-        sky = self._scale.motor_sky_arcsec_per_rad * position
+        sky = self._scale.motor_sky_arcsec_per_rad * motor_rad
         setpoint = self._commands.setpoint_rad
         return Tick(
             time_s=done_s,
@@ -421,8 +422,8 @@ class StellarLoop:
             stack1_v=float(self._commands.stack_v[0]),
             stack2_v=float(self._commands.stack_v[1]),
             stack3_v=float(self._commands.stack_v[2]),
-            siderostat_az_rad=float(position[0]),
-            siderostat_el_rad=float(position[1]),
+            siderostat_az_rad=float(motor_rad[0]),
+            siderostat_el_rad=float(motor_rad[1]),
             siderostat_setpoint_az_rad=float(setpoint[0]),
             siderostat_setpoint_el_rad=float(setpoint[1]),
             siderostat_az_sky_arcsec=float(sky[0]),

@@ -82,3 +82,11 @@ def test_a_reset_forgets_the_motion():
     servo.reset(np.array([7.0, 8.0]))
     assert servo.step(np.array([7.0, 8.0])).tolist() == [0.0, 0.0]
     assert servo.following_error_rad(np.array([7.0, 8.0])) == 0.0
+
+
+def test_an_error_below_one_encoder_count_is_left_alone():
+    servo = PositionServo(
+        GAIN_PER_S, SPEED_RAD_S, ACCELERATION_RAD_S2, PERIOD_S, SETPOINT_PERIOD_S, 0.0016
+    )
+    velocity_rad_s = servo.step(np.array([-0.0015, -0.0017]))
+    assert velocity_rad_s == pytest.approx([0.0, GAIN_PER_S * 0.0017])
