@@ -111,11 +111,17 @@ def run(
 
 
 @app.command()
-def console(rig: RigOption = None, overrides: SetOption = None) -> None:
+def console(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    quitting_ends_instrument: Annotated[
+        bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
+    ] = False,
+) -> None:
     """Attach an operator console to the running supervisor of a rig."""
     from fitctl.commands import run_console
 
-    run_console(_rig(rig, overrides))
+    run_console(_rig(rig, overrides), quitting_ends_instrument=quitting_ends_instrument)
 
 
 @app.command()

@@ -21,7 +21,13 @@ from fitctl.config import ConfigError, Rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import RecorderStatus
-from fitctl.processes import end_with_parent, ended_by_signals
+from fitctl.processes import (
+    ENDING_SIGNALS,
+    end_process,
+    end_with_parent,
+    ended_by_signals,
+    show_process,
+)
 from fitctl.supervisor import messages
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import RECORDS_SOCKET, service_folder
@@ -29,6 +35,7 @@ from fitctl.supervisor.messages import Telemetry
 
 FAILED = 1
 _REPORT_TIMEOUT_S = 0.5
+_CONSOLE_END_S = 3.0
 
 COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
     "standby": messages.Standby,
@@ -76,7 +83,7 @@ def run_demo(
         try:
             with demos.instrument(rig_path, overrides, seed) as running:
                 if console:
-                    return _demo_with_console(running)
+                    return _demo_with_console(rig_path, running)
                 return _demo_headless(rig, running, duration_s, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
             typer.echo(f"demo: {error}", err=True)
@@ -87,11 +94,23 @@ def _interrupt() -> None:
     raise KeyboardInterrupt
 
 
-def _demo_with_console(running: demos.Instrument) -> int:
-    from fitctl.tui.app import ConsoleApp
-
+def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
     thread = demos.acquire_in_background(running)
-    ConsoleApp(Client(running.folder), quit_shuts_down=True).run()
+    # A process of its own: when its terminal goes away it may hang, and must not hang us with it.
+    console = show_process(
+        [
+            "console",
+            "--rig",
+            str(rig_path),
+            "--set",
+            f"service.folder={running.folder}",
+            "--quitting-ends-instrument",
+        ]
+    )
+    try:
+        console.wait()
+    finally:
+        end_process(console, _CONSOLE_END_S)
     thread.join(timeout=5.0)
     newest = demos.newest_telemetry(running.folder)
     if newest is not None and newest.recorder is not None:
@@ -179,7 +198,7 @@ async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
 
     ending = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING_SIGNALS:
         loop.add_signal_handler(number, ending.set)
     testbed = Testbed(rig, seed)
     try:
@@ -243,11 +262,13 @@ def run_recorder(rig: Rig) -> None:
 # ---------------------------------------------------------------- a running instrument
 
 
-def run_console(rig: Rig) -> None:
+def run_console(rig: Rig, *, quitting_ends_instrument: bool) -> None:
     """Attach a console."""
     from fitctl.tui.app import ConsoleApp
 
-    ConsoleApp(Client(service_folder(rig))).run()
+    app = ConsoleApp(Client(service_folder(rig)), quit_shuts_down=quitting_ends_instrument)
+    signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
+    app.run()
 
 
 def send_command(rig: Rig, name: str, loop: str) -> int:

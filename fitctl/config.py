@@ -352,6 +352,7 @@ class LoopMocks(Settings):
     slcan_port: Port
     modbus_port: Port
     mdt693_port: Port
+    drive_command_timeout_s: Positive
     dac: DacMock
     mdt693: Mdt693Mock
 

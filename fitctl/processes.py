@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO
 
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PARENT_CHECK_S = 0.25
 
 
@@ -24,6 +25,11 @@ def start_process(
         stdout=stdout if stdout is not None else subprocess.DEVNULL,
         start_new_session=True,
     )
+
+
+def show_process(arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start ``fitctl ARGUMENTS`` on our own terminal."""
+    return subprocess.Popen([sys.executable, "-m", "fitctl", *arguments])
 
 
 def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:
@@ -41,12 +47,12 @@ def end_process(process: subprocess.Popen[bytes], timeout_s: float) -> None:
 
 @contextmanager
 def ended_by_signals(end: Callable[[], None]) -> Iterator[None]:
-    """Call `end` at SIGINT and SIGTERM, instead of what they do by themselves."""
+    """Call `end` at SIGINT, SIGTERM and SIGHUP, instead of what they do by themselves."""
 
     def handler(_signal: int, _frame: object) -> None:
         end()
 
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handler) for number in ENDING_SIGNALS}
     try:
         yield
     finally:

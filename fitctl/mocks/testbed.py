@@ -36,17 +36,26 @@ class LivePlant:
         One run only.
     started_s : float
         Host's monotonic time of the plant's zero.
+    command_timeout_s : float
+        Motors stop when no velocity command came for this long, as a drive in cyclic velocity mode
+        does without its cycle. It also keeps a motor from running on while this process stands still.
     """
 
-    def __init__(self, plant: Plant, started_s: float) -> None:
+    def __init__(self, plant: Plant, started_s: float, command_timeout_s: float) -> None:
         self.plant = plant
         self.started_s = started_s
         self._velocity_rad_s = np.zeros(2)
         self._enabled = np.zeros(2, dtype=bool)
+        self._command_timeout_s = command_timeout_s
+        self._command_ends_s = 0.0
 
     def advance(self) -> None:
-        """Bring the plant to now."""
-        self.plant.advance(time.monotonic() - self.started_s)
+        """Bring the plant to now; motors stop where their last velocity command had run out."""
+        now_s = time.monotonic() - self.started_s
+        if now_s > self._command_ends_s and np.any(self.plant.inputs.velocity_rad_s):
+            self.plant.advance(self._command_ends_s)
+            self.plant.inputs.velocity_rad_s[:] = 0.0
+        self.plant.advance(now_s)
 
     def spots_px(self, host_s: float) -> NDArray[np.float64]:
         """All spots at a recent host time, shape (spots, 2)."""
@@ -64,7 +73,7 @@ class LivePlant:
         return float(az), float(el)
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
-        """Motor velocities from now on, as far as the axes are enabled."""
+        """Motor velocities, as far as the axes are enabled; good for the command time-out."""
         self._velocity_rad_s[:] = az, el
         self._apply()
 
@@ -75,6 +84,7 @@ class LivePlant:
 
     def _apply(self) -> None:
         self.advance()
+        self._command_ends_s = time.monotonic() - self.started_s + self._command_timeout_s
         self.plant.inputs.velocity_rad_s[0] = np.where(self._enabled, self._velocity_rad_s, 0.0)
 
 
@@ -112,7 +122,11 @@ class Testbed:
         started_s = time.monotonic()
         self._plants = {
             # As in the simulation: each loop's plant has a seed of its own from the run's.
-            name: LivePlant(Plant(rig, name, [seed + 1000 * index]), started_s)
+            name: LivePlant(
+                Plant(rig, name, [seed + 1000 * index]),
+                started_s,
+                mocks.loops[name].drive_command_timeout_s,
+            )
             for index, name in enumerate(rig.loops)
         }
         self._loops = {

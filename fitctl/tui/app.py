@@ -102,6 +102,8 @@ class ConsoleApp(App[None]):
         Binding("e", "events", "Events", show=False),
         Binding("question_mark", "help", "Help", show=False),
         Binding("q", "quit", "Quit", show=False),
+        # What a shell's user expects, also over a dialog.
+        Binding("ctrl+c,ctrl+q", "quit", "Quit", priority=True, show=False),
     ]
 
     def __init__(

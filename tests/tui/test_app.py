@@ -147,6 +147,14 @@ def test_a_stop_just_before_quitting_is_still_sent():
     assert link.closed
 
 
+def test_ctrl_c_quits_even_over_a_dialog():
+    async def scenario(app, pilot, link):
+        await pilot.press("question_mark", "ctrl+c")
+        await until(pilot, lambda: not app.is_running)
+
+    assert run(scenario).closed
+
+
 def test_a_refused_command_is_told_with_its_reason():
     async def scenario(app, pilot, link):
         await pilot.press("a")

@@ -42,7 +42,7 @@ class Motors(Protocol):
         ...
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
-        """From now on, drive the motors at these velocities."""
+        """Drive the motors at these velocities; said again at every SYNC."""
         ...
 
     def set_enabled(self, axis: int, enabled: bool) -> None:
@@ -85,7 +85,6 @@ class Cia402DriveMock:
         )
         self.heartbeat_ms = 0
         self.consumer = 0
-        self._commanded_rad_s = (0.0, 0.0)
         self._counts = (0, 0)
         self._at_syncs = [(0.0, (0, 0)), (0.0, (0, 0))]
         self._in_error = False
@@ -298,11 +297,9 @@ class Cia402DriveMock:
         )
 
     def _command_motors(self) -> None:
+        # Also when nothing changed: a command holds for one time-out only.
         az, el = self.axes
-        wanted = az.velocity_rad_s, el.velocity_rad_s
-        if wanted != self._commanded_rad_s:
-            self._commanded_rad_s = wanted
-            self._motors.command_velocity_rad_s(*wanted)
+        self._motors.command_velocity_rad_s(az.velocity_rad_s, el.velocity_rad_s)
 
     def _axis_changed(self) -> None:
         self._command_motors()
