@@ -39,8 +39,11 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
-WithParentOption = Annotated[
-    bool, typer.Option("--with-parent", hidden=True, help="End when the parent process ends.")
+ParentOption = Annotated[
+    int | None,
+    typer.Option(
+        "--parent-pid", hidden=True, help="End when this process is no longer the parent."
+    ),
 ]
 
 
@@ -91,23 +94,23 @@ def mocks(
     free_ports: Annotated[
         bool, typer.Option("--free-ports", help="Take any free port for every device.")
     ] = False,
-    with_parent: WithParentOption = False,
+    parent_pid: ParentOption = None,
 ) -> None:
     """Serve the rig's mock devices on 127.0.0.1 until Ctrl-C, and print where they listen."""
     from fitctl.commands import run_mocks
 
     settings = _rig(rig, overrides)
-    run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, with_parent=with_parent)
+    run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
 
 
 @app.command()
 def run(
-    rig: RigOption = None, overrides: SetOption = None, with_parent: WithParentOption = False
+    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
 ) -> None:
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
     from fitctl.commands import run_rig
 
-    run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), with_parent=with_parent)
+    run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
 
 
 @app.command()
@@ -170,11 +173,13 @@ def log(path: Annotated[Path, typer.Argument(help="An MCAP file, finished or not
 
 
 @app.command(hidden=True)
-def record(rig: RigOption = None, overrides: SetOption = None) -> None:
+def record(
+    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+) -> None:
     """Record what a supervisor sends; the supervisor starts this by itself."""
     from fitctl.commands import run_recorder
 
-    run_recorder(_rig(rig, overrides))
+    run_recorder(_rig(rig, overrides), parent_pid=parent_pid)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 import signal
 import threading
 import time
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+import zmq
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -47,10 +47,6 @@ COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
     "status": messages.Status,
     "shutdown": messages.Shutdown,
 }
-
-
-def _parent(with_parent: bool) -> int | None:
-    return os.getppid() if with_parent else None
 
 
 def _progress() -> Progress:
@@ -115,7 +111,7 @@ def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
     newest = demos.newest_telemetry(running.folder)
     if newest is not None and newest.recorder is not None:
         typer.echo(f"log: {newest.recorder.path}")
-    return 0
+    return 0 if console.returncode == 0 else FAILED
 
 
 def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as_json: bool) -> int:
@@ -134,7 +130,7 @@ def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as
     else:
         for name, result in results.items():
             typer.echo(_summary_text(name, result))
-    held = all(not math.isnan(result["vernier_s"]) for result in results.values())
+    held = all(result["judged_s"] > 0 for result in results.values())
     return 0 if held else FAILED
 
 
@@ -175,11 +171,13 @@ def _summary_text(name: str, result: dict[str, Any]) -> str:
 # ---------------------------------------------------------------- processes
 
 
-def run_mocks(rig: Rig, seed: int, *, as_json: bool, free_ports: bool, with_parent: bool) -> None:
+def run_mocks(
+    rig: Rig, seed: int, *, as_json: bool, free_ports: bool, parent_pid: int | None
+) -> None:
     """Serve the mock testbed until a signal comes."""
     if free_ports:
         rig = _with_free_ports(rig)
-    end_with_parent(_parent(with_parent))
+    end_with_parent(parent_pid)
     asyncio.run(_serve_mocks(rig, seed, as_json=as_json))
 
 
@@ -203,7 +201,7 @@ async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
     testbed = Testbed(rig, seed)
     try:
         endpoints = await testbed.start()
-    except OSError as error:
+    except (OSError, zmq.ZMQError) as error:
         await testbed.stop()
         msg = f"mocks: a port is taken: {error}; choose others with --set, or use --free-ports"
         raise ConfigError(msg) from None
@@ -217,11 +215,11 @@ async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
     await testbed.stop()
 
 
-def run_rig(rig: Rig, rig_arguments: Sequence[str], *, with_parent: bool) -> None:
+def run_rig(rig: Rig, rig_arguments: Sequence[str], *, parent_pid: int | None) -> None:
     """Supervise a rig."""
     from fitctl.supervisor.run import run_supervisor
 
-    end_with_parent(_parent(with_parent))
+    end_with_parent(parent_pid)
     run_supervisor(
         rig,
         ["record", *rig_arguments],
@@ -229,7 +227,7 @@ def run_rig(rig: Rig, rig_arguments: Sequence[str], *, with_parent: bool) -> Non
     )
 
 
-def run_recorder(rig: Rig) -> None:
+def run_recorder(rig: Rig, *, parent_pid: int | None) -> None:
     """Record until the supervisor ends us, or is gone."""
     from fitctl.logging.recorder import record
 
@@ -252,6 +250,7 @@ def run_recorder(rig: Rig) -> None:
                 folder=Path(rig.logging.folder).expanduser(),
                 stop=stop,
                 on_status=report,
+                parent_pid=parent_pid,
             )
         except LogError as error:
             raise ConfigError(str(error)) from None
@@ -275,6 +274,9 @@ def send_command(rig: Rig, name: str, loop: str) -> int:
     """Give one command and print the answer; returns the exit status."""
     if name not in COMMANDS:
         msg = f"send: {name} is no command; there are {', '.join(COMMANDS)}"
+        raise ConfigError(msg)
+    if loop and loop not in rig.loops:
+        msg = f"send: --loop {loop!r}: rig {rig.name} has {', '.join(rig.loops)}"
         raise ConfigError(msg)
     client = Client(service_folder(rig))
     try:

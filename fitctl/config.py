@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+_LARGEST_SERVO_STEP = 0.4  # part of an error that one servo period may take back, with its latency
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
 
 
@@ -390,6 +391,21 @@ class Rig(Settings):
                     "so that the 7x7 window fits on the frame"
                 )
                 raise ValueError(msg)
+            servo = loop.siderostat.servo
+            if servo.gain_per_s / servo.rate_hz > _LARGEST_SERVO_STEP:
+                msg = (
+                    f"loops.{name}.siderostat.servo: gain_per_s may be at most "
+                    f"{_LARGEST_SERVO_STEP * servo.rate_hz:g} at {servo.rate_hz:g} Hz, "
+                    "or the servo would swing"
+                )
+                raise ValueError(msg)
+        oldest_s = self.camera.frame_delay_s + 2 * self.camera.period_s
+        if self.supervisor.frame_timeout_s <= oldest_s:
+            msg = (
+                f"supervisor.frame_timeout_s must be above {oldest_s:g} s, "
+                "the camera's delay and two frames"
+            )
+            raise ValueError(msg)
         for section, part in (("plant", self.plant), ("mocks", self.mocks)):
             if part is not None and set(part.loops) != set(self.loops):
                 msg = f"{section}.loops must name the same loops as loops: {', '.join(self.loops)}"

@@ -23,9 +23,9 @@ from fitctl.config import Rig
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.model.optics import scales
-from fitctl.processes import end_process, start_process
+from fitctl.processes import end_process, last_line, signals_ignored, start_process
 from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import Acquire, AnyCommand, Shutdown, Standby, Telemetry
+from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
 from fitctl.supervisor.modes import Mode
 
 JUDGED_S = 30.0
@@ -50,9 +50,10 @@ class Instrument:
 
     def check(self) -> None:
         """Raise DemoError if a part of it has ended."""
-        for name, process in (("mock testbed", self.mocks), ("supervisor", self.supervisor)):
+        for name, process in (("mocks", self.mocks), ("supervisor", self.supervisor)):
             if process.poll() is not None:
-                msg = f"the {name} ended with status {process.returncode}; its message is above"
+                why = last_line(self.folder / f"{name}.err") or "it left no message"
+                msg = f"{name} ended with status {process.returncode}: {why}"
                 raise DemoError(msg)
 
 
@@ -66,32 +67,32 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
         If a part does not start.
     """
     started_s = time.monotonic()
-    folder = Path(tempfile.mkdtemp(prefix="fitctl-demo-"))
     processes: list[subprocess.Popen[bytes]] = []
-    client = Client(folder)
+    folder = Path(tempfile.mkdtemp(prefix="fitctl-demo-"))
     try:
         common = ["--rig", str(rig_path), *_set(overrides)]
-        mocks = start_process(
-            ["mocks", *common, "--seed", str(seed), "--free-ports", "--json", "--with-parent"],
-            stdout=subprocess.PIPE,
+        mocks = _start(
+            folder, "mocks", ["mocks", *common, "--seed", str(seed), "--free-ports", "--json"]
         )
         processes.append(mocks)
-        endpoints = _first_line(mocks)
+        endpoints = _first_line(mocks, folder)
         devices = [
             f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
         ]
-        supervisor = start_process(
-            ["run", *common, *_set([*devices, f"service.folder={folder}"]), "--with-parent"]
-        )
+        settings = _set([*devices, f"service.folder={folder}"])
+        supervisor = _start(folder, "supervisor", ["run", *common, *settings])
         processes.append(supervisor)
-        running = Instrument(
-            client, folder, int(endpoints["mocks.bench_port"]), started_s, supervisor, mocks
-        )
-        _wait(running, lambda _: True, "the supervisor's first telemetry")
-        yield running
+        bench_port = int(endpoints["mocks.bench_port"])
+        running = Instrument(Client(folder), folder, bench_port, started_s, supervisor, mocks)
+        try:
+            _wait(running, lambda _: True, "the supervisor's first telemetry")
+            yield running
+        finally:
+            running.client.close()
     finally:
-        _end(client, processes)
-        shutil.rmtree(folder, ignore_errors=True)
+        with signals_ignored():
+            _end(processes)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def acquire(running: Instrument) -> None:
@@ -176,7 +177,10 @@ def watch(
 
 
 def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
-    """How one loop did: the keys of ``fitctl demo --json``."""
+    """How one loop did: the keys of ``fitctl demo --json``.
+
+    ``judged_s`` is zero unless the loop is in VERNIER at the end.
+    """
     ticks = course.ticks.get(loop_name, [])
     end_s = ticks[-1].mid_exposure_s if ticks else math.nan
     start_s = max(course.vernier_since_s.get(loop_name, math.nan), end_s - JUDGED_S)
@@ -184,6 +188,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
     errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
     measured = np.sqrt(np.mean(errors**2, axis=0)) if judged else np.full(2, np.nan)
     truth = _truth(rig, running, loop_name, start_s, end_s)
+    step_s = rig.mock_parts()[0].step_s
     arcsec = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
     timing = [t for (name, _), t in course.timing.items() if name == loop_name]
     last = course.last
@@ -193,7 +198,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
         "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
         "measured_rms_px": {"az": float(measured[0]), "el": float(measured[1])},
         "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
-        "judged_s": max(0.0, end_s - start_s) if judged else 0.0,
+        "judged_s": truth.samples * step_s,
         "frames": len(ticks),
         "frames_lost": ticks[-1].frames_lost if ticks else 0,
         "late_ticks": sum(tick.late for tick in ticks),
@@ -243,15 +248,20 @@ def _set(overrides: Sequence[str]) -> list[str]:
     return [part for override in overrides for part in ("--set", override)]
 
 
-def _first_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+def _start(folder: Path, name: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start a part; its error output goes to a file, because the terminal may be the console's."""
+    with (folder / f"{name}.err").open("wb") as errors:
+        return start_process(arguments, stdout=subprocess.PIPE, stderr=errors)
+
+
+def _first_line(mocks: subprocess.Popen[bytes], folder: Path) -> dict[str, Any]:
     """The endpoints that the mock testbed prints once it listens."""
-    assert process.stdout is not None  # noqa: S101  (for the type checker: it was started with a pipe)
     with selectors.DefaultSelector() as selector:
-        selector.register(process.stdout, selectors.EVENT_READ)
-        line = process.stdout.readline() if selector.select(_START_TIMEOUT_S) else b""
+        selector.register(mocks.stdout, selectors.EVENT_READ)  # type: ignore[arg-type]
+        line = mocks.stdout.readline() if selector.select(_START_TIMEOUT_S) else b""  # type: ignore[union-attr]
     if not line:
-        end_process(process, 1.0)
-        msg = f"the mock testbed did not start (status {process.returncode}); its message is above"
+        why = last_line(folder / "mocks.err") or f"no answer in {_START_TIMEOUT_S:g} s"
+        msg = f"mocks did not start: {why}"
         raise DemoError(msg)
     return json.loads(line)
 
@@ -278,15 +288,7 @@ def _wait(running: Instrument, reached: Callable[[Telemetry], bool], what: str) 
     raise DemoError(msg)
 
 
-def _end(client: Client, processes: list[subprocess.Popen[bytes]]) -> None:
+def _end(processes: list[subprocess.Popen[bytes]]) -> None:
     """Supervisor first, so that it can still bring the mirror to its bias; then the mocks."""
-    try:
-        if len(processes) > 1 and processes[1].poll() is None:
-            client.send(Shutdown())
-            processes[1].wait(_END_TIMEOUT_S)
-    except (ConnectionError, subprocess.TimeoutExpired):
-        pass  # end_process insists
-    finally:
-        client.close()
-        for process in reversed(processes):
-            end_process(process, _END_TIMEOUT_S)
+    for process in reversed(processes):
+        end_process(process, _END_TIMEOUT_S)

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import IO
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -16,13 +17,20 @@ _PARENT_CHECK_S = 0.25
 
 
 def start_process(
-    arguments: Sequence[str], *, stdout: int | IO[bytes] | None = None
+    arguments: Sequence[str],
+    *,
+    stdout: int | None = subprocess.DEVNULL,
+    stderr: IO[bytes] | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Start ``fitctl ARGUMENTS`` in a session of its own, so that Ctrl-C reaches only its parent."""
+    """Start ``fitctl ARGUMENTS`` in a session of its own, so that Ctrl-C reaches only its parent.
+
+    It is told our process id, and ends by itself when we are gone (:func:`end_with_parent`).
+    """
     return subprocess.Popen(
-        [sys.executable, "-m", "fitctl", *arguments],
+        [sys.executable, "-m", "fitctl", *arguments, "--parent-pid", str(os.getpid())],
         stdin=subprocess.DEVNULL,
-        stdout=stdout if stdout is not None else subprocess.DEVNULL,
+        stdout=stdout,
+        stderr=stderr,
         start_new_session=True,
     )
 
@@ -58,6 +66,26 @@ def ended_by_signals(end: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, action in before.items():
             signal.signal(number, action)
+
+
+@contextmanager
+def signals_ignored() -> Iterator[None]:
+    """Let nothing interrupt what must be finished, such as letting go of everything."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, action in before.items():
+            signal.signal(number, action)
+
+
+def last_line(path: Path) -> str:
+    """The last line that a process wrote to its error file, or nothing."""
+    try:
+        lines = path.read_text(errors="replace").split("\n")
+    except OSError:
+        return ""
+    return next((line for line in reversed(lines) if line.strip()), "")
 
 
 def end_with_parent(parent_pid: int | None) -> None:

@@ -55,6 +55,16 @@ BAD_INPUT = {
     "a command that is none": (["send", "explode"], "explode is no command"),
     "a negative duration": (["simulate", "--duration", "-3"], "duration"),
     "a negative seed": (["simulate", "--seed", "-1"], "seed"),
+    "a loop that is none": (["send", "stop", "--loop", "left"], "has right"),
+    "a log folder that is none": (["run", "--set", "logging.folder=/dev/null/x"], "logging.folder"),
+    "a servo that would swing": (
+        ["check", "--set", "loops.right.siderostat.servo.rate_hz=50.0"],
+        "gain_per_s may be at most",
+    ),
+    "a frame limit below the delay": (
+        ["check", "--set", "camera.frame_delay_s=0.3"],
+        "frame_timeout_s must be above",
+    ),
     "an option that is none": (["demo", "--fast"], "--fast"),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),

@@ -37,6 +37,10 @@ class StarEstimator:
         self.assume(star_px, motor_rad, mirror_rad)
         self.known = True
 
+    def forget(self) -> None:
+        """The stages' zeros have changed: nothing is known of the star any more."""
+        self.known = False
+
     def predict_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
         """Where the star falls with the stages as given, shape (2,)."""
         return self._origin_px + self._stages_px(motor_rad, mirror_rad)

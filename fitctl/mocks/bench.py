@@ -76,8 +76,10 @@ class Bench:
     def _answer(self, message: bytes) -> Residual:
         try:
             question = msgspec.msgpack.decode(message, type=ResidualQuestion)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return Residual(np.nan, np.nan, 0, f"not a question: {error}")
+        if not np.all(np.isfinite([question.start_s, question.end_s])):
+            return Residual(np.nan, np.nan, 0, "start_s and end_s must be times")
         plant = self._plants.get(question.loop)
         if plant is None:
             return Residual(np.nan, np.nan, 0, f"no loop is named {question.loop}")

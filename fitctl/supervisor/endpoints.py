@@ -16,16 +16,31 @@ _LONGEST_SOCKET_PATH = 100  # sun_path holds 108 bytes
 
 
 def service_folder(rig: Rig) -> Path:
-    """The folder of a rig's sockets; two rigs of one user do not meet there."""
-    if rig.service.folder:
-        return Path(rig.service.folder).expanduser().absolute()
+    """The folder of a rig's sockets; two rigs of one user do not meet there.
+
+    Raises
+    ------
+    ConfigError
+        If no socket could ever be there.
+    """
+    given = rig.service.folder
+    try:
+        folder = Path(given).expanduser().absolute() if given else _own_folder() / rig.name
+        size = len(os.fsencode(folder / TELEMETRY_SOCKET))
+    except (RuntimeError, ValueError) as error:  # no such user; a NUL or half a character in it
+        msg = f"service.folder: {given!r}: {error}; choose another"
+        raise ConfigError(msg) from None
+    if size > _LONGEST_SOCKET_PATH or b"\0" in os.fsencode(folder):
+        msg = f"service.folder: {str(folder)!r} is too long for a Unix socket, or no path; choose another"
+        raise ConfigError(msg)
+    return folder
+
+
+def _own_folder() -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR")
-    base = (
-        Path(runtime) / "fitctl"
-        if runtime
-        else Path(tempfile.gettempdir()) / f"fitctl-{os.getuid()}"
-    )
-    return base / rig.name
+    if runtime:
+        return Path(runtime) / "fitctl"
+    return Path(tempfile.gettempdir()) / f"fitctl-{os.getuid()}"
 
 
 def make_service_folder(rig: Rig) -> Path:
@@ -34,13 +49,9 @@ def make_service_folder(rig: Rig) -> Path:
     Raises
     ------
     ConfigError
-        If it cannot be made, belongs to someone else, is open to others, or its path is too long for a
-        socket.
+        If it cannot be made, belongs to someone else or is open to others.
     """
     folder = service_folder(rig)
-    if len(str(folder / TELEMETRY_SOCKET)) > _LONGEST_SOCKET_PATH:
-        msg = f"service.folder: {folder} is too long for a Unix socket; choose a shorter one"
-        raise ConfigError(msg)
     try:
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)

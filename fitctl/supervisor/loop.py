@@ -89,6 +89,7 @@ class StellarLoop:
         self.mode = Mode.OFF
         self.mode_since_s = clock.now_s()
         self.last_change: ModeChange | None = None
+        self._last_failure = ""
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
         self.dac_ready = False
         self._rig = rig
@@ -96,6 +97,7 @@ class StellarLoop:
         self._clock = clock
         self._report = report
         self._scale = scales(rig, loop)
+        self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         self._period_s = rig.camera.period_s
         self._due_after_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._sensor = StarSensor(rig.camera, loop)
@@ -139,7 +141,7 @@ class StellarLoop:
             else self.servo.position_at(frame.mid_exposure_s)
         )
         star = self._sense(frame, motor_rad) if frame is not None else None
-        self._judge(frame, star, motor_rad)
+        self._judge(frame, star)
         if (
             frame is not None or self.mode not in TRACKING
         ):  # no frame: the stages wait where they are
@@ -162,22 +164,24 @@ class StellarLoop:
             self._estimator.observe(_position(star), motor_rad, mirror_rad)
         return star
 
-    def _judge(self, frame: Frame | None, star: Star | None, motor_rad: Floats) -> None:
+    def _judge(self, frame: Frame | None, star: Star | None) -> None:
         """Interlocks and findings: what leads to another mode."""
         if self.servo.fault is not None:
-            self.fire(Trigger.FAULT, str(self.servo.fault))
+            self.fail(str(self.servo.fault))
         elif frame is not None and self.mode is Mode.ACQUISITION:
-            self._judge_search(frame, star, motor_rad)
+            self._judge_search(frame, star)
         elif frame is not None and self.mode in {Mode.COARSE, Mode.VERNIER}:
             self._judge_tracking(star)
 
-    def _judge_search(self, frame: Frame, star: Star | None, motor_rad: Floats) -> None:
+    def _judge_search(self, frame: Frame, star: Star | None) -> None:
         acquisition = self.settings.acquisition
         now_s = frame.mid_exposure_s
         sighting = self._sighting
         if sighting is None:
             if star is not None:
-                self._sighting = Sighting(motor_rad, now_s)
+                # Back to where it was seen, with the star in the middle of the field.
+                back_rad = self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
+                self._sighting = Sighting(back_rad, now_s)
             elif self._spiral.exhausted:
                 self.fire(
                     Trigger.SEARCH_EXHAUSTED,
@@ -219,12 +223,14 @@ class StellarLoop:
         row = transition(self.mode, trigger)
         if row is None:
             return False
+        now_s = self._clock.now_s()
         source, self.mode = self.mode, row.target
-        self.mode_since_s = self._clock.now_s()
+        if source is not self.mode:
+            self.mode_since_s = now_s
         self._findings = Findings()
         self._enter(source)
         self.last_change = ModeChange(
-            time_s=self.mode_since_s,
+            time_s=now_s,
             loop=self.name,
             source=source.name,
             target=row.target.name,
@@ -238,6 +244,12 @@ class StellarLoop:
             severity = "warning"
         self._event(severity, f"{source.name} -> {row.target.name}: {reason}")
         return True
+
+    def fail(self, reason: str) -> None:
+        """A device failed: SAFE, or, where that changes nothing, an event; the same failure is told once."""
+        if not self.fire(Trigger.FAULT, reason) and reason != self._last_failure:
+            self._event("error", reason)
+        self._last_failure = reason
 
     def _enter(self, source: Mode) -> None:
         if self.mode is Mode.SAFE:
@@ -260,10 +272,8 @@ class StellarLoop:
         motor_rad = self.servo.position_rad
         if not self._estimator.known:
             self._estimator.assume(self.target_px, motor_rad, np.zeros(2))
-        camera = self._rig.camera
         # The expected star belongs in the middle of the field, where the search sees farthest.
-        middle_px = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
-        self._spiral_centre_rad = self._estimator.motor_for_rad(middle_px, np.zeros(2))
+        self._spiral_centre_rad = self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
         self._spiral = Spiral(self._plan)
         self._sighting = None
 
@@ -302,6 +312,12 @@ class StellarLoop:
         self._commands.stack_v = np.array(stack_v, dtype=float)
         self._commands.mirror_rad = self._angles(self._commands.stack_v)
         self.dac_ready = True
+        self._last_failure = ""
+        if self.servo.encoders_jumped:
+            self._estimator.forget()
+            self._event(
+                "warning", "encoders read elsewhere than before; the star's place is forgotten"
+            )
 
     def at_bias(self) -> bool:
         """The mirror is commanded to its bias."""
@@ -344,7 +360,7 @@ class StellarLoop:
             self._dac.write_v(self._commands.stack_v)
         except DeviceError as error:
             self.dac_ready = False
-            self.fire(Trigger.FAULT, str(error))
+            self.fail(str(error))
         self._mirror_history.append((self._clock.now_s(), self._commands.mirror_rad))
 
     def _angles(self, stack_v: Floats) -> Floats:

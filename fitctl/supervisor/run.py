@@ -5,8 +5,11 @@ from __future__ import annotations
 import fcntl
 import gc
 import importlib.metadata
+import math
 import os
 import platform
+import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +20,7 @@ from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo
-from fitctl.processes import end_process, ended_by_signals, start_process
+from fitctl.processes import end_process, ended_by_signals, last_line, start_process
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
     COMMAND_SOCKET,
@@ -35,9 +38,13 @@ from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
 from fitctl.supervisor.servo import ServoThread
 from fitctl.supervisor.supervisor import Supervisor
 
+_RECORDER_ERRORS = "recorder.err"
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _RECORDER_END_S = 5.0
+_RECORDER_WELL_S = 10.0  # a recorder that lived this long is started again at once
+_RECORDER_PATIENCE_S = 60.0
+_DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
 _VERSIONED = (
     "fitctl",
     "numpy",
@@ -52,25 +59,75 @@ _VERSIONED = (
 
 
 class Recorder:
-    """The recorder process, started again when it dies."""
+    """The recorder process, started again when it dies: at once, then ever more patiently.
 
-    def __init__(self, arguments: Sequence[str], note: Callable[[str, str, str], None]) -> None:
+    Parameters
+    ----------
+    arguments : sequence of str
+        ``fitctl`` arguments that start it.
+    errors : Path
+        Where its error output goes.
+    note : callable
+        Takes events.
+    """
+
+    def __init__(
+        self, arguments: Sequence[str], errors: Path, note: Callable[[str, str, str], None]
+    ) -> None:
         self._arguments = arguments
+        self._errors = errors
         self._note = note
-        self._process = start_process(arguments)
+        self._patience_s = 0.0
+        self._again_s = math.inf
+        self._start()
 
     def check(self) -> None:
-        """Start it again if it has died."""
+        """Start it again if it has died and its time has come; called about once a second."""
+        now_s = time.monotonic()
         code = self._process.poll()
         if code is None:
-            return
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
-        self._note("error", "recorder", f"the recorder {how}; a new one begins a new file")
-        self._process = start_process(self._arguments)
+            if now_s - self._started_s > _RECORDER_WELL_S:
+                self._patience_s = 0.0
+        elif self._again_s == math.inf:
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+            why = last_line(self._errors)
+            self._again_s = now_s + self._patience_s
+            self._note(
+                "error",
+                "recorder",
+                f"the recorder {how}{': ' + why if why else ''}; a new one begins a new file"
+                + (f" in {self._patience_s:.0f} s" if self._patience_s else ""),
+            )
+            self._patience_s = min(max(1.0, 2 * self._patience_s), _RECORDER_PATIENCE_S)
+        if now_s >= self._again_s:
+            self._start()
 
     def end(self) -> None:
         """Let it write what it has and end."""
         end_process(self._process, _RECORDER_END_S)
+
+    def _start(self) -> None:
+        with self._errors.open("wb") as errors:
+            self._process = start_process(self._arguments, stderr=errors)
+        self._started_s = time.monotonic()
+        self._again_s = math.inf
+
+
+def check_log_folder(folder: Path) -> None:
+    """Make the log folder.
+
+    Raises
+    ------
+    ConfigError
+        If nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        msg = f"logging.folder: {folder}: nothing can be written there: {error}; choose another"
+        raise ConfigError(msg) from None
 
 
 @contextmanager
@@ -120,10 +177,13 @@ def run_supervisor(
     ConfigError
         If the socket folder cannot be used, or another supervisor has this rig.
     """
+    check_log_folder(Path(rig.logging.folder).expanduser())
     folder = make_service_folder(rig)
     with ExitStack() as stack:
+        ending = threading.Event()
+        stack.enter_context(ended_by_signals(ending.set))
         stack.enter_context(only_supervisor(folder))
-        for name in (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET):
+        for name in (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, _RECORDER_ERRORS):
             stack.callback((folder / name).unlink, missing_ok=True)
         clock = MonotonicClock()
         queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
@@ -136,7 +196,7 @@ def run_supervisor(
 
         executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
         supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
-        recorder = Recorder(recorder_arguments, supervisor.note)
+        recorder = Recorder(recorder_arguments, folder / _RECORDER_ERRORS, supervisor.note)
         stack.callback(recorder.end)
         scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
         info = run_info(rig, scheduling, clock.now_s())
@@ -155,7 +215,7 @@ def run_supervisor(
         quiet_interpreter()
         on_ready(folder)
         try:
-            _loop(supervisor, queue, recorder, executor, clock)
+            _loop(supervisor, service, queue, recorder, executor, clock, ending)
         finally:
             gc.enable()
             for servo in servos:
@@ -166,27 +226,31 @@ def run_supervisor(
 
 def _loop(
     supervisor: Supervisor,
+    service: Service,
     queue: RecordQueue,
     recorder: Recorder,
     executor: ThreadPoolExecutor,
     clock: MonotonicClock,
+    ending: threading.Event,
 ) -> None:
     housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
-    with ended_by_signals(supervisor.ask_shutdown):
-        try:
-            while not supervisor.shutdown_wanted:
-                supervisor.step()
-                if clock.now_s() >= housekeeping_s:
-                    housekeeping_s += _HOUSEKEEPING_S
-                    queue.pump()
-                    collect_young()
-                    executor.submit(recorder.check)
-            supervisor.stop("shutting down")
-            end_s = clock.now_s() + _WIND_DOWN_S
-            while clock.now_s() < end_s and not supervisor.at_rest():
-                supervisor.step()
-        finally:
-            supervisor.close()
+    try:
+        while not (supervisor.shutdown_wanted or ending.is_set()):
+            supervisor.step()
+            if clock.now_s() >= housekeeping_s:
+                housekeeping_s += _HOUSEKEEPING_S
+                queue.pump()
+                collect_young()
+                executor.submit(recorder.check)
+                if not service.is_alive():
+                    raise RuntimeError(_DEAF)
+        supervisor.shutdown_wanted = True
+        supervisor.stop("shutting down")
+        end_s = clock.now_s() + _WIND_DOWN_S
+        while clock.now_s() < end_s and not supervisor.at_rest():
+            supervisor.step()
+    finally:
+        supervisor.close()
 
 
 def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:

@@ -209,7 +209,7 @@ class Service(threading.Thread):
         identity, tag, payload = parts
         try:
             command = self._decode(payload)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             self._answer(identity, tag, Reply(accepted=False, text=f"not a command: {error}"))
             return
         if command.version != PROTOCOL_VERSION:

@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from fitctl.drivers.interface import (
     DeviceIdentity,
     DeviceTimeout,
     ServoAmplifiers,
+    ServoReading,
 )
 from fitctl.supervisor.realtime import become_realtime
 
@@ -33,6 +35,8 @@ Floats = NDArray[np.float64]
 _HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
 _BLIND_MISSES = 2
+_FOLLOWING_S = 0.05
+_ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
 
 
 class ServoTiming(NamedTuple):
@@ -92,6 +96,9 @@ class SiderostatServo:
         self._last_reading_s = 0.0
         self._missed_readings = 0
         self._misses_in_a_row = 0
+        self._followed_s = 0.0
+        self.encoders_jumped = False
+        self._disabling = False
         self.late_s: deque[float] = deque(maxlen=4096)
 
     # ------------------------------------------------------------ from any thread
@@ -121,12 +128,13 @@ class SiderostatServo:
         return history[0][1] if history else self.position_rad
 
     def open(self) -> DeviceIdentity:
-        """Connect, clear a latched fault and enable, holding where the motors are."""
+        """Connect, clear a latched fault, read the encoders and enable; the motors stand still."""
         return self._ask(self._open)
 
     def disable(self) -> None:
         """Take power from the motors, without waiting for it; a failure shows as a fault."""
-        if self.opened and self.enabled:
+        if self.opened and self.enabled and not self._disabling:
+            self._disabling = True
             self._post(self._disable)
 
     def close(self) -> None:
@@ -147,70 +155,88 @@ class SiderostatServo:
             action, future = self._requests.popleft()
             try:
                 future.set_result(action())
-            except DeviceError as error:
+            except Exception as error:
                 future.set_exception(error)
-        if not self.opened or self.fault is not None:
+        if not self.opened:
+            return
+        if self.fault is not None:
+            # The drive must go on hearing that it shall stand still, and that we live.
+            with suppress(Exception):
+                self._amplifiers.exchange(np.zeros(2))
             return
         try:
             self._exchange()
-        except DeviceError as error:
-            self._stopped = True
-            self.fault = error
+        except Exception as error:
+            self._fail(error)
 
     def _exchange(self) -> None:
-        wish, self._wish_rad = self._wish_rad, None
-        if self._stopped or not self.enabled:
-            self._servo.reset(self.position_rad)
-            velocity_rad_s = np.zeros(2)
-        else:
-            if wish is not None:
-                self._servo.move_to(wish)
-            # Blind motors stand still, and the reference waits for them.
-            blind = self._misses_in_a_row >= _BLIND_MISSES
-            velocity_rad_s = np.zeros(2) if blind else self._servo.step(self.position_rad)
-        reading = self._amplifiers.exchange(velocity_rad_s)
+        reading = self._amplifiers.exchange(self._velocity_rad_s())
         now_s = self._clock.now_s()
         if reading is None:
             self._missed_readings += 1
             self._misses_in_a_row += 1
             if now_s - self._last_reading_s > self._settings.reading_timeout_s:
-                raise DeviceTimeout(
-                    self._device,
-                    self.endpoint,
-                    f"an encoder reading within {self._settings.reading_timeout_s:g} s",
-                    "none",
-                    "check the drive's power and link, then recover",
-                )
+                raise self._no_reading()
             return
-        self._last_reading_s = now_s
+        self._take(reading)
+        if reading.fault:
+            hint = "remove its cause, then recover"
+            raise DeviceFault(self._device, self.endpoint, "no fault", reading.fault, hint)
+        if self.enabled and not reading.enabled:
+            got = "an axis disabled itself"
+            raise DeviceFault(self._device, self.endpoint, "both axes enabled", got, "recover")
+        if self._stopped or not self.enabled:
+            self._servo.reset(reading.position_rad)
+        else:
+            self._check_following(reading)
+
+    def _velocity_rad_s(self) -> Floats:
+        wish, self._wish_rad = self._wish_rad, None
+        if self._stopped or not self.enabled:
+            return np.zeros(2)
+        if wish is not None:
+            self._servo.move_to(wish)
+        if self._misses_in_a_row >= _BLIND_MISSES:
+            return np.zeros(2)  # blind motors stand still, and the reference waits for them
+        return self._servo.step(self.position_rad)
+
+    def _take(self, reading: ServoReading) -> None:
+        self._last_reading_s = self._clock.now_s()
         self._misses_in_a_row = 0
         self.position_rad = reading.position_rad
         self._history.append((reading.time_s, reading.position_rad))
-        if reading.fault:
-            raise DeviceFault(
-                self._device,
-                self.endpoint,
-                "no fault",
-                reading.fault,
-                "remove its cause, then recover",
-            )
-        if self.enabled and not reading.enabled:
-            raise DeviceFault(
-                self._device,
-                self.endpoint,
-                "both axes enabled",
-                "an axis disabled itself",
-                "recover",
-            )
+
+    def _check_following(self, reading: ServoReading) -> None:
+        """A reversal at full speed is behind for a moment; a stuck axis stays behind."""
+        limit_rad = self._settings.following_error_limit_rad
         following_rad = self._servo.following_error_rad(reading.position_rad)
-        if not self._stopped and following_rad > self._settings.following_error_limit_rad:
+        if following_rad <= limit_rad:
+            self._followed_s = reading.time_s
+        elif reading.time_s - self._followed_s > _FOLLOWING_S:
             raise DeviceFault(
                 self._device,
                 self.endpoint,
-                f"following error below {self._settings.following_error_limit_rad:g} rad",
-                f"{following_rad:.2f} rad",
+                f"following error below {limit_rad:g} rad",
+                f"{following_rad:.2f} rad for {_FOLLOWING_S * 1e3:.0f} ms",
                 "look for a stuck axis, then recover",
             )
+
+    def _fail(self, error: Exception) -> None:
+        self._stopped = True
+        if not isinstance(error, DeviceError):
+            expected = "no error inside fitctl"
+            hint = "report it with the log; recover"
+            error = DeviceFault(self._device, self.endpoint, expected, repr(error), hint)
+        self.fault = error
+
+    def _no_reading(self) -> DeviceTimeout:
+        return DeviceTimeout(
+            self._device,
+            self.endpoint,
+            f"an encoder reading within {self._settings.reading_timeout_s:g} s",
+            "none",
+            "check the drive's power and link, then recover",
+        )
 
     @property
     def _device(self) -> str:
@@ -219,17 +245,39 @@ class SiderostatServo:
     def _open(self) -> DeviceIdentity:
         self._stopped = True
         self.fault = None
+        self.opened = self.enabled = False
         identity = self._amplifiers.open()
         self._amplifiers.reset_fault()
+        self._find_position()
         self._amplifiers.enable()
         self.opened = self.enabled = True
         self._last_reading_s = self._clock.now_s()
         return identity
 
+    def _find_position(self) -> None:
+        """Read the encoders before power is on: nothing is ever servoed about a place never read."""
+        last_rad, knew = self.position_rad, bool(self._history)
+        self._history.clear()
+        deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
+        while (reading := self._amplifiers.exchange(np.zeros(2))) is None:
+            if self._clock.now_s() > deadline_s:
+                raise self._no_reading()
+        self._take(reading)
+        self._servo.reset(reading.position_rad)
+        self.encoders_jumped = knew and bool(
+            np.any(np.abs(reading.position_rad - last_rad) > _ENCODER_JUMP_RAD)
+        )
+
     def _disable(self) -> None:
         self._stopped = True
-        self.enabled = False
-        self._amplifiers.disable()
+        try:
+            self._amplifiers.disable()
+            self.enabled = False
+        except Exception as error:
+            self._fail(error)
+            raise
+        finally:
+            self._disabling = False
 
     def _close(self) -> None:
         self._stopped = True

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitctl.clock import Clock
-from fitctl.config import Loop, Rig
+from fitctl.config import Rig
 from fitctl.controllers.centroid import HALF_WINDOW_PX
 from fitctl.drivers.interface import (
     DeviceError,
@@ -24,15 +24,14 @@ from fitctl.drivers.interface import (
     Devices,
     DeviceTimeout,
     Frame,
-    LoopDevices,
 )
 from fitctl.logging.records import (
     AnyRecord,
-    DeviceHealth,
     Event,
     FrameRecord,
     PiezoReading,
 )
+from fitctl.supervisor.health import camera_health, loop_health
 from fitctl.supervisor.loop import StellarLoop
 from fitctl.supervisor.messages import (
     Acquire,
@@ -47,10 +46,10 @@ from fitctl.supervisor.messages import (
     Stop,
 )
 from fitctl.supervisor.modes import Mode, Trigger, usable_commands
+from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices
 from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
-CAMERA = "camera"
 _CLOSE_TIMEOUT_S = 30.0
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Standby: Trigger.STANDBY,
@@ -61,13 +60,6 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
-
-
-class Opened(NamedTuple):
-    """What opening the devices found."""
-
-    identities: dict[str, DeviceIdentity]
-    stack_v: dict[str, np.ndarray]
 
 
 class Job(NamedTuple):
@@ -118,9 +110,12 @@ class Supervisor:
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
         self._notes: deque[tuple[str, str, str]] = deque()
         self._job: Job | None = None
-        self._abandoned = False
-        self._poll: Job | None = None
-        self._polled_s = clock.now_s()
+        self._opening: set[str] = set()
+        self._abandoned: set[str] = set()
+        self._polls: dict[str, Job] = {}
+        self._reported_s = clock.now_s()
+        self._piezo_read_s = dict.fromkeys(rig.loops, 0.0)
+        self._piezo_error = dict.fromkeys(rig.loops, "")
         self._camera_ready = False
         self._last_frame_s = clock.now_s()
         self._identities: dict[str, DeviceIdentity] = {}
@@ -141,10 +136,6 @@ class Supervisor:
     def note(self, severity: str, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
         self._notes.append((severity, source, message))
-
-    def ask_shutdown(self) -> None:
-        """End soon; the process winds down from there."""
-        self.shutdown_wanted = True
 
     # ------------------------------------------------------------ once a frame
 
@@ -177,7 +168,8 @@ class Supervisor:
                     data=frame.image.tobytes(),
                 )
             )
-        if self._clock.now_s() - self._polled_s >= 1.0:
+        self._poll_piezos()
+        if self._clock.now_s() - self._reported_s >= 1.0:
             self._once_a_second()
 
     def stop(self, reason: str) -> None:
@@ -187,15 +179,20 @@ class Supervisor:
 
     def at_rest(self) -> bool:
         """Every mirror that can still be commanded is at its bias."""
-        return all(not loop.dac_ready or loop.at_bias() for loop in self.loops.values())
+        return all(self._at_bias(name) for name in self.loops)
+
+    def _at_bias(self, name: str) -> bool:
+        loop = self.loops[name]
+        return not loop.dac_ready or loop.at_bias()
 
     def close(self) -> None:
         """Disable and let go of everything, whatever state it is in."""
         for loop in self.loops.values():
             loop.dac_ready = False
         self._camera_ready = False
-        names = list(self.loops)
-        self._executor.submit(self._close_devices, names, True).result(timeout=_CLOSE_TIMEOUT_S)
+        self._executor.submit(
+            close_devices, self._devices, self.servos, list(self.loops), True, self._closed_badly
+        ).result(timeout=_CLOSE_TIMEOUT_S)
 
     # ------------------------------------------------------------ frames
 
@@ -228,7 +225,7 @@ class Supervisor:
     def _camera_lost(self, error: DeviceError) -> None:
         self._camera_ready = False
         for loop in self.loops.values():
-            loop.fire(Trigger.FAULT, str(error))
+            loop.fail(str(error))
 
     # ------------------------------------------------------------ commands
 
@@ -242,6 +239,8 @@ class Supervisor:
         if isinstance(command, Shutdown):
             self.shutdown_wanted = True
             return Reply(accepted=True, text="shutting down")
+        if self.shutdown_wanted and not isinstance(command, Stop):
+            return _refusal("shutting down")
         if isinstance(command, SetTarget):
             return self._set_target(command, names)
         trigger = _COMMANDS.get(type(command))
@@ -258,10 +257,13 @@ class Supervisor:
         if trigger in _POWER_UP:
             self._open(usable, trigger)
         elif trigger is Trigger.OFF:
+            moving = [name for name in usable if not self._at_bias(name)]
+            if moving:
+                return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
             self._turn_off(usable)
         else:
-            # A stop while devices are being opened has the last word.
-            self._abandoned = self._abandoned or (trigger is Trigger.STOP and self._job is not None)
+            if trigger is Trigger.STOP:
+                self._abandoned |= self._opening & set(usable)
             for name in usable:
                 self.loops[name].fire(trigger, "operator")
         return Reply(accepted=True)
@@ -289,42 +291,27 @@ class Supervisor:
     def _open(self, names: list[str], trigger: Trigger) -> None:
         for name in names:
             self.loops[name].dac_ready = False
-        self._abandoned = False
+            self._polls.pop(name, None)
+        self._opening, self._abandoned = set(names), set()
         self._event("info", "supervisor", "opening and checking all devices")
         with_camera = not self._camera_ready
-        future = self._executor.submit(self._open_devices, names, with_camera)
+        future = self._executor.submit(
+            open_devices, self._devices, self.servos, names, with_camera, self._closed_badly
+        )
         self._job = Job(future, partial(self._opened, names, with_camera, trigger))
         self._finish_jobs()
-
-    def _open_devices(self, names: list[str], with_camera: bool) -> Opened:
-        """Open everything anew. Limits are checked first; nothing moves before all of it is well."""
-        self._close_devices(names, with_camera)
-        identities: dict[str, DeviceIdentity] = {}
-        stack_v: dict[str, np.ndarray] = {}
-        for name in names:
-            loop = self._devices.loops[name]
-            identities[f"{name} piezo"] = loop.piezo.open()
-            identities[f"{name} D/A"] = loop.dac.open()
-            stack_v[name] = loop.dac.read_v()
-        if with_camera:
-            identities[CAMERA] = self._devices.camera.open()
-        for name in names:
-            identities[f"{name} siderostat"] = self.servos[name].open()
-        if with_camera:
-            self._devices.camera.start()
-        return Opened(identities, stack_v)
 
     def _opened(
         self, names: list[str], with_camera: bool, trigger: Trigger, future: Future
     ) -> None:
+        abandoned, self._opening, self._abandoned = bool(self._abandoned), set(), set()
         error = future.exception()
         if error is not None:
-            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {error}")
+            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {_told(error)}")
             self._close(names, with_camera)
-            if not isinstance(error, DeviceError):
-                raise error
             return
-        if self._abandoned:
+        if abandoned:
+            # A stop while devices are being opened has the last word.
             self._event("warning", "supervisor", "stopped while opening; devices let go")
             self._close(names, with_camera)
             return
@@ -335,6 +322,7 @@ class Supervisor:
         for name in names:
             loop = self.loops[name]
             loop.start_from(opened.stack_v[name])
+            self._piezo_read_s[name] = self._clock.now_s()
             loop.fire(trigger, "all devices open, checked and enabled")
 
     def _turn_off(self, names: list[str]) -> None:
@@ -347,17 +335,13 @@ class Supervisor:
         self._close(names, with_camera)
 
     def _close(self, names: list[str], with_camera: bool) -> None:
-        self._job = Job(
-            self._executor.submit(self._close_devices, names, with_camera), Future.result
+        future = self._executor.submit(
+            close_devices, self._devices, self.servos, names, with_camera, self._closed_badly
         )
+        self._job = Job(future, lambda _: None)
 
-    def _close_devices(self, names: list[str], with_camera: bool) -> None:
-        for name in names:
-            self.servos[name].close()
-            self._devices.loops[name].dac.close()
-            self._devices.loops[name].piezo.close()
-        if with_camera:
-            self._devices.camera.close()
+    def _closed_badly(self, device: str, error: Exception) -> None:
+        self.note("warning", "supervisor", f"{device} did not close well: {_told(error)}")
 
     def _make_safer(self, loop: StellarLoop) -> None:
         if self._clock.now_s() - loop.mode_since_s > self.rig.supervisor.safe_disable_after_s:
@@ -368,99 +352,51 @@ class Supervisor:
         if job is not None and job.future.done():
             self._job = None
             job.done(job.future)
-        poll = self._poll
-        if poll is not None and poll.future.done():
-            self._poll = None
-            poll.done(poll.future)
+        for name, poll in list(self._polls.items()):
+            if poll.future.done():
+                del self._polls[name]
+                poll.done(poll.future)
 
     # ------------------------------------------------------------ once a second
 
     def _once_a_second(self) -> None:
-        self._polled_s = self._clock.now_s()
+        now_s = self._reported_s = self._clock.now_s()
         self._timing.report(self.servos)
-        for record in self._health():
-            self._record(record)
-        names = [name for name, loop in self.loops.items() if loop.dac_ready]
-        if names and self._poll is None and self._job is None:
-            future = self._executor.submit(self._poll_piezos, names)
-            self._poll = Job(future, self._polled)
-
-    def _poll_piezos(self, names: list[str]) -> list[PiezoReading]:
-        readings = []
-        for name in names:
-            piezo = self._devices.loops[name].piezo
-            volts, limit_v = piezo.stack_volts(), piezo.limit_v()
-            readings.append(
-                PiezoReading(
-                    time_s=self._clock.now_s(),
-                    loop=name,
-                    stack1_v=float(volts[0]),
-                    stack2_v=float(volts[1]),
-                    stack3_v=float(volts[2]),
-                    limit_v=limit_v,
-                )
-            )
-        return readings
-
-    def _polled(self, future: Future) -> None:
-        error = future.exception()
-        if error is None:
-            for reading in future.result():
-                self._record(reading)
-        elif isinstance(error, DeviceError):
-            for loop in self.loops.values():
-                loop.fire(Trigger.FAULT, str(error))
-        else:
-            raise error
-
-    def _health(self) -> list[DeviceHealth]:
-        camera = self.rig.camera.device
         counts = self._devices.camera.counts()
-        rows = [
-            self._device_health(
-                CAMERA,
-                f"{camera.address}:{camera.gvcp_port}",
-                self._camera_ready,
-                f"{counts.frames} frames, {counts.lost} lost",
-            )
-        ]
-        for name, settings in self.rig.loops.items():
-            rows += self._loop_health(name, settings, self._devices.loops[name])
-        return rows
+        self._record(camera_health(self.rig, counts, self._camera_ready, self._identities, now_s))
+        for name, loop in self.loops.items():
+            trouble = self._piezo_error[name]
+            for row in loop_health(loop, trouble, self._identities, now_s):
+                self._record(row)
 
-    def _loop_health(self, name: str, settings: Loop, _devices: LoopDevices) -> list[DeviceHealth]:
-        servo, loop = self.servos[name], self.loops[name]
-        powered = "enabled" if servo.enabled else "disabled"
-        siderostat = self._device_health(
-            f"{name} siderostat",
-            settings.siderostat.device.channel,
-            servo.opened,
-            str(servo.fault) if servo.fault else powered,
-            fault=servo.fault is not None,
-        )
-        dac = self._device_health(
-            f"{name} D/A",
-            f"{settings.fsm.dac.host}:{settings.fsm.dac.port}",
-            loop.dac_ready,
-            "written every tick" if loop.dac_ready else "not written",
-        )
-        piezo = self._device_health(
-            f"{name} piezo", settings.fsm.piezo.port, loop.dac_ready, "read once a second"
-        )
-        return [siderostat, dac, piezo]
+    def _poll_piezos(self) -> None:
+        now_s = self._clock.now_s()
+        for name, loop in self.loops.items():
+            due_s = self._piezo_read_s[name] + loop.settings.fsm.piezo.poll_s
+            if loop.dac_ready and now_s >= due_s and name not in self._polls and self._job is None:
+                self._piezo_read_s[name] = now_s
+                future = self._executor.submit(self._read_piezo, name)
+                self._polls[name] = Job(future, partial(self._piezo_was_read, name))
 
-    def _device_health(
-        self, device: str, endpoint: str, is_open: bool, detail: str, *, fault: bool = False
-    ) -> DeviceHealth:
-        identity = self._identities.get(device)
-        return DeviceHealth(
+    def _read_piezo(self, name: str) -> PiezoReading:
+        piezo = self._devices.loops[name].piezo
+        volts, limit_v = piezo.stack_volts(), piezo.limit_v()
+        return PiezoReading(
             time_s=self._clock.now_s(),
-            device=device,
-            endpoint=endpoint,
-            state="fault" if fault else "ok" if is_open else "closed",
-            identity="" if identity is None else f"{identity.model} {identity.serial}".strip(),
-            detail=detail,
+            loop=name,
+            stack1_v=float(volts[0]),
+            stack2_v=float(volts[1]),
+            stack3_v=float(volts[2]),
+            limit_v=limit_v,
         )
+
+    def _piezo_was_read(self, name: str, future: Future) -> None:
+        error = future.exception()
+        self._piezo_error[name] = "" if error is None else _told(error)
+        if error is None:
+            self._record(future.result())
+        else:
+            self.loops[name].fail(_told(error))
 
     def _event(self, severity: str, source: str, message: str) -> None:
         self._record(
@@ -475,3 +411,8 @@ class Supervisor:
 
 def _refusal(text: str) -> Reply:
     return Reply(accepted=False, text=text)
+
+
+def _told(error: BaseException) -> str:
+    """A device's error tells itself; any other is told with its type."""
+    return str(error) if isinstance(error, DeviceError) else repr(error)

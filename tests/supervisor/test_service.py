@@ -132,6 +132,8 @@ def test_stop_takes_the_velocity_before_the_loop_even_looks(served):
     [
         (b"", "truncated"),
         (b"\xff\xff\xff", "not a command"),
+        (b"\x81\xa4type\xa4\xff\xfe\xff\xfe", "not a command"),
+        (b"\x82\xa4type\xa4Stop\xa4loop\xa2\xff\xfe", "not a command"),
         (msgspec.msgpack.encode({"type": "Explode"}), "Explode"),
         (msgspec.msgpack.encode({"type": "Stop", "colour": "red"}), "colour"),
         (msgspec.msgpack.encode({"type": "SetTarget", "az_px": "far", "el_px": 1}), "az_px"),
@@ -184,6 +186,14 @@ def test_a_folder_too_deep_for_a_socket_is_refused(tmp_path):
 
     with pytest.raises(ConfigError, match="too long"):
         make_service_folder(rig)
+
+
+@pytest.mark.parametrize("folder", ["~no-such-user/x", "x\\u0000y", "é" * 60])
+def test_a_folder_that_cannot_be_one_is_refused(folder):
+    rig = load_rig(default_rig_path(), [f'service.folder="{folder}"'])
+
+    with pytest.raises(ConfigError, match=r"service\.folder"):
+        service_folder(rig)
 
 
 def test_two_rigs_of_one_user_have_two_folders():

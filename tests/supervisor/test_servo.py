@@ -18,6 +18,8 @@ class Amplifiers:
         self.commands = []
         self.enabled = self.silent = self.stuck = False
         self.fault = ""
+        self.surprise = None
+        self.readings_until_heard = 0
 
     def open(self):
         return DeviceIdentity("test", "motors", "", "")
@@ -36,7 +38,10 @@ class Amplifiers:
         self.clock.sleep_until(self.clock.now_s() + 0.002)
         if not self.stuck:
             self.position_rad = self.position_rad + velocity_rad_s * 0.002
-        if self.silent:
+        if self.surprise is not None:
+            raise self.surprise
+        self.readings_until_heard -= 1
+        if self.silent or self.readings_until_heard > 0:
             return None
         return ServoReading(self.clock.now_s(), self.position_rad, self.enabled, self.fault)
 
@@ -162,18 +167,90 @@ def test_a_stuck_axis_shows_as_following_error(servo, amplifiers):
     assert "following error" in str(servo.fault)
 
 
-def test_after_a_fault_nothing_is_commanded_until_opened_again(servo, amplifiers):
-    amplifiers.fault = "x"
-    servo.period()
-    count = len(amplifiers.commands)
+@pytest.mark.parametrize("trouble", ["fault", "stuck", "surprise"])
+def test_after_any_fault_the_motors_keep_being_told_to_stand_still(servo, amplifiers, trouble):
+    servo.hold()
+    servo.move_to(np.array([3.0, 0.0]))
     run(servo, 10)
-    assert len(amplifiers.commands) == count
+    assert np.any(amplifiers.commands[-1] != 0)
+    if trouble == "fault":
+        amplifiers.fault = "over-current"
+    elif trouble == "stuck":
+        amplifiers.stuck = True
+    else:
+        amplifiers.surprise = ValueError("nobody thought of this")
+    run(servo, 80)
+    assert servo.fault is not None
+    amplifiers.surprise = None
 
+    servo.move_to(np.array([9.0, 9.0]))
+    run(servo, 10)
+
+    assert len(amplifiers.commands) > 50
+    assert np.all(np.array(amplifiers.commands[-10:]) == 0)
+
+
+def test_opening_again_clears_the_fault(servo, amplifiers):
+    amplifiers.fault = "over-current"
+    servo.period()
     servo.open()
     servo.period()
 
     assert servo.fault is None
-    assert len(amplifiers.commands) > count
+    assert servo.enabled
+
+
+def test_nothing_is_powered_before_its_position_has_been_read(amplifiers):
+    rig = load_rig(default_rig_path())
+    amplifiers.position_rad = np.array([0.8, -0.4])
+    amplifiers.readings_until_heard = 30
+    servo = SiderostatServo("right", rig.loops["right"], amplifiers, amplifiers.clock, 0.02)
+    servo.open()
+    servo.hold()
+    run(servo, 100)
+
+    assert np.all(np.array(amplifiers.commands) == 0)
+
+
+def test_a_drive_that_never_says_where_it_is_is_not_powered(amplifiers):
+    rig = load_rig(default_rig_path())
+    amplifiers.silent = True
+    servo = SiderostatServo("right", rig.loops["right"], amplifiers, amplifiers.clock, 0.02)
+
+    with pytest.raises(DeviceTimeout):
+        servo.open()
+
+    assert not amplifiers.enabled
+
+
+def test_encoders_that_jumped_while_nobody_looked_are_noticed(servo, amplifiers):
+    run(servo, 5)
+    servo.close()
+    amplifiers.position_rad = np.array([40.0, 0.0])
+    servo.open()
+
+    assert servo.encoders_jumped
+
+
+def test_a_reversal_at_full_speed_is_no_following_error(servo, amplifiers):
+    servo.hold()
+    for target in (1.0, 2.0, 0.0, 2.0, 0.0):
+        servo.move_to(np.array([target, -target]))
+        run(servo, 15)
+
+    assert servo.fault is None
+
+
+def test_a_disable_that_fails_shows_as_a_fault(servo, amplifiers, monkeypatch):
+    def refuse():
+        raise DeviceFault("siderostat", "x", "disabled", "still enabled")
+
+    monkeypatch.setattr(amplifiers, "disable", refuse)
+    servo.disable()
+    servo.period()
+
+    assert servo.fault is not None
+    assert servo.enabled
 
 
 def test_position_at_a_past_time_is_interpolated(servo, amplifiers):

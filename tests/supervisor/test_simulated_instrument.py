@@ -217,6 +217,91 @@ def test_in_safe_the_mirror_is_at_its_bias_and_the_amplifiers_go_off_after_their
     assert not servo.enabled
 
 
+def test_stopping_again_in_safe_does_not_keep_the_amplifiers_on(vernier):
+    for _ in range(6):
+        vernier.command(Stop())
+        vernier.run(0.5)
+
+    assert not vernier.supervisor.servos["right"].enabled
+
+
+def test_a_fault_in_safe_is_told_once(vernier, monkeypatch):
+    vernier.command(Stop())
+    error = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
+    piezo = vernier.supervisor._devices.loops["right"].piezo
+    monkeypatch.setattr(piezo, "stack_volts", fail("stack_volts", error))
+    vernier.run(5.0)
+
+    told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
+    assert len(told) == 1
+    assert told[0].severity == "error"
+
+
+def test_a_device_that_cannot_be_closed_keeps_no_other_from_being_closed(vernier, monkeypatch):
+    devices = vernier.supervisor._devices
+    closed = []
+    monkeypatch.setattr(devices.loops["right"].piezo, "close", fail("close", OSError("stuck")))
+    monkeypatch.setattr(devices.camera, "close", lambda: closed.append("camera"))
+    vernier.command(Stop())
+    vernier.run(1.0)
+    assert vernier.command(Off()).accepted
+    vernier.run(0.1)
+
+    assert closed == ["camera"]
+    assert any("right piezo did not close well" in e.message for e in events_of(vernier))
+
+
+def test_off_waits_for_the_mirror(simulate_with):
+    simulation = simulate_with("loops.right.fsm.slew_v_per_s=0.5", **NEAR)
+    simulation.acquire()
+    until(simulation, Mode.VERNIER)
+    simulation.command(SetTarget(az_px=27.0, el_px=19.5))
+    simulation.run(1.5)
+    simulation.command(Stop())
+    reply = simulation.command(Off())
+    assert not reply.accepted
+    assert "on its way to its bias" in reply.text
+
+    simulation.run(3.0)
+
+    assert simulation.command(Off()).accepted
+
+
+def test_an_error_that_is_no_devices_leads_to_safe_and_not_to_a_crash(vernier, monkeypatch):
+    amplifiers = vernier.supervisor._devices.loops["right"].amplifiers
+    monkeypatch.setattr(amplifiers, "exchange", fail("exchange", KeyError("nobody knows")))
+
+    until(vernier, Mode.SAFE, limit_s=0.5)
+
+    assert any("nobody knows" in event.message for event in events_of(vernier))
+
+
+def test_a_star_seen_at_the_edge_is_brought_to_the_middle_of_the_field(simulate_with):
+    simulation = simulate_with(star_offset_px=(28.0, 0.0))
+    simulation.acquire()
+    until(simulation, Mode.COARSE, limit_s=10.0)
+
+    tick = simulation.ticks[-1]
+    assert abs(tick.star_az_px - 19.5) < 3.0
+    assert abs(tick.star_el_px - 19.5) < 3.0
+
+
+def test_encoders_that_count_anew_make_the_old_place_of_the_star_forgotten(vernier):
+    vernier.command(Hold())
+    vernier.command(Off())
+    vernier.run(0.1)
+    vernier.plants["right"].state.motor_rad[:] += 30.0
+    vernier.plants["right"].state.beam_motor_rad[:] += 30.0
+    vernier.command(Standby())
+    vernier.run(0.5)
+
+    assert any("forgotten" in event.message for event in events_of(vernier))
+    before = vernier.supervisor.servos["right"].position_rad.copy()
+    vernier.command(Acquire())
+    vernier.run(0.2)
+    assert np.all(np.abs(vernier.supervisor.servos["right"].position_rad - before) < 4.0)
+
+
 def test_one_command_recovers_and_another_finds_the_star_again(vernier):
     vernier.command(Stop())
     vernier.run(3.0)

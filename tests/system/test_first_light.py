@@ -112,6 +112,59 @@ def test_killing_the_recorder_costs_no_tick_and_its_file_stays_readable(rig):
     assert not log_info(Path(path)).finished
 
 
+def test_a_demo_that_ends_without_its_star_says_so_by_its_status(tmp_path):
+    process = fitctl(
+        "demo",
+        "--headless",
+        "--json",
+        "--duration",
+        3,
+        "--set",
+        f"logging.folder={tmp_path}",
+        stdout=subprocess.PIPE,
+    )
+    output, _ = process.communicate(timeout=60)
+
+    assert process.returncode == 1
+    assert json.loads(output.splitlines()[-1])["judged_s"] == 0.0
+
+
+@pytest.mark.parametrize("after_s", [0.3, 0.8, 1.5, 2.2])
+def test_interrupting_a_demo_while_it_starts_leaves_nothing_behind(tmp_path, after_s):
+    process = fitctl(
+        "demo",
+        "--headless",
+        "--set",
+        f"logging.folder={tmp_path}",
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    psutil.wait_procs([psutil.Process(process.pid)], timeout=after_s)
+    end(process, signal.SIGINT, timeout_s=40)
+
+    assert not left_behind(tmp_path)
+    assert not list(tmp_path.glob("fitctl-demo-*"))
+
+
+def left_behind(folder, limit_s=10.0):
+    """Processes that still name a folder on their command line, after a moment for their end."""
+    end_s = time.monotonic() + limit_s
+    while time.monotonic() < end_s:
+        alive = [p for p in psutil.process_iter() if names(p, folder)]
+        if not alive:
+            return []
+        psutil.wait_procs(alive, timeout=0.5)
+    return alive
+
+
+def names(process, folder):
+    try:
+        return any(str(folder) in part for part in process.cmdline())
+    except (psutil.NoSuchProcess, psutil.AccessDenied):
+        return False
+
+
 def test_a_second_supervisor_on_the_same_rig_is_refused_and_told_who_has_it(rig):
     second = fitctl("run", *rig.common, stderr=subprocess.PIPE)
     _, error = second.communicate(timeout=30)

@@ -73,12 +73,16 @@ class ModbusDac:
             timeout=self._dac.response_timeout_s,
             retries=0,
         )
-        if not client.connect():
+        try:
+            got = "" if client.connect() else "no connection"
+        except (OSError, ValueError) as error:  # ValueError: a host that is no name at all
+            got = str(error)
+        if got:
             raise DeviceUnreachable(
                 _NAME,
                 self._endpoint,
                 "a Modbus/TCP station",
-                "no connection",
+                got,
                 "check its power, its cable, and dac.host and dac.port in the rig file",
             )
         self._client = client
