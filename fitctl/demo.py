@@ -256,9 +256,11 @@ def _start(folder: Path, name: str, arguments: Sequence[str]) -> subprocess.Pope
 
 def _first_line(mocks: subprocess.Popen[bytes], folder: Path) -> dict[str, Any]:
     """The endpoints that the mock testbed prints once it listens."""
-    with selectors.DefaultSelector() as selector:
-        selector.register(mocks.stdout, selectors.EVENT_READ)  # type: ignore[arg-type]
-        line = mocks.stdout.readline() if selector.select(_START_TIMEOUT_S) else b""  # type: ignore[union-attr]
+    line = b""
+    if mocks.stdout is not None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(mocks.stdout, selectors.EVENT_READ)
+            line = mocks.stdout.readline() if selector.select(_START_TIMEOUT_S) else b""
     if not line:
         why = last_line(folder / "mocks.err") or f"no answer in {_START_TIMEOUT_S:g} s"
         msg = f"mocks did not start: {why}"

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 
@@ -27,6 +26,7 @@ from fitctl.logging.records import (
     Event,
     RecorderStatus,
     RunInfo,
+    Severity,
 )
 from fitctl.logging.writer import LogWriter
 
@@ -209,7 +209,7 @@ class _Recording:
     def _write(self, record: AnyRecord) -> None:
         self._writer.write(record, time.monotonic() + self._wall_minus_monotonic_s)
 
-    def _say(self, severity: Literal["info", "warning", "error"], message: str) -> None:
+    def _say(self, severity: Severity, message: str) -> None:
         event = Event(
             time_s=time.monotonic(), severity=severity, source="recorder", message=message
         )

@@ -11,6 +11,7 @@ from typing import Literal
 import msgspec
 
 RECORD_VERSION = 1
+Severity = Literal["info", "warning", "error"]
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, tag=True):
@@ -92,7 +93,7 @@ class ModeChange(Record, frozen=True, kw_only=True):
 class Event(Record, frozen=True, kw_only=True):
     """Something that an operator should read."""
 
-    severity: Literal["info", "warning", "error"]
+    severity: Severity
     source: str
     message: str
 

@@ -23,13 +23,18 @@ from fitctl.controllers.prefilter import Prefilter
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.controllers.vernier import Vernier
 from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
-from fitctl.logging.records import AnyRecord, Event, ModeChange, Tick
+from fitctl.logging.records import AnyRecord, Event, ModeChange, Severity, Tick
 from fitctl.model.optics import mirror_angles, saturate_diamond, scales, stack_volts
 from fitctl.supervisor.modes import TRACKING, Mode, Trigger, transition
 from fitctl.supervisor.servo import SiderostatServo
 
 Floats = NDArray[np.float64]
 _NOWHERE = np.full(2, math.nan)
+_SEVERITY: dict[Trigger, Severity] = {
+    Trigger.FAULT: "error",
+    Trigger.STAR_LOST: "warning",
+    Trigger.SEARCH_EXHAUSTED: "warning",
+}
 
 
 @dataclass
@@ -239,10 +244,7 @@ class StellarLoop:
             reason=reason,
         )
         self._report(self.last_change)
-        severity = {Trigger.FAULT: "error", Trigger.STAR_LOST: "warning"}.get(trigger, "info")
-        if trigger is Trigger.SEARCH_EXHAUSTED:
-            severity = "warning"
-        self._event(severity, f"{source.name} -> {row.target.name}: {reason}")
+        self._event(_SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}")
         return True
 
     def fail(self, reason: str) -> None:
@@ -384,11 +386,11 @@ class StellarLoop:
             abs(star.az_px - star.window_az_px) > most or abs(star.el_px - star.window_el_px) > most
         )
 
-    def _event(self, severity: str, message: str) -> None:
+    def _event(self, severity: Severity, message: str) -> None:
         self._report(
             Event(
                 time_s=self._clock.now_s(),
-                severity=severity,  # type: ignore[arg-type]
+                severity=severity,
                 source=self.name,
                 message=message,
             )

@@ -19,7 +19,7 @@ from pathlib import Path
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
 from fitctl.logging.queue import RecordQueue
-from fitctl.logging.records import AnyRecord, RunInfo
+from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.processes import end_process, ended_by_signals, last_line, start_process
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
@@ -72,7 +72,7 @@ class Recorder:
     """
 
     def __init__(
-        self, arguments: Sequence[str], errors: Path, note: Callable[[str, str, str], None]
+        self, arguments: Sequence[str], errors: Path, note: Callable[[Severity, str, str], None]
     ) -> None:
         self._arguments = arguments
         self._errors = errors

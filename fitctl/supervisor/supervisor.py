@@ -30,6 +30,7 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     PiezoReading,
+    Severity,
 )
 from fitctl.supervisor.health import camera_health, loop_health
 from fitctl.supervisor.loop import StellarLoop
@@ -108,7 +109,7 @@ class Supervisor:
         self._executor = executor
         self._record = record
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
-        self._notes: deque[tuple[str, str, str]] = deque()
+        self._notes: deque[tuple[Severity, str, str]] = deque()
         self._job: Job | None = None
         self._opening: set[str] = set()
         self._abandoned: set[str] = set()
@@ -133,7 +134,7 @@ class Supervisor:
                 self.servos[name].stop()
         self._commands.append((command, reply))
 
-    def note(self, severity: str, source: str, message: str) -> None:
+    def note(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
         self._notes.append((severity, source, message))
 
@@ -398,11 +399,11 @@ class Supervisor:
         else:
             self.loops[name].fail(_told(error))
 
-    def _event(self, severity: str, source: str, message: str) -> None:
+    def _event(self, severity: Severity, source: str, message: str) -> None:
         self._record(
             Event(
                 time_s=self._clock.now_s(),
-                severity=severity,  # type: ignore[arg-type]
+                severity=severity,
                 source=source,
                 message=message,
             )

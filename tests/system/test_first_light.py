@@ -45,6 +45,19 @@ def demo(tmp_path, *arguments):
     return json.loads(output.splitlines()[-1])
 
 
+def quiet_demo(tmp_path):
+    """Start a demo that is to be interrupted; all its files are below `tmp_path`."""
+    return fitctl(
+        "demo",
+        "--headless",
+        "--set",
+        f"logging.folder={tmp_path}",
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+
+
 def nothing_was_lost_without_a_stall(summary):
     return summary["frames_lost"] == 0 or summary["machine_stalls"] > 0
 
@@ -131,15 +144,7 @@ def test_a_demo_that_ends_without_its_star_says_so_by_its_status(tmp_path):
 
 @pytest.mark.parametrize("after_s", [0.3, 0.8, 1.5, 2.2])
 def test_interrupting_a_demo_while_it_starts_leaves_nothing_behind(tmp_path, after_s):
-    process = fitctl(
-        "demo",
-        "--headless",
-        "--set",
-        f"logging.folder={tmp_path}",
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-    )
+    process = quiet_demo(tmp_path)
     psutil.wait_procs([psutil.Process(process.pid)], timeout=after_s)
     end(process, signal.SIGINT, timeout_s=40)
 
@@ -194,15 +199,7 @@ def test_send_gives_commands_from_a_shell(rig):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, number):
-    process = fitctl(
-        "demo",
-        "--headless",
-        "--set",
-        f"logging.folder={tmp_path}",
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-    )
+    process = quiet_demo(tmp_path)
     family = wait_for_family(process, 3)
     end(process, number, timeout_s=40)
 
@@ -212,15 +209,7 @@ def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, number):
 
 
 def test_a_demo_killed_outright_takes_its_processes_with_it(tmp_path):
-    process = fitctl(
-        "demo",
-        "--headless",
-        "--set",
-        f"logging.folder={tmp_path}",
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-    )
+    process = quiet_demo(tmp_path)
     family = wait_for_family(process, 3)
     process.kill()
     process.wait()
