@@ -209,10 +209,10 @@ def run_supervisor(
         )
         service = Service(supervisor, buffer, folder, state, clock)
         servos = [ServoThread(servo, clock) for servo in supervisor.servos.values()]
+        quiet_interpreter()
         service.start()
         for servo in servos:
             servo.start()
-        quiet_interpreter()
         on_ready(folder)
         try:
             _loop(supervisor, service, queue, recorder, executor, clock, ending)

@@ -324,6 +324,8 @@ class Supervisor:
             loop = self.loops[name]
             loop.start_from(opened.stack_v[name])
             self._piezo_read_s[name] = self._clock.now_s()
+            # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
+            self.servos[name].take_timing()
             loop.fire(trigger, "all devices open, checked and enabled")
 
     def _turn_off(self, names: list[str]) -> None:
@@ -362,7 +364,8 @@ class Supervisor:
 
     def _once_a_second(self) -> None:
         now_s = self._reported_s = self._clock.now_s()
-        self._timing.report(self.servos)
+        if self._job is None:
+            self._timing.report(self.servos)
         counts = self._devices.camera.counts()
         self._record(camera_health(self.rig, counts, self._camera_ready, self._identities, now_s))
         for name, loop in self.loops.items():
