@@ -364,8 +364,15 @@ class Supervisor:
 
     def _once_a_second(self) -> None:
         now_s = self._reported_s = self._clock.now_s()
+        # Nothing is timed while devices are let go or being opened: imports and parsing hold everything.
         if self._job is None:
-            self._timing.report(self.servos)
+            self._timing.report(
+                {
+                    name: self.servos[name]
+                    for name in self.loops
+                    if self.loops[name].mode is not Mode.OFF
+                }
+            )
         counts = self._devices.camera.counts()
         self._record(camera_health(self.rig, counts, self._camera_ready, self._identities, now_s))
         for name, loop in self.loops.items():

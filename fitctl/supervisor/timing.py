@@ -31,9 +31,10 @@ class TimingBook:
             self._ticks[tick.loop].append(tick)
 
     def report(self, servos: Mapping[str, SiderostatServo]) -> None:
-        """One record for each loop, for the time since the last report."""
-        for name, ticks in self._ticks.items():
-            servo = servos[name].take_timing()
+        """One record for each of the given loops, for the time since the last report."""
+        for name, its_servo in servos.items():
+            ticks = self._ticks[name]
+            servo = its_servo.take_timing()
             compute = [tick.compute_s for tick in ticks]
             age = [tick.frame_age_s for tick in ticks]
             stalls = [late for late in servo.late_s if late > self._stall_s]
