@@ -147,9 +147,8 @@ class StellarLoop:
         )
         star = self._sense(frame, motor_rad) if frame is not None else None
         self._judge(frame, star)
-        if (
-            frame is not None or self.mode not in TRACKING
-        ):  # no frame: the stages wait where they are
+        # Without a frame to track by, the stages wait where they are.
+        if frame is not None or self.mode not in TRACKING:
             self._laws[self.mode](star)
         self._write()
         done_s = self._clock.now_s()
