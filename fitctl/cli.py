@@ -159,7 +159,10 @@ def simulate(
 @app.command()
 def check(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Read a rig file and say whether it is well."""
+    from fitctl.commands import check_plant
+
     settings = _rig(rig, overrides)
+    check_plant(settings)
     loops = ", ".join(settings.loops)
     typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 import zmq
 from rich.console import Console
@@ -21,6 +22,7 @@ from fitctl.config import ConfigError, Rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import RecorderStatus
+from fitctl.model.plant import plant_constants
 from fitctl.processes import (
     ENDING_SIGNALS,
     end_process,
@@ -294,11 +296,25 @@ def send_command(rig: Rig, name: str, loop: str) -> int:
 # ---------------------------------------------------------------- without an instrument
 
 
+def check_plant(rig: Rig) -> None:
+    """See that the rig's simulated hardware, if it has any, can be.
+
+    Raises
+    ------
+    ConfigError
+        If not.
+    """
+    if rig.plant is not None:
+        for name in rig.loops:
+            plant_constants(rig, name, np.zeros((1, 2)))
+
+
 def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
     """Simulate and print the result; returns the exit status."""
     from fitctl.supervisor.simulate import simulate
 
     rig.mock_parts()
+    check_plant(rig)
     with _progress() as progress:
         task = progress.add_task("simulating", total=1.0)
         results = simulate(

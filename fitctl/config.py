@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+_MOST_HISTORY_STEPS = 10_000_000  # some hundred megabytes
 _LARGEST_SERVO_STEP = 0.4  # part of an error that one servo period may take back, with its latency
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
 
@@ -273,6 +274,7 @@ class Hysteresis(Settings):
 
     full_swing_stroke_m: Positive
     loop_width_fraction: Annotated[float, Field(ge=0, le=0.5)]
+    breakpoints_from: Literal["virgin", "swept"]
     breakpoints_v: Annotated[list[NonNegative], Field(min_length=2)]
 
     @model_validator(mode="after")
@@ -329,6 +331,13 @@ class PlantTruth(Settings):
     step_s: Annotated[float, Field(gt=0, le=1e-3)]
     history_s: Annotated[float, Field(ge=1, le=3600)]
     loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _history_fits_in_memory(self) -> PlantTruth:
+        if self.history_s / self.step_s > _MOST_HISTORY_STEPS:
+            msg = f"history_s may be at most {_MOST_HISTORY_STEPS * self.step_s:g} at this step_s"
+            raise ValueError(msg)
+        return self
 
 
 class DacMock(Settings):

@@ -65,6 +65,14 @@ BAD_INPUT = {
         ["check", "--set", "camera.frame_delay_s=0.3"],
         "frame_timeout_s must be above",
     ),
+    "a stack that cannot be": (
+        ["simulate", "--set", "plant.loops.right.hysteresis.breakpoints_v=[0.0, 0.1]"],
+        "lower it",
+    ),
+    "a history beyond memory": (
+        ["check", "--set", "plant.step_s=1e-6", "--set", "plant.history_s=3600.0"],
+        "history_s may be at most",
+    ),
     "an option that is none": (["demo", "--fast"], "--fast"),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),

@@ -47,8 +47,8 @@ class Vernier:
     """Both axes' compensators, from error in pixels to mirror angle in radians.
 
     Once the wanted mirror angle leaves the diamond of what the stacks reach, the excess is added to the
-    error, as it would have shown had the mirror followed: the compensator sees a mirror without limits
-    and does not wind up.
+    error, much as it would have shown had the mirror followed (a frame later, where the camera takes
+    nearly two): the compensator sees a mirror without limits and does not wind up.
 
     Parameters
     ----------

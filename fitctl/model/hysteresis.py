@@ -30,6 +30,16 @@ def gains_from_slopes(slopes_m_per_v: Floats) -> Floats:
     return np.diff(slopes_m_per_v, prepend=0.0)
 
 
+def half_widths_v(settings: Hysteresis) -> Floats:
+    """Half the deadband width of each element, shape (n,).
+
+    On a ramp from a relaxed (virgin) stack a play begins to follow after half its width; on one that
+    comes after a full downward sweep, after all of it.
+    """
+    breakpoints_v = np.asarray(settings.breakpoints_v)
+    return breakpoints_v if settings.breakpoints_from == "virgin" else breakpoints_v / 2
+
+
 def play(state: Floats, value: Floats, half_width: Floats) -> Floats:
     """One evaluation of the play (backlash) operator: the new output, shapes broadcast."""
     return np.maximum(value - half_width, np.minimum(value + half_width, state))
@@ -65,7 +75,7 @@ def stack_gains(settings: Hysteresis, fsm: Fsm) -> Floats:
     ValueError
         If no such stack exists: the loop is wider than these breakpoints allow.
     """
-    half_width_v = np.asarray(settings.breakpoints_v)
+    half_width_v = half_widths_v(settings)
     full_scale_v = fsm.dac.full_scale_v
     rise = np.diff(half_width_v, prepend=0.0)
     linear = (half_width_v == 0).astype(float)
@@ -78,5 +88,6 @@ def stack_gains(settings: Hysteresis, fsm: Fsm) -> Floats:
     if rise_excess <= 0:
         msg = f"loop_width_fraction {fraction} is wider than the breakpoints allow; lower it"
         raise ValueError(msg)
-    gains = linear + rise * (fraction * stroke_linear / rise_excess)
+    slopes = np.cumsum(linear + rise * (fraction * stroke_linear / rise_excess))
+    gains = gains_from_slopes(slopes)
     return gains * settings.full_swing_stroke_m / swept_stroke(half_width_v, gains, full_scale_v)

@@ -21,7 +21,10 @@ def compiled_advance() -> AdvanceKernel | None:
         import numba
     except ImportError:
         return None
-    loop: Callable[..., None] = numba.njit(cache=True)(_advance_loop)
+    try:
+        loop: Callable[..., None] = numba.njit(cache=True)(_advance_loop)
+    except RuntimeError:  # nowhere to write a cache: it compiles anew each time
+        loop = numba.njit(_advance_loop)
 
     def advance(
         constants: PlantConstants,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config import ARCSEC_PER_RAD, ConfigError, Rig
 from fitctl.model import air_path, hysteresis, structure
 from fitctl.model.kernels import compiled_advance
 from fitctl.model.optics import mirror_from_stacks, scales
@@ -86,13 +86,23 @@ AdvanceKernel = Callable[[PlantConstants, PlantState, PlantInputs, Floats, Float
 
 
 def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantConstants:
-    """Numbers of one step of a rig's loop; `star_offset_px` has shape (runs, 2)."""
+    """Numbers of one step of a rig's loop; `star_offset_px` has shape (runs, 2).
+
+    Raises
+    ------
+    ConfigError
+        If no stack has the hysteresis that the rig asks for.
+    """
     truth, _ = rig.mock_parts()
     loop, plant = rig.loops[loop_name], truth.loops[loop_name]
     scale = scales(rig, loop)
     lag_s = 1 / (2 * np.pi * plant.amplifier_bandwidth_hz)
-    gains = hysteresis.stack_gains(plant.hysteresis, loop.fsm)
-    half_v = np.asarray(plant.hysteresis.breakpoints_v)
+    try:
+        gains = hysteresis.stack_gains(plant.hysteresis, loop.fsm)
+    except ValueError as error:
+        msg = f"plant.loops.{loop_name}.hysteresis: {error}"
+        raise ConfigError(msg) from None
+    half_v = hysteresis.half_widths_v(plant.hysteresis)
     transition, gain = structure.mode_matrices(plant.structure, truth.step_s)
     air_transition, air_noise = air_path.step_matrices(plant.air_path, truth.step_s)
     target = np.array([loop.target_px.az, loop.target_px.el])
@@ -190,6 +200,8 @@ class Plant:
         :func:`advance_reference` or a compiled one; by default compiled where numba is installed.
     star_offset_px : array, shape (runs, 2), optional
         Where the star is at the start, from the target; by default drawn from the seed.
+    history_s : float, optional
+        How long true positions are kept, by default as the rig says; a large batch wants less.
     """
 
     def __init__(
@@ -200,6 +212,7 @@ class Plant:
         *,
         kernel: AdvanceKernel | None = None,
         star_offset_px: Floats | None = None,
+        history_s: float | None = None,
     ) -> None:
         truth, _ = rig.mock_parts()
         plant = truth.loops[loop_name]
@@ -234,7 +247,8 @@ class Plant:
         self._noise = np.empty((_NOISE_BLOCK_STEPS, runs, spots, 2, 2))
         self._noise_used = _NOISE_BLOCK_STEPS
         self._steps = 0
-        self._trace_px = np.empty((max(1, round(truth.history_s / truth.step_s)), runs, spots, 2))
+        kept_s = truth.history_s if history_s is None else history_s
+        self._trace_px = np.empty((max(1, round(kept_s / truth.step_s)), runs, spots, 2))
 
     @property
     def time_s(self) -> float:
@@ -287,8 +301,9 @@ class Plant:
         What is older than the history, or not yet reached, is left out.
         """
         step_s = self.constants.step_s
-        first = max(1, round(start_s / step_s), self._steps - len(self._trace_px) + 1)
-        last = min(round(end_s / step_s), self._steps)
+        last = round(min(end_s, self.time_s) / step_s)
+        oldest = self._steps - len(self._trace_px) + 1
+        first = max(1, oldest, round(min(start_s, self.time_s + step_s) / step_s))
         return self._trace_px[(np.arange(first, last + 1) - 1) % len(self._trace_px)]
 
     def _advance_to_first_step(self) -> None:

@@ -218,6 +218,8 @@ class Simulation:
         Where the star is at the start; by default drawn from the seed.
     record : callable, optional
         Takes every record, as the recorder would.
+    history_s : float, optional
+        How long true positions are kept, by default as the rig says.
     """
 
     def __init__(
@@ -227,13 +229,16 @@ class Simulation:
         *,
         star_offset_px: Floats | None = None,
         record: Callable[[AnyRecord], None] | None = None,
+        history_s: float | None = None,
     ) -> None:
         self.rig = rig
         self.clock = VirtualClock()
         offset = None if star_offset_px is None else np.asarray(star_offset_px)[None]
         self.plants = {
             # Each loop's plant gets a seed of its own from the run's.
-            name: Plant(rig, name, [seed + 1000 * index], star_offset_px=offset)
+            name: Plant(
+                rig, name, [seed + 1000 * index], star_offset_px=offset, history_s=history_s
+            )
             for index, name in enumerate(rig.loops)
         }
         self.camera = SimulatedCamera(rig, self.clock, self.plants)
@@ -300,7 +305,7 @@ def simulate(
 
     `on_progress` is called about ten times a second of real time with the part done.
     """
-    simulation = Simulation(rig, seed)
+    simulation = Simulation(rig, seed, history_s=duration_s + 1.0)  # all of it is judged
     for plant in simulation.plants.values():
         plant.advance(plant.constants.step_s)  # compiles, before the time is taken
     started = shown = time.perf_counter()

@@ -95,9 +95,3 @@ def test_progress_is_the_part_of_the_area_searched(rig, plan):
     assert progress[0] == 0.0
     assert progress == sorted(progress)
     assert progress[-1] == 1.0
-
-
-def test_a_waiting_search_stays_where_it_is(plan):
-    spiral = Spiral(plan)
-    spiral.advance(0.02)
-    assert np.array_equal(spiral.position_px(), spiral.position_px())

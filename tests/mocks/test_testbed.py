@@ -159,6 +159,8 @@ def test_the_bench_answers_nonsense_with_an_error(running):
 
     assert "no loop is named left" in ask_bench(port, ResidualQuestion("left", 0, 1, 0, 0)).error
     assert ask_bench(port, ResidualQuestion("right", 5.0, 1.0, 0, 0)).samples == 0
+    assert ask_bench(port, ResidualQuestion("right", 1e300, 1e301, 0, 0)).samples == 0
+    assert ask_bench(port, ResidualQuestion("right", float("nan"), 1.0, 0, 0)).error
     assert math.isnan(ask_bench(port, ResidualQuestion("right", 5.0, 1.0, 0, 0)).az_rms_px)
 
 

@@ -5,7 +5,13 @@ from hypothesis import strategies as st
 
 from fitctl.config import Hysteresis
 from fitctl.model import hysteresis
-from fitctl.model.hysteresis import gains_from_slopes, hysteresis_output, play, stack_gains
+from fitctl.model.hysteresis import (
+    gains_from_slopes,
+    half_widths_v,
+    hysteresis_output,
+    play,
+    stack_gains,
+)
 
 HALF_WIDTH_V = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.0, 4.5, 4.9])
 FULL_V = 10.0
@@ -156,6 +162,21 @@ def test_the_closed_formulas_are_what_a_sweep_measures(stack):
 
 
 def test_a_loop_wider_than_the_breakpoints_allow_is_refused(rig):
-    narrow = Hysteresis(full_swing_stroke_m=9e-6, loop_width_fraction=0.5, breakpoints_v=[0.0, 0.1])
+    narrow = Hysteresis(
+        full_swing_stroke_m=9e-6,
+        loop_width_fraction=0.5,
+        breakpoints_from="virgin",
+        breakpoints_v=[0.0, 0.1],
+    )
     with pytest.raises(ValueError, match=r"loop_width_fraction 0\.5 is wider .* lower it"):
         stack_gains(narrow, rig.loops["right"].fsm)
+
+
+def test_breakpoints_read_on_a_swept_ramp_are_twice_those_of_a_relaxed_stack(rig):
+    settings = rig.plant.loops["right"].hysteresis
+    doubled = [2 * v for v in settings.breakpoints_v]
+    swept = settings.model_copy(update={"breakpoints_from": "swept", "breakpoints_v": doubled})
+
+    assert np.array_equal(half_widths_v(swept), half_widths_v(settings))
+    fsm = rig.loops["right"].fsm
+    assert stack_gains(swept, fsm) == pytest.approx(stack_gains(settings, fsm))

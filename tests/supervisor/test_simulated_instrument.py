@@ -453,3 +453,11 @@ def test_rms_helpers_say_nan_when_there_is_nothing_to_judge(simulate_with):
             true_residual_rms(simulation.plants["right"], np.zeros(2), math.nan, 1.0)
         ).values()
     )
+
+
+def test_the_whole_run_is_judged_however_short_the_rigs_history():
+    short = load_rig(default_rig_path(), ["plant.history_s=2.0"])
+
+    results = [simulate(rig, 3, 40.0)["right"] for rig in (load_rig(default_rig_path()), short)]
+
+    assert results[0].rms_px == results[1].rms_px

@@ -59,7 +59,9 @@ def quiet_demo(tmp_path):
 
 
 def nothing_was_lost_without_a_stall(summary):
-    return summary["frames_lost"] == 0 or summary["machine_stalls"] > 0
+    """A machine that stood still excuses the frames of that time, and no more."""
+    excused = summary["machine_stalls"] * (1 + summary["worst_stall_s"] * 50)
+    return summary["frames_lost"] <= excused
 
 
 def test_the_demo_acquires_holds_and_sums_up(tmp_path):
@@ -115,8 +117,11 @@ def test_killing_the_recorder_costs_no_tick_and_its_file_stays_readable(rig):
     seen = rig.follow(lambda t: t.recorder is not None and t.recorder.path != path, limit_s=20.0)
 
     ticks = [tick for telemetry in seen for tick in telemetry.ticks if tick.number >= 0]
-    lost = ticks[-1].frames_lost - ticks[0].frames_lost
-    assert ticks[-1].number - ticks[0].number == len(ticks) - 1 + lost
+    timing = {t.time_s: t for telemetry in seen for t in telemetry.timing}.values()
+    stalled_s = sum(t.stalls * t.worst_stall_s for t in timing)
+    missing = ticks[-1].number - ticks[0].number + 1 - len(ticks)
+    assert missing <= stalled_s * 50
+    assert sum(tick.late for tick in ticks) <= 3 + stalled_s * 50 * 3
     assert all(telemetry.loops[0].mode == "VERNIER" for telemetry in seen)
     assert any("recorder was killed" in e.message for t in seen for e in t.events)
     assert seen[-1].records_lost == 0
