@@ -8,7 +8,6 @@ from fitctl.drivers.cia402.node import Node
 from fitctl.drivers.cia402.protocol import NmtCommand
 from fitctl.drivers.interface import DeviceIdentity, DeviceMismatch
 
-_STATUS_EVERY_MS = 100
 _PREFERRED_MODES = (protocol.CYCLIC_SYNCHRONOUS_VELOCITY, protocol.PROFILE_VELOCITY)
 
 
@@ -70,7 +69,7 @@ def _configure_pdos(node: Node, node_id: int) -> None:
     _configure_pdo(node, rpdos, 0, velocities, every_sync, (protocol.TARGET_VELOCITY, 32))
     _configure_pdo(node, tpdos, 0, positions, every_sync, (protocol.POSITION, 32))
     _configure_pdo(node, tpdos, 1, statuswords, on_event, (protocol.STATUSWORD, 16))
-    node.write(protocol.TPDO_COMMUNICATION + 1, 5, "H", _STATUS_EVERY_MS)
+    node.write(protocol.TPDO_COMMUNICATION + 1, 5, "H", protocol.STATUS_EVERY_MS)
 
 
 def _configure_pdo(

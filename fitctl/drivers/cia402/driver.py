@@ -2,8 +2,10 @@
 
 Three frames a servo period: an RPDO with both target velocities, the SYNC that makes the drive act on it
 and latch its encoders, and the TPDO with both positions. Statuswords come in a TPDO of their own, on
-change and ten times a second. While the amplifiers are enabled the drive watches our heartbeat, which
-:meth:`Cia402Amplifiers.exchange` sends: it must be called at least every `master_heartbeat_timeout_s`.
+change and ten times a second. Each SYNC is answered by one TPDO, in order: the driver counts both, so
+that a late TPDO is dated with the SYNC at which its encoders were latched. While the amplifiers are
+enabled the drive watches our heartbeat, which :meth:`Cia402Amplifiers.exchange` sends: it must be called
+at least every `master_heartbeat_timeout_s`.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import contextlib
 import math
 import struct
 import time
+from collections import deque
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -26,6 +29,7 @@ from fitctl.drivers.interface import (
     DeviceFault,
     DeviceIdentity,
     DeviceProtocolError,
+    DeviceTimeout,
     DeviceUnreachable,
     ServoReading,
 )
@@ -34,6 +38,9 @@ if TYPE_CHECKING:
     from fitctl.drivers.cia402.node import Node
 
 _POLL_S = 0.001
+_STATUS_LIMIT_S = 5 * protocol.STATUS_EVERY_MS / 1e3
+_BEHIND_PERIODS = 10
+_MOST_OUTSTANDING = 1000  # the drive's heartbeat is missed long before
 _PAIR = struct.Struct("<ii")
 _STATUS_PAIR = struct.Struct("<HH")
 
@@ -73,8 +80,12 @@ class Cia402Amplifiers:
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
         self._node: Node | None = None
         self._rpdo_id = protocol.RPDO1_BASE + self._device.node_id
-        self._counts: tuple[int, int] | None = None
         self._statuswords = [0, 0]
+        self._status_s = 0.0
+        self._syncs_s: deque[float] = deque(maxlen=_MOST_OUTSTANDING)
+        self._behind = 0
+        self._counts: tuple[int, ...] | None = None
+        self._latched: tuple[float, tuple[int, ...]] | None = None
 
     def open(self) -> DeviceIdentity:
         """Connect, check and configure the drive, start the node; nothing moves, no motor has current.
@@ -94,6 +105,8 @@ class Cia402Amplifiers:
         from fitctl.drivers.cia402.node import Node
 
         self.close()
+        self._syncs_s.clear()
+        self._counts = None
         link = CanLink(self._device)
         try:
             self._node = Node(link, self._device)
@@ -105,6 +118,7 @@ class Cia402Amplifiers:
             self._node.start()
             for axis in range(2):
                 self._state(axis)
+            self._status_s = time.monotonic()
         except BaseException:
             self._node = None
             link.close()
@@ -181,15 +195,17 @@ class Cia402Amplifiers:
         Returns
         -------
         ServoReading or None
-            None when the positions did not come within one servo period. Positions that come later
-            are dropped at the next call.
+            The first positions that come within one servo period, else those that came late since
+            the last call; None when there are neither. `time_s` is when the SYNC was sent that they
+            answer, which may be that of an earlier call.
 
         Raises
         ------
         DeviceUnreachable
             The link broke.
         DeviceTimeout
-            The drive's heartbeat is missing.
+            The drive's heartbeat or its statuswords are missing, or, when positions are behind, the
+            answer to an SDO request.
         DeviceFault
             The drive left the operational state of CANopen. A fault of an axis does not raise: the
             reading carries it.
@@ -197,20 +213,29 @@ class Cia402Amplifiers:
             A velocity is not finite.
         """
         node = self._opened()
+        self._latched = None
         node.drain()
         node.check_alive()
+        self._check_status()
         node.beat()
-        self._counts = None
+        self._behind = self._behind + 1 if self._syncs_s else 0
+        if self._behind >= _BEHIND_PERIODS:
+            self._find_lost()
+        late, self._latched = self._latched, None
         self._send_velocities(velocity_rad_s[0], velocity_rad_s[1])
-        # The drive latches its encoders at SYNC; its sending is the nearest that the host can know.
-        sync_s = time.monotonic()
+        sync_s = self._syncs_s[-1]
         deadline_s = sync_s + self._period_s
-        while self._counts is None:
-            if not node.pump(max(0.0, deadline_s - time.monotonic())):
-                return None
+        while self._latched is None:
+            left_s = deadline_s - time.monotonic()
+            if not node.pump(max(0.0, left_s)) or left_s <= 0:
+                break
+        latched = self._latched or late
+        if latched is None:
+            return None
+        time_s, counts = latched
         return ServoReading(
-            time_s=sync_s,
-            position_rad=np.array(self._counts) * self._rad_per_count,
+            time_s=time_s,
+            position_rad=np.array(counts) * self._rad_per_count,
             enabled=all(
                 protocol.state_of(word) is State.OPERATION_ENABLED for word in self._statuswords
             ),
@@ -273,13 +298,42 @@ class Cia402Amplifiers:
         to_wire = protocol.velocity_to_wire
         velocities = _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
         self._opened().link.send((self._rpdo_id, velocities), (protocol.SYNC_ID, b""))
+        # The drive latches its encoders at SYNC; its sending is the nearest that the host can know.
+        self._syncs_s.append(time.monotonic())
+
+    def _find_lost(self) -> None:
+        """Tell a TPDO that was lost from a slow link; on both the oldest SYNC stays unanswered.
+
+        By the time that the drive answers a request it has long sent its TPDOs of earlier SYNCs: those
+        that have not come before the answer never will. It costs a round trip, but only when behind.
+        """
+        self._opened().read(protocol.ERROR_REGISTER, 0, "B")
+        self._syncs_s.clear()
+        self._behind = 0
 
     def _on_positions(self, data: bytes) -> None:
-        self._counts = _PAIR.unpack(self._sized(data, _PAIR.size, "both positions"))
+        raw = _PAIR.unpack(self._sized(data, _PAIR.size, "both positions"))
+        # The counters are int32 and wrap; the sum of their steps does not.
+        old = self._counts or raw
+        self._counts = tuple(o + protocol.wrap_int32(n - o) for o, n in zip(old, raw, strict=True))
+        if self._syncs_s:
+            self._latched = self._syncs_s.popleft(), self._counts
 
     def _on_statuswords(self, data: bytes) -> None:
         sized = self._sized(data, _STATUS_PAIR.size, "both statuswords")
         self._statuswords[:] = _STATUS_PAIR.unpack(sized)
+        self._status_s = time.monotonic()
+
+    def _check_status(self) -> None:
+        silent_s = time.monotonic() - self._status_s
+        if silent_s > _STATUS_LIMIT_S:
+            raise DeviceTimeout(
+                protocol.DEVICE,
+                self._endpoint,
+                f"the TPDO with the statuswords within {_STATUS_LIMIT_S:g} s",
+                f"none for {silent_s:.2f} s",
+                "another CANopen master changed it; recover",
+            )
 
     # ------------------------------------------------------------ errors
     def _opened(self) -> Node:

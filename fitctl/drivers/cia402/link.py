@@ -23,6 +23,7 @@ from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 
 _SEND_TIMEOUT_S = 0.1
 _END_OF_LINE = re.compile(rb"[\r\a]")
+_LONGEST_LINE = 64  # a frame with a timestamp takes 31 bytes
 _ACKNOWLEDGEMENTS = {b"\r", b"z\r", b"Z\r", b"\a"}
 
 
@@ -65,16 +66,32 @@ class BulkSlcanBus(slcanBus):
     def _read(self, timeout: float | None) -> str | None:
         """The next line that is more than an acknowledgement, or None when none came in time.
 
-        A frame that the adapter refuses (BEL) shows as an answer of the drive that does not come.
+        Bytes that are waiting are looked at once even if `timeout` is 0. A frame that the adapter
+        refuses (BEL) shows as an answer of the drive that does not come.
+
+        Raises
+        ------
+        ValueError
+            If bytes keep coming without a line end.
         """
         deadline_s = None if timeout is None else time.monotonic() + timeout
+        left_s = timeout
+        has_read = False
         while True:
             while end := _END_OF_LINE.search(self._buffer):
                 line = bytes(self._buffer[: end.end()])
                 del self._buffer[: end.end()]
                 if line not in _ACKNOWLEDGEMENTS:
                     return line.decode("ascii", "replace")
-            left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
+            if (length := len(self._buffer)) > _LONGEST_LINE:
+                self._buffer.clear()
+                msg = f"{length} bytes without a line end"
+                raise ValueError(msg)
+            if deadline_s is not None:
+                left_s = max(0.0, deadline_s - time.monotonic())
+                # Bytes that are ready again at once must not outlast the time limit.
+                if has_read and not left_s:
+                    return None
             try:
                 if not select.select([self._descriptor], [], [], left_s)[0]:
                     return None
@@ -85,6 +102,7 @@ class BulkSlcanBus(slcanBus):
                 msg = "the adapter closed the connection"
                 raise can.CanOperationError(msg)
             self._buffer += chunk
+            has_read = True
 
     def shutdown(self) -> None:
         """Leave the bus; the port is closed even if the adapter is gone."""
@@ -161,7 +179,9 @@ class CanLink:
                 return None
             if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
                 return message.arbitration_id, bytes(message.data)
-            timeout_s = max(0.0, deadline_s - time.monotonic())
+            timeout_s = deadline_s - time.monotonic()
+            if timeout_s <= 0:
+                return None
 
     def close(self) -> None:
         """Leave the bus; never raises."""

@@ -23,6 +23,8 @@ from fitctl.drivers.interface import (
 )
 
 _MISSED_HEARTBEATS = 3
+_DRAIN_FRAMES = 100  # more than a full 1 Mbit/s bus carries in five periods of a 500 Hz servo
+_LONGEST_UPLOAD = 4096
 _ABORT_TIMED_OUT = 0x0504_0000
 
 
@@ -73,9 +75,10 @@ class Node:
         return True
 
     def drain(self) -> None:
-        """Take everything that has come in, without waiting."""
-        while self.pump(0.0):
-            pass
+        """Take what has come in, without waiting: at most 100 frames, so that a flood does not hold us."""
+        for _ in range(_DRAIN_FRAMES):
+            if not self.pump(0.0):
+                return
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
         """Take frames, and keep our heartbeat going, until `done` or the time limit."""
@@ -193,46 +196,62 @@ class Node:
         Raises
         ------
         DeviceTimeout, DeviceRefused, DeviceProtocolError
-            No answer in time; an SDO abort; an answer that is none.
+            Not complete within `response_timeout_s`; an SDO abort; an answer that is none, is longer
+            than 4 KiB or not as long as announced.
         """
         what = f"{index:04X}:{subindex:02X}"
+        deadline_s = time.monotonic() + self._device.response_timeout_s
         answer = self._request(protocol.encode_sdo(protocol.SDO_UPLOAD, index, subindex), what)
         self._expect(answer, protocol.SDO_UPLOAD, what)
         frame = protocol.decode_sdo(answer)
         if frame.command & protocol.SDO_EXPEDITED:
             return protocol.expedited_data(frame)
+        size = protocol.announced_size(frame)
+        limit = _LONGEST_UPLOAD if size is None else min(size, _LONGEST_UPLOAD)
         data, toggle, last = b"", 0, False
-        while not last:
+        while not last and len(data) <= limit:
             request = protocol.encode_sdo(protocol.SDO_UPLOAD_SEGMENT | toggle, 0, 0)
-            answer = self._request(request, what, segment=True)
+            answer = self._request(request, what, deadline_s=deadline_s)
             self._expect(answer, toggle, what, mask=protocol.SDO_SPECIFIER | protocol.SDO_TOGGLE)
             chunk, last = protocol.decode_segment(answer)
             data += chunk
             toggle ^= protocol.SDO_TOGGLE
+        if len(data) > limit or (size is not None and len(data) != size):
+            expected = (
+                f"at most {limit} bytes of {what}" if size is None else f"{size} bytes of {what}"
+            )
+            got = f"{len(data)} bytes" + ("" if last else " and more")
+            raise DeviceProtocolError(DEVICE, self.endpoint, expected, got)
         return data
 
     @property
     def _master_id(self) -> int:
         return protocol.master_node_id(self._device.node_id)
 
-    def _request(self, request: bytes, what: str, *, segment: bool = False) -> bytes:
-        """One SDO round trip; late answers to earlier requests are passed over."""
+    def _request(self, request: bytes, what: str, *, deadline_s: float | None = None) -> bytes:
+        """One SDO round trip; late answers to earlier requests are passed over.
+
+        `deadline_s` is given for a segment, which does not name its object.
+        """
         self.drain()
         self._answer = None
+        timeout_s = self._device.response_timeout_s
+        segment = deadline_s is not None
+        left_s = timeout_s if deadline_s is None else deadline_s - time.monotonic()
         can_id = protocol.SDO_REQUEST_BASE + self._device.node_id
         self.link.send((can_id, request))
 
         def answered() -> bool:
             return self._answer is not None and (segment or self._answer[1:4] == request[1:4])
 
-        if not self.pump_until(answered, self._device.response_timeout_s):
+        if not self.pump_until(answered, left_s):
             timed_out = struct.pack("<I", _ABORT_TIMED_OUT)
             abort = bytes([protocol.SDO_ABORT]) + request[1:4] + timed_out
             self.link.send((can_id, abort))
             raise DeviceTimeout(
                 DEVICE,
                 self.endpoint,
-                f"an answer to SDO {what} within {self._device.response_timeout_s:g} s",
+                f"an answer to SDO {what} within {timeout_s:g} s",
                 "none",
                 "check the drive's power, bit rate and node id",
             )

@@ -39,6 +39,8 @@ EVERY_SYNC = 1
 """Transmission type: sent, or acted on, at each SYNC."""
 ON_EVENT = 255
 """Transmission type: sent on change and by the event timer; acted on at once."""
+STATUS_EVERY_MS = 100
+"""Event time that the driver gives the TPDO with the statuswords."""
 
 
 class NmtCommand(IntEnum):
@@ -311,6 +313,11 @@ def expedited_data(frame: SdoFrame) -> bytes:
     """The data of an expedited transfer; all four bytes where no size is given."""
     length = 4 - (frame.command >> 2 & 3) if frame.command & SDO_SIZE_GIVEN else 4
     return frame.data[:length]
+
+
+def announced_size(frame: SdoFrame) -> int | None:
+    """The length in bytes that the start of a segmented transfer announces; None if it does not."""
+    return int.from_bytes(frame.data, "little") if frame.command & SDO_SIZE_GIVEN else None
 
 
 def encode_segment(chunk: bytes, toggle: int, *, last: bool) -> bytes:

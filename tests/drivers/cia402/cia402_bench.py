@@ -1,7 +1,11 @@
 import asyncio
+import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+
+import can
+from can.interfaces.slcan import slcanBus
 
 from fitctl import config
 from fitctl.mocks.cia402.drive import Cia402DriveMock
@@ -22,6 +26,9 @@ class IntegratingMotors:
             self._angle_rad[axis] += velocity * (now_s - self._at_s)
         self._at_s = now_s
         return list(self._angle_rad)
+
+    def turn_to(self, angle_rad: float) -> None:
+        self._angle_rad = [angle_rad, angle_rad]
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
         self.position_rad()
@@ -69,3 +76,40 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 3.0) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, "did not happen in time"
         time.sleep(0.005)
+
+
+@contextlib.contextmanager
+def bridged(
+    bench: Bench, carry: Callable[[can.Message], list[can.Message]] = lambda message: [message]
+) -> Iterator[config.Siderostat]:
+    """The mock behind python-can's virtual bus, by a thread and python-can's own SLCAN.
+
+    `carry` says what goes on of each frame, of either direction; an RPDO or SYNC it must let pass.
+    """
+    stock = slcanBus(f"socket://127.0.0.1:{bench.port}", bitrate=1000000, sleep_after_open=0)
+    done = threading.Event()
+    with can.Bus(interface="virtual", channel="bridged", ignore_config=True) as virtual:
+
+        def bridge() -> None:
+            while not done.is_set():
+                for source in (virtual, stock):
+                    message = source.recv(0.001)
+                    if message is not None:
+                        for each in carry(message):
+                            (stock if is_to_drive(each) else virtual).send(each)
+
+        thread = threading.Thread(target=bridge)
+        thread.start()
+        device = bench.siderostat.device.model_copy(
+            update={"interface": "virtual", "channel": "bridged"}
+        )
+        try:
+            yield bench.siderostat.model_copy(update={"device": device})
+        finally:
+            done.set()
+            thread.join(5)
+            stock.shutdown()
+
+
+def is_to_drive(message: can.Message) -> bool:
+    return message.arbitration_id in {0x000, 0x080, 0x201, 0x601, 0x77F}

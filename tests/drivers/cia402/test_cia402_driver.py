@@ -6,7 +6,7 @@ import can
 import numpy as np
 import pytest
 from can.interfaces.slcan import slcanBus
-from cia402_bench import Bench, wait_until
+from cia402_bench import Bench, bridged, wait_until
 
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
@@ -317,24 +317,8 @@ def test_no_thread_runs_beside_the_servo(amplifiers):
 
 
 def test_any_other_python_can_interface_will_do(bench):
-    """Over python-can's virtual bus, which a thread bridges to the mock by python-can's own SLCAN."""
-    device = bench.siderostat.device.model_copy(
-        update={"interface": "virtual", "channel": "bridged"}
-    )
-    stock = other_master(bench)
-    done = threading.Event()
-    with can.Bus(interface="virtual", channel="bridged", ignore_config=True) as virtual:
-
-        def bridge() -> None:
-            while not done.is_set():
-                for source, sink in ((virtual, stock), (stock, virtual)):
-                    message = source.recv(0.001)
-                    if message is not None:
-                        sink.send(message)
-
-        thread = threading.Thread(target=bridge)
-        thread.start()
-        amplifiers = Cia402Amplifiers(bench.siderostat.model_copy(update={"device": device}))
+    with bridged(bench) as siderostat:
+        amplifiers = Cia402Amplifiers(siderostat)
         try:
             amplifiers.open()
             amplifiers.enable()
@@ -342,6 +326,104 @@ def test_any_other_python_can_interface_will_do(bench):
             wait_until(lambda: bench.motors.velocity_rad_s[0] == pytest.approx(3.0, abs=1e-4))
         finally:
             amplifiers.close()
-            done.set()
-            thread.join(5)
-            stock.shutdown()
+
+
+class LaggingPositions:
+    """Positions as the link delivers them: late by one of our frames, or one of them never."""
+
+    def __init__(self) -> None:
+        self.late = False
+        self.lose = 0
+        self.held: list[can.Message] = []
+
+    def __call__(self, message):
+        if message.arbitration_id in {protocol.SYNC_ID, 0x601}:
+            released, self.held = self.held, []
+            return [message, *released]
+        if message.arbitration_id != 0x181:
+            return [message]
+        if self.lose:
+            self.lose -= 1
+            return []
+        if self.late:
+            self.held.append(message)
+            return []
+        return [message]
+
+
+@pytest.fixture
+def lagging(bench):
+    """Positions' lag, and opened amplifiers with a period that no stall of the machine fills."""
+    positions = LaggingPositions()
+    with bridged(bench, positions) as siderostat:
+        servo = siderostat.servo.model_copy(update={"rate_hz": 5.0})
+        amplifiers = Cia402Amplifiers(siderostat.model_copy(update={"servo": servo}))
+        amplifiers.open()
+        try:
+            yield positions, amplifiers
+        finally:
+            positions.late = False
+            amplifiers.close()
+
+
+def test_positions_that_come_late_are_dated_with_the_sync_that_they_answer(bench, lagging):
+    positions, amplifiers = lagging
+    positions.late = True
+    starts_s = []
+    for turn in range(4):
+        bench.motors.turn_to(2 * math.pi * turn)
+        starts_s.append(time.monotonic())
+        reading = amplifiers.exchange(STILL)
+        wait_until(lambda: len(positions.held) == 1)
+        if turn == 0:
+            assert reading is None
+            continue
+        assert reading.position_rad[0] == pytest.approx(2 * math.pi * (turn - 1))
+        assert starts_s[turn - 1] < reading.time_s < starts_s[turn]
+
+
+def test_after_lost_positions_readings_are_dated_right_again(lagging):
+    positions, amplifiers = lagging
+    reading_of(amplifiers)
+    positions.lose = 1
+    assert amplifiers.exchange(STILL) is None
+    for _ in range(15):
+        start_s = time.monotonic()
+        reading = amplifiers.exchange(STILL)
+        assert reading is not None
+    assert reading.time_s > start_s
+
+
+def test_a_slow_link_is_not_taken_for_lost_positions(lagging):
+    positions, amplifiers = lagging
+    positions.late = True
+    amplifiers.exchange(STILL)
+    for _ in range(25):
+        wait_until(lambda: len(positions.held) == 1)
+        start_s = time.monotonic()
+        reading = amplifiers.exchange(STILL)
+        assert reading is not None
+        assert reading.time_s < start_s
+
+
+def test_positions_go_on_where_the_encoder_counter_wraps(bench, amplifiers):
+    count_rad = 2 * math.pi / bench.siderostat.encoder_counts_per_rev
+    bench.motors.turn_to((2**31 - 10) * count_rad)
+    amplifiers.open()
+    before = reading_of(amplifiers)
+    bench.motors.turn_to((2**31 + 10) * count_rad)
+    after = reading_of(amplifiers)
+    steps = (after.position_rad - before.position_rad) / count_rad
+    assert steps == pytest.approx([20.0, 20.0], abs=0.1)
+
+
+def test_missing_statuswords_time_out_although_positions_come(bench, amplifiers):
+    amplifiers.open()
+    other = other_master(bench)
+    try:
+        out_of_service = (0x281 | protocol.PDO_DISABLED).to_bytes(4, "little")
+        download(other, protocol.TPDO_COMMUNICATION + 1, 1, out_of_service)
+        with pytest.raises(DeviceTimeout, match=r"statuswords within 0\.5 s"):
+            exchange_for(amplifiers, 2.0)
+    finally:
+        other.shutdown()
