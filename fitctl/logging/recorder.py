@@ -81,8 +81,11 @@ def record(
             while not stop.is_set() and os.getppid() == parent:
                 recording.step(_POLL_S)
             deadline_s = time.monotonic() + DRAIN_S
-            while time.monotonic() < deadline_s and recording.step(_QUIET_S):
-                pass
+            still_coming = True
+            while still_coming and time.monotonic() < deadline_s:
+                still_coming = recording.step(_QUIET_S)
+            if still_coming:
+                recording.warn_of_cut_end()
             recording.report()
             writer.close()
             recording.confirm()
@@ -188,6 +191,14 @@ class _Recording:
         self._write(status)
         if self._on_status is not None:
             self._on_status(status)
+
+    def warn_of_cut_end(self) -> None:
+        """Write a warning that the log may end before the queue does."""
+        self._say(
+            "warning",
+            f"records still came when the {DRAIN_S:g} s to drain the queue were over; "
+            "some may be missing at the end of this log",
+        )
 
     def _take(self, data: bytes) -> None:
         self._unconfirmed += 1

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import zmq
@@ -12,6 +14,8 @@ from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
 from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
 
 REPLY_TIMEOUT_S = 2.0
+
+_T = TypeVar("_T")
 
 
 class Client:
@@ -41,10 +45,16 @@ class Client:
         self._subscriber.connect(f"ipc://{folder / TELEMETRY_SOCKET}")
 
     def receive(self, timeout_s: float) -> Telemetry | None:
-        """The next telemetry message, or None when none came in time."""
+        """The next telemetry message, or None when none came in time.
+
+        Raises
+        ------
+        ConnectionError
+            If what came cannot be read; the next message may be readable again.
+        """
         if not self._subscriber.poll(int(timeout_s * 1000)):
             return None
-        return self._decode_telemetry(self._subscriber.recv())
+        return _decoded(self._decode_telemetry, self._subscriber.recv(), "telemetry")
 
     def send(self, command: AnyCommand, timeout_s: float = REPLY_TIMEOUT_S) -> Reply:
         """Give a command and wait for its reply.
@@ -52,7 +62,7 @@ class Client:
         Raises
         ------
         ConnectionError
-            If no supervisor answers in time.
+            If no supervisor answers in time, or its reply cannot be read.
         """
         tag = next(self._tags).to_bytes(8, "big")
         with self._context.socket(zmq.DEALER) as dealer:
@@ -66,9 +76,17 @@ class Client:
                 )
                 raise ConnectionError(msg)
             _, payload = dealer.recv_multipart()
-        return self._decode_reply(payload)
+        return _decoded(self._decode_reply, payload, f"the reply to {type(command).__name__}")
 
     def close(self) -> None:
         """Disconnect."""
         self._subscriber.close()
         self._context.term()
+
+
+def _decoded(decode: Callable[[bytes], _T], payload: bytes, what: str) -> _T:
+    try:
+        return decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        msg = f"{what} ({error}) is unreadable; is the supervisor of another version of fitctl?"
+        raise ConnectionError(msg) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -34,7 +35,8 @@ from fitctl.tui.widgets.traces import Traces
 
 RECEIVE_TIMEOUT_S = 0.2
 EXIT_WAIT_S = 2.5
-UNREADABLE_PAUSE_S = 10.0
+UNREADABLE_NOTICE_S = 10.0  # at most one notice in this time
+UNREADABLE_PAUSE_S = 0.01  # a link that fails at once must not keep a processor busy
 DRAW_PERIODS_S: dict[type[Panel], float] = {
     FocalPlane: 0.1,
     Header: 0.1,
@@ -64,7 +66,7 @@ class Unreadable(Message):
 
 
 class Answered(Message):
-    """A command was answered, or nobody answered: then `reply` is None and `problem` says why."""
+    """A command was answered, or it was not: then `reply` is None and `problem` says why."""
 
     def __init__(self, command: AnyCommand, reply: Reply | None, problem: str = "") -> None:
         super().__init__()
@@ -169,11 +171,14 @@ class ConsoleApp(App[None]):
     # ------------------------------------------------------------ telemetry
 
     def _read(self) -> None:
+        notice_due_s = -math.inf
         while not self._ended.is_set():
             try:
                 telemetry = self.link.receive(RECEIVE_TIMEOUT_S)
-            except (ConnectionError, msgspec.MsgspecError) as error:
-                self.post_message(Unreadable(str(error)))
+            except (ConnectionError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+                if self.clock() >= notice_due_s:
+                    notice_due_s = self.clock() + UNREADABLE_NOTICE_S
+                    self.post_message(Unreadable(str(error)))
                 self._ended.wait(UNREADABLE_PAUSE_S)
                 continue
             if telemetry is not None and not self._ended.is_set():
@@ -191,10 +196,10 @@ class ConsoleApp(App[None]):
     def on_unreadable(self, message: Unreadable) -> None:
         """Say that telemetry comes but cannot be used."""
         self.notify(
-            f"{message.problem}\nAre console and supervisor of one version?",
+            message.problem,
             title="✗ telemetry unreadable",
             severity="error",
-            timeout=UNREADABLE_PAUSE_S,
+            timeout=UNREADABLE_NOTICE_S,
             markup=False,
         )
 
@@ -233,6 +238,8 @@ class ConsoleApp(App[None]):
             answer = Answered(command, self.link.send(command))
         except (ConnectionError, TimeoutError) as error:
             answer = Answered(command, None, str(error))
+        except Exception as error:  # a defect, but STOP must never fail in silence
+            answer = Answered(command, None, f"It failed: {type(error).__name__}: {error}")
         if not self._ended.is_set():
             self.post_message(answer)
 
@@ -240,7 +247,7 @@ class ConsoleApp(App[None]):
         """Say what became of a command, where that is not plain to see."""
         name = type(message.command).__name__
         if message.reply is None:
-            text = f"Nobody answered: {message.problem}"
+            text = message.problem
             if name == "Stop":
                 text += "\nThe instrument may still move. Press STOP again, or cut its power."
             self.notify(

@@ -84,6 +84,7 @@ def test_everything_offered_is_in_the_finished_log(queue, recorder, folder):
     assert info.finished
     assert info.metadata["rig"]["name"] == "bench"
     assert numbers(path) == list(range(100))
+    assert events(path) == []
     last_status = list(read_records(path, ["/fit/recorder/status"]))[-1].message
     assert (last_status.records, last_status.lost) == (101, 0)
     assert process.stdout.read().splitlines()[-1] == b"101 0"
@@ -214,8 +215,11 @@ def test_a_message_that_is_no_record_is_reported_and_passed_over(endpoint, folde
     assert complaint in line
 
 
-def test_draining_ends_even_if_records_keep_coming(endpoint, folder, monkeypatch):
+def test_draining_ends_even_if_records_keep_coming_and_the_log_says_so(
+    endpoint, folder, monkeypatch
+):
     monkeypatch.setattr("fitctl.logging.recorder.DRAIN_S", 0.5)
+    monkeypatch.setattr("fitctl.logging.recorder._QUIET_S", 5.0)  # a stall is no end of records
     stop = threading.Event()
     stop.set()
     queue = RecordQueue(endpoint, SETTINGS.queue_records)
@@ -232,7 +236,9 @@ def test_draining_ends_even_if_records_keep_coming(endpoint, folder, monkeypatch
     queue.close(timeout_s=0.05)
     thread.join()
     assert time.monotonic() - start_s < 5
-    assert log_info(logs_in(folder)[0]).finished
+    (path,) = logs_in(folder)
+    assert log_info(path).finished
+    assert any("some may be missing at the end" in line for line in events(path))
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path, endpoint):

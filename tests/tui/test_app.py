@@ -4,12 +4,16 @@ import asyncio
 import threading
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import closing
 
 import msgspec
 import pytest
+import zmq
 from textual.command import CommandPalette
 from textual.pilot import Pilot
 
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
 from fitctl.supervisor.messages import Acquire, Hold, Off, Recover, Reply, SetTarget, Standby, Stop
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.screens import Reader
@@ -178,6 +182,19 @@ def test_a_stop_that_nobody_answers_is_told_as_a_danger():
     run(scenario, link=FakeLink(nobody))
 
 
+def test_a_stop_that_fails_in_an_unforeseen_way_is_told_as_a_danger_too():
+    def broken(_command):
+        raise TypeError("a defect")
+
+    async def scenario(app, pilot, link):
+        await pilot.press("s")
+        await until(pilot, lambda: notifications(app))
+        assert "Stop not confirmed: It failed: TypeError: a defect" in notifications(app)
+        assert "may still move" in notifications(app)
+
+    run(scenario, link=FakeLink(broken))
+
+
 def test_old_data_are_said_to_be_old_and_new_data_end_it():
     clock = Clock()
     supervisor = FakeSupervisor()
@@ -222,6 +239,55 @@ def test_telemetry_that_cannot_be_read_is_told():
             await until(pilot, lambda: "telemetry unreadable" in notifications(app))
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ConnectionError("unreadable"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
+    ],
+)
+def test_unreadable_messages_are_told_once_and_do_not_hold_up_the_good_ones(error):
+    class Garbled(FakeLink):
+        unreadable = 5
+
+        def receive(self, timeout_s):
+            if self.unreadable:
+                self.unreadable -= 1
+                raise error
+            return super().receive(timeout_s)
+
+    async def scenario(app, pilot, link):
+        assert len(app._notifications) == 1
+
+    run(scenario, link=Garbled())
+
+
+@pytest.mark.parametrize(
+    "payload", [b"\xc1", msgspec.msgpack.encode({"a": 1}), b"\x81\xa1\xff\x01"]
+)
+def test_a_supervisor_of_another_version_is_a_connection_error(tmp_path, payload):
+    def answer():
+        client, tag, _command = commands.recv_multipart()
+        commands.send_multipart([client, tag, payload])
+
+    with closing(Client(tmp_path)) as client, zmq.Context() as context:
+        commands, telemetry = context.socket(zmq.ROUTER), context.socket(zmq.XPUB)
+        commands.bind(f"ipc://{tmp_path}/{COMMAND_SOCKET}")
+        telemetry.bind(f"ipc://{tmp_path}/{TELEMETRY_SOCKET}")
+        answering = threading.Thread(target=answer, daemon=True)
+        answering.start()
+        with commands, telemetry:
+            with pytest.raises(
+                ConnectionError, match=r"reply to Stop .* another version of fitctl"
+            ):
+                client.send(Stop(), timeout_s=DEADLINE_S)
+            answering.join()
+            assert telemetry.poll(1000 * DEADLINE_S)  # the client has subscribed
+            telemetry.send(payload)
+            with pytest.raises(ConnectionError, match=r"telemetry .* another version of fitctl"):
+                client.receive(DEADLINE_S)
 
 
 def test_loops_are_cycled_and_commands_go_to_the_shown_one():

@@ -16,6 +16,9 @@ from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError, Device
 RATE_TOLERANCE = 1e-3  # cameras round the frame rate to their own clock
 EXPOSURE_TOLERANCE = 1e-2  # and the exposure to rows or microseconds
 
+_XML_BYTES_MAX = 16 << 20  # many times that of any known camera; 4 GiB would be read for hours
+_MEMORY_END = 1 << 32
+
 # Set where a camera has them, before anything else: free running, nothing automatic.
 _FREE_RUNNING = (
     ("AcquisitionMode", "Continuous"),
@@ -181,14 +184,16 @@ def _download_xml(channel: ControlChannel) -> str:
             location = protocol.decode_xml_url(text)
         except MalformedPacketError:
             continue
+        if not 0 < location.length <= min(_XML_BYTES_MAX, _MEMORY_END - location.address):
+            continue
         data = channel.read_memory(location.address, location.length)
         return _unpacked(data, channel.endpoint)
     raise DeviceMismatch(
         DEVICE,
         channel.endpoint,
-        "a GenICam description in the camera's memory, Local:NAME;ADDRESS;LENGTH",
+        "a GenICam description of 1 byte to 16 MiB in the camera's memory, Local:NAME;ADDRESS;LENGTH",
         " and ".join(repr(url) for url in urls),
-        "this camera keeps its description elsewhere, which fitctl cannot read yet",
+        "fitctl cannot read a description kept elsewhere; update the camera's firmware",
     )
 
 
@@ -199,7 +204,11 @@ def _unpacked(data: bytes, endpoint: str) -> str:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 data = archive.read(archive.namelist()[0])
         return data.decode("utf-8")
-    except (zipfile.BadZipFile, IndexError, UnicodeDecodeError) as error:
+    except Exception as error:  # a damaged archive can raise any of a dozen kinds
         raise DeviceProtocolError(
-            DEVICE, endpoint, "a readable GenICam description", str(error), "update its firmware"
+            DEVICE,
+            endpoint,
+            "a readable GenICam description",
+            f"{type(error).__name__}: {error}",
+            "update its firmware",
         ) from error

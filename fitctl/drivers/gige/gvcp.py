@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import itertools
 import select
 import socket
@@ -19,7 +20,7 @@ from fitctl.drivers.interface import (
 
 DEVICE = "camera"
 ATTEMPTS = 3
-PENDING_LIMIT_S = 5.0  # a device that asks for more time than this is treated as silent
+PENDING_LIMIT_S = 5.0  # a device that asks for more time than this for one command counts as silent
 _MAX_ANSWER_BYTES = 2048
 
 
@@ -29,16 +30,23 @@ class ControlChannel:
     Parameters
     ----------
     address : str
-        The camera's IP address.
+        The camera's IPv4 address; a host's name would be looked up for longer than any time limit.
     port : int
         Its GVCP port.
     timeout_s : float
-        Time for one command, all attempts together.
+        Time for one command, all attempts together. A camera that asks for more with PENDING_ACK gets
+        up to `PENDING_LIMIT_S` besides, all attempts together.
+
+    Raises
+    ------
+    DeviceUnreachable
+        If the address is none, or the host has no way to it.
     """
 
     def __init__(self, address: str, port: int, timeout_s: float) -> None:
         self.endpoint = f"{address}:{port}"
         self.answered_s = time.monotonic()
+        _check_address(address, self.endpoint)
         self._timeout_s = timeout_s
         self._lock = threading.Lock()
         self._counter = itertools.count()
@@ -141,9 +149,12 @@ class ControlChannel:
     def _answer(self, command: Command, payload: bytes) -> protocol.AnswerPacket:
         request_id = self._next_id()
         packet = protocol.encode_command(command, request_id, payload)
+        attempt_s = self._timeout_s / ATTEMPTS
+        latest_s = time.monotonic() + PENDING_LIMIT_S
         for _attempt in range(ATTEMPTS):
+            latest_s += attempt_s
             self._send(packet)
-            answer = self._receive(request_id, self._timeout_s / ATTEMPTS)
+            answer = self._receive(command, request_id, payload, attempt_s, latest_s)
             if answer is not None:
                 self.answered_s = time.monotonic()
                 return answer
@@ -155,10 +166,11 @@ class ControlChannel:
             "check power, cable and camera.device.address in the rig file",
         )
 
-    def _receive(self, request_id: int, timeout_s: float) -> protocol.AnswerPacket | None:
+    def _receive(
+        self, command: Command, request_id: int, payload: bytes, timeout_s: float, latest_s: float
+    ) -> protocol.AnswerPacket | None:
         """The answer to one attempt; late answers to earlier commands are passed over."""
         deadline_s = time.monotonic() + timeout_s
-        pending_until_s = deadline_s + PENDING_LIMIT_S
         while (left_s := deadline_s - time.monotonic()) > 0:
             if not self._poll.poll(left_s * 1000):
                 continue
@@ -170,12 +182,12 @@ class ControlChannel:
                 raise self._unreachable(error) from error
             except MalformedPacketError as error:
                 raise self._protocol_error("a GVCP answer", str(error)) from error
-            if answer.request_id != request_id:
+            if answer.request_id != request_id or _is_of_other_memory(answer, command, payload):
                 continue
             if answer.command != protocol.PENDING_ACK:
                 return answer
             more_s = self._pending_s(answer.payload)
-            deadline_s = min(time.monotonic() + more_s + timeout_s, pending_until_s)
+            deadline_s = min(time.monotonic() + more_s + timeout_s, latest_s)
         return None
 
     def _pending_s(self, payload: bytes) -> float:
@@ -208,3 +220,27 @@ class ControlChannel:
         return DeviceProtocolError(
             DEVICE, self.endpoint, expected, got, "is this a GigE Vision camera?"
         )
+
+
+def _check_address(address: str, endpoint: str) -> None:
+    try:
+        ipaddress.IPv4Address(address)
+    except ValueError as error:
+        raise DeviceUnreachable(
+            DEVICE,
+            endpoint,
+            "an IPv4 address such as 192.168.1.10",
+            repr(address),
+            "correct camera.device.address in the rig file",
+        ) from error
+
+
+def _is_of_other_memory(answer: protocol.AnswerPacket, command: Command, payload: bytes) -> bool:
+    """Whether this is the answer to an earlier READMEM, whose id has come round again."""
+    return (
+        command == Command.READMEM
+        and answer.command == Command.READMEM + 1
+        and not protocol.is_error(answer.status)
+        and len(answer.payload) >= 4
+        and answer.payload[:4] != payload[:4]
+    )

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from fitctl.drivers.gige import protocol as p
 from fitctl.drivers.gige.gvcp import ControlChannel
-from fitctl.drivers.interface import DeviceProtocolError, DeviceRefused, DeviceTimeout
+from fitctl.drivers.interface import (
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
 
 READ = p.encode_words(p.Register.CONTROL_PRIVILEGE)
 VALUE = p.encode_words(2)
@@ -82,6 +88,23 @@ def test_a_pending_ack_is_waited_for(scripts: list[Script]) -> None:
     assert read_privilege(scripts, [pending, (ACK, VALUE, 0)]) == 2
 
 
+def test_pending_acks_of_all_attempts_share_one_limit(
+    scripts: list[Script], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fitctl.drivers.gige.gvcp.PENDING_LIMIT_S", 1.5)
+    pending = (p.PENDING_ACK, bytes.fromhex("0000 FFFF"), 0)
+    begun_s = time.monotonic()
+    with pytest.raises(DeviceTimeout):
+        read_privilege(scripts, [pending], [pending], [pending])
+    assert 2.0 < time.monotonic() - begun_s < 4.0  # 0.6 s + 1.5 s, not 0.6 s + 3 * 1.5 s
+
+
+@pytest.mark.parametrize("address", ["ä..", "a\0", "camera.example", "127.1", ""])
+def test_what_is_no_ipv4_address_is_unreachable_and_says_where_to_correct_it(address: str) -> None:
+    with pytest.raises(DeviceUnreachable, match=r"IPv4.*correct camera\.device\.address"):
+        ControlChannel(address, p.GVCP_PORT, timeout_s=0.6)
+
+
 def test_an_error_status_is_a_refusal_that_names_the_register(scripts: list[Script]) -> None:
     with pytest.raises(DeviceRefused, match=r"READREG 0x00000A00.*0x8003 INVALID_ADDRESS"):
         read_privilege(scripts, [(ACK, b"", p.Status.INVALID_ADDRESS)])
@@ -105,3 +128,12 @@ def test_memory_is_read_in_pieces_of_512_bytes(scripts: list[Script]) -> None:
     assert channel.read_memory(0x1000, 1030) == bytes(1030)
     channel.close()
     assert [p.decode_readmem(command.payload) for command in script.commands] == pieces
+
+
+def test_memory_from_another_address_is_passed_over(scripts: list[Script]) -> None:
+    other = (p.Command.READMEM + 1, p.encode_words(0x2000, 1), 0)
+    wanted = (p.Command.READMEM + 1, p.encode_words(0x1000, 2), 0)
+    scripts.append(Script([other], [other, wanted]))
+    channel = ControlChannel("127.0.0.1", scripts[-1].port, timeout_s=0.6)
+    assert channel.read_memory(0x1000, 4) == p.encode_words(2)
+    channel.close()

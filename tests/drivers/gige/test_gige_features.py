@@ -1,0 +1,73 @@
+"""The description in the camera's memory, when the camera is not to be trusted."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+import pytest
+
+from fitctl.drivers.gige import protocol as p
+from fitctl.drivers.gige.features import Features
+from fitctl.drivers.gige.gvcp import ControlChannel
+from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
+
+XML_ADDRESS = 0x10000
+
+
+class Memory(ControlChannel):
+    """A camera's memory without the network: one URL, and what it points to."""
+
+    def __init__(self, url: str, content: bytes = b"") -> None:
+        super().__init__("127.0.0.1", p.GVCP_PORT, timeout_s=0.1)
+        self.close()
+        self._url = url
+        self._content = content
+
+    def read_text(self, register: p.TextRegister) -> str:
+        return self._url if register.address == p.Register.XML_URL_1 else ""
+
+    def read_memory(self, address: int, length: int) -> bytes:
+        assert (address, length) == (XML_ADDRESS, len(self._content)), "not to be read"
+        return self._content
+
+
+@pytest.mark.parametrize(
+    "place", ["10000;FFFFFFFF", "10000;1000001", "10000;0", "FFFFFFFF;2", "123456789;10"]
+)
+def test_a_description_of_an_absurd_size_or_place_is_refused_unread(place: str) -> None:
+    with pytest.raises(DeviceMismatch, match=r"1 byte to 16 MiB.*" + place):
+        Features(Memory(f"Local:camera.zip;{place}"))
+
+
+def archive() -> bytearray:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as writer:
+        writer.writestr("a.xml", "<x>" * 100)
+    return bytearray(buffer.getvalue())
+
+
+def changed(offset: int, value: int) -> bytes:
+    """An archive with one byte changed: in its directory if `offset` is counted from there."""
+    data = archive()
+    data[offset] = value
+    return bytes(data)
+
+
+DATA = 30 + len("a.xml")  # after the local header
+DIRECTORY = bytes(archive()).index(b"PK\x01\x02")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (changed(DATA, 0xFF), "invalid block type"),
+        (changed(DIRECTORY + 8, 0x01), "encrypted"),
+        (changed(DIRECTORY + 10, 99), "compression method is not supported"),
+        (b"PK but no archive", "not a zip file"),
+        (b"\xff\xfe", "can't decode byte"),
+    ],
+)
+def test_a_description_that_cannot_be_unpacked_is_named(content: bytes, why: str) -> None:
+    with pytest.raises(DeviceProtocolError, match=why):
+        Features(Memory(f"Local:camera.zip;{XML_ADDRESS:X};{len(content):X}", content))
