@@ -24,6 +24,7 @@ from pydantic import (
 
 _MOST_HISTORY_STEPS = 10_000_000  # some hundred megabytes
 _LARGEST_SERVO_STEP = 0.4  # part of an error that one servo period may take back, with its latency
+HALF_WINDOW_PX = 3  # of Eq. 7's 7x7 window, about its central pixel
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
 
 
@@ -102,6 +103,25 @@ class Camera(Settings):
     def period_s(self) -> float:
         """Time between frames."""
         return 1.0 / self.frame_rate_hz
+
+    @property
+    def largest_window_px(self) -> tuple[int, int]:
+        """The last pixel, az and el, about which the window fits; the first is `HALF_WINDOW_PX`."""
+        return self.width_px - 1 - HALF_WINDOW_PX, self.height_px - 1 - HALF_WINDOW_PX
+
+    def window_fits(self, az_px: float, el_px: float) -> bool:
+        """Whether the whole window about a place is on the frame."""
+        az, el = self.largest_window_px
+        return HALF_WINDOW_PX <= az_px <= az and HALF_WINDOW_PX <= el_px <= el
+
+    @property
+    def window_range_text(self) -> str:
+        """Where the window fits, for people."""
+        az, el = self.largest_window_px
+        return (
+            f"must lie in {HALF_WINDOW_PX}..{az} px az and {HALF_WINDOW_PX}..{el} px el, "
+            "so that the 7x7 window fits on the frame"
+        )
 
     @model_validator(mode="after")
     def _exposure_fits(self) -> Camera:
@@ -393,12 +413,8 @@ class Rig(Settings):
     @model_validator(mode="after")
     def _names_agree(self) -> Rig:
         for name, loop in self.loops.items():
-            most_az, most_el = self.camera.width_px - 4, self.camera.height_px - 4
-            if not (3 <= loop.target_px.az <= most_az and 3 <= loop.target_px.el <= most_el):
-                msg = (
-                    f"loops.{name}.target_px must lie in 3..{most_az} px az and 3..{most_el} px el, "
-                    "so that the 7x7 window fits on the frame"
-                )
+            if not self.camera.window_fits(loop.target_px.az, loop.target_px.el):
+                msg = f"loops.{name}.target_px {self.camera.window_range_text}"
                 raise ValueError(msg)
             servo = loop.siderostat.servo
             if servo.gain_per_s / servo.rate_hz > _LARGEST_SERVO_STEP:

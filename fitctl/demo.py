@@ -27,6 +27,7 @@ from fitctl.processes import end_process, last_line, signals_ignored, start_proc
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
 from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import pair, rms
 
 JUDGED_S = 30.0
 _START_TIMEOUT_S = 60.0
@@ -186,7 +187,6 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
     start_s = max(course.vernier_since_s.get(loop_name, math.nan), end_s - JUDGED_S)
     judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
     errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
-    measured = np.sqrt(np.mean(errors**2, axis=0)) if judged else np.full(2, np.nan)
     truth = _truth(rig, running, loop_name, start_s, end_s)
     step_s = rig.mock_parts()[0].step_s
     arcsec = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
@@ -196,7 +196,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
         "acquired_s": _since(running, course, loop_name, Mode.COARSE),
         "vernier_s": _since(running, course, loop_name, Mode.VERNIER),
         "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
-        "measured_rms_px": {"az": float(measured[0]), "el": float(measured[1])},
+        "measured_rms_px": pair(rms(errors)),
         "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
         "judged_s": truth.samples * step_s,
         "frames": len(ticks),

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Camera, Loop
+from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 
-HALF_WINDOW_PX = 3
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 _MAX_CANDIDATES = 6
 _LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
@@ -50,8 +49,7 @@ class StarSensor:
         self._threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_low_dn = loop.flux_range.low * loop.star_flux_dn
         self._flux_high_dn = loop.flux_range.high * loop.star_flux_dn
-        self._largest_az_px = camera.width_px - 1 - HALF_WINDOW_PX
-        self._largest_el_px = camera.height_px - 1 - HALF_WINDOW_PX
+        self._largest_az_px, self._largest_el_px = camera.largest_window_px
 
     def measure(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float

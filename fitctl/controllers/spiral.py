@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Rig
-from fitctl.controllers.centroid import HALF_WINDOW_PX
+from fitctl.config import HALF_WINDOW_PX, Rig
 from fitctl.model.optics import scales
 
 _LOOKS_BEYOND_FOUND = 2  # frames in the chord beyond those that count a star as found

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import Clock
-from fitctl.config import Rig
-from fitctl.controllers.centroid import HALF_WINDOW_PX, Star, StarSensor
+from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.controllers.centroid import Star, StarSensor
 from fitctl.controllers.coarse import CoarseIntegrator
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.prefilter import Prefilter
@@ -97,7 +97,6 @@ class StellarLoop:
         self._last_failure = ""
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
         self.dac_ready = False
-        self._rig = rig
         self._dac = dac
         self._clock = clock
         self._report = report

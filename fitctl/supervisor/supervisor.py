@@ -17,7 +17,6 @@ import numpy as np
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.controllers.centroid import HALF_WINDOW_PX
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
@@ -191,9 +190,7 @@ class Supervisor:
         for loop in self.loops.values():
             loop.dac_ready = False
         self._camera_ready = False
-        self._executor.submit(
-            close_devices, self._devices, self.servos, list(self.loops), True, self._closed_badly
-        ).result(timeout=_CLOSE_TIMEOUT_S)
+        self._submit(close_devices, list(self.loops), True).result(timeout=_CLOSE_TIMEOUT_S)
 
     # ------------------------------------------------------------ frames
 
@@ -275,14 +272,9 @@ class Supervisor:
         return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
 
     def _set_target(self, command: SetTarget, names: list[str]) -> Reply:
-        camera = self.rig.camera
+        if not self.rig.camera.window_fits(command.az_px, command.el_px):
+            return _refusal(f"target {self.rig.camera.window_range_text}")
         wanted = np.array([command.az_px, command.el_px])
-        most = np.array([camera.width_px, camera.height_px]) - 1 - HALF_WINDOW_PX
-        if not np.all((wanted >= HALF_WINDOW_PX) & (wanted <= most)):
-            return _refusal(
-                f"target must lie in {HALF_WINDOW_PX}..{most[0]} px az and "
-                f"{HALF_WINDOW_PX}..{most[1]} px el, so that the window fits"
-            )
         for name in names:
             self.loops[name].target_px = wanted
         return Reply(accepted=True)
@@ -296,9 +288,7 @@ class Supervisor:
         self._opening, self._abandoned = set(names), set()
         self._event("info", "supervisor", "opening and checking all devices")
         with_camera = not self._camera_ready
-        future = self._executor.submit(
-            open_devices, self._devices, self.servos, names, with_camera, self._closed_badly
-        )
+        future = self._submit(open_devices, names, with_camera)
         self._job = Job(future, partial(self._opened, names, with_camera, trigger))
         self._finish_jobs()
 
@@ -338,10 +328,14 @@ class Supervisor:
         self._close(names, with_camera)
 
     def _close(self, names: list[str], with_camera: bool) -> None:
-        future = self._executor.submit(
-            close_devices, self._devices, self.servos, names, with_camera, self._closed_badly
+        self._job = Job(self._submit(close_devices, names, with_camera), lambda _: None)
+
+    def _submit(
+        self, work: Callable[..., Opened | None], names: list[str], with_camera: bool
+    ) -> Future:
+        return self._executor.submit(
+            work, self._devices, self.servos, names, with_camera, self._closed_badly
         )
-        self._job = Job(future, lambda _: None)
 
     def _closed_badly(self, device: str, error: Exception) -> None:
         self.note("warning", "supervisor", f"{device} did not close well: {_told(error)}")

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.controllers.centroid import HALF_WINDOW_PX, StarSensor
+from fitctl.config import HALF_WINDOW_PX
+from fitctl.controllers.centroid import StarSensor
 from fitctl.model.scene import Scene
 
 NOWHERE = (-500.0, -500.0)

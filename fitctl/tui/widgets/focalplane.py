@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from fitctl.config import HALF_WINDOW_PX
 from fitctl.logging.records import FrameRecord, Tick
 from fitctl.tui.draw.frame import (
     Mark,
@@ -20,7 +21,7 @@ from fitctl.tui.draw.frame import (
 from fitctl.tui.look import DIM, GREEN, INK, ORANGE, SKY, WHITE, Line, number, pad, text
 from fitctl.tui.widgets.panel import Panel
 
-WINDOW_PX = 7
+WINDOW_PX = 2 * HALF_WINDOW_PX + 1
 """Side of the centroid's window; a tick names its central pixel."""
 
 
