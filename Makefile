@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow bench-sim lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -43,8 +43,11 @@ pytest: $(READY)
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
+bench-sim: $(READY)  ## How many times real time the simulation and the batch run
+	$(BIN)/python -m benchmarks.simulate $(ARGS)
+
 lock: $(READY)  ## Resolve the requirements anew (needs uv)
-	uv pip compile pyproject.toml --extra fast --group dev --universal --python-version 3.11 \
+	uv pip compile pyproject.toml --extra fast --extra cluster --group dev --universal --python-version 3.11 \
 	    --generate-hashes --no-annotate --custom-compile-command "make lock" --quiet -o requirements/dev.lock
 
 clean:  ## Remove .venv and caches

@@ -5,6 +5,7 @@ What is slow to import is imported inside the command that needs it, so that ``-
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +14,10 @@ import typer
 from typer.exceptions import TyperException
 
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+
+# Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
+# give, above all beside a loop that must not be late.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 UNUSABLE = 2
 INTERRUPTED = 130
@@ -39,6 +44,14 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+ControllerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--controller",
+        metavar="NAME",
+        help="eq20, lqg-ltr, minimum-variance, fslq, or a saved file.",
+    ),
+]
 ParentOption = Annotated[
     int | None,
     typer.Option(
@@ -49,6 +62,16 @@ ParentOption = Annotated[
 
 def _rig(path: Path | None, overrides: list[str] | None) -> Rig:
     return load_rig(path or default_rig_path(), overrides or ())
+
+
+def with_controller(
+    path: Path | None, overrides: list[str] | None, controller: str | None
+) -> list[str]:
+    """The overrides, and with them one that gives every loop the named controller, if any."""
+    if controller is None:
+        return overrides or []
+    loops = _rig(path, overrides).loops
+    return [*(overrides or []), *(f"loops.{n}.vernier.controller={controller}" for n in loops)]
 
 
 def _rig_arguments(path: Path | None, overrides: list[str] | None) -> list[str]:
@@ -77,7 +100,7 @@ def demo(
     On a terminal the console comes up. Without one, or with --headless, the same runs for a while and
     a summary is printed at the end.
     """
-    from fitctl.commands import run_demo
+    from fitctl.commands.instrument import run_demo
 
     settings = _rig(rig, overrides)
     console = not (headless or as_json) and sys.stdin.isatty() and sys.stdout.isatty()
@@ -97,7 +120,7 @@ def mocks(
     parent_pid: ParentOption = None,
 ) -> None:
     """Serve the rig's mock devices on 127.0.0.1 until Ctrl-C, and print where they listen."""
-    from fitctl.commands import run_mocks
+    from fitctl.commands.instrument import run_mocks
 
     settings = _rig(rig, overrides)
     run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
@@ -108,7 +131,7 @@ def run(
     rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
 ) -> None:
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
-    from fitctl.commands import run_rig
+    from fitctl.commands.instrument import run_rig
 
     run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
 
@@ -122,7 +145,7 @@ def console(
     ] = False,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig."""
-    from fitctl.commands import run_console
+    from fitctl.commands.instrument import run_console
 
     run_console(_rig(rig, overrides), quitting_ends_instrument=quitting_ends_instrument)
 
@@ -130,36 +153,154 @@ def console(
 @app.command()
 def send(
     command: Annotated[
-        str, typer.Argument(help="standby, acquire, hold, stop, recover, off, status or shutdown.")
+        str,
+        typer.Argument(
+            help="standby, acquire, hold, stop, recover, off, status, shutdown, "
+            "target AZ_PX EL_PX or controller NAME."
+        ),
     ],
+    values: Annotated[
+        list[str] | None, typer.Argument(help="What target and controller need.")
+    ] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
     loop: Annotated[str, typer.Option(help="One loop by name; without it, all.")] = "",
 ) -> None:
     """Give one command to the running supervisor of a rig."""
-    from fitctl.commands import send_command
+    from fitctl.commands.instrument import send_command
 
-    raise typer.Exit(send_command(_rig(rig, overrides), command, loop))
+    raise typer.Exit(send_command(_rig(rig, overrides), command, values or [], loop))
 
 
 @app.command()
 def simulate(
     rig: RigOption = None,
     overrides: SetOption = None,
+    controller: ControllerOption = None,
     seed: SeedOption = 0,
     duration: Annotated[float, typer.Option(min=1.0, help="Seconds of virtual time.")] = 120.0,
+    runs: Annotated[
+        int, typer.Option(min=1, help="How many, with seeds from --seed on, on every core.")
+    ] = 1,
+    scheduler: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:port.")
+    ] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Acquire and hold on the virtual clock: same supervisor and plant, no wires, much faster."""
-    from fitctl.commands import run_simulation
+    """Acquire and hold on the virtual clock: same supervisor and plant, no wires, much faster.
 
-    raise typer.Exit(run_simulation(_rig(rig, overrides), seed, duration, as_json=as_json))
+    With --runs, means, percentiles and the worst seeds of many runs; each is the run that its seed
+    gives alone.
+    """
+    from fitctl.commands.simulate import run_many, run_simulation
+
+    settings = _rig(rig, with_controller(rig, overrides, controller))
+    if runs == 1 and not scheduler:
+        raise typer.Exit(run_simulation(settings, seed, duration, as_json=as_json))
+    seeds = range(seed, seed + runs)
+    raise typer.Exit(run_many(settings, seeds, duration, scheduler, as_json=as_json))
+
+
+@app.command()
+def identify(
+    what: Annotated[str, typer.Argument(help="hysteresis, backlash, response, airpath or delay.")],
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    log: Annotated[
+        Path | None, typer.Option(help="Learn from this log (or bench file) of an earlier run.")
+    ] = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulate", help="Experiment on the virtual clock, in seconds.")
+    ] = False,
+    mock: Annotated[
+        bool, typer.Option("--mock", help="Start the rig's mock devices and experiment on them.")
+    ] = False,
+    seed: SeedOption = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="The rig fragment; by default RIG-LOOP-WHAT.toml.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="The plot; by default beside the fragment, as PNG.")
+    ] = None,
+) -> None:
+    """Measure what a rig truly is, and write it as a fragment that its rig file includes.
+
+    Without --log, --simulate or --mock the rig's running supervisor does the experiment: the loop must
+    hold a star in VERNIER. The stages move open loop meanwhile; a stop ends it at once.
+    """
+    from fitctl.commands.identify import Output, Source
+    from fitctl.commands.identify import identify as run
+    from fitctl.identify.experiments import EXPERIMENTS
+
+    if what not in EXPERIMENTS:
+        msg = f"identify: {what} cannot be identified; there are {', '.join(EXPERIMENTS)}"
+        raise ConfigError(msg)
+    settings = _rig(rig, overrides)
+    path = rig or default_rig_path()
+    source, output = Source(log, simulated, mock, seed), Output(out, plot)
+    raise typer.Exit(run(settings, path, overrides or [], what, loop, source, output))
+
+
+@app.command()
+def design(
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="vernier, coarse, bound, compare, or a pair: eq20, lqg-ltr, minimum-variance, fslq."
+        ),
+    ],
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    as_json: JsonOption = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw Fig. 9 (vernier), PNG or SVG.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Save the pair (*.json), for loops.NAME.vernier.controller."
+        ),
+    ] = None,
+) -> None:
+    """Design the loop's controllers from the rig file: margins, residual, and the bound for any.
+
+    vernier is LQG/LTR as the paper does it; compare sets all pairs side by side.
+    """
+    from fitctl.commands.design import Output, run_design
+
+    run_design(_rig(rig, overrides), what, loop, Output(as_json, plot, out))
+
+
+@app.command()
+def figures(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for everything; made if missing.")
+    ],
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    seed: SeedOption = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few and short runs: to see how it looks.")
+    ] = False,
+) -> None:
+    """Make the paper's figures from this system, and measure what every controller shows.
+
+    Figs. 3, 5, 6, 7, 9, 11 and 12 as PNG and SVG, with captions and beside the paper's numbers in
+    figures.md; residuals, attenuation, steps and piston in performance.md; both as JSON too.
+    """
+    from fitctl.commands.figures import run_figures
+
+    settings = _rig(rig, overrides)
+    raise typer.Exit(run_figures(settings, loop, seed, out, quick=quick))
 
 
 @app.command()
 def check(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Read a rig file and say whether it is well."""
-    from fitctl.commands import check_plant
+    from fitctl.commands.instrument import check_plant
 
     settings = _rig(rig, overrides)
     check_plant(settings)
@@ -170,7 +311,7 @@ def check(rig: RigOption = None, overrides: SetOption = None) -> None:
 @app.command()
 def log(path: Annotated[Path, typer.Argument(help="An MCAP file, finished or not.")]) -> None:
     """Say what a log holds."""
-    from fitctl.commands import show_log
+    from fitctl.commands.instrument import show_log
 
     show_log(path)
 
@@ -180,7 +321,7 @@ def record(
     rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
 ) -> None:
     """Record what a supervisor sends; the supervisor starts this by itself."""
-    from fitctl.commands import run_recorder
+    from fitctl.commands.instrument import run_recorder
 
     run_recorder(_rig(rig, overrides), parent_pid=parent_pid)
 

@@ -165,6 +165,7 @@ class Siderostat(Settings):
     acceleration_limit_rad_s2: Positive
     servo: ServoSettings
     device: Cia402Device
+    backlash_sky_arcsec: NonNegative | None = None
 
 
 class ModbusDacDevice(Settings):
@@ -192,6 +193,37 @@ class Mdt693Device(Settings):
     poll_s: Annotated[float, Field(ge=0.2, le=60)]
 
 
+class Structure(Settings):
+    """Lightly damped modes of the mirror's mount."""
+
+    mode_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    damping: Annotated[float, Field(gt=0, lt=1)]
+    cross_axis: NonNegative
+    participation: Annotated[float, Field(ge=0, le=1)]
+
+
+class StackHysteresis(Settings):
+    """What is known of the three stacks' hysteresis: `fitctl identify hysteresis` measures it."""
+
+    half_widths_v: Annotated[list[NonNegative], Field(min_length=2)]
+    gains_m_per_v: Annotated[list[list[Finite]], Field(min_length=3, max_length=3)]
+
+    @model_validator(mode="after")
+    def _can_be_inverted(self) -> StackHysteresis:
+        widths = self.half_widths_v
+        if widths[0] != 0 or any(b <= a for a, b in itertools.pairwise(widths)):
+            msg = "half_widths_v must start at 0 and ascend"
+            raise ValueError(msg)
+        for stack, gains in enumerate(self.gains_m_per_v, start=1):
+            if len(gains) != len(widths):
+                msg = f"gains_m_per_v: stack {stack} has {len(gains)}, half_widths_v {len(widths)}"
+                raise ValueError(msg)
+            if min(itertools.accumulate(gains)) <= 0:
+                msg = f"gains_m_per_v: stack {stack} would move against its voltage; identify it again"
+                raise ValueError(msg)
+        return self
+
+
 class Fsm(Settings):
     """The fast steering mirror, its D/A and its piezo amplifier."""
 
@@ -203,6 +235,8 @@ class Fsm(Settings):
     slew_v_per_s: Positive
     dac: ModbusDacDevice
     piezo: Mdt693Device
+    hysteresis: StackHysteresis | None = None
+    structure: Structure | None = None
 
     @model_validator(mode="after")
     def _range_fits_the_dac(self) -> Fsm:
@@ -236,10 +270,50 @@ class Coarse(Settings):
     reach_frames: Count
 
 
-class Vernier(Settings):
-    """Which compensator drives the mirror."""
+class AirPathModel(Settings):
+    """Eq. 8: gain / (b1 s^2 + b2 s + 1), px, driven by unit-intensity white noise."""
 
-    controller: Literal["eq20"]
+    gain_px: NonNegative
+    b1_s2: Positive
+    b2_s: Positive
+
+
+class LqgLtr(Settings):
+    """Design parameters of Eq. 10-19."""
+
+    omega_n_rad_s: Positive
+    zeta: Positive
+    omega_notch_rad_s: Positive
+    zeta_zero: Positive
+    zeta_pole: Positive
+    process_noise: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    measurement_noise: Positive
+    control_weight: Positive
+
+
+class MinimumVariance(Settings):
+    """Design parameters of the minimum-variance pair."""
+
+    drift_px_per_sqrt_s: Positive
+    offload_per_s: Positive
+
+
+class Fslq(Settings):
+    """Design parameters of the frequency-shaped LQ pair."""
+
+    crossover_hz: Positive
+    control_weight: Positive
+    drift_px_per_sqrt_s: Positive
+
+
+class Vernier(Settings):
+    """Which design drives mirror and siderostat in VERNIER, and what designs are made from."""
+
+    controller: Annotated[str, Field(pattern=r"^(eq20|lqg-ltr|minimum-variance|fslq|.+\.json)$")]
+    air_path: AirPathModel
+    lqg_ltr: LqgLtr
+    minimum_variance: MinimumVariance
+    fslq: Fslq
 
 
 class Prefilter(Settings):
@@ -306,21 +380,9 @@ class Hysteresis(Settings):
         return self
 
 
-class Structure(Settings):
-    """Lightly damped modes of the mirror's mount."""
+class AirPath(AirPathModel):
+    """The air path as it truly is."""
 
-    mode_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)]
-    damping: Annotated[float, Field(gt=0, lt=1)]
-    cross_axis: NonNegative
-    participation: Annotated[float, Field(ge=0, le=1)]
-
-
-class AirPath(Settings):
-    """Eq. 8: gain / (b1 s^2 + b2 s + 1)."""
-
-    gain_px: NonNegative
-    b1_s2: Positive
-    b2_s: Positive
     relative_rms_px: NonNegative
 
 
@@ -462,7 +524,7 @@ def default_rig_path() -> Path:
 
 
 def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
-    """Read and validate a rig file.
+    """Read and validate a rig file, with the fragments of its ``include`` list laid over it, in order.
 
     Parameters
     ----------
@@ -477,10 +539,24 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     ConfigError
         One line for each thing that is wrong: file, key, what is allowed.
     """
+    document = _read_toml(path, "copy rigs/fit-mock.toml or name another with --rig")
+    fragments = document.pop("include", [])
+    if not isinstance(fragments, list) or not all(isinstance(name, str) for name in fragments):
+        msg = f"{path}: include: must be a list of file names (is {fragments!r})"
+        raise ConfigError(msg)
+    for name in fragments:
+        fragment = path.parent / name
+        lay_over(document, _read_toml(fragment, f"it is in the include list of {path}"))
+    for override in overrides:
+        _override(document, override)
+    return rig_from_document(document, str(path))
+
+
+def _read_toml(path: Path, hint: str) -> dict[str, Any]:
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        msg = f"{path}: no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+        msg = f"{path}: no such rig file; {hint}"
         raise ConfigError(msg) from None
     except (OSError, UnicodeDecodeError) as error:
         msg = f"{path}: cannot be read: {error}"
@@ -488,9 +564,16 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     except tomllib.TOMLDecodeError as error:
         msg = f"{path}: not TOML: {error}"
         raise ConfigError(msg) from None
-    for override in overrides:
-        _override(document, override)
-    return rig_from_document(document, str(path))
+
+
+def lay_over(document: dict[str, Any], fragment: Mapping[str, Any]) -> None:
+    """Lay a fragment over a document, table by table: what the fragment says holds."""
+    for key, value in fragment.items():
+        under = document.get(key)
+        if isinstance(value, dict) and isinstance(under, dict):
+            lay_over(under, value)
+        else:
+            document[key] = value
 
 
 def rig_from_document(document: Mapping[str, Any], origin: str) -> Rig:

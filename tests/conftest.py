@@ -1,5 +1,8 @@
 import asyncio
+import os
 import threading
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as fitctl.cli
 
 import hypothesis
 import pytest

@@ -12,6 +12,11 @@ from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_docu
 RIGS = sorted((Path(__file__).parent.parent / "rigs").glob("*.toml"))
 DOCUMENT = tomllib.loads(default_rig_path().read_text(encoding="utf-8"))
 OPTIONAL = {"plant", "mocks"}  # a rig of real hardware leaves them out
+LEFT_OUT_AT_WILL = {
+    ("loops", "right", "fsm", "hysteresis"),
+    ("loops", "right", "fsm", "structure"),
+    ("loops", "right", "siderostat", "backlash_sky_arcsec"),
+}
 
 
 def keys_of(table, path=()):
@@ -20,9 +25,11 @@ def keys_of(table, path=()):
     for key, value in items:
         here = (*path, key)
         chosen = isinstance(key, int) or (path and path[-1] == "loops")
-        if not chosen and key not in OPTIONAL:
+        if not chosen and key not in OPTIONAL and here not in LEFT_OUT_AT_WILL:
             yield here
-        if isinstance(value, dict) or (isinstance(value, list) and isinstance(value[0], dict)):
+        if isinstance(value, dict) or (
+            isinstance(value, list) and value and isinstance(value[0], dict)
+        ):
             yield from keys_of(value, here)
 
 

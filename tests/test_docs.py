@@ -28,11 +28,11 @@ from documents import (
 )
 
 from fitctl.cli import app
-from fitctl.commands import COMMANDS as SENT
+from fitctl.commands.instrument import command_of
 from fitctl.config import default_rig_path, load_rig, rig_from_document
 from fitctl.logging.records import RecorderStatus
 from fitctl.logging.writer import LogWriter
-from fitctl.supervisor.messages import Shutdown, Status
+from fitctl.supervisor.messages import Acquire, Shutdown, Status
 from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
 from fitctl.supervisor.run import run_info
 from fitctl.supervisor.simulate import Simulation
@@ -118,7 +118,7 @@ def test_every_command_exists_with_its_options(found):
             return
         assert arguments[0] in CLI.commands, f"fitctl has no command {arguments[0]}"
         if arguments[0] == "send" and "--help" not in arguments:
-            assert parsed("send", arguments[1:])["command"] in SENT
+            sent_command(arguments[1:])
         with contextlib.suppress(typer.Exit):  # --help
             parsed(arguments[0], arguments[1:])
     elif program == "make":
@@ -127,6 +127,12 @@ def test_every_command_exists_with_its_options(found):
         assert (Path(sys.executable).parent / program).exists()
     else:
         assert program in OUTSIDE, f"{program}: add it to OUTSIDE if it should be there"
+
+
+def sent_command(words):
+    options = parsed("send", words)
+    rig = load_rig(default_rig_path())
+    return command_of(rig, options["command"], options["values"] or [], options["loop"])
 
 
 def masked(lines):
@@ -178,19 +184,21 @@ def test_the_session_in_operating_is_what_the_supervisor_answers():
     for found in ours():
         if found.document.name != "operating.md" or found.words[1] != "send" or not found.output:
             continue
-        options = parsed("send", found.words[2:])
-        name = options["command"]
-        if SENT[name] is Status:
+        command = sent_command(found.words[2:])
+        if isinstance(command, Status):
             answer = ", ".join(
                 f"{n} {loop.mode.name}" for n, loop in simulation.supervisor.loops.items()
             )
         else:
-            reply = simulation.command(SENT[name](loop=options["loop"]))
+            reply = simulation.command(command)
             answer = reply.text or ("accepted" if reply.accepted else "refused")
         assert found.output == (answer,), str(found)
-        if name == "acquire" and simulation.supervisor.loops["right"].mode is Mode.ACQUISITION:
+        if (
+            isinstance(command, Acquire)
+            and simulation.supervisor.loops["right"].mode is Mode.ACQUISITION
+        ):
             simulation.run(20.0)
-        if SENT[name] is Shutdown:
+        if isinstance(command, Shutdown):
             return
     pytest.fail("operating.md shows no session that ends in a shutdown")
 

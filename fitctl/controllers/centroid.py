@@ -10,8 +10,16 @@ from numpy.typing import NDArray
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
-_MAX_CANDIDATES = 6
-_LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
+# Eq. 7's three sums over a window, row by row: light, and its moments along azimuth and elevation.
+_SUMS = np.array(
+    [
+        np.ones(_LEVER_PX.size**2),
+        np.tile(_LEVER_PX, _LEVER_PX.size),
+        np.repeat(_LEVER_PX, _LEVER_PX.size),
+    ]
+)
+MAX_CANDIDATES = 6
+LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
 
 
 class Star(NamedTuple):
@@ -60,7 +68,7 @@ class StarSensor:
     def find(self, image: NDArray[np.uint16]) -> Star | None:
         """Look over the whole frame, brightest spot first; None when this loop's star is not there."""
         search = image.astype(np.float64)
-        for _ in range(_MAX_CANDIDATES):
+        for _ in range(MAX_CANDIDATES):
             el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
             peak_dn = search[el_px, az_px] - self._bias_dn
             if peak_dn < self._threshold_dn:
@@ -90,13 +98,10 @@ class StarSensor:
             ]
             - self._bias_dn
         )
-        columns = window.sum(axis=0)
-        flux_dn = float(columns.sum())
+        flux_dn, az_moment, el_moment = (_SUMS @ window.ravel()).tolist()
         if flux_dn <= 0:
             return None
-        az_px = az + float(columns @ _LEVER_PX) / flux_dn
-        el_px = el + float(window.sum(axis=1) @ _LEVER_PX) / flux_dn
-        return Star(az_px, el_px, flux_dn, az, el)
+        return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
 
     def _accepted(self, star: Star | None) -> Star | None:
         if star is None or not self._flux_low_dn <= star.flux_dn <= self._flux_high_dn:
@@ -111,4 +116,4 @@ class StarSensor:
         )
 
     def _is_spread(self, star: Star, peak_dn: float) -> bool:
-        return peak_dn <= _LARGEST_PEAK * star.flux_dn
+        return peak_dn <= LARGEST_PEAK * star.flux_dn

@@ -70,19 +70,15 @@ class PositionServo:
 
     def step(self, position_rad: Floats) -> Floats:
         """One servo period: velocity command, shape (2,), for the measured motor angles."""
-        return np.array(
-            [
-                self._velocity_rad_s(axis, position)
-                for axis, position in zip(self._axes, position_rad.tolist(), strict=True)
-            ]
-        )
+        az, el = self._axes
+        az_rad, el_rad = position_rad.tolist()
+        return np.array([self._velocity_rad_s(az, az_rad), self._velocity_rad_s(el, el_rad)])
 
     def following_error_rad(self, position_rad: Floats) -> float:
         """How far the motors are from the moving reference; the larger of the axes."""
-        return max(
-            abs(axis.reference_rad - position)
-            for axis, position in zip(self._axes, position_rad.tolist(), strict=True)
-        )
+        az, el = self._axes
+        az_rad, el_rad = position_rad.tolist()
+        return max(abs(az.reference_rad - az_rad), abs(el.reference_rad - el_rad))
 
     def _velocity_rad_s(self, axis: _Axis, position_rad: float) -> float:
         if abs(axis.target_rad - axis.reference_rad) <= abs(axis.step_rad):
@@ -98,4 +94,5 @@ class PositionServo:
 
 
 def _limited(value: float, most: float) -> float:
-    return min(max(value, -most), most)
+    # Runs 500 times a second for each axis: a comparison is quicker than min and max.
+    return most if value > most else -most if value < -most else value

@@ -90,6 +90,23 @@ class ModeChange(Record, frozen=True, kw_only=True):
     reason: str
 
 
+class ExperimentStart(Record, frozen=True, kw_only=True):
+    """An experiment begins: its motions as JSON, one :class:`fitctl.model.drives.Drive` each."""
+
+    loop: str
+    name: str
+    drives_json: str
+
+
+class InjectionRecord(Record, frozen=True, kw_only=True):
+    """Voltages at the D/A, written outside the tick; ``time_s`` is when they took effect."""
+
+    loop: str
+    stack1_v: float
+    stack2_v: float
+    stack3_v: float
+
+
 class Event(Record, frozen=True, kw_only=True):
     """Something that an operator should read."""
 
@@ -151,6 +168,8 @@ AnyRecord = (
     | Tick
     | FrameRecord
     | ModeChange
+    | ExperimentStart
+    | InjectionRecord
     | Event
     | DeviceHealth
     | PiezoReading

@@ -136,7 +136,8 @@ class Testbed:
         self._scene = Scene(
             rig.camera, [spot for name in rig.loops for spot in truth.loops[name].spots]
         )
-        self._random = next(iter(self._plants.values())).plant.frame_random[0]
+        self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
+        self._exposures = 0
         self._camera = GigeCameraMock(rig.camera, self._render, port=mocks.gvcp_port)
         self._bench = Bench(
             {name: live.plant for name, live in self._plants.items()}, started_s, mocks.bench_port
@@ -187,7 +188,8 @@ class Testbed:
 
     def _render(self, mid_exposure_s: float) -> NDArray[np.uint16]:
         spots = [live.spots_px(mid_exposure_s) for live in self._plants.values()]
-        return self._scene.frame(np.concatenate(spots), self._random)
+        self._exposures += 1
+        return self._scene.frame(np.concatenate(spots), self._pixel_key, self._exposures)
 
     async def _keep_up(self) -> None:
         """Advance in small pieces also when nobody looks, so that nobody ever waits for an hour's steps."""

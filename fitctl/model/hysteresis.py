@@ -46,8 +46,63 @@ def play(state: Floats, value: Floats, half_width: Floats) -> Floats:
 
 
 def hysteresis_output(state: Floats, gains: Floats) -> Floats:
-    """Displacement of the parallel elements: state has shape (..., n), gains (n,)."""
-    return state @ gains
+    """Displacement of the parallel elements: state has shape (..., n), gains (n,) or (..., n)."""
+    return np.vecdot(state, gains)
+
+
+def inverse_model(half_width_v: Floats, gains: Floats) -> tuple[Floats, Floats]:
+    """The exact inverse operator, metres to volts: itself parallel plays.
+
+    Parameters
+    ----------
+    half_width_v : array, shape (n,)
+        Ascending, the first zero.
+    gains : array, shape (..., n)
+        All their partial sums (the slopes) positive: otherwise no inverse exists.
+
+    Returns
+    -------
+    half_width_m, gains_v_per_m : arrays, shape (..., n)
+
+    Notes
+    -----
+    Krejci and Kuhnen, Inverse control of systems with hysteresis and creep, IEE Proc. Control Theory
+    Appl. 148 (2001), Eq. 20-22.
+    """
+    slopes = np.cumsum(gains, axis=-1)
+    half_width_m = slopes * half_width_v - np.cumsum(gains * half_width_v, axis=-1)
+    return half_width_m, np.diff(1.0 / slopes, prepend=0.0)
+
+
+def inverse_state(plays_v: Floats, gains: Floats) -> Floats:
+    """Plays of the inverse operator, metres, that belong to the model's plays; both shape (..., n)."""
+    slopes = np.cumsum(gains, axis=-1)
+    moved_m = np.cumsum(gains * plays_v, axis=-1)
+    return slopes * plays_v + moved_m[..., -1:] - moved_m
+
+
+def inverse_volts(plays_v: Floats, half_width_v: Floats, gains: Floats, wanted_m: Floats) -> Floats:
+    """The voltage at which stacks with a memory reach a displacement, exactly.
+
+    Parameters
+    ----------
+    plays_v : array, shape (..., n)
+        The model's plays as they are now; they are not changed.
+    half_width_v : array, shape (n,)
+        Ascending, the first zero.
+    gains : array, shape (..., n)
+        All their partial sums (the slopes) positive.
+    wanted_m : array, shape (...)
+        In the model's own metres: zero for a relaxed stack.
+
+    Returns
+    -------
+    array, shape (...)
+        Not limited to what a D/A can give.
+    """
+    half_width_m, gains_v_per_m = inverse_model(half_width_v, gains)
+    plays_m = play(inverse_state(plays_v, gains), wanted_m[..., None], half_width_m)
+    return np.vecdot(plays_m, gains_v_per_m)
 
 
 def swept_stroke(half_width_v: Floats, gains: Floats, full_scale_v: float) -> float:

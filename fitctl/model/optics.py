@@ -94,8 +94,9 @@ def mirror_from_stacks(displacement_m: Floats, stack_radius_m: float) -> Floats:
 
     The plane through the three points of Eq. 2, for small angles; piston does not enter.
     """
-    d1, d2, d3 = displacement_m[..., 0], displacement_m[..., 1], displacement_m[..., 2]
-    return np.stack([d2 - d3, d1 - d2], axis=-1) / (2 * stack_radius_m)
+    # Neighbours' differences are those of elevation, then azimuth.
+    apart_m = displacement_m[..., :-1] - displacement_m[..., 1:]
+    return apart_m[..., ::-1] / (2 * stack_radius_m)
 
 
 def mirror_normal(displacement_m: Floats, stack_radius_m: float) -> Floats:
@@ -127,5 +128,5 @@ def saturate_diamond(mirror_rad: Floats, range_rad: float) -> Floats:
     Two axes share three stacks, so what can be reached is a diamond; clipping each axis by itself
     would overdrive a stack and turn the motion.
     """
-    reach = np.abs(mirror_rad).sum(axis=-1, keepdims=True)
-    return mirror_rad * np.minimum(1.0, range_rad / np.maximum(reach, 1e-300))
+    reach = np.abs(mirror_rad[..., 0]) + np.abs(mirror_rad[..., 1])
+    return mirror_rad * np.minimum(1.0, range_rad / np.maximum(reach, 1e-300))[..., None]

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from fitctl.config import Camera, Spot
+from fitctl.model.compiled import kernels
+from fitctl.model.light import light_below, light_table
+from fitctl.model.pixel_noise import pixel_normals, quantiles
 
 Floats = NDArray[np.float64]
 FULL_WELL_DN = 65535
@@ -32,6 +34,8 @@ class Scene:
         self._flux_dn = np.array([spot.flux_dn for spot in spots])
         # The 1/e^2 diameter of a Gaussian is four standard deviations.
         self._sigma_px = np.array([spot.diameter_px / 4 for spot in spots])
+        self._light_dn = np.empty(self._shape)
+        self._down, self._across = np.empty(self._shape[0]), np.empty(self._shape[1])
         self._edges_x: Floats = np.arange(camera.width_px + 1.0) - 0.5
         self._edges_y: Floats = np.arange(camera.height_px + 1.0) - 0.5
 
@@ -41,15 +45,45 @@ class Scene:
         down = self._pixel_fractions(self._edges_y, positions_px[..., 1])
         return self._bias_dn + (down * self._flux_dn[:, None]).swapaxes(-1, -2) @ across
 
-    def frame(self, positions_px: Floats, random: np.random.Generator) -> NDArray[np.uint16]:
-        """One frame with pixel noise, shape (height, width), of spots at (spots, 2)."""
-        noisy = self.expected(positions_px)
-        noisy += self._noise_dn * random.standard_normal(self._shape)
+    def frame(self, positions_px: Floats, key: int, number: int) -> NDArray[np.uint16]:
+        """One frame with pixel noise, shape (height, width), of spots at (spots, 2).
+
+        The noise is that of frame `number` of the run whose key is given
+        (:mod:`fitctl.model.pixel_noise`).
+        """
+        compiled = kernels()
+        if compiled is None:
+            return self.frame_reference(positions_px, key, number)
+        compiled.render(
+            self._light_dn,
+            0,
+            0,
+            self._shape[1],
+            positions_px,
+            self._flux_dn,
+            self._sigma_px,
+            len(self._flux_dn),
+            self._bias_dn,
+            self._noise_dn,
+            FULL_WELL_DN,
+            np.uint64(key),
+            number,
+            quantiles(),
+            light_table(),
+            self._down,
+            self._across,
+        )
+        return self._light_dn.astype(np.uint16)
+
+    def frame_reference(self, positions_px: Floats, key: int, number: int) -> NDArray[np.uint16]:
+        """:meth:`frame` in NumPy; the compiled one is held to this."""
+        noise = pixel_normals(key, number, math.prod(self._shape)).reshape(self._shape)
+        noisy = self.expected(positions_px) + self._noise_dn * noise
         return np.clip(np.rint(noisy), 0, FULL_WELL_DN).astype(np.uint16)
 
     def _pixel_fractions(self, edges: Floats, centre_px: Floats) -> Floats:
         """Part of a spot's light that falls on each column (or row), shape (..., spots, pixels)."""
-        below = ndtr((edges - centre_px[..., None]) / self._sigma_px[:, None])
+        below = light_below((edges - centre_px[..., None]) / self._sigma_px[:, None])
         return np.asarray(below[..., 1:] - below[..., :-1])
 
 

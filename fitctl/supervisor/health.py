@@ -48,15 +48,15 @@ def loop_health(
         _health(
             f"{name} D/A",
             f"{dac.host}:{dac.port}",
-            loop.dac_ready,
-            "written every tick" if loop.dac_ready else "not written",
+            loop.stages.ready,
+            "written every tick" if loop.stages.ready else "not written",
             identities,
             now_s,
         ),
         _health(
             f"{name} piezo",
             piezo.port,
-            loop.dac_ready,
+            loop.stages.ready,
             piezo_error or f"read every {piezo.poll_s:g} s",
             identities,
             now_s,

@@ -7,26 +7,37 @@ diamond -> D/A write and siderostat set-point -> record.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import Clock
 from fitctl.config import HALF_WINDOW_PX, Rig
 from fitctl.controllers.centroid import Star, StarSensor
-from fitctl.controllers.coarse import CoarseIntegrator
+from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.estimator import StarEstimator
+from fitctl.controllers.pair import Design, Measurement, Pair
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.controllers.spiral import Spiral, plan_spiral
-from fitctl.controllers.vernier import Vernier
 from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
-from fitctl.logging.records import AnyRecord, Event, ModeChange, Severity, Tick
-from fitctl.model.optics import mirror_angles, saturate_diamond, scales, stack_volts
-from fitctl.supervisor.modes import TRACKING, Mode, Trigger, transition
+from fitctl.logging.records import (
+    AnyRecord,
+    Event,
+    ExperimentStart,
+    InjectionRecord,
+    ModeChange,
+    Severity,
+    Tick,
+)
+from fitctl.model.drives import SIDEROSTAT, Drive, channel_values, experiment_s
+from fitctl.model.optics import scales
+from fitctl.supervisor.modes import FOLLOWING, TRACKING, Mode, Trigger, transition
 from fitctl.supervisor.servo import SiderostatServo
+from fitctl.supervisor.stages import Stages
 
 Floats = NDArray[np.float64]
 _NOWHERE = np.full(2, math.nan)
@@ -55,13 +66,22 @@ class Findings:
     out_of_reach: int = 0
 
 
-@dataclass
-class Commands:
-    """What the stages were last told."""
+@dataclass(frozen=True)
+class Experiment:
+    """Test motions under way, about where the siderostat was held."""
 
-    stack_v: Floats
-    mirror_rad: Floats = field(default_factory=lambda: np.zeros(2))
-    setpoint_rad: Floats = field(default_factory=lambda: np.zeros(2))
+    drives: list[Drive]
+    start_s: float
+    end_s: float
+    held_rad: Floats
+
+
+class Seen(NamedTuple):
+    """A frame's star, if any, and where the stages were at its mid-exposure, each shape (2,)."""
+
+    star: Star | None
+    mirror_rad: Floats
+    motor_rad: Floats
 
 
 class StellarLoop:
@@ -96,8 +116,6 @@ class StellarLoop:
         self.last_change: ModeChange | None = None
         self._last_failure = ""
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
-        self.dac_ready = False
-        self._dac = dac
         self._clock = clock
         self._report = report
         self._scale = scales(rig, loop)
@@ -111,25 +129,22 @@ class StellarLoop:
         self._spiral_centre_rad = np.zeros(2)
         self._sighting: Sighting | None = None
         self._prefilter = Prefilter(loop.prefilter.time_constant_s, self._period_s, self.target_px)
-        self._coarse = CoarseIntegrator(
-            loop.coarse.gain_rad_per_m, self._scale.pixel_size_m, self._period_s
+        self._coarse_step_rad_per_px = (
+            loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * self._period_s
         )
-        self._vernier = Vernier(self._period_s, self._scale.mirror_px_per_rad, loop.fsm.range_rad)
+        self._pair = self._pair_of(design_for(rig, name))
+        self.stages = Stages(rig, name, servo, dac, clock)
+        self._experiment: Experiment | None = None
         self._range_px = self._scale.mirror_px_per_rad * loop.fsm.range_rad
-        self._travel_rad = loop.siderostat.travel_sky_arcsec / self._scale.motor_sky_arcsec_per_rad
         self._at_travel_limit = False
         self._findings = Findings()
-        self._commands = Commands(stack_v=np.full(3, loop.fsm.bias_v))
-        # The mirror angle in force at each exposure, for the estimator.
-        self._mirror_history: deque[tuple[float, Floats]] = deque(
-            [(-math.inf, np.zeros(2))], maxlen=max(8, math.ceil(0.3 / self._period_s))
-        )
-        self._laws: dict[Mode, Callable[[Star | None], None]] = {
+        self._laws: dict[Mode, Callable[[Seen], None]] = {
             Mode.OFF: self._rest,
             Mode.STANDBY: self._rest,
             Mode.ACQUISITION: self._search,
             Mode.COARSE: self._pull_in,
             Mode.VERNIER: self._hold_star,
+            Mode.EXPERIMENT: self._move_as_told,
             Mode.SAFE: self._rest,
         }
 
@@ -138,24 +153,25 @@ class StellarLoop:
     def tick(self, frame: Frame | None, frames_lost: int) -> Tick:
         """One tick, with the newest frame or without one."""
         started_s = self._clock.now_s()
-        # Where the motors were when the frame was exposed: what it shows belongs to that.
-        motor_rad = (
-            self.servo.position_rad
-            if frame is None
-            else self.servo.position_at(frame.mid_exposure_s)
-        )
-        star = self._sense(frame, motor_rad) if frame is not None else None
-        self._judge(frame, star)
+        self._note_injections()
+        seen = self._sense(frame)
+        self._judge(frame, seen.star)
         # Without a frame to track by, the stages wait where they are.
         if frame is not None or self.mode not in TRACKING:
-            self._laws[self.mode](star)
+            self._laws[self.mode](seen)
         self._write()
-        done_s = self._clock.now_s()
-        return self._tick_record(frame, star, motor_rad, started_s, done_s, frames_lost)
+        return self._record(frame, seen, started_s, frames_lost)
 
-    def _sense(self, frame: Frame, motor_rad: Floats) -> Star | None:
-        mirror_rad = self._mirror_at(frame.mid_exposure_s)
-        if self.mode in {Mode.COARSE, Mode.VERNIER} and self._findings.lost == 0:
+    def _sense(self, frame: Frame | None) -> Seen:
+        """What a frame shows belongs to where the stages were when it was exposed."""
+        if frame is None:
+            return Seen(None, self.stages.mirror_now_rad, self.servo.position_rad)
+        motor_rad = self.servo.position_at(frame.mid_exposure_s)
+        mirror_rad = self.stages.mirror_at(frame.mid_exposure_s)
+        return Seen(self._find(frame, mirror_rad, motor_rad), mirror_rad, motor_rad)
+
+    def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        if self.mode in FOLLOWING and self._findings.lost == 0:
             predicted = self._estimator.predict_px(motor_rad, mirror_rad)
             star = self._sensor.measure(frame.image, *predicted)
             # The estimate may be half a window off after a jump; then the whole frame decides.
@@ -173,7 +189,10 @@ class StellarLoop:
             self.fail(str(self.servo.fault))
         elif frame is not None and self.mode is Mode.ACQUISITION:
             self._judge_search(frame, star)
-        elif frame is not None and self.mode in {Mode.COARSE, Mode.VERNIER}:
+        elif self.mode is Mode.EXPERIMENT and self.stages.injector.fault is not None:
+            self.stages.ready = False
+            self.fail(str(self.stages.injector.fault))
+        elif frame is not None and self.mode in FOLLOWING:
             self._judge_tracking(star)
 
     def _judge_search(self, frame: Frame, star: Star | None) -> None:
@@ -252,20 +271,20 @@ class StellarLoop:
         self._last_failure = reason
 
     def _enter(self, source: Mode) -> None:
+        if source is Mode.EXPERIMENT:
+            self._end_experiment()
         if self.mode is Mode.SAFE:
             self.servo.stop()
         elif self.mode is Mode.STANDBY:
             self.servo.hold()
-            self._commands.setpoint_rad = self.servo.setpoint_rad
+            self.stages.siderostat_held()
         elif self.mode is Mode.ACQUISITION:
             self._start_search()
         elif self.mode is Mode.COARSE:
             self._prefilter.reset(self.target_px)
-            sighting, self._sighting = self._sighting, None
-            if source is Mode.ACQUISITION and sighting is not None:
-                self._coarse.reset(sighting.motor_rad)
+            self._sighting = None
         elif self.mode is Mode.VERNIER:
-            self._vernier.reset()
+            self._start_pair()
 
     def _start_search(self) -> None:
         """A new spiral, about where the star is expected: on the target, or where it was last seen."""
@@ -279,39 +298,109 @@ class StellarLoop:
 
     # ------------------------------------------------------------ control laws
 
-    def _rest(self, _star: Star | None) -> None:
+    def _rest(self, _seen: Seen) -> None:
         """Mirror back to its bias; the siderostat is held or stopped by its servo."""
-        self._mirror_to_bias()
+        self.stages.mirror_to_bias()
 
-    def _search(self, _star: Star | None) -> None:
-        self._mirror_to_bias()
+    def _search(self, _seen: Seen) -> None:
+        self.stages.mirror_to_bias()
         if self._sighting is not None:
             self._siderostat_to(self._sighting.motor_rad)
             return
         offset_px = self._spiral.advance(self._period_s)
         self._siderostat_to(self._spiral_centre_rad + offset_px / self._scale.motor_px_per_rad)
 
-    def _pull_in(self, star: Star | None) -> None:
-        self._mirror_to_bias()
+    def _pull_in(self, seen: Seen) -> None:
+        self.stages.mirror_to_bias()
         command_px = self._prefilter.step(self.target_px)
-        if star is not None:
-            self._siderostat_to(self._coarse.step(_position(star) - command_px))
+        if seen.star is not None:
+            error_px = _position(seen.star) - command_px
+            self._siderostat_by(-self._coarse_step_rad_per_px * error_px)
 
-    def _hold_star(self, star: Star | None) -> None:
+    def _hold_star(self, seen: Seen) -> None:
         command_px = self._prefilter.step(self.target_px)
-        if star is None:
+        if seen.star is None:
             return
-        error_px = _position(star) - command_px
-        self._siderostat_to(self._coarse.step(error_px))
-        self._mirror_to(self._vernier.step(error_px))
+        command = self._pair.step(
+            Measurement(
+                _position(seen.star) - command_px, command_px, seen.mirror_rad, seen.motor_rad
+            )
+        )
+        self._siderostat_by(command.motor_step_rad)
+        self.stages.mirror_to(
+            command.mirror_rad, hysteresis_inverse=self._pair.design.hysteresis_inverse
+        )
+
+    def _move_as_told(self, _seen: Seen) -> None:
+        experiment = self._experiment
+        assert experiment is not None  # noqa: S101  # the mode is entered with one
+        now_s = self._clock.now_s()
+        if now_s >= experiment.end_s:
+            self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
+            return
+        offset_px = channel_values(experiment.drives, SIDEROSTAT, now_s - experiment.start_s)
+        self._siderostat_to(experiment.held_rad + offset_px / self._scale.motor_px_per_rad)
+
+    # ------------------------------------------------------------ designs and experiments
+
+    @property
+    def controller(self) -> str:
+        """The design at work in VERNIER."""
+        return self._pair.design.name
+
+    def use(self, design: Design) -> None:
+        """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
+        before = self.controller
+        self._pair = self._pair_of(design)
+        if self.mode is Mode.VERNIER:
+            self._start_pair()
+        self._event("info", f"controller {before} -> {design.name}")
+
+    def start_experiment(self, name: str, drives: list[Drive]) -> bool:
+        """Move the stages as told, from the next tick on; False where this mode has no star to watch."""
+        now_s = self._clock.now_s()
+        self._experiment = Experiment(
+            drives, now_s, now_s + experiment_s(drives), self.stages.setpoint_rad.copy()
+        )
+        if not self.fire(Trigger.EXPERIMENT, name):
+            return False
+        text = msgspec.json.encode(drives).decode()
+        self._report(ExperimentStart(time_s=now_s, loop=self.name, name=name, drives_json=text))
+        self._report_injection(now_s, self.stages.stack_v)
+        self.stages.injector.start(drives, now_s)
+        return True
+
+    def _end_experiment(self) -> None:
+        self.stages.injector.end()
+        self._note_injections()
+        experiment, self._experiment = self._experiment, None
+        if experiment is not None and self.mode is not Mode.SAFE:
+            self._siderostat_to(experiment.held_rad)
+
+    def _note_injections(self) -> None:
+        for time_s, stack_v in self.stages.take_injections():
+            self._report_injection(time_s, stack_v)
+
+    def _report_injection(self, time_s: float, stack_v: Floats) -> None:
+        v1, v2, v3 = stack_v.tolist()
+        self._report(
+            InjectionRecord(time_s=time_s, loop=self.name, stack1_v=v1, stack2_v=v2, stack3_v=v3)
+        )
+
+    def _pair_of(self, design: Design) -> Pair:
+        return Pair(design, self._scale, self.settings.fsm.range_rad)
+
+    def _start_pair(self) -> None:
+        held_rad = self.stages.mirror_held_rad(
+            hysteresis_inverse=self._pair.design.hysteresis_inverse
+        )
+        self._pair.start(held_rad, self.servo.position_rad, self._prefilter.value_px)
 
     # ------------------------------------------------------------ stages
 
     def start_from(self, stack_v: Floats) -> None:
         """Take the D/A's outputs, shape (3,), as found; the mirror goes to its bias from there."""
-        self._commands.stack_v = np.array(stack_v, dtype=float)
-        self._commands.mirror_rad = self._angles(self._commands.stack_v)
-        self.dac_ready = True
+        self.stages.start_from(stack_v)
         self._last_failure = ""
         if self.servo.encoders_jumped:
             self._estimator.forget()
@@ -319,29 +408,11 @@ class StellarLoop:
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
             )
 
-    def at_bias(self) -> bool:
-        """The mirror is commanded to its bias."""
-        return bool(np.allclose(self._commands.stack_v, self.settings.fsm.bias_v))
-
-    def _mirror_to(self, mirror_rad: Floats) -> None:
-        fsm = self.settings.fsm
-        self._commands.mirror_rad = saturate_diamond(mirror_rad, fsm.range_rad)
-        volts = stack_volts(
-            self._commands.mirror_rad, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v
-        )
-        # Rounding may leave the D/A's range by a part in 1e15.
-        self._commands.stack_v = np.clip(volts, 0.0, fsm.dac.full_scale_v)
-
-    def _mirror_to_bias(self) -> None:
-        fsm = self.settings.fsm
-        most_v = fsm.slew_v_per_s * self._period_s
-        left_v = fsm.bias_v - self._commands.stack_v
-        self._commands.stack_v = self._commands.stack_v + np.clip(left_v, -most_v, most_v)
-        self._commands.mirror_rad = self._angles(self._commands.stack_v)
+    def _siderostat_by(self, step_rad: Floats) -> None:
+        self._siderostat_to(self.stages.setpoint_rad + step_rad)
 
     def _siderostat_to(self, setpoint_rad: Floats) -> None:
-        within = np.clip(setpoint_rad, -self._travel_rad, self._travel_rad)
-        limited = bool(np.any(within != setpoint_rad))
+        limited = not self.stages.siderostat_to(setpoint_rad)
         if limited and not self._at_travel_limit:
             self._event(
                 "warning",
@@ -349,31 +420,66 @@ class StellarLoop:
                 "arcsec; it waits there",
             )
         self._at_travel_limit = limited
-        self._commands.setpoint_rad = within
-        self.servo.move_to(within)
 
     def _write(self) -> None:
         """Every tick, so that the D/A's watchdog sees that we live."""
-        if not self.dac_ready or self.mode is Mode.OFF:
+        if not self.stages.ready or self.mode in {Mode.OFF, Mode.EXPERIMENT}:
             return
         try:
-            self._dac.write_v(self._commands.stack_v)
+            self.stages.write()
         except DeviceError as error:
-            self.dac_ready = False
             self.fail(str(error))
-        self._mirror_history.append((self._clock.now_s(), self._commands.mirror_rad))
-
-    def _angles(self, stack_v: Floats) -> Floats:
-        fsm = self.settings.fsm
-        return mirror_angles(stack_v, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
-
-    def _mirror_at(self, time_s: float) -> Floats:
-        for since_s, mirror_rad in reversed(self._mirror_history):
-            if since_s <= time_s:
-                return mirror_rad
-        return self._mirror_history[0][1]
 
     # ------------------------------------------------------------ records
+
+    def _record(self, frame: Frame | None, seen: Seen, started_s: float, frames_lost: int) -> Tick:
+        """What this tick was: names, times and numbers as they are logged."""
+        done_s = self._clock.now_s()
+        star, stages = seen.star, self.stages
+        exposed_s = math.nan if frame is None else frame.mid_exposure_s
+        star_px = _NOWHERE if star is None else _position(star)
+        target_az_px, target_el_px = self._prefilter.value_px.tolist()
+        error_az_px, error_el_px = (star_px - self._prefilter.value_px).tolist()
+        fsm_az_rad, fsm_el_rad = stages.mirror_rad.tolist()
+        stack1_v, stack2_v, stack3_v = stages.stack_v.tolist()
+        motor_az_rad, motor_el_rad = seen.motor_rad.tolist()
+        setpoint_az_rad, setpoint_el_rad = stages.setpoint_rad.tolist()
+        return Tick(
+            time_s=done_s,
+            loop=self.name,
+            number=-1 if frame is None else frame.number,
+            mode=self.mode.name,
+            mode_number=int(self.mode),
+            mid_exposure_s=exposed_s,
+            frame_age_s=math.nan if frame is None else frame.received_s - exposed_s,
+            compute_s=done_s - started_s,
+            late=frame is not None and done_s - exposed_s > self._due_after_s,
+            frames_lost=frames_lost,
+            star_visible=star is not None,
+            star_az_px=float(star_px[0]),
+            star_el_px=float(star_px[1]),
+            star_flux_dn=math.nan if star is None else star.flux_dn,
+            window_az_px=-1 if star is None else star.window_az_px,
+            window_el_px=-1 if star is None else star.window_el_px,
+            target_az_px=target_az_px,
+            target_el_px=target_el_px,
+            error_az_px=error_az_px,
+            error_el_px=error_el_px,
+            fsm_az_rad=fsm_az_rad,
+            fsm_el_rad=fsm_el_rad,
+            fsm_range_fraction=(abs(fsm_az_rad) + abs(fsm_el_rad)) / self.settings.fsm.range_rad,
+            fsm_saturated=self.mode is Mode.VERNIER and self._pair.saturated,
+            stack1_v=stack1_v,
+            stack2_v=stack2_v,
+            stack3_v=stack3_v,
+            siderostat_az_rad=motor_az_rad,
+            siderostat_el_rad=motor_el_rad,
+            siderostat_setpoint_az_rad=setpoint_az_rad,
+            siderostat_setpoint_el_rad=setpoint_el_rad,
+            siderostat_az_sky_arcsec=motor_az_rad * self._scale.motor_sky_arcsec_per_rad,
+            siderostat_el_sky_arcsec=motor_el_rad * self._scale.motor_sky_arcsec_per_rad,
+            search_progress=self._spiral.progress if self.mode is Mode.ACQUISITION else math.nan,
+        )
 
     def _error_px(self, star: Star) -> Floats:
         return _position(star) - self._prefilter.value_px
@@ -392,59 +498,6 @@ class StellarLoop:
                 source=self.name,
                 message=message,
             )
-        )
-
-    def _tick_record(
-        self,
-        frame: Frame | None,
-        star: Star | None,
-        motor_rad: Floats,
-        started_s: float,
-        done_s: float,
-        frames_lost: int,
-    ) -> Tick:
-        exposed_s = math.nan if frame is None else frame.mid_exposure_s
-        command_px = self._prefilter.value_px
-        star_px = _NOWHERE if star is None else _position(star)
-        error_px = star_px - command_px
-        mirror = self._commands.mirror_rad
-        sky = self._scale.motor_sky_arcsec_per_rad * motor_rad
-        setpoint = self._commands.setpoint_rad
-        return Tick(
-            time_s=done_s,
-            loop=self.name,
-            number=-1 if frame is None else frame.number,
-            mode=self.mode.name,
-            mode_number=int(self.mode),
-            mid_exposure_s=exposed_s,
-            frame_age_s=math.nan if frame is None else frame.received_s - exposed_s,
-            compute_s=done_s - started_s,
-            late=frame is not None and done_s - exposed_s > self._due_after_s,
-            frames_lost=frames_lost,
-            star_visible=star is not None,
-            star_az_px=float(star_px[0]),
-            star_el_px=float(star_px[1]),
-            star_flux_dn=math.nan if star is None else star.flux_dn,
-            window_az_px=-1 if star is None else star.window_az_px,
-            window_el_px=-1 if star is None else star.window_el_px,
-            target_az_px=float(command_px[0]),
-            target_el_px=float(command_px[1]),
-            error_az_px=float(error_px[0]),
-            error_el_px=float(error_px[1]),
-            fsm_az_rad=float(mirror[0]),
-            fsm_el_rad=float(mirror[1]),
-            fsm_range_fraction=float(np.abs(mirror).sum()) / self.settings.fsm.range_rad,
-            fsm_saturated=self.mode is Mode.VERNIER and self._vernier.saturated,
-            stack1_v=float(self._commands.stack_v[0]),
-            stack2_v=float(self._commands.stack_v[1]),
-            stack3_v=float(self._commands.stack_v[2]),
-            siderostat_az_rad=float(motor_rad[0]),
-            siderostat_el_rad=float(motor_rad[1]),
-            siderostat_setpoint_az_rad=float(setpoint[0]),
-            siderostat_setpoint_el_rad=float(setpoint[1]),
-            siderostat_az_sky_arcsec=float(sky[0]),
-            siderostat_el_sky_arcsec=float(sky[1]),
-            search_progress=self._spiral.progress if self.mode is Mode.ACQUISITION else math.nan,
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 
 from fitctl.logging.records import (
@@ -14,8 +16,10 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
+from fitctl.model.drives import Drive
 
 PROTOCOL_VERSION = 1
+ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
@@ -56,6 +60,19 @@ class SetTarget(Command, frozen=True, kw_only=True):
     el_px: float
 
 
+class SetController(Command, frozen=True, kw_only=True):
+    """Work with another design; in VERNIER the mirror goes on where it is. Files cannot be named here."""
+
+    name: ControllerName
+
+
+class Experiment(Command, frozen=True, kw_only=True):
+    """From COARSE or VERNIER: move the stages of one loop as told, open loop, and go back to COARSE."""
+
+    name: str
+    drives: list[Drive]
+
+
 class Status(Command, frozen=True, kw_only=True):
     """Ask for one telemetry message."""
 
@@ -71,7 +88,18 @@ class RecorderReport(Command, frozen=True, kw_only=True):
 
 
 AnyCommand = (
-    Standby | Acquire | Hold | Stop | Recover | Off | SetTarget | Status | Shutdown | RecorderReport
+    Standby
+    | Acquire
+    | Hold
+    | Stop
+    | Recover
+    | Off
+    | SetTarget
+    | SetController
+    | Experiment
+    | Status
+    | Shutdown
+    | RecorderReport
 )
 
 
@@ -91,6 +119,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     requirement_px: float
     sky_arcsec_per_px: float
     usable_commands: list[str]
+    controller: str = ""
     last_change: ModeChange | None = None
 
 

@@ -19,6 +19,7 @@ class Mode(IntEnum):
     COARSE = 3
     VERNIER = 4
     SAFE = 5
+    EXPERIMENT = 6
 
 
 MEANING = {
@@ -28,9 +29,13 @@ MEANING = {
     Mode.COARSE: "star found; the siderostat pulls it in",
     Mode.VERNIER: "the fast steering mirror holds the star, the siderostat takes what lasts",
     Mode.SAFE: "mirror to its bias, siderostat stopped, amplifiers disabled after a time",
+    Mode.EXPERIMENT: "open loop: the stages move as an identification asks, the camera watches",
 }
 
-TRACKING = frozenset({Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER})
+FOLLOWING = frozenset({Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
+"""The star is known, and looked for where it should be."""
+
+TRACKING = FOLLOWING | {Mode.ACQUISITION}
 
 
 class Trigger(IntEnum):
@@ -48,8 +53,11 @@ class Trigger(IntEnum):
     STAR_LOST = 9
     SEARCH_EXHAUSTED = 10
     FAULT = 11
+    EXPERIMENT = 12
+    EXPERIMENT_DONE = 13
 
 
+# Those that need no more than their name; an experiment needs its motions.
 COMMANDS = frozenset(
     {
         Trigger.STANDBY,
@@ -78,7 +86,7 @@ def _from(
     return [Transition(source, trigger, target, condition) for source in sources]
 
 
-_POWERED = (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
+_POWERED = (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT)
 
 TRANSITIONS: tuple[Transition, ...] = (
     *_from((Mode.OFF,), Trigger.STANDBY, Mode.STANDBY, "all devices open, checked and enabled"),
@@ -94,7 +102,10 @@ TRANSITIONS: tuple[Transition, ...] = (
         "error in the mirror's reach for reach_frames",
     ),
     *_from(
-        (Mode.COARSE, Mode.VERNIER), Trigger.STAR_LOST, Mode.ACQUISITION, "no star for lost_frames"
+        (Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT),
+        Trigger.STAR_LOST,
+        Mode.ACQUISITION,
+        "no star for lost_frames",
     ),
     *_from(
         (Mode.VERNIER,),
@@ -102,7 +113,14 @@ TRANSITIONS: tuple[Transition, ...] = (
         Mode.COARSE,
         "error beyond its range for reach_frames",
     ),
-    *_from((Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER), Trigger.HOLD, Mode.STANDBY, "asked for"),
+    *_from((Mode.COARSE, Mode.VERNIER), Trigger.EXPERIMENT, Mode.EXPERIMENT, "asked for"),
+    *_from((Mode.EXPERIMENT,), Trigger.EXPERIMENT_DONE, Mode.COARSE, "all motions done"),
+    *_from(
+        (Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT),
+        Trigger.HOLD,
+        Mode.STANDBY,
+        "asked for",
+    ),
     *_from(tuple(Mode), Trigger.STOP, Mode.SAFE, "asked for, at once"),
     *_from(_POWERED, Trigger.FAULT, Mode.SAFE, "any device fault"),
     *_from(

@@ -35,7 +35,7 @@ from fitctl.supervisor.realtime import (
     quiet_interpreter,
 )
 from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
-from fitctl.supervisor.servo import ServoThread
+from fitctl.supervisor.servo import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
 
 _RECORDER_ERRORS = "recorder.err"
@@ -208,18 +208,18 @@ def run_supervisor(
             records_lost=lambda: queue.lost,
         )
         service = Service(supervisor, buffer, folder, state, clock)
-        servos = [ServoThread(servo, clock) for servo in supervisor.servos.values()]
+        threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
         quiet_interpreter()
         service.start()
-        for servo in servos:
-            servo.start()
+        for thread in threads:
+            thread.start()
         on_ready(folder)
         try:
             _loop(supervisor, service, queue, recorder, executor, clock, ending)
         finally:
             gc.enable()
-            for servo in servos:
-                servo.stop()
+            for thread in threads:
+                thread.stop()
             service.stop()
             queue.close()  # while the recorder, which the stack ends, still listens
 

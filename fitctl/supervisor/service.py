@@ -99,6 +99,7 @@ class TelemetryBuffer:
                     requirement_px=loop.settings.requirement_px,
                     sky_arcsec_per_px=scales(supervisor.rig, loop.settings).sky_arcsec_per_px,
                     usable_commands=[t.name.capitalize() for t in usable_commands(loop.mode)],
+                    controller=loop.controller,
                     last_change=loop.last_change,
                 )
                 for name, loop in supervisor.loops.items()

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +32,10 @@ from fitctl.drivers.interface import (
 from fitctl.supervisor.realtime import become_realtime
 
 Floats = NDArray[np.float64]
-_HISTORY_S = 0.3
+HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
 _BLIND_MISSES = 2
-_FOLLOWING_S = 0.05
+FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
 
 
@@ -92,7 +92,7 @@ class SiderostatServo:
         self._stopped = True
         self._wish_rad: Floats | None = None
         self._requests: deque[tuple[Callable[[], DeviceIdentity | None], Future]] = deque()
-        self._history: deque[tuple[float, Floats]] = deque(maxlen=round(_HISTORY_S / self.period_s))
+        self._history: deque[tuple[float, Floats]] = deque(maxlen=round(HISTORY_S / self.period_s))
         self._last_reading_s = 0.0
         self._missed_readings = 0
         self._misses_in_a_row = 0
@@ -169,6 +169,9 @@ class SiderostatServo:
         except Exception as error:
             self._fail(error)
 
+    def wait(self) -> None:
+        """There is always work."""
+
     def _exchange(self) -> None:
         reading = self._amplifiers.exchange(self._velocity_rad_s())
         now_s = self._clock.now_s()
@@ -212,12 +215,12 @@ class SiderostatServo:
         following_rad = self._servo.following_error_rad(reading.position_rad)
         if following_rad <= limit_rad:
             self._followed_s = reading.time_s
-        elif reading.time_s - self._followed_s > _FOLLOWING_S:
+        elif reading.time_s - self._followed_s > FOLLOWING_S:
             raise DeviceFault(
                 self._device,
                 self.endpoint,
                 f"following error below {limit_rad:g} rad",
-                f"{following_rad:.2f} rad for {_FOLLOWING_S * 1e3:.0f} ms",
+                f"{following_rad:.2f} rad for {FOLLOWING_S * 1e3:.0f} ms",
                 "look for a stuck axis, then recover",
             )
 
@@ -305,34 +308,49 @@ class SiderostatServo:
             ) from None
 
 
-class ServoThread:
-    """Runs a servo at its rate with absolute deadlines; a missed deadline is skipped, never made up."""
+class Periodic(Protocol):
+    """What wants to be run at a pace of its own."""
 
-    def __init__(self, servo: SiderostatServo, clock: Clock) -> None:
-        self._servo = servo
+    period_s: float
+    threaded: bool
+    late_s: deque[float]
+
+    def period(self) -> None:
+        """Do one period's work."""
+
+    def wait(self) -> None:
+        """Return once there is work, or after a while."""
+
+
+class PeriodicThread:
+    """Runs something periodic with absolute deadlines; a missed deadline is skipped, never made up."""
+
+    def __init__(self, work: Periodic, clock: Clock) -> None:
+        self._work = work
         self._clock = clock
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"servo-{servo.name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=type(work).__name__, daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
-        self._servo.threaded = True
+        self._work.threaded = True
         self._thread.start()
 
     def stop(self) -> None:
         """End the thread after the period it is in."""
         self._ending.set()
         self._thread.join(timeout=5.0)
-        self._servo.threaded = False
+        self._work.threaded = False
 
     def _run(self) -> None:
         become_realtime(priority=60)
-        period_s = self._servo.period_s
+        period_s = self._work.period_s
         deadline_s = self._clock.now_s() + period_s
         while not self._ending.is_set():
             self._clock.sleep_until(deadline_s)
             late_s = self._clock.now_s() - deadline_s
-            self._servo.late_s.append(late_s)
-            self._servo.period()
+            self._work.late_s.append(late_s)
+            self._work.period()
+            self._work.wait()
             passed = max(1, int((self._clock.now_s() - deadline_s) / period_s) + 1)
             deadline_s += passed * period_s

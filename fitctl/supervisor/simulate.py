@@ -59,6 +59,8 @@ class SimulatedAmplifiers:
     def __init__(self, plant: Plant, clock: VirtualClock, counts_per_rev: int) -> None:
         self._plant = plant
         self._clock = clock
+        self._motor_rad = plant.state.motor_rad[0]
+        self._velocity_rad_s = plant.inputs.velocity_rad_s[0]
         self._rad_per_count = 2 * math.pi / counts_per_rev
         self._enabled = False
 
@@ -73,7 +75,7 @@ class SimulatedAmplifiers:
     def disable(self) -> None:
         """Stand still."""
         self._enabled = False
-        self._plant.inputs.velocity_rad_s[:] = 0.0
+        self._velocity_rad_s[:] = 0.0
 
     def reset_fault(self) -> None:
         """There are none."""
@@ -83,9 +85,12 @@ class SimulatedAmplifiers:
         now_s = self._clock.now_s()
         self._plant.advance(now_s)
         if self._enabled:
-            self._plant.inputs.velocity_rad_s[0] = velocity_rad_s
-        counts = np.floor(self._plant.state.motor_rad[0] / self._rad_per_count)
-        return ServoReading(now_s, counts * self._rad_per_count, self._enabled, "")
+            self._velocity_rad_s[:] = velocity_rad_s
+        count = self._rad_per_count
+        position_rad = np.array(
+            [math.floor(rad / count) * count for rad in self._motor_rad.tolist()]
+        )
+        return ServoReading(now_s, position_rad, self._enabled, "")
 
     def close(self) -> None:
         """Stand still."""
@@ -141,7 +146,8 @@ class SimulatedCamera:
         self._scene = Scene(
             rig.camera, [spot for name in plants for spot in truth.loops[name].spots]
         )
-        self._random = next(iter(plants.values())).frame_random[0]
+        self._pixel_key = next(iter(plants.values())).pixel_keys[0]
+        self._exposures = 0  # never starts again, as the frames' numbers do: noise must not repeat
         self._frames = 0
         self._start_s = 0.0
         self._next_period_s: list[float] = []
@@ -165,10 +171,10 @@ class SimulatedCamera:
             return None
         self._go_on_to(arrives_s)
         self._frames += 1
+        self._exposures += 1
         spots = np.concatenate([plant.spots_px(exposed_s)[0] for plant in self._plants.values()])
-        return Frame(
-            self._frames, exposed_s, self._clock.now_s(), self._scene.frame(spots, self._random)
-        )
+        image = self._scene.frame(spots, self._pixel_key, self._exposures)
+        return Frame(self._frames, exposed_s, self._clock.now_s(), image)
 
     def counts(self) -> CameraCounts:
         """Nothing is ever lost here."""
@@ -194,13 +200,17 @@ class SimulatedCamera:
 
 
 class SimulationResult(NamedTuple):
-    """What a simulated run gave; RMS about the target over `judged_s`, nan if that is empty."""
+    """What a simulated run gave; RMS about the target over `judged_s`, nan if that is empty.
+
+    The piston's RMS is about its mean: what path-length control has to follow.
+    """
 
     acquired_s: float
     vernier_s: float
     rms_px: dict[str, float]
     measured_rms_px: dict[str, float]
     judged_s: float
+    piston_rms_m: float
     mode_times: dict[str, float]
     frames: int
     speed_x: float
@@ -256,7 +266,7 @@ class Simulation:
             rig, Devices(self.camera, loops), self.clock, InlineExecutor(), self._take
         )
         self.camera.on_servo_period = [
-            (servo.period_s, servo.period) for servo in self.supervisor.servos.values()
+            (work.period_s, work.period) for work in self.supervisor.periodic
         ]
 
     def _take(self, record: AnyRecord) -> None:
@@ -337,6 +347,7 @@ def _judge(simulation: Simulation, name: str, speed_x: float) -> SimulationResul
         rms_px=pair(true_px),
         measured_rms_px=pair(rms(measured)),
         judged_s=max(0.0, end_s - start_s) if judged else 0.0,
+        piston_rms_m=piston_rms_m(simulation.plants[name], start_s, end_s),
         mode_times=_mode_times(changes, end_s),
         frames=sum(tick.number >= 0 for tick in ticks),
         speed_x=speed_x,
@@ -348,6 +359,13 @@ def true_residual_rms(plant: Plant, target_px: Floats, start_s: float, end_s: fl
     if not start_s < end_s:
         return np.full(2, math.nan)
     return rms(plant.history_px(start_s, end_s)[:, 0, 0, :] - target_px)
+
+
+def piston_rms_m(plant: Plant, start_s: float, end_s: float) -> float:
+    """RMS of the mirror's piston (Eq. 4) about its mean; nan if the time is empty."""
+    if not start_s < end_s:
+        return math.nan
+    return float(np.std(plant.history_piston_m(start_s, end_s)[:, 0]))
 
 
 def rms(values: Floats) -> Floats:

@@ -17,6 +17,7 @@ import numpy as np
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
+from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
@@ -31,23 +32,26 @@ from fitctl.logging.records import (
     PiezoReading,
     Severity,
 )
+from fitctl.supervisor.drives import refused_drives
 from fitctl.supervisor.health import camera_health, loop_health
 from fitctl.supervisor.loop import StellarLoop
 from fitctl.supervisor.messages import (
     Acquire,
     AnyCommand,
+    Experiment,
     Hold,
     Off,
     Recover,
     Reply,
+    SetController,
     SetTarget,
     Shutdown,
     Standby,
     Stop,
 )
-from fitctl.supervisor.modes import Mode, Trigger, usable_commands
+from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
 from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices
-from fitctl.supervisor.servo import SiderostatServo
+from fitctl.supervisor.servo import Periodic, SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
 _CLOSE_TIMEOUT_S = 30.0
@@ -113,6 +117,7 @@ class Supervisor:
         self._opening: set[str] = set()
         self._abandoned: set[str] = set()
         self._polls: dict[str, Job] = {}
+        self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
         self._piezo_read_s = dict.fromkeys(rig.loops, 0.0)
         self._piezo_error = dict.fromkeys(rig.loops, "")
@@ -136,6 +141,11 @@ class Supervisor:
     def note(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
         self._notes.append((severity, source, message))
+
+    @property
+    def periodic(self) -> list[Periodic]:
+        """What runs at a pace of its own, beside the frames."""
+        return [*self.servos.values(), *(loop.stages.injector for loop in self.loops.values())]
 
     # ------------------------------------------------------------ once a frame
 
@@ -183,12 +193,12 @@ class Supervisor:
 
     def _at_bias(self, name: str) -> bool:
         loop = self.loops[name]
-        return not loop.dac_ready or loop.at_bias()
+        return not loop.stages.ready or loop.stages.at_bias()
 
     def close(self) -> None:
         """Disable and let go of everything, whatever state it is in."""
         for loop in self.loops.values():
-            loop.dac_ready = False
+            loop.stages.ready = False
         self._camera_ready = False
         self._submit(close_devices, list(self.loops), True).result(timeout=_CLOSE_TIMEOUT_S)
 
@@ -239,12 +249,18 @@ class Supervisor:
             return Reply(accepted=True, text="shutting down")
         if self.shutdown_wanted and not isinstance(command, Stop):
             return _refusal("shutting down")
-        if isinstance(command, SetTarget):
-            return self._set_target(command, names)
-        trigger = _COMMANDS.get(type(command))
-        if trigger is not None:
-            return self._fire(trigger, names)
-        return _refusal(f"{type(command).__name__} is not for the supervisor")
+        match command:
+            case SetTarget():
+                reply = self._set_target(command, names)
+            case SetController():
+                reply = self._set_controller(command, names)
+            case Experiment():
+                reply = self._start_experiment(command, names)
+            case _ if type(command) in _COMMANDS:
+                reply = self._fire(_COMMANDS[type(command)], names)
+            case _:
+                reply = _refusal(f"{type(command).__name__} is not for the supervisor")
+        return reply
 
     def _fire(self, trigger: Trigger, names: list[str]) -> Reply:
         usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
@@ -279,11 +295,40 @@ class Supervisor:
             self.loops[name].target_px = wanted
         return Reply(accepted=True)
 
+    def _set_controller(self, command: SetController, names: list[str]) -> Reply:
+        for name in names:
+            # A design takes longer than a tick.
+            future = self._executor.submit(design_for, self.rig, name, command.name)
+            self._designs.append(Job(future, partial(self._designed, name, command.name)))
+        self._finish_jobs()
+        return Reply(accepted=True, text="designing; an event tells when it is at work")
+
+    def _designed(self, name: str, controller: str, future: Future) -> None:
+        error = future.exception()
+        if error is None:
+            self.loops[name].use(future.result())
+        else:
+            self._event("error", name, f"no design {controller}: {_told(error)}")
+
+    def _start_experiment(self, command: Experiment, names: list[str]) -> Reply:
+        if len(names) != 1:
+            return _refusal(f"an experiment is on one loop; name it: {', '.join(names)}")
+        loop = self.loops[names[0]]
+        if transition(loop.mode, Trigger.EXPERIMENT) is None:
+            return _refusal(
+                f"experiment means nothing in {loop.mode.name}; it needs a star in COARSE or VERNIER"
+            )
+        why_not = refused_drives(self.rig, loop.name, command.drives)
+        if why_not:
+            return _refusal(f"experiment: {why_not}")
+        loop.start_experiment(command.name, command.drives)
+        return Reply(accepted=True)
+
     # ------------------------------------------------------------ device work
 
     def _open(self, names: list[str], trigger: Trigger) -> None:
         for name in names:
-            self.loops[name].dac_ready = False
+            self.loops[name].stages.ready = False
             self._polls.pop(name, None)
         self._opening, self._abandoned = set(names), set()
         self._event("info", "supervisor", "opening and checking all devices")
@@ -320,7 +365,7 @@ class Supervisor:
 
     def _turn_off(self, names: list[str]) -> None:
         for name in names:
-            self.loops[name].dac_ready = False
+            self.loops[name].stages.ready = False
             self.loops[name].fire(Trigger.OFF, "operator")
         # The camera serves all loops; the last one out turns it off.
         with_camera = all(loop.mode is Mode.OFF for loop in self.loops.values())
@@ -349,6 +394,9 @@ class Supervisor:
         if job is not None and job.future.done():
             self._job = None
             job.done(job.future)
+        while self._designs and self._designs[0].future.done():
+            design = self._designs.popleft()
+            design.done(design.future)
         for name, poll in list(self._polls.items()):
             if poll.future.done():
                 del self._polls[name]
@@ -378,7 +426,12 @@ class Supervisor:
         now_s = self._clock.now_s()
         for name, loop in self.loops.items():
             due_s = self._piezo_read_s[name] + loop.settings.fsm.piezo.poll_s
-            if loop.dac_ready and now_s >= due_s and name not in self._polls and self._job is None:
+            if (
+                loop.stages.ready
+                and now_s >= due_s
+                and name not in self._polls
+                and self._job is None
+            ):
                 self._piezo_read_s[name] = now_s
                 future = self._executor.submit(self._read_piezo, name)
                 self._polls[name] = Job(future, partial(self._piezo_was_read, name))

@@ -42,6 +42,7 @@ MODES = {
     "COARSE": Look("◇", ORANGE),
     "VERNIER": Look("◆", GREEN),
     "SAFE": Look("■", RED),
+    "EXPERIMENT": Look("◈", PINK),
 }
 UNKNOWN_MODE = Look("?", PINK)
 

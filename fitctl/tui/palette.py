@@ -1,15 +1,16 @@
-"""The command palette's one command with numbers: ``target AZ EL``."""
+"""The command palette's commands beyond the keys: ``target AZ EL``, and the controllers by name."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, cast, get_args
 
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 
-from fitctl.supervisor.messages import SetTarget
+from fitctl.supervisor.messages import ControllerName, SetController, SetTarget
 
 if TYPE_CHECKING:
     from fitctl.tui.app import ConsoleApp
@@ -45,3 +46,29 @@ class TargetProvider(Provider):
             label = f"Move the target to az {command.az_px:g}, el {command.el_px:g} px"
             app = cast("ConsoleApp", self.app)
             yield Hit(1.0, label, partial(app.give, command), help="Through the prefilter")
+
+
+class ControllerProvider(Provider):
+    """Offers every controller by name."""
+
+    async def discover(self) -> Hits:
+        """All of them."""
+        for name, command in _CONTROLLERS.items():
+            yield DiscoveryHit(name, self._give(command), help=_CONTROLLER_HELP)
+
+    async def search(self, query: str) -> Hits:
+        """Those that match."""
+        matcher = self.matcher(query)
+        for name, command in _CONTROLLERS.items():
+            score = matcher.match(name)
+            if score > 0:
+                yield Hit(
+                    score, matcher.highlight(name), self._give(command), help=_CONTROLLER_HELP
+                )
+
+    def _give(self, command: SetController) -> Callable[[], object]:
+        return partial(cast("ConsoleApp", self.app).give, command)
+
+
+_CONTROLLERS = {f"controller {name}": SetController(name=name) for name in get_args(ControllerName)}
+_CONTROLLER_HELP = "In VERNIER the mirror goes on where it is"

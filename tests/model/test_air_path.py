@@ -9,6 +9,7 @@ from scipy.signal import welch
 
 from fitctl.model import air_path
 from fitctl.model.air_path import discretize, state_space, stationary_covariance, step_matrices
+from fitctl.model.compiled import kernels
 from fitctl.model.plant import Plant
 
 steps_s = st.floats(1e-4, 1.0)
@@ -87,6 +88,49 @@ def test_the_noise_gain_is_a_root_of_the_step_covariance(air, dynamics):
         _, gain = step_matrices(air, step_s)
         _, covariance = discretize(*dynamics, step_s)
         assert gain @ gain.T == pytest.approx(covariance, rel=1e-6, abs=1e-15)
+
+
+# ---------------------------------------------------------------- between nodes
+
+
+def test_the_cubic_meets_motion_and_rate_at_both_nodes():
+    steps, step_s = 10, 5e-4
+    weights = air_path.bridge_weights(steps, step_s)
+    cubic = np.polynomial.Polynomial([0.3, -2.0, 50.0, 3000.0])
+    ends_s = np.array([0.0, steps * step_s])
+    ends = np.column_stack([cubic(ends_s), cubic.deriv()(ends_s)]).ravel()
+    times_s = np.arange(1, steps + 1) * step_s
+    assert weights @ ends == pytest.approx(cubic(times_s), rel=1e-12)
+
+
+def test_what_the_cubic_leaves_out_is_a_thousandth_of_what_is_measured(air, dynamics):
+    # Halfway, given both ends: by conditioning the exact joint distribution of three nodes.
+    half, half_covariance = discretize(*dynamics, air_path.NODE_S / 2)
+    first = stationary_covariance(air)
+    middle = half @ first @ half.T + half_covariance
+    cross = np.hstack([half @ first, middle @ half.T])
+    ends = np.block(
+        [
+            [first, (half @ half @ first).T],
+            [half @ half @ first, half @ middle @ half.T + half_covariance],
+        ]
+    )
+    left = middle - cross @ np.linalg.solve(ends, cross.T)
+    assert air_path.bridge_rms_px(air) == pytest.approx(math.sqrt(left[0, 0]), rel=0.02)
+    assert air_path.bridge_rms_px(air) < 0.013 / 500
+
+
+@pytest.mark.skipif(kernels() is None, reason="numba is not installed (extra `fast`)")
+@given(seed=st.integers(0, 2**31), steps=st.integers(1, 20), nodes=st.integers(1, 30))
+def test_the_compiled_motion_is_the_reference_motion(air, seed, steps, nodes):
+    random = np.random.default_rng(seed)
+    normals, state = random.standard_normal((nodes, 2, 2)), random.standard_normal((2, 2))
+    matrices = (*step_matrices(air, steps * 5e-4), air_path.bridge_weights(steps, 5e-4))
+    compiled_state, compiled_px = state.copy(), np.empty((nodes * steps, 2))
+    kernels().air_motion(compiled_state, normals, *matrices, compiled_px)
+    reference_px = air_path.air_motion(state, normals, *matrices)
+    assert compiled_px == pytest.approx(reference_px, rel=1e-9, abs=1e-12)
+    assert compiled_state == pytest.approx(state, rel=1e-9, abs=1e-12)
 
 
 # ---------------------------------------------------------------- the plant's own motion

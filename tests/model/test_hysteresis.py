@@ -9,6 +9,9 @@ from fitctl.model.hysteresis import (
     gains_from_slopes,
     half_widths_v,
     hysteresis_output,
+    inverse_model,
+    inverse_state,
+    inverse_volts,
     play,
     stack_gains,
 )
@@ -180,3 +183,52 @@ def test_breakpoints_read_on_a_swept_ramp_are_twice_those_of_a_relaxed_stack(rig
     assert np.array_equal(half_widths_v(swept), half_widths_v(settings))
     fsm = rig.loops["right"].fsm
     assert stack_gains(swept, fsm) == pytest.approx(stack_gains(settings, fsm))
+
+
+# ---------------------------------------------------------------- the inverse
+
+STACKS_GAINS = np.array([1.0, 0.7, 1.3])[:, None] * np.linspace(6e-7, 1e-8, HALF_WIDTH_V.size)
+FALLING_GAINS = np.append(1e-6, np.full(HALF_WIDTH_V.size - 1, -5e-8))
+wanted = st.lists(st.floats(-1e-5, 1e-5), min_size=3, max_size=3).map(np.array)
+stack_histories = st.lists(
+    st.lists(volts, min_size=3, max_size=3).map(lambda values: np.array(values)[:, None]),
+    max_size=10,
+)
+
+
+@given(stack_histories, wanted, st.sampled_from([STACKS_GAINS, np.tile(FALLING_GAINS, (3, 1))]))
+def test_stacks_at_the_inverse_voltage_are_where_they_shall_be(history, wanted_m, gains):
+    plays = np.zeros((3, HALF_WIDTH_V.size))
+    for voltage in history:
+        plays = play(plays, voltage, HALF_WIDTH_V)
+
+    found_v = inverse_volts(plays, HALF_WIDTH_V, gains, wanted_m)
+
+    reached_m = hysteresis_output(play(plays, found_v[:, None], HALF_WIDTH_V), gains)
+    assert reached_m == pytest.approx(wanted_m, abs=1e-18)
+
+
+@given(st.lists(wanted, max_size=10))
+def test_the_inverse_is_a_model_of_plays_with_a_memory_of_its_own(wishes):
+    half_width_m, gains_v_per_m = inverse_model(HALF_WIDTH_V, STACKS_GAINS)
+    stacks = own = np.zeros((3, HALF_WIDTH_V.size))
+    for wanted_m in wishes:
+        found_v = inverse_volts(stacks, HALF_WIDTH_V, STACKS_GAINS, wanted_m)
+        stacks = play(stacks, found_v[:, None], HALF_WIDTH_V)
+        own = play(own, wanted_m[:, None], half_width_m)
+
+        assert hysteresis_output(own, gains_v_per_m) == pytest.approx(found_v, abs=1e-9)
+        assert inverse_state(stacks, STACKS_GAINS) == pytest.approx(own, abs=1e-18)
+
+
+def test_the_inverse_of_the_inverse_is_the_model():
+    again = inverse_model(*inverse_model(HALF_WIDTH_V, STACKS_GAINS[0]))
+    assert again[0] == pytest.approx(HALF_WIDTH_V)
+    assert again[1] == pytest.approx(STACKS_GAINS[0])
+
+
+def test_to_stay_costs_no_voltage():
+    plays = states([3.0, 8.0, 4.2])[-1]
+    here_m = hysteresis_output(plays, STACKS_GAINS[0])
+    found_v = inverse_volts(plays, HALF_WIDTH_V, STACKS_GAINS[0], np.asarray(here_m))
+    assert found_v == pytest.approx(4.2)

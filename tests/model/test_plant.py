@@ -1,5 +1,3 @@
-import copy
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,9 +5,9 @@ from hypothesis import strategies as st
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.controllers.position_servo import PositionServo
-from fitctl.model.kernels import compiled_advance
-from fitctl.model.optics import scales, stack_volts
-from fitctl.model.plant import Plant, advance_reference
+from fitctl.model.optics import piston_m, scales, stack_volts
+from fitctl.model.plant import Plant
+from fitctl.model.plant_step import PlantState, PlantTrace, bind_reference, compiled_advance
 
 STILL_AIR = "plant.loops.right.air_path.gain_px=0.0"
 STRAIGHT_STACKS = [
@@ -42,24 +40,29 @@ def from_target(plant, rig, time_s):
 def test_the_compiled_step_does_what_the_reference_does(rig, seed, runs, steps):
     random = np.random.default_rng(seed)
     plant = Plant(rig, "right", range(runs))
-    state, inputs = plant.state, plant.inputs
-    for name, scale in {
-        "motor_rad": 5.0, "motor_rad_s": 50.0, "beam_motor_rad": 5.0,
-        "plays_v": 5.0, "modes": 1e-4, "air": 0.3,
-    }.items():  # fmt: skip
-        setattr(state, name, scale * random.standard_normal(getattr(state, name).shape))
-    inputs.velocity_rad_s = 50 * random.standard_normal((runs, 2))
-    inputs.stack_v = random.uniform(0, 10, (runs, 3))
-    noise = random.standard_normal((steps, runs, 2, 2, 2))
-    compiled_state, compiled_px = copy.deepcopy(state), np.empty((steps, runs, 2, 2))
-    reference_px = np.empty_like(compiled_px)
-    compiled_advance()(plant.constants, compiled_state, inputs, noise, compiled_px)
-    advance_reference(plant.constants, state, inputs, noise, reference_px)
-    assert compiled_px == pytest.approx(reference_px, rel=1e-9, abs=1e-9)
-    for name in ("motor_rad", "motor_rad_s", "beam_motor_rad", "plays_v", "modes", "air"):
-        assert getattr(compiled_state, name) == pytest.approx(
-            getattr(state, name), rel=1e-9, abs=1e-12
+    state = plant.state
+    for array, scale in (
+        (state.motor_rad, 5.0), (state.motor_rad_s, 50.0), (state.beam_motor_rad, 5.0),
+        (state.plays_v, 5.0), (state.modes, 1e-4), (state.velocity_rad_s, 50.0),
+    ):  # fmt: skip
+        array[:] = scale * random.standard_normal(array.shape)
+    state.stack_v[:] = random.uniform(0, 10, (runs, 3))
+    air_px = 0.3 * random.standard_normal((steps + 5, runs, 2, 2))
+    outcomes = []
+    for kernel in (compiled_advance(), bind_reference):
+        own = PlantState(runs, state.plays_v.shape[-1])
+        own.rows[:], own.plays_v[:] = state.rows, state.plays_v
+        trace = PlantTrace(np.zeros((steps + 3, runs, 2, 2)), np.zeros((steps + 3, runs)))
+        kernel(plant.constants, own, air_px, trace)(5, 3, steps)
+        outcomes.append(
+            (
+                *trace,
+                own.plays_v,
+                *(own.rows[name] for name in own.rows.dtype.names if name != "stacks_at_v"),
+            )
         )
+    for compiled, reference in zip(*outcomes, strict=True):
+        assert compiled == pytest.approx(reference, rel=1e-9, abs=1e-12)
 
 
 @settings(max_examples=20)
@@ -74,9 +77,10 @@ def test_the_motion_does_not_depend_on_how_the_time_is_cut(rig, cuts):
     whole, cut = (plant.spots_px(0.75) for plant in plants)
     assert np.array_equal(whole, cut)
     assert np.array_equal(*(plant.history_px(0.0, 0.75) for plant in plants))
+    assert np.array_equal(*(plant.history_piston_m(0.0, 0.75) for plant in plants))
 
 
-@pytest.mark.parametrize("kernel", [None, advance_reference])
+@pytest.mark.parametrize("kernel", [None, bind_reference])
 def test_a_run_does_not_depend_on_the_runs_beside_it(rig, kernel):
     together = Plant(rig, "right", [3, 4, 5], kernel=kernel)
     alone = Plant(rig, "right", [4], kernel=kernel)
@@ -188,6 +192,26 @@ def test_fringe_and_pointing_spot_move_together(rig):
     plant.inputs.velocity_rad_s[0] = [2.0, 1.0]
     pointing, fringe = plant.spots_px(1.0)[0]
     assert fringe - pointing == pytest.approx([spot.offset_px.az, spot.offset_px.el])
+
+
+def test_piston_is_that_of_eq_4_from_the_stacks_true_displacements(rig):
+    plant = plant_with(STILL_AIR)
+    plant.inputs.stack_v[0] = [8.0, 3.0, 6.5]
+    plant.advance(0.1)
+    radius_m = rig.loops["right"].fsm.stack_radius_m
+    piston = piston_m(plant.state.displacement_m[0], radius_m)
+    assert plant.history_piston_m(0.0, 0.1)[-1, 0] == pytest.approx(piston, rel=1e-6)
+    assert abs(piston) > 1e-7
+
+
+def test_a_spots_own_air_does_not_depend_on_how_many_spots_there_are(rig):
+    spots = rig.plant.loops["right"].spots
+    loop = rig.plant.loops["right"].model_copy(update={"spots": spots[:1]})
+    alone = rig.model_copy(
+        update={"plant": rig.plant.model_copy(update={"loops": {"right": loop}})}
+    )
+    pointing = [Plant(one, "right", [3]).spots_px(0.7)[0, 0] for one in (rig, alone)]
+    assert pointing[0] == pytest.approx(pointing[1], abs=1e-12)
 
 
 def test_the_position_servo_has_40_to_50_hz_of_bandwidth_on_the_plant(rig):

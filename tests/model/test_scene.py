@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.controllers.centroid import StarSensor
+from fitctl.model.compiled import kernels
 from fitctl.model.scene import FULL_WELL_DN, Scene, centroid_noise_px
 
 within = st.floats(6.0, 33.0)  # a spot's light is all on the frame
@@ -69,16 +70,15 @@ def test_a_batch_of_frames_is_each_frame_alone(rig, spots):
 
 
 def test_pixels_have_the_rigs_noise_about_its_bias(rig, star_only):
-    random = np.random.default_rng(1)
     nowhere = np.array([[-500.0, -500.0]])
-    dark = np.array([star_only.frame(nowhere, random) for _ in range(50)], dtype=float)
+    dark = np.array([star_only.frame(nowhere, 1, number) for number in range(50)], dtype=float)
     assert dark.mean() == pytest.approx(rig.camera.bias_dn, abs=5 * 20 / np.sqrt(dark.size))
     assert dark.std() == pytest.approx(rig.camera.pixel_noise_dn, rel=5 / np.sqrt(2 * dark.size))
 
 
 def test_a_glaring_star_saturates_and_does_not_wrap(rig, spots):
     glare = spots[0].model_copy(update={"flux_dn": 1e7})
-    image = Scene(rig.camera, [glare]).frame(np.array([[20.0, 20.0]]), np.random.default_rng(0))
+    image = Scene(rig.camera, [glare]).frame(np.array([[20.0, 20.0]]), 0, 0)
     assert image.dtype == np.uint16
     assert image[20, 20] == FULL_WELL_DN
     assert np.all(image[18:23, 20] > 10_000)
@@ -86,7 +86,7 @@ def test_a_glaring_star_saturates_and_does_not_wrap(rig, spots):
 
 def test_noise_below_zero_reads_zero(rig, spots):
     dark = rig.camera.model_copy(update={"bias_dn": 0.0})
-    image = Scene(dark, spots[:1]).frame(np.array([[-500.0, 0.0]]), np.random.default_rng(0))
+    image = Scene(dark, spots[:1]).frame(np.array([[-500.0, 0.0]]), 0, 0)
     assert image.min() == 0
     assert image.max() < 200
 
@@ -101,8 +101,26 @@ def test_centroid_noise_over_rendered_frames_is_what_the_formula_says(rig, star_
     frames = 1500
     # Anywhere within a pixel, as in the loop.
     places = np.array([24.0, 19.5]) + random.uniform(-0.5, 0.5, (frames, 2))
-    stars = [sensor.measure(star_only.frame(place[None], random), *place) for place in places]
+    stars = [
+        sensor.measure(star_only.frame(place[None], 2, number), *place)
+        for number, place in enumerate(places)
+    ]
     errors_px = np.array([[star.az_px, star.el_px] for star in stars]) - places
     expected_px = centroid_noise_px(rig.camera, 28_000.0, 7)
     assert errors_px.std() == pytest.approx(expected_px, rel=4 / np.sqrt(2 * errors_px.size) + 0.02)
     assert np.abs(errors_px.mean()) < 4 * expected_px / np.sqrt(errors_px.size) + 1e-4
+
+
+@pytest.mark.skipif(kernels() is None, reason="numba is not installed (extra `fast`)")
+@given(
+    places=st.lists(st.tuples(st.floats(-20, 60), st.floats(-20, 60)), min_size=2, max_size=2),
+    key=st.integers(0, 2**64 - 1),
+    number=st.integers(0, 10**7),
+)
+def test_the_compiled_frame_is_the_reference_frame(rig, spots, places, key, number):
+    scene = Scene(rig.camera, spots)
+    compiled = scene.frame(np.array(places), key, number)
+    reference = scene.frame_reference(np.array(places), key, number)
+    # Where a sum comes to half a DN, the last bit may round it either way.
+    assert np.count_nonzero(compiled != reference) <= 1
+    assert np.abs(compiled.astype(int) - reference).max() <= 1

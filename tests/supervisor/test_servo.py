@@ -6,7 +6,7 @@ import pytest
 from fitctl.clock import VirtualClock
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceIdentity, DeviceTimeout, ServoReading
-from fitctl.supervisor.servo import ServoThread, SiderostatServo
+from fitctl.supervisor.servo import PeriodicThread, SiderostatServo
 
 
 class Amplifiers:
@@ -272,7 +272,7 @@ def test_the_thread_keeps_its_rate_and_ends(amplifiers):
     clock = MonotonicClock()
     amplifiers.clock = VirtualClock()
     servo = SiderostatServo("right", rig.loops["right"], amplifiers, clock, 0.02)
-    thread = ServoThread(servo, clock)
+    thread = PeriodicThread(servo, clock)
     thread.start()
     servo.open()
     begun_s = clock.now_s()

@@ -31,6 +31,8 @@ from fitctl.tui.widgets.panel import Panel
 BADGE_COLUMNS = 19
 BADGE_FROM_COLUMNS = 100
 
+ASIDE = {"SAFE", "EXPERIMENT"}
+
 
 class Header(Panel):
     """Rig, loop, mode, time in mode, link, clock; the modes as a diagram; the last transition."""
@@ -96,8 +98,10 @@ class Header(Panel):
     def _diagram(self) -> Line:
         line: Line = []
         for mode, look in MODES.items():
+            if mode == "EXPERIMENT" and mode != self._mode:
+                continue  # rare, and the line is full
             if line:
-                line.append(text("   " if mode == "SAFE" else " ── ", FAINT))
+                line.append(text("   " if mode in ASIDE else " ── ", FAINT))
             if mode == self._mode:
                 line.append(text(f"▐{look.symbol} {mode}▌", look.colour, bold=True))
             else:

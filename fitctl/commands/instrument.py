@@ -1,28 +1,27 @@
-"""What the commands do, between their options (:mod:`fitctl.cli`) and the rooms that do the work."""
+"""Commands about an instrument: running it, attaching to it, looking at its logs."""
 
 from __future__ import annotations
 
 import asyncio
-import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import typer
 import zmq
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from fitctl import demo as demos
+from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, Rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import RecorderStatus
-from fitctl.model.plant import plant_constants
+from fitctl.model.plant_constants import plant_constants
 from fitctl.processes import (
     ENDING_SIGNALS,
     end_process,
@@ -51,15 +50,17 @@ COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
 }
 
 
-def _progress() -> Progress:
-    """A progress line on standard error, so that results alone are on standard output."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        console=Console(stderr=True),
-        transient=False,
-    )
+class WithValues(NamedTuple):
+    """A command that needs values, and their names in the order in which they are given."""
+
+    make: type[messages.SetTarget | messages.SetController]
+    fields: tuple[str, ...]
+
+
+WITH_VALUES = {
+    "target": WithValues(messages.SetTarget, ("az_px", "el_px")),
+    "controller": WithValues(messages.SetController, ("name",)),
+}
 
 
 # ---------------------------------------------------------------- demo
@@ -118,7 +119,7 @@ def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
 
 def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as_json: bool) -> int:
     demos.acquire(running)
-    with _progress() as progress:
+    with progress_line() as progress:
         task = progress.add_task("starting", total=duration_s)
 
         def show(gone_s: float, telemetry: Telemetry) -> None:
@@ -272,17 +273,42 @@ def run_console(rig: Rig, *, quitting_ends_instrument: bool) -> None:
     app.run()
 
 
-def send_command(rig: Rig, name: str, loop: str) -> int:
-    """Give one command and print the answer; returns the exit status."""
-    if name not in COMMANDS:
-        msg = f"send: {name} is no command; there are {', '.join(COMMANDS)}"
-        raise ConfigError(msg)
+def command_of(rig: Rig, name: str, values: Sequence[str], loop: str) -> messages.AnyCommand:
+    """The command that words on a command line ask for.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such command or loop, or its values are not what it needs.
+    """
     if loop and loop not in rig.loops:
         msg = f"send: --loop {loop!r}: rig {rig.name} has {', '.join(rig.loops)}"
         raise ConfigError(msg)
+    if name not in COMMANDS | WITH_VALUES:
+        msg = f"send: {name} is no command; there are {', '.join(COMMANDS | WITH_VALUES)}"
+        raise ConfigError(msg)
+    fields = WITH_VALUES[name].fields if name in WITH_VALUES else ()
+    if len(values) != len(fields):
+        needs = " ".join(fields) or "no values"
+        msg = f"send: {name} needs {needs} (is {' '.join(values) or 'nothing'})"
+        raise ConfigError(msg)
+    if name in COMMANDS:
+        return COMMANDS[name](loop=loop)
+    given: dict[str, object] = dict(zip(fields, values, strict=True))
+    try:
+        # Numbers come as text here; msgspec reads them, and checks what they may be.
+        return msgspec.convert(given | {"loop": loop}, WITH_VALUES[name].make, strict=False)
+    except msgspec.ValidationError as error:
+        msg = f"send: {name} {' '.join(values)}: {error}"
+        raise ConfigError(msg) from None
+
+
+def send_command(rig: Rig, name: str, values: Sequence[str], loop: str) -> int:
+    """Give one command and print the answer; returns the exit status."""
+    command = command_of(rig, name, values, loop)
     client = Client(service_folder(rig))
     try:
-        reply = client.send(COMMANDS[name](loop=loop))
+        reply = client.send(command)
     except ConnectionError as error:
         typer.echo(f"send: {error}", err=True)
         return FAILED
@@ -307,35 +333,6 @@ def check_plant(rig: Rig) -> None:
     if rig.plant is not None:
         for name in rig.loops:
             plant_constants(rig, name, np.zeros((1, 2)))
-
-
-def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
-    """Simulate and print the result; returns the exit status."""
-    from fitctl.supervisor.simulate import simulate
-
-    rig.mock_parts()
-    check_plant(rig)
-    with _progress() as progress:
-        task = progress.add_task("simulating", total=1.0)
-        results = simulate(
-            rig, seed, duration_s, on_progress=lambda part: progress.update(task, completed=part)
-        )
-        progress.update(task, completed=1.0)
-    plain = {name: result._asdict() for name, result in results.items()}
-    if as_json:
-        typer.echo(demos.to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
-    else:
-        for name, result in results.items():
-            rms, measured = result.rms_px, result.measured_rms_px
-            typer.echo(
-                f"loop {name}: star found after {result.acquired_s:.1f} s, vernier after "
-                f"{result.vernier_s:.1f} s\n"
-                f"  true residual RMS  az {rms['az']:.4f} px, el {rms['el']:.4f} px"
-                f" over {result.judged_s:.0f} s\n"
-                f"  measured RMS       az {measured['az']:.4f} px, el {measured['el']:.4f} px\n"
-                f"  speed              {result.speed_x:.0f}x real time"
-            )
-    return 0 if all(not math.isnan(result.vernier_s) for result in results.values()) else FAILED
 
 
 def show_log(path: Path) -> None:

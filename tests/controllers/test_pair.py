@@ -6,13 +6,33 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.controllers.vernier import Vernier, eq20_discrete, eq20_zpk
+from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.choose import DESIGNS
+from fitctl.controllers.design.eq20 import design_eq20, eq20_zpk, tustin
+from fitctl.controllers.pair import Measurement, Pair
 from fitctl.model.optics import saturate_diamond, scales
 
 PERIOD_S = 0.02
 PX_PER_RAD = 2 * 0.457 / 24e-6
 RANGE_RAD = 1.772e-4
 NO_LIMIT_RAD = 1e6
+
+
+class Vernier:
+    """Eq. 20's pair, as if there were nothing but a star and a mirror."""
+
+    def __init__(self, rig, range_rad=RANGE_RAD, design=None):
+        design = design or design_eq20(basis(rig, "right"))
+        self.pair = Pair(design, scales(rig, rig.loops["right"]), range_rad)
+
+    def step(self, error_px):
+        nothing = np.zeros(2)
+        return self.pair.step(Measurement(error_px, nothing, nothing, nothing)).mirror_rad
+
+
+def eq20_discrete(period_s):
+    zeros, poles, gain = eq20_zpk()
+    return tustin(tuple(zeros), tuple(poles), gain, period_s)
 
 
 def eq20():
@@ -90,8 +110,8 @@ def test_the_discrete_compensator_is_stable_and_keeps_its_constant(period_s):
     assert c @ np.linalg.solve(np.eye(8) - a, b) + d == pytest.approx(26.75, abs=5e-3)
 
 
-def test_the_vernier_is_the_compensator_of_each_axis():
-    vernier = Vernier(PERIOD_S, PX_PER_RAD, NO_LIMIT_RAD)
+def test_the_vernier_is_the_compensator_of_each_axis(rig):
+    vernier = Vernier(rig, NO_LIMIT_RAD)
     errors_px = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     mirror_px = np.array([vernier.step(error) for error in errors_px]) * PX_PER_RAD
     compensator = control.sample_system(control.ss(eq20()), PERIOD_S, method="bilinear")
@@ -104,26 +124,26 @@ def test_the_vernier_is_the_compensator_of_each_axis():
 
 
 @given(errors=st.lists(st.tuples(st.floats(-40, 40), st.floats(-40, 40)), min_size=1, max_size=60))
-def test_the_mirror_is_never_told_to_leave_the_diamond(errors):
-    vernier = Vernier(PERIOD_S, PX_PER_RAD, RANGE_RAD)
+def test_the_mirror_is_never_told_to_leave_the_diamond(rig, errors):
+    vernier = Vernier(rig)
     for error_px in errors:
         mirror_rad = vernier.step(np.array(error_px))
         assert np.abs(mirror_rad).sum() <= RANGE_RAD * (1 + 1e-12)
 
 
-def test_within_reach_the_deadzone_does_nothing():
-    limited = Vernier(PERIOD_S, PX_PER_RAD, RANGE_RAD)
-    free = Vernier(PERIOD_S, PX_PER_RAD, NO_LIMIT_RAD)
+def test_within_reach_the_deadzone_does_nothing(rig):
+    limited = Vernier(rig)
+    free = Vernier(rig, NO_LIMIT_RAD)
     for error_px in np.random.default_rng(1).uniform(-0.1, 0.1, (300, 2)):
         assert np.array_equal(limited.step(error_px), free.step(error_px))
-        assert not limited.saturated
+        assert not limited.pair.saturated
 
 
 class WindingUp(Vernier):
     """The same compensator and limit, without the feedback."""
 
-    def __init__(self):
-        super().__init__(PERIOD_S, PX_PER_RAD, NO_LIMIT_RAD)
+    def __init__(self, rig):
+        super().__init__(rig, NO_LIMIT_RAD)
 
     def step(self, error_px):
         return saturate_diamond(super().step(error_px), RANGE_RAD)
@@ -147,21 +167,40 @@ def frames_until_within(residual_px, limit_px):
 
 
 @pytest.mark.parametrize("jump_px", [(30.0, 0.0), (-20.0, 22.0)])
-def test_after_ten_seconds_out_of_reach_the_mirror_recovers_without_wind_up(jump_px):
+def test_after_ten_seconds_out_of_reach_the_mirror_recovers_without_wind_up(rig, jump_px):
     jump = np.array(jump_px)
-    limited = Vernier(PERIOD_S, PX_PER_RAD, RANGE_RAD)
+    limited = Vernier(rig)
     recovered = residual_after_a_jump(limited, jump, jump_frames=500, after_frames=1500)
-    wound_up = residual_after_a_jump(WindingUp(), jump, jump_frames=500, after_frames=1500)
+    wound_up = residual_after_a_jump(WindingUp(rig), jump, jump_frames=500, after_frames=1500)
     assert frames_until_within(recovered, 0.1) * PERIOD_S < 2.0
     assert frames_until_within(wound_up, 0.1) > 3 * frames_until_within(recovered, 0.1)
-    assert not limited.saturated
+    assert not limited.pair.saturated
 
 
-def test_it_says_when_it_is_saturated():
-    vernier = Vernier(PERIOD_S, PX_PER_RAD, RANGE_RAD)
+def test_it_says_when_it_is_saturated(rig):
+    vernier = Vernier(rig)
     for _ in range(50):
         vernier.step(np.array([30.0, 0.0]))
-    assert vernier.saturated
-    vernier.reset()
-    assert not vernier.saturated
+    assert vernier.pair.saturated
+    vernier.pair.start(np.zeros(2), np.zeros(2), np.zeros(2))
+    assert not vernier.pair.saturated
     assert vernier.step(np.zeros(2)).tolist() == [0.0, 0.0]
+
+
+# ---------------------------------------------------------------- taking over from another design
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("held_px", [(1.0, -0.5), (-3.0, 2.0)])
+def test_a_design_takes_the_mirror_over_where_it_is(rig, name, held_px):
+    scale = scales(rig, rig.loops["right"])
+    pair = Pair(DESIGNS[name](basis(rig, "right")), scale, RANGE_RAD)
+    held_rad = np.array(held_px) / scale.mirror_px_per_rad
+    motor_rad, target_px = np.array([5.0, -3.0]), np.array([24.0, 19.5])
+    pair.start(held_rad, motor_rad, target_px)
+
+    first = pair.step(Measurement(np.zeros(2), target_px, held_rad, motor_rad))
+
+    bump_px = (first.mirror_rad - held_rad) * scale.mirror_px_per_rad
+    # What a design works from, an error in pixels, is not there at the first tick: it gives little.
+    assert np.abs(bump_px).max() < 0.03 * np.abs(held_px).max()

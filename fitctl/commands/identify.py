@@ -1,0 +1,157 @@
+"""`fitctl identify`: an experiment (on a rig, mocks, the virtual clock) or a log, and what it tells."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import tomli_w
+import typer
+
+from fitctl import demo as demos
+from fitctl.commands.instrument import FAILED
+from fitctl.commands.progress import progress_line
+from fitctl.config import ConfigError, Rig
+from fitctl.identify.errors import IdentifyError
+from fitctl.identify.experiments import EXPERIMENTS, Finding, response_on_mock_bench
+from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
+from fitctl.logging.errors import LogError
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.endpoints import service_folder
+from fitctl.supervisor.modes import Mode
+
+_MOCK_VERNIER_S = 60.0
+_MOCK_SETTLE_S = 5.0
+_BENCH_ONLY = (
+    "the response is measured on a bench of its own, with a position-sensing detector: give its "
+    "record with --log FILE (NPZ or CSV), or --mock for the mock bench"
+)
+
+
+class Source(NamedTuple):
+    """Where the records come from; without any of these, from the rig's running supervisor."""
+
+    log: Path | None
+    simulate: bool
+    mock: bool
+    seed: int
+
+
+class Output(NamedTuple):
+    """Where the fragment and the plot go; by default named after rig, loop and experiment."""
+
+    fragment: Path | None
+    plot: Path | None
+
+
+def identify(
+    rig: Rig,
+    rig_path: Path,
+    overrides: Sequence[str],
+    what: str,
+    loop_name: str,
+    source: Source,
+    output: Output,
+) -> int:
+    """Identify one thing of one loop; returns the exit status."""
+    if loop_name not in rig.loops:
+        msg = f"identify: --loop {loop_name!r}: rig {rig.name} has {', '.join(rig.loops)}"
+        raise ConfigError(msg)
+    try:
+        with _shown(what) as progress:
+            finding = _found(rig, rig_path, overrides, what, loop_name, source, progress)
+        text = _fragment_text(rig, what, finding)
+    except LogError as error:
+        raise ConfigError(str(error)) from None
+    except (IdentifyError, ConnectionError, demos.DemoError) as error:
+        typer.echo(f"identify {what}: {error}", err=True)
+        return FAILED
+    stem = f"{rig.name}-{loop_name}-{what}"
+    fragment_path = output.fragment or Path(f"{stem}.toml")
+    plot_path = output.plot or fragment_path.with_suffix(".png")
+    try:
+        fragment_path.write_text(text, encoding="utf-8")
+        finding.plot(plot_path)
+    except (OSError, ValueError) as error:
+        msg = f"identify: nothing can be written as {fragment_path} and {plot_path}: {error}"
+        raise ConfigError(msg) from None
+    for line in finding.lines():
+        typer.echo(line)
+    typer.echo(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
+    return 0
+
+
+def _found(
+    rig: Rig,
+    rig_path: Path,
+    overrides: Sequence[str],
+    what: str,
+    loop_name: str,
+    source: Source,
+    progress: Progress,
+) -> Finding:
+    experiment = EXPERIMENTS[what]
+    if source.log is not None:
+        return experiment.from_log(rig, loop_name, source.log)
+    if experiment.plan is None or experiment.from_records is None:
+        if not (source.simulate or source.mock):
+            raise IdentifyError(_BENCH_ONLY)
+        rig.mock_parts()
+        return response_on_mock_bench(rig, loop_name, source.seed, _by_axis(progress))
+    drives = experiment.plan(rig, loop_name)
+    if source.simulate:
+        rig.mock_parts()
+        records = on_simulation(rig, loop_name, what, drives, source.seed, progress)
+        return experiment.from_records(rig, loop_name, records)
+    if source.mock:
+        rig.mock_parts()
+        with demos.instrument(rig_path, overrides, source.seed) as running:
+            _hold_a_star(running, loop_name)
+            path = on_rig(running.client, rig, loop_name, what, drives, progress)
+            return experiment.from_log(rig, loop_name, path)
+    client = Client(service_folder(rig))
+    try:
+        insist_on_vernier(client, loop_name)
+        path = on_rig(client, rig, loop_name, what, drives, progress)
+    finally:
+        client.close()
+    return experiment.from_log(rig, loop_name, path)
+
+
+def _by_axis(progress: Progress) -> Callable[[str], None]:
+    """Progress by halves."""
+    done = itertools.count()
+    return lambda _axis: progress(next(done) / 2)
+
+
+def _hold_a_star(running: demos.Instrument, loop_name: str) -> None:
+    demos.acquire(running)
+    deadline_s = time.monotonic() + _MOCK_VERNIER_S
+    since_s = None
+    while since_s is None or time.monotonic() < since_s + _MOCK_SETTLE_S:
+        running.check()
+        telemetry = running.client.receive(0.5)
+        modes = {} if telemetry is None else {loop.name: loop.mode for loop in telemetry.loops}
+        if since_s is None and modes.get(loop_name) == Mode.VERNIER.name:
+            since_s = time.monotonic()
+        if since_s is None and time.monotonic() > deadline_s:
+            msg = f"the mock star was not held within {_MOCK_VERNIER_S:g} s; modes {modes}"
+            raise IdentifyError(msg)
+
+
+def _fragment_text(rig: Rig, what: str, finding: Finding) -> str:
+    when = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    said = "".join(f"# {line}\n" for line in finding.lines())
+    head = f"# Written by `fitctl identify {what}` for rig {rig.name}, {when}.\n{said}\n"
+    return head + tomli_w.dumps(finding.fragment())
+
+
+@contextmanager
+def _shown(what: str) -> Iterator[Callable[[float], None]]:
+    with progress_line() as progress:
+        task = progress.add_task(f"identify {what}", total=1.0)
+        yield lambda part: progress.update(task, completed=part)

@@ -1,0 +1,123 @@
+"""`fitctl simulate`: the instrument without wires, once or many times."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+
+import typer
+
+from fitctl import demo as demos
+from fitctl.commands.instrument import FAILED, check_plant
+from fitctl.commands.progress import progress_line
+from fitctl.config import Rig
+from fitctl.supervisor.campaign import (
+    PERCENTILES,
+    CampaignError,
+    LoopSummary,
+    Statistics,
+    dask_executor,
+    local_executor,
+    run_campaign,
+    summarize,
+)
+from fitctl.supervisor.simulate import SimulationResult, simulate
+
+
+def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
+    """Simulate and print the result; returns the exit status."""
+    rig.mock_parts()
+    check_plant(rig)
+    with progress_line() as progress:
+        task = progress.add_task("simulating", total=1.0)
+        results = simulate(
+            rig, seed, duration_s, on_progress=lambda part: progress.update(task, completed=part)
+        )
+        progress.update(task, completed=1.0)
+    plain = {name: result._asdict() for name, result in results.items()}
+    if as_json:
+        typer.echo(demos.to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
+    else:
+        for name, result in results.items():
+            typer.echo(_told(name, result))
+    return 0 if all(not math.isnan(result.vernier_s) for result in results.values()) else FAILED
+
+
+def _told(name: str, result: SimulationResult) -> str:
+    rms, measured = result.rms_px, result.measured_rms_px
+    return (
+        f"loop {name}: star found after {result.acquired_s:.1f} s, vernier after "
+        f"{result.vernier_s:.1f} s\n"
+        f"  true residual RMS  az {rms['az']:.4f} px, el {rms['el']:.4f} px"
+        f" over {result.judged_s:.0f} s\n"
+        f"  measured RMS       az {measured['az']:.4f} px, el {measured['el']:.4f} px\n"
+        f"  piston RMS         {result.piston_rms_m * 1e9:.1f} nm\n"
+        f"  speed              {result.speed_x:.0f}x real time"
+    )
+
+
+def run_many(
+    rig: Rig, seeds: Sequence[int], duration_s: float, scheduler: str, *, as_json: bool
+) -> int:
+    """Simulate every seed, here or on a Dask cluster, and print what they say together."""
+    rig.mock_parts()
+    check_plant(rig)
+    started = time.perf_counter()
+    try:
+        with (
+            dask_executor(scheduler) if scheduler else local_executor() as (executor, workers),
+            progress_line() as progress,
+        ):
+            task = progress.add_task(f"{len(seeds)} runs", total=len(seeds))
+            results = run_campaign(
+                rig,
+                seeds,
+                duration_s,
+                executor,
+                workers,
+                on_progress=lambda done: progress.update(task, completed=done),
+            )
+    except CampaignError as error:
+        typer.echo(str(error), err=True)
+        return FAILED
+    wall_s = time.perf_counter() - started
+    summaries = summarize(results)
+    speed_x = len(seeds) * duration_s / wall_s
+    if as_json:
+        head = {"duration_s": duration_s, "workers": workers, "wall_s": wall_s, "speed_x": speed_x}
+        typer.echo(demos.to_json(head | {"loops": summaries}))
+    else:
+        for name, summary in summaries.items():
+            typer.echo(_told_together(name, summary))
+        typer.echo(f"{speed_x:.0f}x real time on {workers} workers, {wall_s:.1f} s in all")
+    return 0 if all(summary.held == summary.runs for summary in summaries.values()) else FAILED
+
+
+def _told_together(name: str, summary: LoopSummary) -> str:
+    head = "".join(f"{f'{p}%':>10}" for p in PERCENTILES)
+    rows = [
+        ("true RMS az, px", summary.rms_px["az"], 4, 1.0),
+        ("true RMS el, px", summary.rms_px["el"], 4, 1.0),
+        ("worst axis, px", summary.rms_px["worst_axis"], 4, 1.0),
+        ("measured az, px", summary.measured_rms_px["az"], 4, 1.0),
+        ("measured el, px", summary.measured_rms_px["el"], 4, 1.0),
+        ("piston RMS, nm", summary.piston_rms_m, 1, 1e9),
+        ("star found, s", summary.acquired_s, 1, 1.0),
+        ("vernier, s", summary.vernier_s, 1, 1.0),
+    ]
+    worst = ", ".join(f"{run.seed} ({run.rms_px:.4f} px)" for run in summary.worst_seeds)
+    return "\n".join(
+        [
+            f"loop {name}: {summary.held} of {summary.runs} runs held their star, "
+            f"{summary.judged} for long enough to be judged",
+            f"  {'':18}{'mean':>10}{head}{'worst':>10}",
+            *(_row(title, figure, digits, scale) for title, figure, digits, scale in rows),
+            f"  worst seeds       {worst}",
+        ]
+    )
+
+
+def _row(title: str, figure: Statistics, digits: int, scale: float) -> str:
+    values = [figure.mean, *figure.percentiles.values(), figure.worst]
+    return f"  {title:18}" + "".join(f"{value * scale:10.{digits}f}" for value in values)

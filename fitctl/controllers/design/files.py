@@ -1,0 +1,147 @@
+"""Designs in files (JSON): with everything needed to make them again, and refused where they do not fit."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from fitctl.config import ConfigError
+from fitctl.controllers.design.basis import Basis, basis_of
+from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
+
+FORMAT = "fitctl design 1"
+_MATRICES = ("a", "b", "c", "d")
+# Matrices are written with all their digits; made again on another machine they differ by rounding, and
+# by what a Riccati solution makes of that.
+_ROUNDING = 1e-6
+
+
+def save_design(design: Design, path: Path) -> None:
+    """Write a design.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written.
+    """
+    document = {
+        "format": FORMAT,
+        "fitctl": importlib.metadata.version("fitctl"),
+        "name": design.name,
+        "period_s": design.period_s,
+        "delay_s": design.delay_s,
+        "inputs": list(INPUTS),
+        "outputs": list(OUTPUTS),
+        "hysteresis_inverse": design.hysteresis_inverse,
+        "parameters": design.parameters,
+        **{name: getattr(design, name).tolist() for name in _MATRICES},
+    }
+    try:
+        path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror}"
+        raise ConfigError(msg) from None
+
+
+def load_design(
+    path: Path, rig_basis: Basis, makers: Mapping[str, Callable[[Basis], Design]]
+) -> Design:
+    """Read a design for a loop.
+
+    Parameters
+    ----------
+    rig_basis : Basis
+        Of the loop that it shall drive: rate and delay must be this loop's.
+    makers : mapping
+        By which a design is made again from its parameters, by name.
+
+    Raises
+    ------
+    ConfigError
+        One line: the file, what differs, what was expected, and what to do.
+    """
+    document = _document(path)
+    wanted: dict[str, Any] = {
+        "format": FORMAT,
+        "inputs": list(INPUTS),
+        "outputs": list(OUTPUTS),
+        "period_s": rig_basis.period_s,
+        "delay_s": rig_basis.delay_s,
+    }
+    for key, expected in wanted.items():
+        got = document.get(key)
+        if not _same(got, expected):
+            hint = "design it again for this rig: fitctl design ... --out FILE"
+            raise _refusal(path, key, f"this rig needs {_shown(expected)}", _shown(got), hint)
+    name = str(document.get("name"))
+    if name not in makers:
+        hint = "use a file that this fitctl saved"
+        raise _refusal(path, "name", f"one of {', '.join(makers)}", _shown(name), hint)
+    try:
+        again = makers[name](basis_of(document["parameters"], rig_basis))
+    except ValidationError as error:
+        problem = error.errors()[0]
+        got = f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}"
+        hint = "use a file that this fitctl saved"
+        raise _refusal(path, "parameters", f"those of {name}", got, hint) from None
+    except (KeyError, TypeError, ValueError, AttributeError, np.linalg.LinAlgError) as error:
+        hint = "use a file that this fitctl saved"
+        raise _refusal(path, "parameters", f"those of {name}", repr(error), hint) from None
+    for key in _MATRICES:
+        if not _follows(document.get(key), getattr(again, key)):
+            hint = "the file was changed, or made by another fitctl; design it again"
+            expected = "the matrix that follows from its parameters"
+            raise _refusal(path, key, expected, "another", hint)
+    if document.get("hysteresis_inverse") is not again.hysteresis_inverse:
+        got, hint = _shown(document.get("hysteresis_inverse")), "design it again"
+        raise _refusal(path, "hysteresis_inverse", str(again.hysteresis_inverse), got, hint)
+    return again
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        msg = f"{path}: no such design file; make one with fitctl design ... --out FILE"
+        raise ConfigError(msg) from None
+    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        msg = f"{path}: cannot be read as a design: {error}; make one with fitctl design ... --out FILE"
+        raise ConfigError(msg) from None
+    if not isinstance(document, dict):
+        hint = "make one with fitctl design ... --out FILE"
+        raise _refusal(path, "format", FORMAT, "no JSON object", hint)
+    return document
+
+
+def _same(got: object, expected: object) -> bool:
+    if isinstance(expected, float):
+        return isinstance(got, int | float) and math.isclose(got, expected, rel_tol=1e-9)
+    return got == expected
+
+
+def _follows(given: object, made: np.ndarray) -> bool:
+    try:
+        matrix = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    if matrix.shape != made.shape:
+        return False
+    return bool(np.allclose(matrix, made, rtol=_ROUNDING, atol=_ROUNDING))
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "none"
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def _refusal(path: Path, key: str, expected: str, got: str, hint: str) -> ConfigError:
+    return ConfigError(f"{path}: {key}: expected {expected}, got {got}; {hint}")

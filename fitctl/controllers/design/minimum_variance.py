@@ -1,0 +1,43 @@
+"""The pair that comes closest to the bound: the mirror undoes what is expected, on the mean of its hold.
+
+Literature: Kulcsar, Raynaud et al., Optics Express 14, 7464 (2006), minimum variance for tip-tilt;
+Marquis et al., JOSA A (2024), fractional loop delays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fitctl.controllers.design.basis import Basis, design_parameters
+from fitctl.controllers.design.predictor import Gains, predicting_design, star_filter
+from fitctl.controllers.design.sampled import hold
+from fitctl.controllers.pair import Design
+
+
+def design_minimum_variance(basis: Basis) -> Design:
+    """Kalman filter, prediction to the mean over the hold, and a siderostat that relieves the mirror.
+
+    The mirror u brings to zero, on the mean of the hold, what is expected of the star and of the
+    siderostat, which is then half-way through its step s. The siderostat takes over what the mirror
+    holds, s = offload T u.
+    """
+    settings = basis.settings.minimum_variance
+    acts = hold(basis.air_path, basis.period_s, basis.delay_s)
+    expected = np.append(acts.weight @ acts.air, 1.0)
+    part = settings.offload_per_s * basis.period_s
+    # u + (star + motor + s / 2) = 0 and s = part u.
+    outputs = np.array([1.0, part]) / (1.0 + part / 2)
+    gains = Gains(
+        star=-np.outer(outputs, expected),
+        motor=-outputs,
+        memory=np.zeros((2, 0)),
+        keep=np.zeros((0, 0)),
+        take=np.zeros((0, 2)),
+    )
+    return predicting_design(
+        "minimum-variance",
+        basis,
+        star_filter(basis, settings.drift_px_per_sqrt_s),
+        gains,
+        design_parameters(basis, "minimum_variance"),
+    )

@@ -1,0 +1,80 @@
+"""The fast steering mirror as far as it is known: from wanted angles to stack voltages, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Fsm
+from fitctl.model.hysteresis import inverse_volts, play
+from fitctl.model.optics import mirror_angles, mirror_from_stacks, stack_matrix, stack_volts
+
+Floats = NDArray[np.float64]
+
+
+class Mirror:
+    """Remembers what was written to the D/A, and with it where the mirror is.
+
+    Where the rig file has the stacks' hysteresis, angles are what that model gives for the voltages so
+    far, and it can be inverted; otherwise they are Eq. 5's.
+
+    Parameters
+    ----------
+    fsm : Fsm
+    """
+
+    def __init__(self, fsm: Fsm) -> None:
+        self._fsm = fsm
+        self._geometry = (fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
+        self._stack_matrix = stack_matrix(fsm.stack_radius_m)
+        known = fsm.hysteresis
+        self.hysteresis_known = known is not None
+        if known is not None:
+            self._half_width_v = np.asarray(known.half_widths_v)
+            self._gains = np.asarray(known.gains_m_per_v)
+            # Where stacks rest that came up from zero to their bias: the mirror's zero.
+            self._zero_m = self._gains @ np.maximum(fsm.bias_v - self._half_width_v, 0.0)
+        self.assume(np.full(3, fsm.bias_v))
+
+    def assume(self, stack_v: Floats) -> None:
+        """Take the stacks, shape (3,), to have come up to these voltages from zero."""
+        if self.hysteresis_known:
+            self._plays_v = np.zeros_like(self._gains)
+        self.written(stack_v)
+
+    def written(self, stack_v: Floats) -> None:
+        """These voltages, shape (3,), are on the D/A now."""
+        self.stack_v = np.array(stack_v, dtype=float)
+        if self.hysteresis_known:
+            self._plays_v = play(self._plays_v, self.stack_v[:, None], self._half_width_v)
+
+    @property
+    def angles_rad(self) -> Floats:
+        """Where the mirror is, shape (2,)."""
+        if not self.hysteresis_known:
+            return mirror_angles(self.stack_v, *self._geometry)
+        displacement_m = np.vecdot(self._plays_v, self._gains) - self._zero_m
+        return mirror_from_stacks(displacement_m, self._fsm.stack_radius_m)
+
+    def held_rad(self, *, hysteresis_inverse: bool) -> Floats:
+        """The angles, shape (2,), for which :meth:`volts_for` leaves the mirror as it is.
+
+        By Eq. 1 these are the angles of ideal stacks at the voltages as they are. Eq. 5 would not do: it
+        has the mirror's middle at rest, and voltages that the inverse made have moved it.
+        """
+        if hysteresis_inverse and self.hysteresis_known:
+            return self.angles_rad
+        ideal_m = (self.stack_v - self._fsm.bias_v) * self._fsm.stack_scale_m_per_v
+        return mirror_from_stacks(ideal_m, self._fsm.stack_radius_m)
+
+    def volts_for(self, mirror_rad: Floats, *, hysteresis_inverse: bool) -> Floats:
+        """Voltages, shape (3,), that turn the mirror to `mirror_rad`, shape (2,), within the D/A's range.
+
+        By Eq. 1, or by the exact inverse of the identified hysteresis where asked for and known.
+        """
+        if hysteresis_inverse and self.hysteresis_known:
+            wanted_m = self._zero_m + self._stack_matrix @ mirror_rad
+            volts = inverse_volts(self._plays_v, self._half_width_v, self._gains, wanted_m)
+        else:
+            volts = stack_volts(mirror_rad, *self._geometry)
+        return np.minimum(np.maximum(volts, 0.0), self._fsm.dac.full_scale_v)

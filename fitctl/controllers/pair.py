@@ -1,0 +1,167 @@
+"""The vernier/coarse pair: mirror and siderostat, driven together from the star's error (Figs. 8 and 10).
+
+A design is data: one linear system, the same for both axes, at the loop's rate. Everything that is not
+linear is here, once for all designs: the mirror's diamond, and the deadzone feedback about it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.model.optics import Scales, saturate_diamond
+
+Floats = NDArray[np.float64]
+
+HAND_OVER_S = 10.0
+"""Time constant with which the siderostat takes over what a design found the mirror holding (choice)."""
+
+INPUTS = ("error_px", "excess_px", "mirror_px", "motor_px", "target_px")
+OUTPUTS = ("mirror_px", "motor_step_px")
+_ENDLESS = 1e-9  # an eigenvalue this close to 1 is a memory without end
+
+
+@dataclass(frozen=True)
+class Design:
+    """A vernier/coarse pair: x+ = A x + B u, y = C x + D u, for each axis.
+
+    Inputs u, of the frame in hand:
+
+    - ``error_px``: star less target;
+    - ``excess_px``: by how much the last wanted mirror angle passed the diamond (Fig. 10);
+    - ``mirror_px``: where the mirror had moved the star at mid-exposure;
+    - ``motor_px``: where the siderostat's encoders had, from where the pair was started;
+    - ``target_px``: the target, from where it was when the pair was started.
+
+    Outputs y: ``mirror_px``, where the mirror shall move the star until the next command, and
+    ``motor_step_px``, by how much the siderostat's set-point moves it.
+
+    Attributes
+    ----------
+    name : str
+        eq20, lqg-ltr, minimum-variance or fslq.
+    period_s, delay_s : float
+        Of the loop that it was made for: frame period, and mid-exposure to command.
+    a, b, c, d : arrays, shapes (n, n), (n, 5), (2, n), (2, 5)
+    hysteresis_inverse : bool
+        Whether stack voltages go through the inverse of the identified hysteresis.
+    parameters : dict
+        Everything that it was made from; with the name, enough to make it again.
+    """
+
+    name: str
+    period_s: float
+    delay_s: float
+    a: Floats = field(repr=False)
+    b: Floats = field(repr=False)
+    c: Floats = field(repr=False)
+    d: Floats = field(repr=False)
+    hysteresis_inverse: bool
+    parameters: dict[str, Any] = field(repr=False)
+
+
+class Measurement(NamedTuple):
+    """What one frame told, each shape (2,): in pixels from the frame, in radians from the stages."""
+
+    error_px: Floats
+    target_px: Floats
+    mirror_rad: Floats
+    motor_rad: Floats
+
+
+class PairCommand(NamedTuple):
+    """Mirror angles on the diamond, and the step of the motors' set-point, each shape (2,)."""
+
+    mirror_rad: Floats
+    motor_step_rad: Floats
+
+
+class Pair:
+    """A design at work on both axes.
+
+    Parameters
+    ----------
+    design : Design
+    scale : Scales
+    range_rad : float
+        phi_max: |az| + |el| of the mirror.
+    """
+
+    def __init__(self, design: Design, scale: Scales, range_rad: float) -> None:
+        self.design = design
+        self._mirror_px_per_rad = scale.mirror_px_per_rad
+        self._motor_px_per_rad = scale.motor_px_per_rad
+        self._range_rad = range_rad
+        self._at_rest = rest_state(design)
+        self._left_at_rest = left_at_rest(design, self._at_rest)
+        self._kept = math.exp(-design.period_s / HAND_OVER_S)
+        self._system = np.block([[design.d, design.c], [design.b, design.a]]).T
+        self._given = np.empty((2, 5 + len(design.a)))
+        self.start(np.zeros(2), np.zeros(2), np.zeros(2))
+
+    def start(self, mirror_rad: Floats, motor_rad: Floats, target_px: Floats) -> None:
+        """Begin as if the mirror had long been held at `mirror_rad`, so that it goes on without a bump.
+
+        What a design does not hold by itself without an error (Eq. 20 holds nothing so) is added to its
+        command, and handed over to the siderostat little by little.
+        """
+        mirror_px = mirror_rad * self._mirror_px_per_rad
+        self.state = np.outer(mirror_px, self._at_rest)
+        self.held_px = mirror_px * self._left_at_rest
+        self.excess_px = np.zeros(2)
+        self.motor_origin_rad = np.array(motor_rad, dtype=float)
+        self.target_origin_px = np.array(target_px, dtype=float)
+
+    @property
+    def saturated(self) -> bool:
+        """The last wanted mirror angle was outside the diamond."""
+        return bool((np.abs(self.excess_px) > 1e-9).any())
+
+    def step(self, measured: Measurement) -> PairCommand:
+        """One period."""
+        given = self._given
+        given[:, 0] = measured.error_px
+        given[:, 1] = self.excess_px
+        given[:, 2] = measured.mirror_rad * self._mirror_px_per_rad
+        given[:, 3] = (measured.motor_rad - self.motor_origin_rad) * self._motor_px_per_rad
+        given[:, 4] = measured.target_px - self.target_origin_px
+        given[:, 5:] = self.state
+        # All of the design in one product, which in a tick costs less than four.
+        made = given @ self._system
+        self.state = made[:, 2:]
+        wanted_px = made[:, 0] + self.held_px
+        handed_px = self.held_px * (1 - self._kept)
+        self.held_px = self.held_px - handed_px
+        mirror_rad = saturate_diamond(wanted_px / self._mirror_px_per_rad, self._range_rad)
+        # Fed back a frame later, where the camera takes nearly two: much as the error would have been
+        # had the mirror followed.
+        self.excess_px = wanted_px - mirror_rad * self._mirror_px_per_rad
+        return PairCommand(mirror_rad, (made[:, 1] + handed_px) / self._motor_px_per_rad)
+
+
+def rest_state(design: Design) -> Floats:
+    """The state in which a design rests while the mirror is held at one pixel, shape (n,).
+
+    x with x = A x + B u for u = (0, 0, 1, 0, 0): no error, and the mirror where it is. Where a design
+    has a memory without end, as of drift, the x that commands the mirror to stay there.
+    """
+    mirror = INPUTS.index("mirror_px")
+    rest = np.eye(len(design.a)) - design.a
+    solution, *_ = np.linalg.lstsq(rest, design.b[:, mirror], rcond=None)
+    state: Floats = np.asarray(solution, dtype=float)
+    values, vectors = np.linalg.eig(design.a)
+    for remembered in vectors[:, np.abs(values - 1) < _ENDLESS].real.T:
+        shown = design.c[0] @ remembered
+        if shown != 0:
+            state = state + remembered * left_at_rest(design, state) / shown
+    return state
+
+
+def left_at_rest(design: Design, at_rest: Floats) -> float:
+    """What a design at rest does not command of the one pixel at which the mirror is held."""
+    mirror = INPUTS.index("mirror_px")
+    return float(1.0 - design.c[0] @ at_rest - design.d[0, mirror])

@@ -1,0 +1,161 @@
+"""By how much a running loop attenuates its disturbance, measured from its ticks as a log has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from fitctl.config import Rig
+from fitctl.controllers.mirror import Mirror
+from fitctl.identify.errors import IdentifyError
+from fitctl.logging.records import Tick
+from fitctl.model.optics import scales
+from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import SETTLE_S
+
+Floats = NDArray[np.float64]
+Ticks = Mapping[str, NDArray[Any]]
+SEGMENT_S = 8.0  # 0.125 Hz a bin
+BAND_HZ = 0.15  # either side of the frequency asked for
+_MOST_MISSING = 0.02  # of the frames
+
+
+class Rebuilt(NamedTuple):
+    """One stretch of VERNIER, frame by frame.
+
+    Attributes
+    ----------
+    time_s : array, shape (frames,)
+        Of mid-exposure.
+    error_px : array, shape (frames, 2)
+        Centroid less target, as measured.
+    disturbance_px : array, shape (frames, 2)
+        What it would have been with the stages at rest.
+    """
+
+    time_s: Floats
+    error_px: Floats
+    disturbance_px: Floats
+
+
+class Spectra(NamedTuple):
+    """One-sided power spectral densities of both, px²/Hz, mean of both axes, shape (frequencies,)."""
+
+    frequency_hz: Floats
+    error: Floats
+    disturbance: Floats
+
+
+def tick_columns(ticks: Iterable[Tick]) -> dict[str, NDArray[Any]]:
+    """Ticks in hand in the form of :func:`fitctl.logging.reading.tick_arrays`."""
+    rows = [msgspec.structs.astuple(tick) for tick in ticks]
+    names = (field.name for field in msgspec.structs.fields(Tick))
+    return {
+        name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
+    }
+
+
+def rebuilt(rig: Rig, loop_name: str, ticks: Ticks) -> Rebuilt:
+    """Open the loop again, on paper: the error less where both stages had moved the star at mid-exposure.
+
+    The last stretch of VERNIER counts, from `SETTLE_S` after its start. The mirror is where the rig
+    file's hysteresis puts it for the logged stack voltages (Eq. 5 where it is not known), the siderostat
+    where its encoders were. What neither tells, backlash and unknown hysteresis, stays in both series.
+
+    Parameters
+    ----------
+    ticks : mapping of str to array
+        All ticks of a log in their order: the stacks remember.
+
+    Raises
+    ------
+    IdentifyError
+        If there is no such stretch, or the star is missing on too many of its frames.
+    """
+    loop = rig.loops[loop_name]
+    scale = scales(rig, loop)
+    inside = _last_vernier(ticks)
+    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)])
+    mirror = Mirror(loop.fsm)
+    mirror.assume(volts[0])
+    angles_rad = np.empty((len(volts), 2))
+    for row, stack_v in enumerate(volts):
+        mirror.written(stack_v)
+        angles_rad[row] = mirror.angles_rad
+    # A command acts from its tick's end until the next.
+    exposed_s = ticks["mid_exposure_s"][inside]
+    in_force = np.searchsorted(ticks["time_s"], exposed_s, side="right") - 1
+    stages_px = scale.mirror_px_per_rad * angles_rad[in_force]
+    stages_px += scale.motor_px_per_rad * _pair(ticks, "siderostat_{}_rad")[inside]
+    error_px = _pair(ticks, "error_{}_px")[inside]
+    return Rebuilt(exposed_s, error_px, error_px - stages_px)
+
+
+def _last_vernier(ticks: Ticks) -> NDArray[np.intp]:
+    """Frames with a star in the last stretch of VERNIER, once it has settled."""
+    vernier = (ticks["mode"] == Mode.VERNIER.name) & (ticks["number"] >= 0)
+    entered = np.flatnonzero(np.diff(vernier.astype(int), prepend=0) == 1)
+    if len(entered) == 0:
+        msg = "attenuation: no frame in VERNIER; record while the star is held"
+        raise IdentifyError(msg)
+    begin_s = ticks["time_s"][entered[-1]] + SETTLE_S
+    counts = vernier & (ticks["time_s"] >= begin_s)
+    frames = np.flatnonzero(counts & ticks["star_visible"])
+    if len(frames) < max(2, (1 - _MOST_MISSING) * np.count_nonzero(counts)):
+        msg = (
+            f"attenuation: {len(frames)} usable frames of {np.count_nonzero(counts)} in VERNIER after "
+            f"{SETTLE_S:g} s; expected a star on at least {100 * (1 - _MOST_MISSING):g} %; record longer"
+        )
+        raise IdentifyError(msg)
+    return frames
+
+
+def _pair(ticks: Ticks, name: str) -> Floats:
+    return np.column_stack([ticks[name.format(axis)] for axis in ("az", "el")])
+
+
+def spectra(series: Rebuilt, period_s: float) -> Spectra:
+    """Welch's method with Hann windows, means removed.
+
+    Raises
+    ------
+    IdentifyError
+        If the stretch is shorter than one segment.
+    """
+    segment = round(SEGMENT_S / period_s)
+    if len(series.error_px) < segment:
+        msg = (
+            f"attenuation: {len(series.error_px) * period_s:.1f} s in VERNIER; expected at least "
+            f"{SEGMENT_S:g} s, better a minute; record longer"
+        )
+        raise IdentifyError(msg)
+    options: dict[str, Any] = {"fs": 1 / period_s, "nperseg": segment, "axis": 0}
+    frequency_hz, error = welch(series.error_px, **options)
+    _, disturbance = welch(series.disturbance_px, **options)
+    return Spectra(frequency_hz, error.mean(axis=1), disturbance.mean(axis=1))
+
+
+def mean_spectra(of_runs: list[Spectra]) -> Spectra:
+    """The mean over runs."""
+    return Spectra(
+        of_runs[0].frequency_hz,
+        np.mean([one.error for one in of_runs], axis=0),
+        np.mean([one.disturbance for one in of_runs], axis=0),
+    )
+
+
+def attenuation(measured: Spectra, at_hz: float) -> float:
+    """Disturbance over error about a frequency, as amplitudes.
+
+    The centroid noise n needs no subtraction: the rebuilt disturbance is d + n, and the loop, which
+    cannot tell the two apart, makes S (d + n) of it, the measured error. To take a white floor off each
+    spectrum would be wrong, because in closed loop the star's true motion follows the noise.
+    """
+    near = np.abs(measured.frequency_hz - at_hz) <= BAND_HZ
+    ratio = measured.disturbance[near] / measured.error[near]
+    return float(np.exp(np.mean(np.log(ratio)) / 2))

@@ -1,0 +1,116 @@
+"""A figure with its caption and its comparison with the paper; and how all of them look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, which colour-blind people tell apart; lines differ in style besides.
+BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, BLACK = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#56B4E9",
+    "#CC79A7",
+    "#000000",
+)
+_DPI = 120
+
+
+class Comparison(NamedTuple):
+    """One quantity: the paper's and ours.
+
+    Attributes
+    ----------
+    quantity : str
+        With its unit.
+    paper : float or None
+        None where the paper prints no number.
+    ours : float
+    note : str
+        What the paper says in words, or what ours is judged by.
+    """
+
+    quantity: str
+    paper: float | None
+    ours: float
+    note: str = ""
+
+    @property
+    def ratio(self) -> float | None:
+        """Ours over the paper's."""
+        return None if self.paper is None else self.ours / self.paper
+
+
+@dataclass(frozen=True)
+class Plate:
+    """One of the paper's figures, made from this system.
+
+    Attributes
+    ----------
+    name : str
+        Of its files, without suffix.
+    title, caption : str
+    rows : list of Comparison
+    """
+
+    name: str
+    title: str
+    caption: str
+    rows: list[Comparison] = field(default_factory=list)
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON."""
+        rows = [row._asdict() | {"ratio": row.ratio} for row in self.rows]
+        return asdict(self) | {"rows": rows}
+
+    def markdown(self) -> list[str]:
+        """Picture, caption and table."""
+        head = ["quantity", "paper", "ours", "ratio", "remark"]
+        rows = [
+            [
+                row.quantity,
+                "not printed" if row.paper is None else f"{row.paper:.4g}",
+                "never" if math.isnan(row.ours) else f"{row.ours:.4g}",
+                "" if row.ratio is None else f"{row.ratio:.3f}",
+                row.note,
+            ]
+            for row in self.rows
+        ]
+        return [
+            f"## {self.title}",
+            "",
+            f"![{self.title}]({self.name}.svg)",
+            "",
+            self.caption,
+            "",
+            *table(head, rows),
+        ]
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
+
+
+def new_figure(width_in: float = 7.0, height_in: float = 4.8) -> Figure:
+    """An empty figure whose lettering can be read in print."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """Write a figure as PNG and as SVG; the same data give the same files."""
+    import matplotlib
+
+    with matplotlib.rc_context({"svg.hashsalt": name, "path.simplify_threshold": 0.5}):
+        figure.savefig(folder / f"{name}.png", dpi=_DPI, metadata={"Software": None})
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})

@@ -1,0 +1,67 @@
+"""How a loop settles after a step: from true positions, or from a log's ticks."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Settling(NamedTuple):
+    """What followed a step.
+
+    Attributes
+    ----------
+    settled_s : float
+        From the step until the star stays within the tolerance; nan if it never does.
+    overshoot_px : float
+        Largest distance beyond the target on the step's far side; 0 if it never got there.
+    """
+
+    settled_s: float
+    overshoot_px: float
+
+
+def settling(time_s: Floats, distance_px: Floats, stepped_s: float, within_px: float) -> Settling:
+    """Settling of one axis.
+
+    Parameters
+    ----------
+    time_s, distance_px : arrays, shape (n,)
+        Star less where it shall come to rest; NaN where it was not seen.
+    stepped_s, within_px : float
+    """
+    after = (time_s >= stepped_s) & np.isfinite(distance_px)
+    since_s, distance_px = time_s[after] - stepped_s, distance_px[after]
+    if len(distance_px) == 0:
+        return Settling(math.nan, math.nan)
+    outside = np.flatnonzero(np.abs(distance_px) > within_px)
+    if len(outside) == 0:
+        settled_s = 0.0
+    elif outside[-1] == len(distance_px) - 1:
+        settled_s = math.nan
+    else:
+        settled_s = float(since_s[outside[-1] + 1])
+    side = np.sign(distance_px[np.argmax(np.abs(distance_px))])
+    return Settling(settled_s, float(max(0.0, (-side * distance_px).max())))
+
+
+def decayed_s(time_s: Floats, value: Floats, stepped_s: float, part: float) -> float:
+    """From a step until a value stays below a part of the largest that it had since; nan if never."""
+    after = time_s >= stepped_s
+    size = np.abs(value[after])
+    outside = np.flatnonzero(size > part * size.max())
+    if outside[-1] == len(size) - 1:
+        return math.nan
+    return float(time_s[after][outside[-1] + 1] - stepped_s)
+
+
+def smoothed(values: Floats, samples: int) -> Floats:
+    """Running mean over an odd number of samples, shape as given (n,); its ends are held."""
+    half = samples // 2
+    held = np.pad(values, half, mode="edge")
+    return np.convolve(held, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")

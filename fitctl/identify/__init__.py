@@ -1,0 +1,1 @@
+"""Learning what a rig truly is: from experiments on it, or from its logs."""

@@ -1,0 +1,214 @@
+"""The air path, from a minute of frames with the stages at rest: Eq. 8 and the noise floor (Fig. 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from fitctl.config import AirPathModel, Rig
+from fitctl.identify.air_fit import AirFit, fit_air_path
+from fitctl.identify.errors import IdentifyError
+from fitctl.identify.frames import Tracks
+from fitctl.model.air_path import rms_px, state_space
+from fitctl.model.drives import Drive
+
+Floats = NDArray[np.float64]
+
+AXES = ("az", "el")
+RECOMMENDED_S = 60.0
+_LEAST_S = 20.0
+_SEGMENT_S = 20.48
+
+
+class RelativeMotion(NamedTuple):
+    """How one spot moves against the pointing spot, each shape (2,) for az and el.
+
+    Attributes
+    ----------
+    spot : int
+    correlation : array
+        Of the two spots' centroids, noise included.
+    measured_px, rms_px : arrays
+        RMS of their difference: as measured, and less both spots' fitted white noise.
+    """
+
+    spot: int
+    correlation: Floats
+    measured_px: Floats
+    rms_px: Floats
+
+
+@dataclass(frozen=True)
+class AirPathResult:
+    """What the frames told.
+
+    Attributes
+    ----------
+    loop : str
+    tracks : Tracks
+        Spot 0 is the brightest: the pointing spot.
+    joint : AirFit
+        One fit of the pointing spot's two axes: what designs use.
+    fits : list of (AirFit, AirFit)
+        For each spot, az and el by themselves.
+    relative : list of RelativeMotion
+        For each spot but the first.
+    frequency_hz : array, shape (frequencies,)
+    psd_px2_per_hz : array, shape (frequencies, spots, 2)
+        Welch, one-sided, means removed.
+    """
+
+    loop: str
+    tracks: Tracks
+    joint: AirFit
+    fits: list[tuple[AirFit, AirFit]]
+    relative: list[RelativeMotion]
+    frequency_hz: Floats
+    psd_px2_per_hz: Floats
+
+    def fragment(self) -> dict[str, Any]:
+        """What to lay over the rig file: the air path that designs are made for."""
+        air = self.joint.model.model_dump()
+        return {"loops": {self.loop: {"vernier": {"air_path": air}}}}
+
+    def lines(self) -> list[str]:
+        """For an operator."""
+        lines = [
+            f"{self.tracks.duration_s:.0f} s of frames, {self.tracks.px.shape[1]} spots, "
+            f"{self.tracks.filled:.1%} filled in"
+        ]
+        if self.tracks.duration_s < RECOMMENDED_S:
+            lines.append(f"shorter than {RECOMMENDED_S:.0f} s: the intervals are wide")
+        lines.append(f"pointing spot, both axes: {_told(self.joint)}")
+        for spot, pair in enumerate(self.fits):
+            lines += [
+                f"spot {spot} ({self.tracks.flux_dn[spot]:.0f} DN) {axis}: {_told(fit)}"
+                for axis, fit in zip(AXES, pair, strict=True)
+            ]
+        lines += [
+            f"spot {moving.spot} against spot 0, {axis}: correlation {moving.correlation[i]:.3f}, "
+            f"relative motion {moving.rms_px[i]:.4f} px RMS "
+            f"({moving.measured_px[i]:.4f} with centroid noise)"
+            for moving in self.relative
+            for i, axis in enumerate(AXES)
+        ]
+        return lines
+
+    def plot(self, path: Path) -> None:
+        """Fig. 7: spectra of all spots and the joint fit."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(7.0, 4.8), layout="constrained")
+        axes = figure.add_subplot()
+        shown = slice(1, None)  # the means are removed
+        for spot in range(self.psd_px2_per_hz.shape[1]):
+            for i, axis in enumerate(AXES):
+                axes.loglog(
+                    self.frequency_hz[shown],
+                    self.psd_px2_per_hz[shown, spot, i],
+                    linewidth=0.8,
+                    label=f"spot {spot} {axis}",
+                )
+        axes.loglog(
+            self.frequency_hz[shown],
+            model_psd_px2_per_hz(self.joint, self.frequency_hz[shown], self.tracks.period_s),
+            "k",
+            linewidth=1.8,
+            label="Eq. 8 and white noise, fitted to spot 0",
+        )
+        axes.set_xlabel("frequency (Hz)")
+        axes.set_ylabel("power spectral density (px²/Hz)")
+        axes.set_title(f"Centroids of loop {self.loop}, {self.tracks.duration_s:.0f} s, open loop")
+        axes.grid(which="both", alpha=0.3)
+        axes.legend(fontsize=8)
+        figure.savefig(path)
+
+
+def plan(_rig: Rig, _loop_name: str) -> list[Drive]:
+    """Nothing moves, for a little longer than a minute: a motion of no amplitude."""
+    return [
+        Drive(
+            channel="fsm_az",
+            shape="sine",
+            amplitude=0.0,
+            frequency_hz=1.0,
+            duration_s=RECOMMENDED_S + 4,
+        )
+    ]
+
+
+def analyse(rig: Rig, loop_name: str, tracks: Tracks) -> AirPathResult:
+    """Fit the air path of one loop to its spots' tracks, stages at rest.
+
+    Raises
+    ------
+    IdentifyError
+        If there is too little of it, or it does not look like Eq. 8.
+    """
+    if tracks.duration_s < _LEAST_S:
+        msg = (
+            f"air path: {tracks.duration_s:.1f} s of frames; expected at least {_LEAST_S:.0f} s, better "
+            f"{RECOMMENDED_S:.0f} s, with the stages at rest; take a longer record"
+        )
+        raise IdentifyError(msg)
+    start = rig.loops[loop_name].vernier.air_path
+    period_s, px = tracks.period_s, tracks.px
+    fits = []
+    for spot in range(px.shape[1]):
+        az, el = (fit_air_path(px[:, spot, [axis]], period_s, start) for axis in range(2))
+        fits.append((az, el))
+    frequency_hz, psd = welch(
+        px,
+        fs=1 / period_s,
+        nperseg=min(len(px), round(_SEGMENT_S / period_s)),
+        detrend="constant",
+        axis=0,
+    )
+    return AirPathResult(
+        loop=loop_name,
+        tracks=tracks,
+        joint=fit_air_path(px[:, 0], period_s, start),
+        fits=fits,
+        relative=[_relative(px, fits, spot) for spot in range(1, px.shape[1])],
+        frequency_hz=frequency_hz,
+        psd_px2_per_hz=psd,
+    )
+
+
+def model_psd_px2_per_hz(fit: AirFit, frequency_hz: Floats, period_s: float) -> Floats:
+    """One-sided spectrum of Eq. 8 and the noise floor, shape as `frequency_hz`.
+
+    Unit intensity is 1 per Hz two-sided, hence 2 one-sided; sampled noise spreads over half the rate.
+    """
+    a, b, c = state_space(fit.model)
+    s = 2j * np.pi * np.asarray(frequency_hz)[:, None, None]
+    response = (c @ np.linalg.solve(s * np.eye(2) - a, b))[:, 0, 0]
+    return 2 * np.abs(response) ** 2 + 2 * period_s * fit.noise_px.value**2
+
+
+def _relative(px: Floats, fits: list[tuple[AirFit, AirFit]], spot: int) -> RelativeMotion:
+    measured_px = np.std(px[:, spot] - px[:, 0], axis=0)
+    noise_px2 = np.array(
+        [sum(fits[k][axis].noise_px.value ** 2 for k in (0, spot)) for axis in range(2)]
+    )
+    return RelativeMotion(
+        spot=spot,
+        correlation=np.array(
+            [np.corrcoef(px[:, 0, axis], px[:, spot, axis])[0, 1] for axis in range(2)]
+        ),
+        measured_px=measured_px,
+        rms_px=np.sqrt(np.maximum(measured_px**2 - noise_px2, 0.0)),
+    )
+
+
+def _told(fit: AirFit) -> str:
+    model: AirPathModel = fit.model
+    return (
+        f"gain {fit.gain_px} px, b1 {fit.b1_s2} s², b2 {fit.b2_s} s, noise {fit.noise_px} px, "
+        f"motion {rms_px(model):.3f} px RMS"
+    )

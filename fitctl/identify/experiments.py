@@ -1,0 +1,92 @@
+"""What can be identified, and how: one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from fitctl.config import Rig
+from fitctl.identify import airpath, backlash, delay, hysteresis, response
+from fitctl.identify.frames import frames_of_log, frames_of_records, track_spots
+from fitctl.identify.record import gather, gather_log
+from fitctl.logging.records import AnyRecord
+from fitctl.mocks.detector import DetectorBench
+from fitctl.model.drives import Drive
+
+
+class Finding(Protocol):
+    """What an identification found."""
+
+    def fragment(self) -> dict[str, Any]:
+        """What to lay over the rig file."""
+
+    def lines(self) -> list[str]:
+        """For an operator."""
+
+    def plot(self, path: Path) -> None:
+        """PNG or SVG, by the path's suffix."""
+
+
+class Identification(NamedTuple):
+    """One thing that can be identified.
+
+    Attributes
+    ----------
+    plan : callable or None
+        The motions, of a rig's loop; None for what is measured on the detector bench.
+    from_log : callable
+        From a log that has the experiment, or from a bench's file.
+    from_records : callable or None
+        The same from records in hand.
+    """
+
+    plan: Callable[[Rig, str], list[Drive]] | None
+    from_log: Callable[[Rig, str, Path], Finding]
+    from_records: Callable[[Rig, str, list[AnyRecord]], Finding] | None
+
+
+def _of_stages(
+    name: str,
+    plan: Callable[[Rig, str], list[Drive]],
+    analyse: Callable[..., Finding],
+) -> Identification:
+    """An identification from a loop's own ticks and voltages."""
+    return Identification(
+        plan=plan,
+        from_log=lambda rig, loop, path: analyse(rig, gather_log(path, loop, name)),
+        from_records=lambda rig, loop, records: analyse(rig, gather(records, loop, name)),
+    )
+
+
+def _air_path_from_log(rig: Rig, loop_name: str, path: Path) -> Finding:
+    frames = frames_of_log(path, loop_name)
+    tracks = track_spots(frames, rig.camera, rig.loops[loop_name])
+    return airpath.analyse(rig, loop_name, tracks)
+
+
+def _air_path_from_records(rig: Rig, loop_name: str, records: list[AnyRecord]) -> Finding:
+    frames = frames_of_records(records, loop_name)
+    tracks = track_spots(frames, rig.camera, rig.loops[loop_name])
+    return airpath.analyse(rig, loop_name, tracks)
+
+
+def _response_from_file(rig: Rig, loop_name: str, path: Path) -> Finding:
+    return response.analyse([response.read_bench(path, rig.loops[loop_name].fsm)], loop_name)
+
+
+def response_on_mock_bench(
+    rig: Rig, loop_name: str, seed: int, on_axis: Callable[[str], None]
+) -> Finding:
+    """Drive the mock of the detector bench with the paper's chirps."""
+    bench = DetectorBench(rig, loop_name, seed)
+    return response.analyse(response.measure(bench, on_axis), loop_name)
+
+
+EXPERIMENTS: dict[str, Identification] = {
+    "hysteresis": _of_stages("hysteresis", hysteresis.plan, hysteresis.analyse),
+    "backlash": _of_stages("backlash", backlash.plan, backlash.analyse),
+    "delay": _of_stages("delay", delay.plan, delay.analyse),
+    "airpath": Identification(airpath.plan, _air_path_from_log, _air_path_from_records),
+    "response": Identification(None, _response_from_file, None),
+}

@@ -1,0 +1,128 @@
+"""Experiments carried out: by a running supervisor, or on the virtual clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from fitctl.config import Rig
+from fitctl.identify.errors import IdentifyError
+from fitctl.logging.records import AnyRecord
+from fitctl.model.drives import Drive, experiment_s
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.messages import AnyCommand, Experiment, Status, Telemetry
+from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import Simulation
+
+_ACQUIRE_LIMIT_S = 120.0
+_SETTLE_S = 5.0  # in vernier, before the loop is opened: what the search left behind decays
+_SILENCE_S = 5.0
+_FLUSH_SLACK_S = 2.0
+
+Progress = Callable[[float], None]
+
+
+def on_simulation(
+    rig: Rig, loop_name: str, name: str, drives: list[Drive], seed: int, on_progress: Progress
+) -> list[AnyRecord]:
+    """Acquire on the virtual clock and carry an experiment out; its records.
+
+    Raises
+    ------
+    IdentifyError
+        If the star is not found, or is lost on the way.
+    """
+    records: list[AnyRecord] = []
+    simulation = Simulation(rig, seed, record=records.append, history_s=1.0)
+    loop = simulation.supervisor.loops[loop_name]
+    simulation.acquire()
+    while loop.mode is not Mode.VERNIER:
+        if simulation.clock.now_s() > _ACQUIRE_LIMIT_S:
+            msg = (
+                f"the star was not in vernier within {_ACQUIRE_LIMIT_S:g} s; mode {loop.mode.name}"
+            )
+            raise IdentifyError(msg)
+        simulation.run(0.5)
+    simulation.run(_SETTLE_S)
+    records.clear()
+    reply = simulation.command(Experiment(loop=loop_name, name=name, drives=drives))
+    if not reply.accepted:
+        raise IdentifyError(reply.text)
+    start_s, duration_s = simulation.clock.now_s(), experiment_s(drives)
+    while loop.mode is Mode.EXPERIMENT:
+        simulation.run(0.5)
+        on_progress(min(1.0, (simulation.clock.now_s() - start_s) / duration_s))
+    _insist_on_end(loop.mode.name, loop.last_change.reason if loop.last_change else "")
+    return records
+
+
+def on_rig(
+    client: Client, rig: Rig, loop_name: str, name: str, drives: list[Drive], on_progress: Progress
+) -> Path:
+    """Have a running supervisor carry an experiment out; the log that has it.
+
+    Raises
+    ------
+    IdentifyError
+        If the supervisor refuses, falls silent, or the star is lost on the way.
+    ConnectionError
+        If no supervisor answers.
+    """
+    _command(client, Experiment(loop=loop_name, name=name, drives=drives))
+    start_s, duration_s = time.monotonic(), experiment_s(drives)
+    heard_s = start_s
+    while True:
+        telemetry = client.receive(0.5)
+        now_s = time.monotonic()
+        if telemetry is None:
+            if now_s - heard_s > _SILENCE_S:
+                msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then try again"
+                raise IdentifyError(msg)
+            continue
+        heard_s = now_s
+        on_progress(min(1.0, (now_s - start_s) / duration_s))
+        # A message from before the experiment may still be under way.
+        if now_s - start_s > 1.0 and _mode(telemetry, loop_name) != Mode.EXPERIMENT.name:
+            break
+    change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
+    _insist_on_end(_mode(telemetry, loop_name), change.reason if change else "")
+    if telemetry.recorder is None:
+        msg = "the supervisor has no recorder, so there is no log to learn from; see its events"
+        raise IdentifyError(msg)
+    time.sleep(rig.logging.flush_s + _FLUSH_SLACK_S)  # until the log's newest second is on disk
+    return Path(telemetry.recorder.path)
+
+
+def insist_on_vernier(client: Client, loop_name: str) -> None:
+    """Refuse to begin without a star that is held.
+
+    Raises
+    ------
+    IdentifyError
+        If the loop is in another mode.
+    ConnectionError
+        If no supervisor answers.
+    """
+    client.send(Status())
+    telemetry = client.receive(2.0)
+    mode = "unknown" if telemetry is None else _mode(telemetry, loop_name)
+    if mode != Mode.VERNIER.name:
+        msg = f"loop {loop_name} is in {mode}; an experiment begins in VERNIER: fitctl send acquire"
+        raise IdentifyError(msg)
+
+
+def _command(client: Client, command: AnyCommand) -> None:
+    reply = client.send(command)
+    if not reply.accepted:
+        raise IdentifyError(reply.text)
+
+
+def _mode(telemetry: Telemetry, loop_name: str) -> str:
+    return next((loop.mode for loop in telemetry.loops if loop.name == loop_name), "unknown")
+
+
+def _insist_on_end(mode: str, reason: str) -> None:
+    if mode not in {Mode.COARSE.name, Mode.VERNIER.name}:
+        msg = f"the experiment did not come to its end; mode {mode}: {reason}"
+        raise IdentifyError(msg)

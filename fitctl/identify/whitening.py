@@ -1,0 +1,69 @@
+"""Least squares on a star that the air moves: what the air path explains is taken out first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.model import air_path
+from fitctl.model.scene import centroid_noise_px
+
+Floats = NDArray[np.float64]
+_ANYWHERE_PX2 = 1e4  # variance of where the star stands before the first frame
+
+
+def whitener(rig: Rig, loop_name: str, mid_exposure_s: Floats) -> Callable[[Floats], Floats]:
+    """A linear map that makes one axis of the star's noise white, with unit variance.
+
+    It is the Kalman filter of the rig's own models (air path, drift as a random walk, centroid noise):
+    its innovations, over their standard deviation. Applied to centroids and regressors alike, ordinary
+    least squares becomes the generalized one (Gauss-Markov), and an unknown constant is taken out too.
+
+    Parameters
+    ----------
+    mid_exposure_s : array, shape (frames,)
+        Of the frames that have a star, ascending; frames may be missing.
+
+    Returns
+    -------
+    callable
+        From columns, shape (frames, m) in px, to as many whitened ones.
+    """
+    settings = rig.loops[loop_name]
+    period_s = rig.camera.period_s
+    noise_px = centroid_noise_px(rig.camera, settings.star_flux_dn, 7)
+    air = settings.vernier.air_path
+    a_air, b_air, _ = air_path.state_space(air)
+    a, intensity, covariance = np.zeros((3, 3, 3))
+    a[:2, :2] = a_air
+    intensity[:2, :2] = b_air @ b_air.T
+    intensity[2, 2] = settings.vernier.minimum_variance.drift_px_per_sqrt_s**2
+    covariance[:2, :2] = air_path.stationary_covariance(air)
+    covariance[2, 2] = _ANYWHERE_PX2
+    see = np.array([1.0, 0.0, 1.0])
+    # A lost frame makes a longer step; times within one period are the clocks' noise.
+    missed = np.maximum(1, np.rint(np.diff(mid_exposure_s) / period_s)).astype(int)
+    steps = {n: air_path.discretize(a, intensity, n * period_s) for n in set(missed.tolist())}
+    gains, deviations, transitions = [], [], []
+    for n in [*missed.tolist(), 1]:
+        variance = see @ covariance @ see + noise_px**2
+        gain = covariance @ see / variance
+        transition, noise = steps.get(n, (np.eye(3), np.zeros((3, 3))))
+        covariance = covariance - np.outer(gain, see @ covariance)
+        covariance = transition @ covariance @ transition.T + noise
+        gains.append(gain[:, None])
+        deviations.append(np.sqrt(variance))
+        transitions.append(transition)
+
+    def whiten(columns: Floats) -> Floats:
+        state = np.zeros((3, columns.shape[1]))
+        innovations = np.empty_like(columns)
+        for row, (gain, transition) in enumerate(zip(gains, transitions, strict=True)):
+            innovations[row] = columns[row] - state[0] - state[2]
+            state = transition @ (state + gain * innovations[row])
+        return innovations / np.array(deviations)[:, None]
+
+    return whiten

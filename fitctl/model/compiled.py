@@ -1,0 +1,60 @@
+"""Compiling by numba, where it is installed (extra ``fast``); without it everything runs on NumPy."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+
+@functools.cache
+def kernels() -> ModuleType | None:
+    """The compiled kernels of the model, or None without numba; each compiles at its first call."""
+    try:
+        import numba  # noqa: F401
+    except ImportError:
+        return None
+    from fitctl.model import kernels as compiled
+
+    return compiled
+
+
+@functools.cache
+def _cache_folder() -> str:
+    """Where compiled code is kept: named by what all files of kernels read.
+
+    Numba takes kept code for good as long as the outermost function's own file is unchanged, but
+    kernels here call kernels of other files.
+    """
+    package = Path(__file__).parent.parent
+    sources = b"".join(path.read_bytes() for path in sorted(package.glob("*/*kernel*.py")))
+    return str(package / "__pycache__" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}")
+
+
+def jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a kernel at its first call, and keep the result for other processes where that can be."""
+    return _compiled(function)
+
+
+def jit_fused(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As :func:`jit`, but products may go into sums without rounding in between: not for times."""
+    return _compiled(function, fastmath={"contract"})
+
+
+def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    from numba import njit
+    from numba.core import config as module
+
+    config: Any = module  # its options are made when it is imported
+
+    options |= {"nogil": True, "error_model": "numpy"}
+    given, config.CACHE_DIR = config.CACHE_DIR, _cache_folder()
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # nowhere to write: it compiles anew in each process
+        return njit(**options)(function)
+    finally:
+        config.CACHE_DIR = given

@@ -1,0 +1,52 @@
+"""Everything random in a run, from its seed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.model.optics import scales
+from fitctl.model.pixel_noise import noise_key
+
+Floats = NDArray[np.float64]
+
+
+class RunRandomness(NamedTuple):
+    """Everything random in a run, each from a stream of its own.
+
+    Attributes
+    ----------
+    air : list of Generator
+        One for each spot: the first moves all spots, the others what each has besides.
+    pixels : int
+        Key of the pixel noise.
+    place : Generator
+        Of the star at the start.
+    """
+
+    air: list[np.random.Generator]
+    pixels: int
+    place: np.random.Generator
+
+
+def run_randomness(seed: int, spots: int) -> RunRandomness:
+    """The streams of one run; no stream depends on how much of another is used."""
+    air, pixels, place = np.random.SeedSequence(seed).spawn(3)
+    return RunRandomness(
+        [np.random.default_rng(child) for child in air.spawn(spots)],
+        noise_key(pixels),
+        np.random.default_rng(place),
+    )
+
+
+def place_star(rig: Rig, loop_name: str, random: np.random.Generator) -> Floats:
+    """A place uniform over the disc of the rig's largest star offset, in pixels from the target."""
+    truth, _ = rig.mock_parts()
+    largest = truth.loops[loop_name].star_offset_sky_arcsec_max
+    radius_arcsec = largest * np.sqrt(random.uniform())
+    angle = random.uniform(0, 2 * np.pi)
+    arcsec_per_px = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
+    return np.array([np.cos(angle), np.sin(angle)]) * radius_arcsec / arcsec_per_px

@@ -1,0 +1,152 @@
+"""One loop's stages, mirror and siderostat: what they were told, and where the mirror was when."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.clock import Clock
+from fitctl.config import Rig
+from fitctl.controllers.mirror import Mirror
+from fitctl.drivers.interface import MirrorDac
+from fitctl.model.optics import saturate_diamond, scales
+from fitctl.supervisor.injector import Injection, Injector, stack_v_per_px
+from fitctl.supervisor.servo import SiderostatServo
+
+Floats = NDArray[np.float64]
+HISTORY_S = 0.3  # of mirror angles; frames are far younger when they are used
+
+
+class Stages:
+    """Commands of one loop's stages.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    servo : SiderostatServo
+    dac : MirrorDac
+    clock : Clock
+
+    Attributes
+    ----------
+    ready : bool
+        The D/A may be written to.
+    stack_v : array, shape (3,)
+        Wanted at the D/A, from the next write on.
+    mirror_rad, setpoint_rad : arrays, shape (2,)
+        Commanded mirror angles and motor set-points.
+    injector : Injector
+        Writes the D/A in this one's stead while an experiment runs.
+    """
+
+    def __init__(
+        self, rig: Rig, loop_name: str, servo: SiderostatServo, dac: MirrorDac, clock: Clock
+    ) -> None:
+        loop = rig.loops[loop_name]
+        scale = scales(rig, loop)
+        self.ready = False
+        self.stack_v = np.full(3, loop.fsm.bias_v)
+        self.mirror_rad = np.zeros(2)
+        self.setpoint_rad = np.zeros(2)
+        self.injector = Injector(
+            dac,
+            clock,
+            stack_v_per_px(
+                loop.fsm.stack_radius_m, loop.fsm.stack_scale_m_per_v, scale.mirror_px_per_rad
+            ),
+            loop.fsm.bias_v,
+            loop.fsm.dac.full_scale_v,
+        )
+        self._fsm = loop.fsm
+        self._servo = servo
+        self._dac = dac
+        self._clock = clock
+        self._mirror = Mirror(loop.fsm)
+        self._most_slew_v = loop.fsm.slew_v_per_s * rig.camera.period_s
+        self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        shortest_s = min(rig.camera.period_s, self.injector.period_s)
+        self._mirror_history: deque[tuple[float, Floats]] = deque(
+            [(-math.inf, np.zeros(2))], maxlen=math.ceil(HISTORY_S / shortest_s)
+        )
+
+    # ------------------------------------------------------------ mirror
+
+    @property
+    def mirror_now_rad(self) -> Floats:
+        """Where the mirror is, as far as it is known, shape (2,)."""
+        return self._mirror.angles_rad
+
+    def mirror_held_rad(self, *, hysteresis_inverse: bool) -> Floats:
+        """What :meth:`mirror_to` must be asked for, shape (2,), to leave the mirror as it is."""
+        return self._mirror.held_rad(hysteresis_inverse=hysteresis_inverse)
+
+    def mirror_at(self, time_s: float) -> Floats:
+        """Where it was at a recent time, shape (2,)."""
+        for since_s, mirror_rad in reversed(self._mirror_history):
+            if since_s <= time_s:
+                return mirror_rad
+        return self._mirror_history[0][1]
+
+    def start_from(self, stack_v: Floats) -> None:
+        """Take the D/A's outputs, shape (3,), as found."""
+        self._mirror.assume(stack_v)
+        self.stack_v = self._mirror.stack_v
+        self.mirror_rad = self._mirror.angles_rad
+        self.ready = True
+
+    def at_bias(self) -> bool:
+        """The mirror is commanded to its bias."""
+        return bool(np.allclose(self.stack_v, self._fsm.bias_v))
+
+    def mirror_to(self, mirror_rad: Floats, *, hysteresis_inverse: bool) -> None:
+        """Turn the mirror, no farther than its diamond."""
+        self.mirror_rad = saturate_diamond(mirror_rad, self._fsm.range_rad)
+        self.stack_v = self._mirror.volts_for(
+            self.mirror_rad, hysteresis_inverse=hysteresis_inverse
+        )
+
+    def mirror_to_bias(self) -> None:
+        """One frame's way back to the bias."""
+        left_v = self._fsm.bias_v - self.stack_v
+        self.stack_v = self.stack_v + np.clip(left_v, -self._most_slew_v, self._most_slew_v)
+        self.mirror_rad = self._mirror.angles_rad
+
+    def write(self) -> None:
+        """Give the D/A what is wanted.
+
+        Raises
+        ------
+        DeviceError
+            If it does not take it; then nothing more is written until :meth:`start_from`.
+        """
+        self.ready = False
+        self._dac.write_v(self.stack_v)
+        self.ready = True
+        self._mirror.written(self.stack_v)
+        self._mirror_history.append((self._clock.now_s(), self._mirror.angles_rad))
+
+    def take_injections(self) -> list[Injection]:
+        """What an experiment has written since last asked."""
+        injections = self.injector.take_written()
+        for time_s, stack_v in injections:
+            self._mirror.written(stack_v)
+            self.stack_v, self.mirror_rad = stack_v, self._mirror.angles_rad
+            self._mirror_history.append((time_s, self.mirror_rad))
+        return injections
+
+    # ------------------------------------------------------------ siderostat
+
+    def siderostat_held(self) -> None:
+        """The servo holds the siderostat where it is."""
+        self.setpoint_rad = self._servo.setpoint_rad
+
+    def siderostat_to(self, setpoint_rad: Floats) -> bool:
+        """Move the set-point, shape (2,), no farther than its travel; False where that ends."""
+        most_rad = self._travel_rad  # np.clip takes several times as long
+        self.setpoint_rad = np.minimum(np.maximum(setpoint_rad, -most_rad), most_rad)
+        self._servo.move_to(self.setpoint_rad)
+        return bool((self.setpoint_rad == setpoint_rad).all())

@@ -1,0 +1,121 @@
+"""`fitctl design` as a stranger meets it."""
+
+import json
+
+import pytest
+
+from fitctl.cli import main
+
+FLIGHT = [
+    *("--set", "camera.frame_rate_hz=500.0"),
+    *("--set", "camera.exposure_s=0.001"),
+    *("--set", "camera.frame_delay_s=0.0035"),
+]
+
+
+@pytest.fixture
+def design(capsys):
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["design", *map(str, arguments)])
+        printed = capsys.readouterr()
+        return end.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+def test_the_vernier_in_json_has_what_the_paper_prints(design):
+    status, out, _ = design("vernier", "--json")
+    found = json.loads(out)
+    assert status == 0
+    assert len(found["poles"]) == 8
+    assert len(found["zeros"]) == 7
+    assert all(len(root) == 2 for root in found["poles"] + found["zeros"])
+    assert found["order_removed"] == 2
+    assert found["gain"] == pytest.approx(18.3, abs=0.2)
+    assert found["distance_from_eq20_db"] < 0.5
+    assert found["distance_from_eq20_deg"] < 2.0
+    for hz in ("0.1", "0.5", "1", "2"):
+        assert found[f"attenuation_{hz}hz"] > 1
+    for key in ("crossover_hz", "phase_margin_deg", "gain_margin_db", "peak_sensitivity"):
+        assert found[key] > 0
+
+
+@pytest.mark.parametrize(("name", "magic"), [("fig9.png", b"\x89PNG"), ("fig9.svg", b"<?xml")])
+def test_the_vernier_is_drawn(design, tmp_path, name, magic):
+    status, _, _ = design("vernier", "--plot", tmp_path / name)
+    assert status == 0
+    assert (tmp_path / name).read_bytes().startswith(magic)
+
+
+def test_the_bound_of_any_rig(design):
+    assert json.loads(design("bound", "--json")[1])["residual_px"] == pytest.approx(
+        0.0130, abs=5e-5
+    )
+    flight = json.loads(design("bound", "--json", *FLIGHT)[1])
+    assert flight["rate_hz"] == pytest.approx(500)
+    assert flight["residual_px"] < 0.004
+
+
+def test_the_coarse_loop_and_what_its_play_does(design):
+    found = json.loads(design("coarse", "--json")[1])
+    assert found["crossover_hz"] == pytest.approx(0.074, abs=1e-3)
+    assert found["limit_cycle_alone"]["gain_hz"] > found["limit_cycle_beside_vernier"]["gain_hz"]
+    assert all(part["bounded"] for part in found["deadzone"].values())
+
+
+def test_all_designs_beside_the_bound(design):
+    status, out, _ = design("compare")
+    assert status == 0
+    lines = out.splitlines()
+    assert [line.split()[0] for line in lines] == [
+        "design",
+        "eq20",
+        "lqg-ltr",
+        "minimum-variance",
+        "fslq",
+        "bound",
+    ]
+    found = json.loads(design("compare", "--json")[1])
+    ratios = {one["name"]: one["ratio_to_bound"] for one in found["designs"]}
+    assert ratios["minimum-variance"] < 1.03 < ratios["eq20"]
+
+
+def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsys):
+    path = tmp_path / "mine.json"
+    status, out, _ = design("minimum-variance", "--out", path)
+    assert status == 0
+    assert "of the bound" in out
+    with pytest.raises(SystemExit):
+        main(
+            [
+                *("simulate", "--duration", "2", "--json"),
+                *("--set", f"loops.right.vernier.controller={path}"),
+            ]
+        )
+    assert json.loads(capsys.readouterr().out)["frames"] > 0
+
+
+@pytest.mark.parametrize("what", ["vernier", "coarse", "bound", "fslq", "eq20", "lqg-ltr"])
+def test_people_get_text_that_fits_their_terminal(design, what):
+    status, out, err = design(what)
+    assert (status, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 118
+
+
+BAD_INPUT = {
+    "something that is no design": (["everything"], "there are vernier, coarse, bound"),
+    "a loop that is none": (["bound", "--loop", "left"], "has right"),
+    "a plot of another kind": (["vernier", "--plot", "fig9.bmp"], ".png or .svg"),
+    "a plot of what has none": (["bound", "--plot", "bound.png"], "use it with vernier"),
+    "a file of what is no pair": (["compare", "--out", "all.json"], "--out is for a pair"),
+    "a file that cannot be": (["eq20", "--out", "/dev/null/x.json"], "/dev/null/x.json"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "said"), BAD_INPUT.values(), ids=BAD_INPUT.keys())
+def test_what_cannot_be_is_one_line_and_status_2(design, arguments, said):
+    status, _, err = design(*arguments)
+    assert status == 2
+    assert len(err.splitlines()) == 1
+    assert said in err
