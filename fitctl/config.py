@@ -411,6 +411,7 @@ class PlantTruth(Settings):
     """The simulated hardware."""
 
     step_s: Annotated[float, Field(gt=0, le=1e-3)]
+    frame_delay_s: NonNegative | None = None  # where the truth is not what camera.frame_delay_s says
     history_s: Annotated[float, Field(ge=1, le=3600)]
     loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
 
@@ -498,6 +499,14 @@ class Rig(Settings):
                 msg = f"{section}.loops must name the same loops as loops: {', '.join(self.loops)}"
                 raise ValueError(msg)
         return self
+
+    @property
+    def true_camera(self) -> Camera:
+        """The camera as mocks and simulation have it: delayed as the plant says."""
+        true_s = None if self.plant is None else self.plant.frame_delay_s
+        if true_s is None:
+            return self.camera
+        return self.camera.model_copy(update={"frame_delay_s": true_s})
 
     def mock_parts(self) -> tuple[PlantTruth, Mocks]:
         """The sections that only mocks and simulation need.

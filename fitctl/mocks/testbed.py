@@ -138,7 +138,7 @@ class Testbed:
         )
         self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
         self._exposures = 0
-        self._camera = GigeCameraMock(rig.camera, self._render, port=mocks.gvcp_port)
+        self._camera = GigeCameraMock(rig.true_camera, self._render, port=mocks.gvcp_port)
         self._bench = Bench(
             {name: live.plant for name, live in self._plants.items()}, started_s, mocks.bench_port
         )

@@ -137,7 +137,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     ------
     TooLargeForBatchError
     """
-    loop, camera = rig.loops[loop_name], rig.camera
+    loop, camera = rig.loops[loop_name], rig.true_camera
     truth, _ = rig.mock_parts()
     plant = truth.loops[loop_name]
     fsm, siderostat, acquisition = loop.fsm, loop.siderostat, loop.acquisition
