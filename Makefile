@@ -52,3 +52,4 @@ lock: $(READY)  ## Resolve the requirements anew (needs uv)
 
 clean:  ## Remove .venv and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find fitctl tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

@@ -94,6 +94,7 @@ def demo(
         bool, typer.Option("--headless", help="No console, also on a terminal.")
     ] = False,
     as_json: JsonOption = False,
+    controller: ControllerOption = None,
 ) -> None:
     """Run the whole instrument on mock devices: see a star acquired and held.
 
@@ -102,9 +103,10 @@ def demo(
     """
     from fitctl.commands.instrument import run_demo
 
+    overrides = with_controller(rig, overrides, controller)
     settings = _rig(rig, overrides)
     console = not (headless or as_json) and sys.stdin.isatty() and sys.stdout.isatty()
-    arguments = (rig or default_rig_path(), overrides or [], seed)
+    arguments = (rig or default_rig_path(), overrides, seed)
     raise typer.Exit(run_demo(settings, *arguments, duration, console=console, as_json=as_json))
 
 
@@ -128,11 +130,15 @@ def mocks(
 
 @app.command()
 def run(
-    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    controller: ControllerOption = None,
+    parent_pid: ParentOption = None,
 ) -> None:
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
     from fitctl.commands.instrument import run_rig
 
+    overrides = with_controller(rig, overrides, controller)
     run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
 
 

@@ -19,6 +19,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -26,6 +27,8 @@ _MOST_HISTORY_STEPS = 10_000_000  # some hundred megabytes
 _LARGEST_SERVO_STEP = 0.4  # part of an error that one servo period may take back, with its latency
 HALF_WINDOW_PX = 3  # of Eq. 7's 7x7 window, about its central pixel
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
+ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
+CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
 
 
 class ConfigError(Exception):
@@ -309,11 +312,19 @@ class Fslq(Settings):
 class Vernier(Settings):
     """Which design drives mirror and siderostat in VERNIER, and what designs are made from."""
 
-    controller: Annotated[str, Field(pattern=r"^(eq20|lqg-ltr|minimum-variance|fslq|.+\.json)$")]
+    controller: str
     air_path: AirPathModel
     lqg_ltr: LqgLtr
     minimum_variance: MinimumVariance
     fslq: Fslq
+
+    @field_validator("controller")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in CONTROLLERS and not name.endswith(".json"):
+            msg = f"must be one of {', '.join(CONTROLLERS)}, or a file *.json that `fitctl design` saved"
+            raise ValueError(msg)
+        return name
 
 
 class Prefilter(Settings):
@@ -411,7 +422,9 @@ class PlantTruth(Settings):
     """The simulated hardware."""
 
     step_s: Annotated[float, Field(gt=0, le=1e-3)]
-    frame_delay_s: NonNegative | None = None  # where the truth is not what camera.frame_delay_s says
+    frame_delay_s: NonNegative | None = (
+        None  # where the truth is not what camera.frame_delay_s says
+    )
     history_s: Annotated[float, Field(ge=1, le=3600)]
     loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import msgspec
 
+from fitctl.config import ControllerName
 from fitctl.logging.records import (
     DeviceHealth,
     Event,
@@ -19,7 +18,6 @@ from fitctl.logging.records import (
 from fitctl.model.drives import Drive
 
 PROTOCOL_VERSION = 1
-ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):

@@ -6,11 +6,12 @@ import math
 import re
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING, cast
 
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 
-from fitctl.supervisor.messages import ControllerName, SetController, SetTarget
+from fitctl.config import CONTROLLERS
+from fitctl.supervisor.messages import SetController, SetTarget
 
 if TYPE_CHECKING:
     from fitctl.tui.app import ConsoleApp
@@ -70,5 +71,5 @@ class ControllerProvider(Provider):
         return partial(cast("ConsoleApp", self.app).give, command)
 
 
-_CONTROLLERS = {f"controller {name}": SetController(name=name) for name in get_args(ControllerName)}
+_CONTROLLERS = {f"controller {name}": SetController(name=name) for name in CONTROLLERS}
 _CONTROLLER_HELP = "In VERNIER the mirror goes on where it is"

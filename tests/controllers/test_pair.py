@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fitctl.config import CONTROLLERS
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import DESIGNS
 from fitctl.controllers.design.eq20 import design_eq20, eq20_zpk, tustin
@@ -204,3 +205,7 @@ def test_a_design_takes_the_mirror_over_where_it_is(rig, name, held_px):
     bump_px = (first.mirror_rad - held_rad) * scale.mirror_px_per_rad
     # What a design works from, an error in pixels, is not there at the first tick: it gives little.
     assert np.abs(bump_px).max() < 0.03 * np.abs(held_px).max()
+
+
+def test_every_controller_that_can_be_named_can_be_made():
+    assert tuple(DESIGNS) == CONTROLLERS
