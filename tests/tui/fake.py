@@ -132,6 +132,7 @@ class FakeSupervisor:
             requirement_px=0.1,
             usable_commands=["Stop", *USABLE[self.mode]],
             sky_arcsec_per_px=2.708,
+            controller="minimum-variance",
             last_change=self._change(loop),
         )
 

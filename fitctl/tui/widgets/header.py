@@ -62,7 +62,11 @@ class Header(Panel):
         ground = DIM if self.state.stale else look.colour
         label = f"{look.symbol} {self._mode}".center(BADGE_COLUMNS)
         blank = " " * BADGE_COLUMNS
-        return [[text(row, PAPER, on=ground, bold=True)] for row in (blank, label, blank)]
+        loop = self.state.loop
+        # In VERNIER it matters which design holds the star.
+        design = loop.state.controller if loop and self._mode == "VERNIER" else ""
+        rows = (blank, label, design.center(BADGE_COLUMNS))
+        return [[text(row, PAPER, on=ground, bold=True)] for row in rows]
 
     def _status(self, columns: int, *, small_badge: bool) -> Line:
         state, loop, newest = self.state, self.state.loop, self.state.newest
