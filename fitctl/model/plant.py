@@ -2,7 +2,8 @@
 
 Siderostat motors -> backlash -> beam; stack volts -> hysteresis -> mirror -> modes -> beam; air path;
 star -> spots on the focal plane. A leading axis batches independent runs, each with a seed of its own:
-a run's result does not depend on which others are beside it, nor on how the time is cut into calls.
+a run's result does not depend on which others are beside it, nor, but for rounding, on how the time is
+cut into calls.
 """
 
 from __future__ import annotations
