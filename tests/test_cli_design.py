@@ -11,6 +11,7 @@ FLIGHT = [
     *("--set", "camera.exposure_s=0.001"),
     *("--set", "camera.frame_delay_s=0.0035"),
 ]
+LATE = ["--set", "camera.frame_delay_s=0.055"]
 
 
 @pytest.fixture
@@ -96,6 +97,15 @@ def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["frames"] > 0
 
 
+@pytest.mark.parametrize("what", ["eq20", "coarse", "compare"])
+def test_an_unstable_design_is_said_to_be_so(design, what):
+    """Eq. 20 turns too far with two frames and three quarters of delay."""
+    status, out, _ = design(what, *LATE)
+    assert status == 0
+    assert "unstable" in out
+    assert "inf of" not in out
+
+
 @pytest.mark.parametrize("what", ["vernier", "coarse", "bound", "fslq", "eq20", "lqg-ltr"])
 def test_people_get_text_that_fits_their_terminal(design, what):
     status, out, err = design(what)
@@ -110,7 +120,15 @@ BAD_INPUT = {
     "a plot of what has none": (["bound", "--plot", "bound.png"], "use it with vernier"),
     "a file of what is no pair": (["compare", "--out", "all.json"], "--out is for a pair"),
     "a file that cannot be": (["eq20", "--out", "/dev/null/x.json"], "/dev/null/x.json"),
-}
+    "a file that no rig could name": (["eq20", "--out", "eq20.txt"], "must end in .json"),
+    "a design for no disturbance": (
+        ["bound", "--set", "loops.right.vernier.air_path.gain_px=0"], "air_path.gain_px",
+    ),
+    "values without a solution": (
+        ["vernier", "--set", "loops.right.vernier.lqg_ltr.measurement_noise=1e-300"], "no solution",
+    ),
+    "an unstable design to be saved": (["eq20", *LATE, "--out", "eq20.json"], "unstable"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "said"), BAD_INPUT.values(), ids=BAD_INPUT.keys())

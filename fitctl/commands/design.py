@@ -16,8 +16,8 @@ from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, loopshape, lqg_ltr
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.bound import bound
-from fitctl.controllers.design.choose import DESIGNS
-from fitctl.controllers.design.deadzone import deadzone_result
+from fitctl.controllers.design.choose import DESIGNS, design_for, solving
+from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
 from fitctl.controllers.design.eq20 import eq20_zpk
 from fitctl.controllers.design.files import save_design
@@ -61,15 +61,19 @@ def run_design(rig: Rig, what: str, loop: str, output: Output) -> None:
     if output.plot is not None and name != "lqg-ltr":
         msg = f"design {what}: --plot draws Fig. 9: use it with vernier"
         raise ConfigError(msg)
-    result, lines = reports[what](rig, loop)
-    typer.echo(demos.to_json(result) if output.as_json else "\n".join(lines))
-    its_basis = basis(rig, loop)
+    if output.out is not None and output.out.suffix != ".json":
+        msg = f"design {what}: --out {output.out}: must end in .json, or no rig file can name it"
+        raise ConfigError(msg)
+    with solving(f"design {what}", loop):
+        result, lines = reports[what](rig, loop)
     if output.out is not None:
-        save_design(DESIGNS[name](its_basis), output.out)
+        save_design(design_for(rig, loop, name), output.out)
     if output.plot is not None:
+        its_basis = basis(rig, loop)
         vernier = _response(lqg_ltr.vernier_compensator(its_basis))
         title = "Coarse and vernier loop shapes (Fig. 9), LQG/LTR"
         save_figure(draw_loop_shapes(its_basis, vernier, title), output.plot)
+    typer.echo(demos.to_json(result) if output.as_json else "\n".join(lines))
 
 
 # ---------------------------------------------------------------- the paper's vernier and coarse
@@ -108,8 +112,7 @@ def _vernier(rig: Rig, loop: str) -> Report:
         *_shape_lines(shape),
         "  (the paper's text says about 5 Hz, and 10x at 1 Hz)",
         f"sampled at {1 / its_basis.period_s:g} Hz by Tustin, held",
-        *_shape_lines(sampled.shape),
-        f"  residual  {sampled.residual_px:.4f} px, {sampled.ratio_to_bound:.2f} of the bound",
+        *_standing_lines(sampled),
         "recovery: R, distance from the target loop, fastest pole",
         *(
             f"  {step.control_weight:8.1e}  {step.distance_db:6.2f} dB"
@@ -174,8 +177,7 @@ def _coarse(rig: Rig, loop: str) -> Report:
         "the mirror's limit; below 1 it is bounded, and has no limit cycle",
         *(
             f"  {name:<17} {found.largest_real:7.3f} {found.largest_crossing:7.3f}  "
-            + ("bounded" if found.bounded else "not shown to be bounded")
-            + (", may swing" if found.limit_cycle else ", no limit cycle")
+            + _deadzone_text(found)
             for name, found in deadzones.items()
         ),
     ]
@@ -184,6 +186,13 @@ def _coarse(rig: Rig, loop: str) -> Report:
         result["backlash_half_width_px"] = backlash
         lines.insert(2, f"  (the rig file knows of a play of half width {backlash:.3f} px)")
     return result, lines
+
+
+def _deadzone_text(found: DeadzoneResult) -> str:
+    if math.isinf(found.largest_real):
+        return "unstable without any limit"
+    bounded = "bounded" if found.bounded else "not shown to be bounded"
+    return bounded + (", may swing" if found.limit_cycle else ", no limit cycle")
 
 
 def _backlash_half_width_px(rig: Rig, loop: str) -> float | None:
@@ -215,8 +224,7 @@ def _one(name: str) -> Callable[[Rig, str], Report]:
         found = standing(DESIGNS[name](its_basis), its_basis)
         lines = [
             f"{name}, order {found.order}, sampled at {1 / its_basis.period_s:g} Hz",
-            *_shape_lines(found.shape),
-            f"  residual  {found.residual_px:.4f} px, linear; {found.ratio_to_bound:.3f} of the bound",
+            *_standing_lines(found),
         ]
         return _standing_numbers(found), lines
 
@@ -238,6 +246,8 @@ def _compare(rig: Rig, loop: str) -> Report:
 
 def _compare_line(found: Standing) -> str:
     shape = found.shape
+    if not shape.stable:
+        return f"{found.name:<17} {found.order:5d}  unstable"
     return (
         f"{found.name:<17} {found.order:5d}  {shape.crossover_hz:6.2f} Hz"
         f"  {shape.phase_margin_deg:4.0f} deg  {shape.gain_margin_db:4.1f} dB"
@@ -269,7 +279,16 @@ def _shape_numbers(shape: loopshape.LoopShape) -> dict[str, Any]:
     return numbers | {f"attenuation_{hz:g}hz": value for hz, value in attenuation.items()}
 
 
+def _standing_lines(found: Standing) -> list[str]:
+    residual = (
+        f"  residual  {found.residual_px:.4f} px, linear; {found.ratio_to_bound:.3f} of the bound"
+    )
+    return [*_shape_lines(found.shape), *([residual] if found.shape.stable else [])]
+
+
 def _shape_lines(shape: loopshape.LoopShape) -> list[str]:
+    if not shape.stable:
+        return [f"  unstable: crossover {shape.crossover_hz:.2f} Hz, no margins"]
     attenuation = ", ".join(f"{value:.1f}x at {hz:g} Hz" for hz, value in shape.attenuation.items())
     return [
         f"  crossover {shape.crossover_hz:.2f} Hz, phase margin {shape.phase_margin_deg:.1f} deg,"

@@ -99,7 +99,7 @@ def write_performance(
                 [
                     row.controller,
                     f"{row.attenuation:.2f}",
-                    f"{row.design.shape.attenuation[AT_HZ]:.2f}",
+                    f"{row.design.shape.attenuation.get(AT_HZ, math.nan):.2f}",
                     f"{PAPER_ATTENUATION:g}",
                     f"{row.attenuation / PAPER_ATTENUATION:.2f}",
                 ]
@@ -163,7 +163,7 @@ def write_performance(
             "rough": row.rough._asdict(),
             "flight": row.flight._asdict(),
             "design": {
-                "attenuation": row.design.shape.attenuation[AT_HZ],
+                "attenuation": row.design.shape.attenuation.get(AT_HZ, math.nan),
                 "residual_px": row.design.residual_px,
                 "ratio_to_bound": row.design.ratio_to_bound,
             },

@@ -55,6 +55,8 @@ def decayed_s(time_s: Floats, value: Floats, stepped_s: float, part: float) -> f
     after = time_s >= stepped_s
     size = np.abs(value[after])
     outside = np.flatnonzero(size > part * size.max())
+    if len(outside) == 0:
+        return 0.0
     if outside[-1] == len(size) - 1:
         return math.nan
     return float(time_s[after][outside[-1] + 1] - stepped_s)

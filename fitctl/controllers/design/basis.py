@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fitctl.config import AirPathModel, Rig, Vernier
+from fitctl.config import AirPathModel, ConfigError, Rig, Vernier
 from fitctl.model.optics import scales
 from fitctl.model.scene import centroid_noise_px
 
@@ -43,8 +43,20 @@ class Basis:
 
 
 def basis(rig: Rig, loop_name: str) -> Basis:
-    """What designs for a rig's loop are made for."""
+    """What designs for a rig's loop are made for.
+
+    Raises
+    ------
+    ConfigError
+        If the rig file knows of no disturbance: then there is nothing to design for.
+    """
     loop, camera = rig.loops[loop_name], rig.camera
+    if loop.vernier.air_path.gain_px == 0:
+        msg = (
+            f"rig {rig.name}: loops.{loop_name}.vernier.air_path.gain_px: must be above 0, or there is "
+            "nothing to design for; measure it with fitctl identify airpath"
+        )
+        raise ConfigError(msg)
     scale = scales(rig, loop)
     return Basis(
         period_s=camera.period_s,

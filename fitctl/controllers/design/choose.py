@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design.basis import Basis, basis
@@ -12,6 +15,7 @@ from fitctl.controllers.design.files import load_design
 from fitctl.controllers.design.fslq import design_fslq
 from fitctl.controllers.design.lqg_ltr import design_lqg_ltr
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
+from fitctl.controllers.design.sampled import sampled_loop
 from fitctl.controllers.pair import Design
 
 DESIGNS: dict[str, Callable[[Basis], Design]] = {
@@ -28,15 +32,46 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
     Raises
     ------
     ConfigError
-        If there is no such design, or its file cannot be used with this rig.
+        If there is no such design, its file cannot be used with this rig, the rig's values have no
+        solution, or the loop would be unstable.
     """
     chosen = controller or rig.loops[loop_name].vernier.controller
+    its_basis = basis(rig, loop_name)
     if chosen.endswith(".json"):
-        return load_design(Path(chosen), basis(rig, loop_name), DESIGNS)
-    if chosen not in DESIGNS:
+        design = load_design(Path(chosen), its_basis, DESIGNS)
+    elif chosen in DESIGNS:
+        with solving(f"controller {chosen}", loop_name):
+            design = DESIGNS[chosen](its_basis)
+    else:
         msg = (
             f"controller {chosen}: there are {', '.join(DESIGNS)}, and files (*.json) that "
             "`fitctl design` saved"
         )
         raise ConfigError(msg)
-    return DESIGNS[chosen](basis(rig, loop_name))
+    if not sampled_loop(design, its_basis).stable:
+        msg = (
+            f"controller {chosen}: unstable at {1 / its_basis.period_s:g} Hz with "
+            f"{its_basis.delay_s * 1e3:g} ms of delay; choose another, fitctl design compare shows them all"
+        )
+        raise ConfigError(msg)
+    return design
+
+
+@contextmanager
+def solving(what: str, loop_name: str) -> Iterator[None]:
+    """For the mathematics of designs: what has no solution is a rig file's fault, and told as such.
+
+    Raises
+    ------
+    ConfigError
+        One line, where numpy or scipy give up.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (ValueError, ArithmeticError) as error:
+        msg = (
+            f"{what}: no solution for these values of camera and loops.{loop_name}.vernier ({error}); "
+            "go back to those of rigs/fit-mock.toml one by one"
+        )
+        raise ConfigError(msg) from None

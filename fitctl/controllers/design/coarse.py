@@ -4,7 +4,7 @@ The siderostat's play is behind its encoders, so no servo sees it: the star loop
 A sine of amplitude A passes a play of half width h with the gain and the lag of N(A); the loop swings
 by itself where N(A) L(jw) = -1.
 
-On FIT, beside the paper: an integrator behind 52 ms of lag swings with its play from 4.8 Hz on, where it
+On FIT, beside the paper: an integrator behind 50 ms of lag swings with its play from 4.8 Hz on, where it
 would swing from 5.0 Hz on without any play; beside Eq. 20 at work, from 2.3 Hz on. The paper's empirical
 tenth of a hertz does not follow from its own Fig. 8, nor does its describing function show it: its play
 alone never adds more than the 90 degrees that an integrator leaves. What does follow is that the margin

@@ -6,8 +6,8 @@ q is always u scaled by one number from 0 to 1, so what holds for one axis holds
 
 - describing function: a deadzone's is real and from 0 to 1, so the loop can swing by itself only where
   M crosses the real axis at or above 1;
-- circle criterion: where the real part of M stays below 1 at all frequencies, every course of the loop
-  is bounded and comes to rest, whatever saturates and for how long.
+- circle criterion: where M is stable and its real part stays below 1 at all frequencies, every course
+  of the loop is bounded and comes to rest, whatever saturates and for how long.
 
 References: Khalil, Nonlinear Systems (3rd edition), 7.1 and 7.2; for sampled loops, Tsypkin's criterion.
 """
@@ -33,7 +33,8 @@ class DeadzoneResult(NamedTuple):
     Attributes
     ----------
     largest_real : float
-        Largest real part of M: bounded and at rest in the end if below 1.
+        Largest real part of M: bounded and at rest in the end if below 1; infinite where the loop is
+        unstable without any limit, so that neither criterion says anything.
     largest_crossing : float
         Largest real value at which M crosses the real axis: no limit cycle if below 1.
     at_hz : float
@@ -74,6 +75,8 @@ def deadzone_response(design: Design, basis: Basis, omega_rad_s: Floats) -> NDAr
 
 def deadzone_result(design: Design, basis: Basis) -> DeadzoneResult:
     """Describing function and circle criterion for a design in its loop."""
+    if not sampled_loop(design, basis).stable:
+        return DeadzoneResult(largest_real=math.inf, largest_crossing=math.inf, at_hz=math.nan)
     # The lowest frequency is as good as rest; the highest is where sampling ends.
     omega = np.append(np.geomspace(1e-5, math.pi, 20_000, endpoint=False), math.pi) / basis.period_s
     response = deadzone_response(design, basis, omega)

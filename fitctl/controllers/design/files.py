@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
+import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
 
 FORMAT = "fitctl design 1"
 _MATRICES = ("a", "b", "c", "d")
+_MOST_BYTES = 1_000_000  # a hundred times a design's
 # Matrices are written with all their digits; made again on another machine they differ by rounding, and
 # by what a Riccati solution makes of that.
 _ROUNDING = 1e-6
@@ -91,7 +93,7 @@ def load_design(
         got = f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}"
         hint = "use a file that this fitctl saved"
         raise _refusal(path, "parameters", f"those of {name}", got, hint) from None
-    except (KeyError, TypeError, ValueError, AttributeError, np.linalg.LinAlgError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         hint = "use a file that this fitctl saved"
         raise _refusal(path, "parameters", f"those of {name}", repr(error), hint) from None
     for key in _MATRICES:
@@ -107,7 +109,10 @@ def load_design(
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        # As floats, since an integer of hundreds of digits fits into nothing else.
+        document = None if len(content) > _MOST_BYTES else json.loads(content, parse_int=float)
     except FileNotFoundError:
         msg = f"{path}: no such design file; make one with fitctl design ... --out FILE"
         raise ConfigError(msg) from None
@@ -116,7 +121,7 @@ def _document(path: Path) -> dict[str, Any]:
         raise ConfigError(msg) from None
     if not isinstance(document, dict):
         hint = "make one with fitctl design ... --out FILE"
-        raise _refusal(path, "format", FORMAT, "no JSON object", hint)
+        raise _refusal(path, "format", FORMAT, "no JSON object, or too large a file", hint)
     return document
 
 
@@ -139,9 +144,11 @@ def _follows(given: object, made: np.ndarray) -> bool:
 def _shown(value: object) -> str:
     if value is None:
         return "none"
-    text = f"{value:g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= 120 else text[:117] + "..."
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _refusal(path: Path, key: str, expected: str, got: str, hint: str) -> ConfigError:
-    return ConfigError(f"{path}: {key}: expected {expected}, got {got}; {hint}")
+    # Whatever the file held, it is told on one line.
+    return ConfigError(
+        f"{path}: {key}: expected {expected}, got {textwrap.shorten(got, 120)}; {hint}"
+    )

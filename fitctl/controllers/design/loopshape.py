@@ -27,8 +27,10 @@ class LoopShape(NamedTuple):
 
     Attributes
     ----------
+    stable : bool
+        Once closed. Where it is not, nothing but the crossover means anything, and the rest is nan.
     crossover_hz : float
-        Highest frequency at which the loop's gain falls through one.
+        Highest frequency at which the loop's gain falls through one; nan where it does not.
     phase_margin_deg, gain_margin_db : float
         The smallest; infinite where the loop has none.
     peak_sensitivity : float
@@ -38,6 +40,7 @@ class LoopShape(NamedTuple):
         Of a disturbance, at each of `ATTENUATION_HZ` below the loop's highest frequency.
     """
 
+    stable: bool
     crossover_hz: float
     phase_margin_deg: float
     gain_margin_db: float
@@ -88,8 +91,19 @@ def sampled_response(design: Design, basis: Basis) -> Response:
     return response
 
 
-def loop_shape(response: Response, highest_hz: float) -> LoopShape:
-    """Crossover, margins and attenuation of a loop, from `LOWEST_HZ` to `highest_hz`."""
+def loop_shape(response: Response, highest_hz: float, *, stable: bool | None = None) -> LoopShape:
+    """Crossover, margins and attenuation of a loop, from `LOWEST_HZ` to `highest_hz`.
+
+    Parameters
+    ----------
+    response : callable
+        Of the open loop.
+    highest_hz : float
+        Beyond, the loop's gain must be below one.
+    stable : bool, optional
+        Whether the closed loop is; by default by Nyquist's criterion, for a loop that is stable when
+        open but for one integrator, as Eq. 16 is.
+    """
     import control  # a second of import, and only designs need it
 
     omega = 2 * math.pi * np.geomspace(LOWEST_HZ, highest_hz, _POINTS)
@@ -97,18 +111,32 @@ def loop_shape(response: Response, highest_hz: float) -> LoopShape:
     gain_margins, phase_margins, *_, crossings, _ = control.stability_margins(
         control.FRD(loop, omega, smooth=True), returnall=True
     )
+    crossover_hz = float(max(crossings, default=math.nan)) / (2 * math.pi)
+    compared_hz = [hz for hz in ATTENUATION_HZ if hz < highest_hz]
+    if stable is None:
+        # From an integrator's side to near 1, around the origin not once.
+        stable = bool(abs(np.unwrap(np.angle(1 + loop))[-1]) < math.pi)
+    if not stable:
+        return LoopShape(
+            stable=False,
+            crossover_hz=crossover_hz,
+            phase_margin_deg=math.nan,
+            gain_margin_db=math.nan,
+            peak_sensitivity=math.nan,
+            peak_sensitivity_hz=math.nan,
+            attenuation=dict.fromkeys(compared_hz, math.nan),
+        )
     sensitivity = 1 / np.abs(1 + loop)
     peak = int(sensitivity.argmax())
     above_one = [margin for margin in gain_margins if margin > 1]
     return LoopShape(
-        crossover_hz=float(max(crossings, default=math.nan)) / (2 * math.pi),
+        stable=True,
+        crossover_hz=crossover_hz,
         phase_margin_deg=float(min(np.abs(phase_margins), default=math.inf)),
         gain_margin_db=20 * math.log10(min(above_one)) if above_one else math.inf,
         peak_sensitivity=float(sensitivity[peak]),
         peak_sensitivity_hz=float(omega[peak]) / (2 * math.pi),
         attenuation={
-            hz: float(abs(1 + response(np.array([2 * math.pi * hz]))[0]))
-            for hz in ATTENUATION_HZ
-            if hz < highest_hz
+            hz: float(abs(1 + response(np.array([2 * math.pi * hz]))[0])) for hz in compared_hz
         },
     )

@@ -66,6 +66,12 @@ class SampledLoop(NamedTuple):
     command_error: Floats
     motor_held: Floats
 
+    @property
+    def stable(self) -> bool:
+        """Closed at the camera, every course of it dies away."""
+        closed = self.a + np.outer(self.b, self.star)
+        return bool(np.abs(np.linalg.eigvals(closed)).max() < 1.0)
+
 
 def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
     """A design, which may have been made for another delay, on the stages of a loop."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from fitctl.controllers.design.basis import Basis
@@ -21,7 +22,7 @@ class Standing(NamedTuple):
     shape : LoopShape
         Sampled, with hold and delay.
     residual_px : float
-        RMS left of the air path, linear, in continuous time.
+        RMS left of the air path, linear, in continuous time; infinite if unstable.
     ratio_to_bound : float
     """
 
@@ -38,7 +39,11 @@ def standing(design: Design, basis: Basis) -> Standing:
     return Standing(
         name=design.name,
         order=len(design.a),
-        shape=loop_shape(sampled_response(design, basis), 0.5 / basis.period_s),
+        shape=loop_shape(
+            sampled_response(design, basis),
+            0.5 / basis.period_s,
+            stable=math.isfinite(residual_px),
+        ),
         residual_px=residual_px,
         ratio_to_bound=residual_px / bound(basis).residual_px,
     )

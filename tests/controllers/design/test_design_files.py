@@ -155,6 +155,19 @@ def test_a_name_that_is_none_is_told_with_those_there_are(rig):
         design_for(rig, "right", "best")
 
 
+def test_a_design_that_would_swing_is_refused():
+    late = load_rig(default_rig_path(), ["camera.frame_delay_s=0.055"])
+    design_for(late, "right", "minimum-variance")
+    with pytest.raises(ConfigError, match="controller eq20: unstable at 50 Hz with 55 ms of delay"):
+        design_for(late, "right", "eq20")
+
+
+def test_a_file_too_large_for_a_design_is_refused(tmp_path, fit):
+    path = tmp_path / "pair.json"
+    path.write_text("[" + "1," * 600_000 + "1]")
+    assert "too large" in refusal(path, fit)
+
+
 def test_designs_are_the_same_each_time(rig):
     for make in DESIGNS.values():
         assert np.array_equal(make(basis(rig, "right")).a, make(basis(rig, "right")).a)
