@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Fsm
 from fitctl.model.hysteresis import inverse_volts, play
-from fitctl.model.optics import mirror_angles, mirror_from_stacks, stack_matrix, stack_volts
+from fitctl.model.optics import mirror_from_stacks, stack_matrix
 
 Floats = NDArray[np.float64]
 
@@ -25,8 +25,10 @@ class Mirror:
 
     def __init__(self, fsm: Fsm) -> None:
         self._fsm = fsm
-        self._geometry = (fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
         self._stack_matrix = stack_matrix(fsm.stack_radius_m)
+        # Eq. 1 and 5, whose matrices are the same at every tick.
+        self._stack_v_per_rad = self._stack_matrix / fsm.stack_scale_m_per_v
+        self._rad_per_stack_v = np.linalg.pinv(self._stack_v_per_rad)
         known = fsm.hysteresis
         self.hysteresis_known = known is not None
         if known is not None:
@@ -34,6 +36,9 @@ class Mirror:
             self._gains = np.asarray(known.gains_m_per_v)
             # Where stacks rest that came up from zero to their bias: the mirror's zero.
             self._zero_m = self._gains @ np.maximum(fsm.bias_v - self._half_width_v, 0.0)
+            self._zero_rad = mirror_from_stacks(self._zero_m, fsm.stack_radius_m)
+            per_m = mirror_from_stacks(np.eye(3), fsm.stack_radius_m).T
+            self._rad_per_play_v = (per_m[..., None] * self._gains).reshape(2, -1)
         self.assume(np.full(3, fsm.bias_v))
 
     def assume(self, stack_v: Floats) -> None:
@@ -52,9 +57,8 @@ class Mirror:
     def angles_rad(self) -> Floats:
         """Where the mirror is, shape (2,)."""
         if not self.hysteresis_known:
-            return mirror_angles(self.stack_v, *self._geometry)
-        displacement_m = np.vecdot(self._plays_v, self._gains) - self._zero_m
-        return mirror_from_stacks(displacement_m, self._fsm.stack_radius_m)
+            return self._rad_per_stack_v @ (self.stack_v - self._fsm.bias_v)
+        return self._rad_per_play_v.dot(self._plays_v.ravel()) - self._zero_rad
 
     def held_rad(self, *, hysteresis_inverse: bool) -> Floats:
         """The angles, shape (2,), for which :meth:`volts_for` leaves the mirror as it is.
@@ -76,5 +80,5 @@ class Mirror:
             wanted_m = self._zero_m + self._stack_matrix @ mirror_rad
             volts = inverse_volts(self._plays_v, self._half_width_v, self._gains, wanted_m)
         else:
-            volts = stack_volts(mirror_rad, *self._geometry)
+            volts = self._stack_v_per_rad @ mirror_rad + self._fsm.bias_v
         return np.minimum(np.maximum(volts, 0.0), self._fsm.dac.full_scale_v)

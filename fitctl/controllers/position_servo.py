@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,8 +66,8 @@ class PositionServo:
         most = self._velocity_limit * self._period_s
         for axis, target in zip(self._axes, target_rad.tolist(), strict=True):
             axis.target_rad = target
-            step = (target - axis.reference_rad) / self._periods_per_setpoint
-            axis.step_rad = _limited(step, most)
+            step_rad = (target - axis.reference_rad) / self._periods_per_setpoint
+            axis.step_rad = step_rad if abs(step_rad) <= most else math.copysign(most, step_rad)
 
     def step(self, position_rad: Floats) -> Floats:
         """One servo period: velocity command, shape (2,), for the measured motor angles."""
@@ -88,11 +89,12 @@ class PositionServo:
         error_rad = axis.reference_rad - position_rad
         if abs(error_rad) < self._resolution_rad:
             error_rad = 0.0
-        wanted = _limited(self._gain_per_s * error_rad, self._velocity_limit)
-        axis.velocity_rad_s += _limited(wanted - axis.velocity_rad_s, self._velocity_step)
+        # In line and by comparison: it runs 500 times a second for each axis.
+        wanted_rad_s = self._gain_per_s * error_rad
+        if abs(wanted_rad_s) > self._velocity_limit:
+            wanted_rad_s = math.copysign(self._velocity_limit, wanted_rad_s)
+        change_rad_s = wanted_rad_s - axis.velocity_rad_s
+        if abs(change_rad_s) > self._velocity_step:
+            change_rad_s = math.copysign(self._velocity_step, change_rad_s)
+        axis.velocity_rad_s += change_rad_s
         return axis.velocity_rad_s
-
-
-def _limited(value: float, most: float) -> float:
-    # Runs 500 times a second for each axis: a comparison is quicker than min and max.
-    return most if value > most else -most if value < -most else value

@@ -123,10 +123,11 @@ def _stack_points(displacement_m: Floats, r: float) -> tuple[Floats, Floats, Flo
 
 
 def saturate_diamond(mirror_rad: Floats, range_rad: float) -> Floats:
-    """Scale a pair of mirror angles, shape (..., 2), into |az| + |el| <= range, keeping its direction.
+    """Scale a pair of mirror angles, shape (2,), into |az| + |el| <= range, keeping its direction.
 
     Two axes share three stacks, so what can be reached is a diamond; clipping each axis by itself
     would overdrive a stack and turn the motion.
     """
-    reach = np.abs(mirror_rad[..., 0]) + np.abs(mirror_rad[..., 1])
-    return mirror_rad * np.minimum(1.0, range_rad / np.maximum(reach, 1e-300))[..., None]
+    az_rad, el_rad = mirror_rad.tolist()
+    reach_rad = abs(az_rad) + abs(el_rad)
+    return mirror_rad if reach_rad <= range_rad else mirror_rad * (range_rad / reach_rad)

@@ -40,7 +40,6 @@ from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.stages import Stages
 
 Floats = NDArray[np.float64]
-_NOWHERE = np.full(2, math.nan)
 _SEVERITY: dict[Trigger, Severity] = {
     Trigger.FAULT: "error",
     Trigger.STAR_LOST: "warning",
@@ -173,7 +172,7 @@ class StellarLoop:
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
         if self.mode in FOLLOWING and self._findings.lost == 0:
             predicted = self._estimator.predict_px(motor_rad, mirror_rad)
-            star = self._sensor.measure(frame.image, *predicted)
+            star = self._sensor.measure(frame.image, *predicted.tolist())
             # The estimate may be half a window off after a jump; then the whole frame decides.
             if star is None or self._near_edge(star):
                 star = self._sensor.find(frame.image)
@@ -228,7 +227,9 @@ class StellarLoop:
                 self.fire(Trigger.STAR_LOST, f"no star on {findings.lost} frames in a row")
             return
         findings.lost = 0
-        need = float(np.sum(np.abs(self._error_px(star)))) / self._range_px
+        target_az_px, target_el_px = self._prefilter.value_px.tolist()
+        error_px = abs(star.az_px - target_az_px) + abs(star.el_px - target_el_px)
+        need = error_px / self._range_px
         frames = self.settings.coarse.reach_frames
         in_reach = need <= self.settings.coarse.reach_fraction
         findings.in_reach = findings.in_reach + 1 if in_reach else 0
@@ -437,9 +438,8 @@ class StellarLoop:
         done_s = self._clock.now_s()
         star, stages = seen.star, self.stages
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
-        star_px = _NOWHERE if star is None else _position(star)
+        star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
         target_az_px, target_el_px = self._prefilter.value_px.tolist()
-        error_az_px, error_el_px = (star_px - self._prefilter.value_px).tolist()
         fsm_az_rad, fsm_el_rad = stages.mirror_rad.tolist()
         stack1_v, stack2_v, stack3_v = stages.stack_v.tolist()
         motor_az_rad, motor_el_rad = seen.motor_rad.tolist()
@@ -456,15 +456,15 @@ class StellarLoop:
             late=frame is not None and done_s - exposed_s > self._due_after_s,
             frames_lost=frames_lost,
             star_visible=star is not None,
-            star_az_px=float(star_px[0]),
-            star_el_px=float(star_px[1]),
+            star_az_px=star_az_px,
+            star_el_px=star_el_px,
             star_flux_dn=math.nan if star is None else star.flux_dn,
             window_az_px=-1 if star is None else star.window_az_px,
             window_el_px=-1 if star is None else star.window_el_px,
             target_az_px=target_az_px,
             target_el_px=target_el_px,
-            error_az_px=error_az_px,
-            error_el_px=error_el_px,
+            error_az_px=star_az_px - target_az_px,
+            error_el_px=star_el_px - target_el_px,
             fsm_az_rad=fsm_az_rad,
             fsm_el_rad=fsm_el_rad,
             fsm_range_fraction=(abs(fsm_az_rad) + abs(fsm_el_rad)) / self.settings.fsm.range_rad,
@@ -480,9 +480,6 @@ class StellarLoop:
             siderostat_el_sky_arcsec=motor_el_rad * self._scale.motor_sky_arcsec_per_rad,
             search_progress=self._spiral.progress if self.mode is Mode.ACQUISITION else math.nan,
         )
-
-    def _error_px(self, star: Star) -> Floats:
-        return _position(star) - self._prefilter.value_px
 
     def _near_edge(self, star: Star) -> bool:
         most = HALF_WINDOW_PX - 1.5

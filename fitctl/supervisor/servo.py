@@ -6,8 +6,9 @@ only uses the driver; the other threads leave wishes (a set-point, a stop, a req
 
 from __future__ import annotations
 
-import itertools
+import bisect
 import math
+import operator
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -34,6 +35,7 @@ from fitctl.supervisor.realtime import become_realtime
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
+_READ_AT = operator.itemgetter(0)  # of an entry of the history: when
 _BLIND_MISSES = 2
 FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
@@ -120,12 +122,15 @@ class SiderostatServo:
 
     def position_at(self, time_s: float) -> Floats:
         """Motor angles at a recent time, shape (2,), interpolated between readings."""
-        history = list(self._history)
-        for (t1, p1), (t0, p0) in itertools.pairwise(reversed(history)):
-            if t0 <= time_s:
-                part = min(1.0, (time_s - t0) / (t1 - t0)) if t1 > t0 else 1.0
-                return p0 + part * (p1 - p0)
-        return history[0][1] if history else self.position_rad
+        history = list(self._history)  # at once: the servo's thread appends
+        later = bisect.bisect_right(history, time_s, key=_READ_AT)
+        if later == 0:
+            return history[0][1] if history else self.position_rad
+        t0, p0 = history[later - 1]
+        if later == len(history):
+            return p0
+        t1, p1 = history[later]
+        return p0 + (time_s - t0) / (t1 - t0) * (p1 - p0)
 
     def open(self) -> DeviceIdentity:
         """Connect, clear a latched fault, read the encoders and enable; the motors stand still."""
@@ -181,7 +186,7 @@ class SiderostatServo:
             if now_s - self._last_reading_s > self._settings.reading_timeout_s:
                 raise self._no_reading()
             return
-        self._take(reading)
+        self._take(reading, now_s)
         if reading.fault:
             hint = "remove its cause, then recover"
             raise DeviceFault(self._device, self.endpoint, "no fault", reading.fault, hint)
@@ -203,8 +208,8 @@ class SiderostatServo:
             return np.zeros(2)  # blind motors stand still, and the reference waits for them
         return self._servo.step(self.position_rad)
 
-    def _take(self, reading: ServoReading) -> None:
-        self._last_reading_s = self._clock.now_s()
+    def _take(self, reading: ServoReading, now_s: float) -> None:
+        self._last_reading_s = now_s
         self._misses_in_a_row = 0
         self.position_rad = reading.position_rad
         self._history.append((reading.time_s, reading.position_rad))
@@ -265,7 +270,7 @@ class SiderostatServo:
         while (reading := self._amplifiers.exchange(np.zeros(2))) is None:
             if self._clock.now_s() > deadline_s:
                 raise self._no_reading()
-        self._take(reading)
+        self._take(reading, self._clock.now_s())
         self._servo.reset(reading.position_rad)
         self.encoders_jumped = knew and bool(
             np.any(np.abs(reading.position_rad - last_rad) > _ENCODER_JUMP_RAD)

@@ -6,6 +6,7 @@ quantization; time goes on only while the supervisor waits for a frame.
 
 from __future__ import annotations
 
+import heapq
 import math
 import time
 from collections.abc import Callable
@@ -86,9 +87,10 @@ class SimulatedAmplifiers:
         self._plant.advance(now_s)
         if self._enabled:
             self._velocity_rad_s[:] = velocity_rad_s
+        az_rad, el_rad = self._motor_rad.tolist()
         count = self._rad_per_count
         position_rad = np.array(
-            [math.floor(rad / count) * count for rad in self._motor_rad.tolist()]
+            [math.floor(az_rad / count) * count, math.floor(el_rad / count) * count]
         )
         return ServoReading(now_s, position_rad, self._enabled, "")
 
@@ -140,7 +142,7 @@ class SimulatedCamera:
     def __init__(self, rig: Rig, clock: VirtualClock, plants: dict[str, Plant]) -> None:
         truth, _ = rig.mock_parts()
         self.on_servo_period: list[tuple[float, Callable[[], None]]] = []
-        self._camera = rig.camera
+        self._camera = rig.true_camera
         self._clock = clock
         self._plants = plants
         self._scene = Scene(
@@ -150,7 +152,7 @@ class SimulatedCamera:
         self._exposures = 0  # never starts again, as the frames' numbers do: noise must not repeat
         self._frames = 0
         self._start_s = 0.0
-        self._next_period_s: list[float] = []
+        self._due: list[tuple[float, int]] = []  # a heap: when, and which
 
     def open(self) -> DeviceIdentity:
         """Nothing to connect."""
@@ -160,7 +162,9 @@ class SimulatedCamera:
         """The first exposure begins now."""
         self._frames = 0
         self._start_s = self._clock.now_s() + self._camera.exposure_s / 2
-        self._next_period_s = [self._clock.now_s() + period for period, _ in self.on_servo_period]
+        now_s = self._clock.now_s()
+        self._due = [(now_s + work[0], which) for which, work in enumerate(self.on_servo_period)]
+        heapq.heapify(self._due)
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         """Go on to the next frame's arrival, or by `timeout_s`."""
@@ -187,15 +191,12 @@ class SimulatedCamera:
         """Nothing to disconnect."""
 
     def _go_on_to(self, time_s: float) -> None:
-        while True:
-            due = min(self._next_period_s)
-            if due > time_s:
-                break
-            which = self._next_period_s.index(due)
+        while self._due[0][0] <= time_s:
+            due_s, which = self._due[0]
             period_s, run = self.on_servo_period[which]
-            self._clock.sleep_until(due)
+            self._clock.sleep_until(due_s)
             run()
-            self._next_period_s[which] += period_s
+            heapq.heapreplace(self._due, (due_s + period_s, which))
         self._clock.sleep_until(time_s)
 
 

@@ -146,7 +146,9 @@ class Stages:
 
     def siderostat_to(self, setpoint_rad: Floats) -> bool:
         """Move the set-point, shape (2,), no farther than its travel; False where that ends."""
-        most_rad = self._travel_rad  # np.clip takes several times as long
-        self.setpoint_rad = np.minimum(np.maximum(setpoint_rad, -most_rad), most_rad)
+        az_rad, el_rad = setpoint_rad.tolist()
+        most_rad = self._travel_rad
+        within = -most_rad <= az_rad <= most_rad and -most_rad <= el_rad <= most_rad
+        self.setpoint_rad = setpoint_rad if within else np.clip(setpoint_rad, -most_rad, most_rad)
         self._servo.move_to(self.setpoint_rad)
-        return bool((self.setpoint_rad == setpoint_rad).all())
+        return within
