@@ -30,6 +30,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+fault = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
+app.add_typer(fault, name="fault")
+
 RigOption = Annotated[
     Path | None,
     typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
@@ -119,13 +122,81 @@ def mocks(
     free_ports: Annotated[
         bool, typer.Option("--free-ports", help="Take any free port for every device.")
     ] = False,
+    faults: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="What goes wrong and when: a TOML file of [[fault]] tables."
+        ),
+    ] = None,
     parent_pid: ParentOption = None,
 ) -> None:
     """Serve the rig's mock devices on 127.0.0.1 until Ctrl-C, and print where they listen."""
+    from fitctl.commands.fault import with_script
     from fitctl.commands.instrument import run_mocks
 
     settings = _rig(rig, overrides)
+    if faults is not None:
+        settings = with_script(settings, faults)
     run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
+
+
+DeviceArgument = Annotated[
+    str, typer.Argument(help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.")
+]
+PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has parts.")]
+
+
+@fault.command("set")
+def fault_set(
+    device: DeviceArgument,
+    kind: Annotated[str, typer.Argument(help="`fitctl fault kinds` lists them.")],
+    value: Annotated[float | None, typer.Argument(help="In the kind's unit.")] = None,
+    part: PartOption = "",
+    for_s: Annotated[
+        float | None, typer.Option("--for", metavar="SECONDS", help="Without it, until cleared.")
+    ] = None,
+    probability: Annotated[float, typer.Option(help="That it hits, each time.")] = 1.0,
+    rig: RigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Begin a fault."""
+    from fitctl.commands.fault import change_faults
+    from fitctl.mocks.bench import SetFault
+
+    wanted = SetFault(device, kind, part, value, for_s, probability)
+    change_faults(_rig(rig, overrides), wanted)
+
+
+@fault.command("clear")
+def fault_clear(
+    device: Annotated[str, typer.Argument(help="Without it, all devices.")] = "",
+    kind: Annotated[str, typer.Argument(help="Without it, all kinds.")] = "",
+    part: PartOption = "",
+    rig: RigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """End faults."""
+    from fitctl.commands.fault import change_faults
+    from fitctl.mocks.bench import ClearFaults
+
+    change_faults(_rig(rig, overrides), ClearFaults(device, kind, part))
+
+
+@fault.command("now")
+def fault_now(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Print what is wrong now."""
+    from fitctl.commands.fault import change_faults
+    from fitctl.mocks.bench import ListFaults
+
+    change_faults(_rig(rig, overrides), ListFaults())
+
+
+@fault.command("kinds")
+def fault_kinds() -> None:
+    """Print what can go wrong with each device."""
+    from fitctl.commands.fault import list_kinds
+
+    list_kinds()
 
 
 @app.command()

@@ -463,12 +463,43 @@ class LoopMocks(Settings):
     mdt693: Mdt693Mock
 
 
+class Fault(Settings):
+    """Something that goes wrong with a mock device.
+
+    Attributes
+    ----------
+    at_s : float
+        When it begins, from the start of the mocks.
+    device : str
+        ``camera``, or a loop's device such as ``right.mdt693``.
+    kind : str
+        What goes wrong; `fitctl fault kinds` shows what can.
+    part : str
+        Of the device, where the kind has parts; empty is all of it.
+    value : float, optional
+        In the kind's unit; absent is the kind's own.
+    for_s : float, optional
+        How long it lasts; absent is until it is cleared.
+    probability : float
+        That it hits a message, or whatever the kind acts on, each time.
+    """
+
+    at_s: NonNegative = 0.0
+    device: str
+    kind: str
+    part: str = ""
+    value: Finite | None = None
+    for_s: Positive | None = None
+    probability: Fraction = 1.0
+
+
 class Mocks(Settings):
     """Where the mock devices listen, always on 127.0.0.1; port 0 means any free one."""
 
     gvcp_port: Port
     bench_port: Port
     loops: Annotated[dict[str, LoopMocks], Field(min_length=1)]
+    faults: list[Fault] = []
 
 
 class Rig(Settings):

@@ -195,6 +195,7 @@ def _with_free_ports(rig: Rig) -> Rig:
 
 
 async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
+    from fitctl.mocks.faults import UnknownFault
     from fitctl.mocks.testbed import Testbed
 
     ending = asyncio.Event()
@@ -204,6 +205,10 @@ async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
     testbed = Testbed(rig, seed)
     try:
         endpoints = await testbed.start()
+    except UnknownFault as error:
+        await testbed.stop()
+        msg = f"mocks: {error}"
+        raise ConfigError(msg) from None
     except (OSError, zmq.ZMQError) as error:
         await testbed.stop()
         msg = f"mocks: a port is taken: {error}; choose others with --set, or use --free-ports"

@@ -1,4 +1,4 @@
-"""The bench's own knowledge: where the star truly was. A referee for judging runs, not a device.
+"""The bench about the devices: where the star truly was, and what shall go wrong. No device itself.
 
 ZeroMQ REP on 127.0.0.1, msgpack. Known limitation: history is as long as ``plant.history_s``.
 """
@@ -6,20 +6,28 @@ ZeroMQ REP on 127.0.0.1, msgpack. Known limitation: history is as long as ``plan
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
 import zmq
 import zmq.asyncio
+from pydantic import ValidationError
 
+from fitctl.config import Fault
+from fitctl.mocks.faults import Faults, UnknownFault, check_fault
 from fitctl.model.plant import Plant
 
 _MAX_QUESTION_BYTES = 1024
 _TIMEOUT_MS = 5000
 
 
-class ResidualQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=True):
+    """What a bench can be asked."""
+
+
+class ResidualQuestion(_Question, frozen=True):
     """Asks how far the star was from a target, from one host time to another."""
 
     loop: str
@@ -38,11 +46,107 @@ class Residual(msgspec.Struct, frozen=True):
     error: str = ""
 
 
+class SetFault(_Question, frozen=True):
+    """Begin a fault; fields as in :class:`fitctl.config.Fault`."""
+
+    device: str
+    kind: str
+    part: str = ""
+    value: float | None = None
+    for_s: float | None = None
+    probability: float = 1.0
+
+
+class ClearFaults(_Question, frozen=True):
+    """End faults: of a device or, without one, of all; of a kind or all; of a part or all."""
+
+    device: str = ""
+    kind: str = ""
+    part: str = ""
+
+
+class ListFaults(_Question, frozen=True):
+    """Ask what is wrong now."""
+
+
+class FaultsNow(msgspec.Struct, frozen=True):
+    """What is wrong now, or why the question could not be obeyed."""
+
+    active: list[dict[str, Any]]
+    error: str = ""
+
+
+_AnyQuestion = ResidualQuestion | SetFault | ClearFaults | ListFaults
+
+
+class FaultTable:
+    """The faults of all mock devices.
+
+    Parameters
+    ----------
+    devices : mapping
+        Of each device by its name, such as ``right.mdt693``.
+    """
+
+    def __init__(self, devices: Mapping[str, Faults]) -> None:
+        self._devices = devices
+        self._timers: list[asyncio.TimerHandle] = []
+
+    def schedule(self, faults: Sequence[Fault]) -> None:
+        """Begin each fault at its time from now.
+
+        Raises
+        ------
+        UnknownFault
+            If a device has none such; then none is begun.
+        """
+        for fault in faults:
+            check_fault(fault, self._of(fault.device).kinds)
+        loop = asyncio.get_running_loop()
+        for fault in faults:
+            begin = self._of(fault.device).set
+            self._timers.append(loop.call_later(fault.at_s, begin, fault))
+
+    def answer(self, question: SetFault | ClearFaults | ListFaults) -> FaultsNow:
+        """Obey, and say what is wrong then."""
+        try:
+            if isinstance(question, SetFault):
+                fault = Fault(**msgspec.structs.asdict(question))
+                self._of(fault.device).set(fault)
+            elif isinstance(question, ClearFaults):
+                names = [question.device] if question.device else list(self._devices)
+                for name in names:
+                    self._of(name).clear(question.kind, question.part)
+        except UnknownFault as error:
+            return FaultsNow([], str(error))
+        except ValidationError as error:
+            first = error.errors()[0]
+            return FaultsNow([], f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
+        active = [fault for faults in self._devices.values() for fault in faults.active]
+        return FaultsNow([fault.model_dump(exclude={"at_s"}) for fault in active])
+
+    def close(self) -> None:
+        """Nothing goes wrong any more."""
+        for timer in self._timers:
+            timer.cancel()
+        for faults in self._devices.values():
+            faults.close()
+
+    def _of(self, device: str) -> Faults:
+        if device not in self._devices:
+            msg = f"no device is named {device}; there are {', '.join(self._devices)}"
+            raise UnknownFault(msg)
+        return self._devices[device]
+
+
 class Bench:
     """Answers questions about the truth until stopped."""
 
-    def __init__(self, plants: Mapping[str, Plant], started_s: float, port: int) -> None:
+    def __init__(
+        self, plants: Mapping[str, Plant], faults: FaultTable, started_s: float, port: int
+    ) -> None:
         self._plants = plants
+        self._faults = faults
         self._started_s = started_s
         self._port = port
         self._context = zmq.asyncio.Context()
@@ -73,11 +177,16 @@ class Bench:
             answer = self._answer(await self._socket.recv())
             await self._socket.send(msgspec.msgpack.encode(answer))
 
-    def _answer(self, message: bytes) -> Residual:
+    def _answer(self, message: bytes) -> Residual | FaultsNow:
         try:
-            question = msgspec.msgpack.decode(message, type=ResidualQuestion)
+            question = msgspec.msgpack.decode(message, type=_AnyQuestion)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return Residual(np.nan, np.nan, 0, f"not a question: {error}")
+        if isinstance(question, ResidualQuestion):
+            return self._residual(question)
+        return self._faults.answer(question)
+
+    def _residual(self, question: ResidualQuestion) -> Residual:
         if not np.all(np.isfinite([question.start_s, question.end_s])):
             return Residual(np.nan, np.nan, 0, "start_s and end_s must be times")
         plant = self._plants.get(question.loop)
@@ -94,13 +203,28 @@ class Bench:
 
 
 def ask_bench(port: int, question: ResidualQuestion) -> Residual:
-    """Ask a running bench.
+    """Ask a running bench where the star was.
 
     Raises
     ------
     ConnectionError
         If none answers within five seconds.
     """
+    return msgspec.msgpack.decode(_ask(port, question), type=Residual)
+
+
+def ask_faults(port: int, question: SetFault | ClearFaults | ListFaults) -> FaultsNow:
+    """Have a running bench begin or end faults, or list them.
+
+    Raises
+    ------
+    ConnectionError
+        If none answers within five seconds.
+    """
+    return msgspec.msgpack.decode(_ask(port, question), type=FaultsNow)
+
+
+def _ask(port: int, question: _AnyQuestion) -> bytes:
     context = zmq.Context()
     try:
         with context.socket(zmq.REQ) as socket:
@@ -110,6 +234,6 @@ def ask_bench(port: int, question: ResidualQuestion) -> Residual:
             if not socket.poll(_TIMEOUT_MS):
                 msg = f"the mock testbed's bench does not answer at 127.0.0.1:{port}"
                 raise ConnectionError(msg)
-            return msgspec.msgpack.decode(socket.recv(), type=Residual)
+            return socket.recv()
     finally:
         context.term()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import LoopMocks, Rig
-from fitctl.mocks.bench import Bench
+from fitctl.mocks.bench import Bench, FaultTable
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.mdt693.server import Mdt693Mock
@@ -139,13 +139,26 @@ class Testbed:
         self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
         self._exposures = 0
         self._camera = GigeCameraMock(rig.true_camera, self._render, port=mocks.gvcp_port)
-        self._bench = Bench(
-            {name: live.plant for name, live in self._plants.items()}, started_s, mocks.bench_port
-        )
+        self._fault_plan = mocks.faults
+        devices = {"camera": self._camera.faults}
+        for name, loop in self._loops.items():
+            devices |= {
+                f"{name}.drive": loop.drive.faults,
+                f"{name}.dac": loop.dac.faults,
+                f"{name}.mdt693": loop.piezo.faults,
+            }
+        self._faults = FaultTable(devices)
+        plants = {name: live.plant for name, live in self._plants.items()}
+        self._bench = Bench(plants, self._faults, started_s, mocks.bench_port)
         self._housekeeping: asyncio.Task | None = None
 
     async def start(self) -> dict[str, Any]:
         """Start every device.
+
+        Raises
+        ------
+        UnknownFault
+            If the rig file's faults name one that a device does not have.
 
         Returns
         -------
@@ -153,6 +166,7 @@ class Testbed:
             Endpoints by the rig file's keys, ready for ``--set``; the ``mocks`` keys are for those who
             want the pty or the bench.
         """
+        self._faults.schedule(self._fault_plan)
         for live in self._plants.values():
             live.advance()  # compiles the kernels before anyone waits for an answer
         endpoints: dict[str, Any] = {
@@ -179,6 +193,7 @@ class Testbed:
         if self._housekeeping is not None:
             self._housekeeping.cancel()
             await asyncio.gather(self._housekeeping, return_exceptions=True)
+        self._faults.close()
         await self._camera.stop()
         for loop in self._loops.values():
             await loop.drive.stop()

@@ -27,7 +27,9 @@ from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
 from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter
 from fitctl.mocks.cia402.timers import Periodic, Watchdog
+from fitctl.mocks.faults import WIRE_FAULTS, Faults
 
+FAULTS = dict(WIRE_FAULTS)
 BOTH_VELOCITY_MODES = 1 << (protocol.PROFILE_VELOCITY - 1) | 1 << (
     protocol.CYCLIC_SYNCHRONOUS_VELOCITY - 1
 )
@@ -73,6 +75,7 @@ class Cia402DriveMock:
         port: int,
         supported_modes: int = BOTH_VELOCITY_MODES,
     ) -> None:
+        self.faults = Faults(FAULTS)
         self._motors = motors
         self._port = port
         self._node_id = siderostat.device.node_id

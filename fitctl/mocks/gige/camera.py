@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from fitctl.config import Camera
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Command, MalformedPacketError, Register, Status
+from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.gige.acquisition import Acquisition
 from fitctl.mocks.gige.memory import RegisterError
 from fitctl.mocks.gige.registers import CameraClock, Registers
 
+FAULTS = dict(WIRE_FAULTS)
 Address = tuple[str, int]
 
 
@@ -46,6 +48,7 @@ class GigeCameraMock:
     def __init__(
         self, camera: Camera, render: Callable[[float], NDArray[np.uint16]], *, port: int
     ) -> None:
+        self.faults = Faults(FAULTS)
         self._camera = camera
         self._render = render
         self._port = port

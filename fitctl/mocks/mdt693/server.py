@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 from fitctl import config
 from fitctl.drivers.mdt693.protocol import ACKNOWLEDGED, NOT_DEFINED, REFUSED, TERMINATOR
+from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.mdt693.device import COMMAND_BYTES_MAX, Amplifier, CommandError, Dialect
 
+FAULTS = dict(WIRE_FAULTS)
 _GARBAGE = b"\xfe[ 1\x00?\r"  # as a wrong baud rate would look
 
 
@@ -103,6 +105,7 @@ class Mdt693Mock:
         dialect: Dialect | None = None,
     ) -> None:
         self.amplifier = Amplifier(settings, piezo, on_outputs, dialect)
+        self.faults = Faults(FAULTS)
         self.silent = False
         self.garbled = False
         self._reply_s = settings.reply_s

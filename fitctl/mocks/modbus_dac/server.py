@@ -20,7 +20,9 @@ from fitctl.drivers.modbus_dac.protocol import (
     decode_counts,
     encode_volts,
 )
+from fitctl.mocks.faults import WIRE_FAULTS, Faults
 
+FAULTS = dict(WIRE_FAULTS)
 _FUNCTIONS = {READ_HOLDING_REGISTERS, WRITE_SINGLE_REGISTER, WRITE_MULTIPLE_REGISTERS}
 _ADDRESSES = 65535
 
@@ -75,6 +77,7 @@ class ModbusDacMock:
         *,
         port: int,
     ) -> None:
+        self.faults = Faults(FAULTS)
         self.watchdog_trips = 0
         self.silent = False
         self.refuse_with = 0
