@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -190,8 +191,19 @@ def _with_free_ports(rig: Rig) -> Rig:
         name: loop.model_copy(update={"slcan_port": 0, "modbus_port": 0, "mdt693_port": 0})
         for name, loop in mocks.loops.items()
     }
-    free = mocks.model_copy(update={"gvcp_port": 0, "bench_port": 0, "loops": loops})
+    # The bench keeps its port where it can: there `fitctl fault` finds the mocks of a demo.
+    bench_port = mocks.bench_port if _is_free(mocks.bench_port) else 0
+    free = mocks.model_copy(update={"gvcp_port": 0, "bench_port": bench_port, "loops": loops})
     return rig.model_copy(update={"mocks": free})
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
 
 
 async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
