@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.model.compiled import jit, jit_fused
+from fitctl.model.compiled import jit, jit_fused, jit_inlined
 from fitctl.model.light import PER_SIGMA, REACH_SIGMAS
 
 Floats = NDArray[np.float64]
@@ -51,7 +51,7 @@ def air_motion(
         state[axis, 0], state[axis, 1] = x0, v0
 
 
-@jit
+@jit_inlined
 def play_output(plays: Floats, value: float, half_width: Floats, gain: Floats) -> float:
     """Output of parallel plays, shape (n,) each, after they met `value`; they are moved on."""
     total = 0.0
@@ -63,7 +63,7 @@ def play_output(plays: Floats, value: float, half_width: Floats, gain: Floats) -
     return total
 
 
-@jit
+@jit_inlined
 def move_stacks(c: Any, s: Any, plays_v: Floats, half_v: Floats, gain_m_per_v: Floats) -> None:
     """Take the stacks of one run to their volts. They are static: without a change nothing moves."""
     for stack in range(3):
@@ -75,11 +75,8 @@ def move_stacks(c: Any, s: Any, plays_v: Floats, half_v: Floats, gain_m_per_v: F
 
 
 @jit_fused
-def step_run(
-    c: Any, s: Any, origin_px: Floats, air_px: Floats, air_from: int, spot_px: Floats, first: int,
-    steps: int,
-) -> None:  # fmt: skip
-    """Steps of one run and its first spot; stacks stand still. Shapes (2,), (rows, 2) and (rows, 2).
+def step_run(c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats) -> None:
+    """A step for each row, of one run and its first spot; stacks stand still. Shapes (2,), twice (rows, 2).
 
     Both axes and modes go side by side: each is a chain of dependent sums, and four run in the time of
     one.
@@ -112,22 +109,22 @@ def step_run(
     moved_az, moved_el = command_az * c.step_s, command_el * c.step_s
     motor_az, lead_az, beam_az = s.motor_rad[0], s.motor_rad_s[0] - command_az, s.beam_motor_rad[0]
     motor_el, lead_el, beam_el = s.motor_rad[1], s.motor_rad_s[1] - command_el, s.beam_motor_rad[1]
-    for row in range(steps):
-        place1, rate1 = a1 * place1 + b1 * rate1 + to_place1, c1 * place1 + d1 * rate1 + to_rate1
-        place2, rate2 = a2 * place2 + b2 * rate2 + to_place2, c2 * place2 + d2 * rate2 + to_rate2
+    for row in range(spot_px.shape[0]):
+        place1, rate1 = to_place1 + b1 * rate1 + a1 * place1, to_rate1 + d1 * rate1 + c1 * place1
+        place2, rate2 = to_place2 + b2 * rate2 + a2 * place2, to_rate2 + d2 * rate2 + c2 * place2
         motor_az += moved_az + lead_az * catch_up_s
         motor_el += moved_el + lead_el * catch_up_s
         lead_az *= decay
         lead_el *= decay
         beam_az = max(motor_az - half, min(motor_az + half, beam_az))
         beam_el = max(motor_el - half, min(motor_el + half, beam_el))
-        spot_px[first + row, 0] = (
+        spot_px[row, 0] = (
             still_az_px + az_px1 * place1 + az_px2 * place2 + motor_px * beam_az
-            + air_px[air_from + row, 0]
+            + air_px[row, 0]
         )  # fmt: skip
-        spot_px[first + row, 1] = (
+        spot_px[row, 1] = (
             still_el_px + el_px1 * place1 + el_px2 * place2 + motor_px * beam_el
-            + air_px[air_from + row, 1]
+            + air_px[row, 1]
         )  # fmt: skip
     s.modes[0, 0], s.modes[0, 1], s.modes[1, 0], s.modes[1, 1] = place1, rate1, place2, rate2
     s.motor_rad[0], s.motor_rad_s[0], s.beam_motor_rad[0] = motor_az, command_az + lead_az, beam_az
@@ -161,8 +158,8 @@ def advance(
         s = state[run]
         move_stacks(c, s, plays_v[run], play_half_v, play_gain_m_per_v)
         step_run(
-            c, s, origin_px[run, 0], air_px[:, run, 0], air_from, trace_px[:, run, 0], trace_from,
-            steps,
+            c, s, origin_px[run, 0], air_px[air_from : air_from + steps, run, 0],
+            trace_px[trace_from : trace_from + steps, run, 0],
         )  # fmt: skip
         trace_piston_m[trace_from : trace_from + steps, run] = piston_m(s)
         for spot in range(1, trace_px.shape[2]):
@@ -176,7 +173,7 @@ def advance(
                     )
 
 
-@jit
+@jit_inlined
 def mix(word: Any) -> Any:
     """SplitMix64's finalizer."""
     word = (word ^ (word >> _S30)) * _MIX1
@@ -184,7 +181,7 @@ def mix(word: Any) -> Any:
     return word ^ (word >> _S31)
 
 
-@jit
+@jit_inlined
 def light_fractions(
     first: int, centre_px: float, sigma_px: float, table: Floats, fraction: Floats
 ) -> Any:
@@ -211,7 +208,7 @@ def light_fractions(
     return low, max(low, high)
 
 
-@jit
+@jit_inlined
 def render(
     light_dn: Floats,
     first_row: int,

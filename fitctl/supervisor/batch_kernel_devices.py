@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.model.compiled import jit
+from fitctl.model.compiled import jit, jit_inlined
 from fitctl.model.kernels import air_motion, move_stacks, piston_m, step_run
 from fitctl.supervisor.batch_kernel_steps import (
     following_error_rad,
@@ -58,13 +58,14 @@ def judge_steps(s: Any, r: Any, w: Any, plant: Any) -> None:
     r.judged_to = r.steps
 
 
-@jit
+@jit_inlined
 def advance_to(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
     """``Plant.advance`` to now; the air must be there."""
     missing = int(np.rint(r.now_s / c.step_s)) - r.steps
     while missing > 0:
         count = min(missing, s.ring_steps - r.row)
-        step_run(c, plant, r.origin_px, w.air_px, r.row, w.trace_px, r.row, count)
+        end = r.row + count
+        step_run(c, plant, r.origin_px, w.air_px[r.row : end], w.trace_px[r.row : end])
         r.steps += count
         missing -= count
         r.row += count
@@ -72,7 +73,7 @@ def advance_to(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
             r.row = 0
 
 
-@jit
+@jit_inlined
 def move_plant_stacks(s: Any, w: Any, c: Any, plant: Any) -> None:
     """Take the stacks to their volts."""
     n = s.plays
@@ -108,7 +109,7 @@ def mirror_at(s: Any, r: Any, w: Any, time_s: float) -> None:
 # ---------------------------------------------------------------- the siderostat
 
 
-@jit
+@jit_inlined
 def read_encoders(s: Any, r: Any, w: Any, plant: Any) -> None:
     """``SimulatedAmplifiers.exchange`` but for the command, and ``SiderostatServo._take``."""
     entry = r.readings & _HISTORY
@@ -120,7 +121,7 @@ def read_encoders(s: Any, r: Any, w: Any, plant: Any) -> None:
     r.readings += 1
 
 
-@jit
+@jit_inlined
 def servo_period(s: Any, r: Any, w: Any, c: Any, plant: Any) -> bool:
     """``SiderostatServo.period``; False where the motors do not follow."""
     if r.wish:

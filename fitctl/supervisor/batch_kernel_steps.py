@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.controllers.centroid import LARGEST_PEAK, MAX_CANDIDATES
-from fitctl.model.compiled import jit
+from fitctl.model.compiled import jit, jit_inlined
 from fitctl.model.kernels import play_output, render
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ _SIDE_PX = 2 * HALF_WINDOW_PX + 1
 # ---------------------------------------------------------------- position servo
 
 
-@jit
+@jit_inlined
 def limited(value: float, most: float) -> float:
     """`value` within +-`most`."""
     return most if value > most else -most if value < -most else value
@@ -41,7 +41,7 @@ def servo_move_to(s: Any, r: Any) -> None:
         r.servo_step_rad[axis] = limited(step_rad, s.velocity_limit_rad_s * s.servo_period_s)
 
 
-@jit
+@jit_inlined
 def servo_step(s: Any, r: Any) -> None:
     """``PositionServo.step``, from the last reading to a velocity command."""
     for axis in range(2):
@@ -60,7 +60,7 @@ def servo_step(s: Any, r: Any) -> None:
         )
 
 
-@jit
+@jit_inlined
 def following_error_rad(r: Any) -> float:
     """``PositionServo.following_error_rad``."""
     return max(
@@ -72,7 +72,7 @@ def following_error_rad(r: Any) -> float:
 # ---------------------------------------------------------------- what a frame shows
 
 
-@jit
+@jit_inlined
 def centroid(
     s: Any, light_dn: Floats, first_row: int, first_column: int, window_az: int, window_el: int
 ) -> Any:
