@@ -54,6 +54,7 @@ class StarSensor:
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
         self._bias_dn = camera.bias_dn
+        self._window_bias_dn = camera.bias_dn * _LEVER_PX.size**2
         self._threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_low_dn = loop.flux_range.low * loop.star_flux_dn
         self._flux_high_dn = loop.flux_range.high * loop.star_flux_dn
@@ -91,14 +92,12 @@ class StarSensor:
     ) -> Star | None:
         az = min(max(round(window_az_px), HALF_WINDOW_PX), self._largest_az_px)
         el = min(max(round(window_el_px), HALF_WINDOW_PX), self._largest_el_px)
-        window = (
-            image[
-                el - HALF_WINDOW_PX : el + HALF_WINDOW_PX + 1,
-                az - HALF_WINDOW_PX : az + HALF_WINDOW_PX + 1,
-            ]
-            - self._bias_dn
-        )
-        flux_dn, az_moment, el_moment = (_SUMS @ window.ravel()).tolist()
+        window = image[
+            el - HALF_WINDOW_PX : el + HALF_WINDOW_PX + 1,
+            az - HALF_WINDOW_PX : az + HALF_WINDOW_PX + 1,
+        ].astype(np.float64)
+        light_dn, az_moment, el_moment = _SUMS.dot(window.ravel()).tolist()
+        flux_dn = light_dn - self._window_bias_dn  # the bias has no moment about the middle
         if flux_dn <= 0:
             return None
         return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)

@@ -93,11 +93,10 @@ class Pair:
     def __init__(self, design: Design, scale: Scales, range_rad: float) -> None:
         self.design = design
         self._mirror_px_per_rad = scale.mirror_px_per_rad
-        self._motor_px_per_rad = scale.motor_px_per_rad
         self._range_rad = range_rad
         self._at_rest = rest_state(design)
         self._left_at_rest = left_at_rest(design, self._at_rest)
-        self._system = self._with_hand_over()
+        self._system = self._in_rad(scale)
         self._given = np.zeros((len(self._system) + 3, 2))
         self.start(np.zeros(2), np.zeros(2), np.zeros(2))
 
@@ -125,17 +124,26 @@ class Pair:
         given = self._given
         given[0] = measured.error_px
         given[1] = self.excess_px
-        given[2] = measured.mirror_rad * self._mirror_px_per_rad
-        given[3] = (measured.motor_rad - self.motor_origin_rad) * self._motor_px_per_rad
+        given[2] = measured.mirror_rad
+        given[3] = measured.motor_rad - self.motor_origin_rad
         given[4] = measured.target_px - self.target_origin_px
         made = self._system.dot(given)  # `@` takes twice as long
         given[len(INPUTS) :] = made[len(OUTPUTS) :]
-        wanted_px = made[0]
-        mirror_rad = saturate_diamond(wanted_px / self._mirror_px_per_rad, self._range_rad)
+        wanted_rad, motor_step_rad = made[: len(OUTPUTS)]
+        mirror_rad = saturate_diamond(wanted_rad, self._range_rad)
         # Fed back a frame later, where the camera takes nearly two: much as the error would have been
         # had the mirror followed.
-        self.excess_px = wanted_px - mirror_rad * self._mirror_px_per_rad
-        return PairCommand(mirror_rad, made[1] / self._motor_px_per_rad)
+        self.excess_px = (wanted_rad - mirror_rad) * self._mirror_px_per_rad
+        return PairCommand(mirror_rad, motor_step_rad)
+
+    def _in_rad(self, scale: Scales) -> Floats:
+        """The design with its hand-over, but the stages in radians, as they are measured and commanded."""
+        system = self._with_hand_over()
+        system[:, INPUTS.index("mirror_px")] *= scale.mirror_px_per_rad
+        system[:, INPUTS.index("motor_px")] *= scale.motor_px_per_rad
+        system[OUTPUTS.index("mirror_px")] /= scale.mirror_px_per_rad
+        system[OUTPUTS.index("motor_step_px")] /= scale.motor_px_per_rad
+        return system
 
     def _with_hand_over(self) -> Floats:
         """The design and, as one more state, what it found held: in a tick one product costs least."""

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+AzEl = tuple[float, float]
 
 
 @dataclass(slots=True)
 class _Axis:
-    """One axis in plain floats: on two numbers they are several times quicker than arrays."""
+    """One axis: where its motor shall be, and what moves it there."""
 
     target_rad: float
     reference_rad: float
@@ -26,7 +23,8 @@ class PositionServo:
 
     Set-points come at the frame rate; between them the reference moves in a straight line, so that a
     search is a smooth walk. With the amplifier's own lag and one period of latency the loop is a
-    second-order one of 45 Hz.
+    second-order one of 45 Hz. Both axes' angles and velocities are pairs of plain floats, which are
+    several times quicker than arrays.
 
     Parameters
     ----------
@@ -55,31 +53,30 @@ class PositionServo:
         self._period_s = period_s
         self._resolution_rad = resolution_rad
         self._periods_per_setpoint = max(1, round(setpoint_period_s / period_s))
-        self.reset(np.zeros(2))
+        self.reset((0.0, 0.0))
 
-    def reset(self, position_rad: Floats) -> None:
-        """Rest at `position_rad`, shape (2,)."""
-        self._axes = [_Axis(position, position) for position in position_rad.tolist()]
+    def reset(self, position_rad: AzEl) -> None:
+        """Rest at `position_rad`."""
+        az_rad, el_rad = position_rad
+        self._az, self._el = _Axis(az_rad, az_rad), _Axis(el_rad, el_rad)
 
-    def move_to(self, target_rad: Floats) -> None:
-        """Be at `target_rad`, shape (2,), one set-point period from now, or as soon as the limit allows."""
+    def move_to(self, target_rad: AzEl) -> None:
+        """Be at `target_rad` one set-point period from now, or as soon as the limit allows."""
         most = self._velocity_limit * self._period_s
-        for axis, target in zip(self._axes, target_rad.tolist(), strict=True):
+        for axis, target in zip((self._az, self._el), target_rad, strict=True):
             axis.target_rad = target
             step_rad = (target - axis.reference_rad) / self._periods_per_setpoint
             axis.step_rad = step_rad if abs(step_rad) <= most else math.copysign(most, step_rad)
 
-    def step(self, position_rad: Floats) -> Floats:
-        """One servo period: velocity command, shape (2,), for the measured motor angles."""
-        az, el = self._axes
-        az_rad, el_rad = position_rad.tolist()
-        return np.array([self._velocity_rad_s(az, az_rad), self._velocity_rad_s(el, el_rad)])
+    def step(self, position_rad: AzEl) -> AzEl:
+        """One servo period: velocity command for the measured motor angles."""
+        az_rad, el_rad = position_rad
+        return self._velocity_rad_s(self._az, az_rad), self._velocity_rad_s(self._el, el_rad)
 
-    def following_error_rad(self, position_rad: Floats) -> float:
+    def following_error_rad(self, position_rad: AzEl) -> float:
         """How far the motors are from the moving reference; the larger of the axes."""
-        az, el = self._axes
-        az_rad, el_rad = position_rad.tolist()
-        return max(abs(az.reference_rad - az_rad), abs(el.reference_rad - el_rad))
+        az_rad, el_rad = position_rad
+        return max(abs(self._az.reference_rad - az_rad), abs(self._el.reference_rad - el_rad))
 
     def _velocity_rad_s(self, axis: _Axis, position_rad: float) -> float:
         if abs(axis.target_rad - axis.reference_rad) <= abs(axis.step_rad):

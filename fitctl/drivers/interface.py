@@ -7,10 +7,12 @@ Every call returns or raises within the device's time limit. A driver is used by
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+AzEl = tuple[float, float]
 
 
 class DeviceError(Exception):
@@ -130,15 +132,14 @@ class CameraDriver(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class ServoReading:
+class ServoReading(NamedTuple):
     """What the two amplifiers said in one servo period.
 
     Attributes
     ----------
     time_s : float
         Host's monotonic time at which the encoders were read.
-    position_rad : float array, shape (2,)
+    position_rad : pair of float
         Motor angles, azimuth and elevation.
     enabled : bool
         Both axes follow velocity commands.
@@ -147,13 +148,16 @@ class ServoReading:
     """
 
     time_s: float
-    position_rad: NDArray[np.float64]
+    position_rad: AzEl
     enabled: bool
     fault: str
 
 
 class ServoAmplifiers(Protocol):
-    """Both axes' amplifiers in velocity mode, with their encoders."""
+    """Both axes' amplifiers in velocity mode, with their encoders.
+
+    Angles and velocities are plain floats: 500 times a second, arrays of two cost more than the work.
+    """
 
     def open(self) -> DeviceIdentity:
         """Connect and configure; nothing moves."""
@@ -171,7 +175,7 @@ class ServoAmplifiers(Protocol):
         """Clear a latched fault. Raises DeviceFault if it stays."""
         ...
 
-    def exchange(self, velocity_rad_s: NDArray[np.float64]) -> ServoReading | None:
+    def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period: command both motors, read both encoders.
 
         Returns None when no reading came within the period; the caller judges how often it may. Once

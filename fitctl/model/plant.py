@@ -83,8 +83,7 @@ class Plant:
         self.state.stack_v[:] = self.constants.bias_v
         self._block_steps = BLOCK_NODES * len(self.constants.air.weights)
         self._air_px = np.empty((self._block_steps, runs, spots, 2))
-        self._air_used = self._block_steps
-        self._steps = 0
+        self._steps = self._room_until = 0
         kept_s = truth.history_s if history_s is None else history_s
         kept = max(1, round(kept_s / truth.step_s))
         self._trace = PlantTrace(np.empty((kept, runs, spots, 2)), np.empty((kept, runs)))
@@ -109,16 +108,13 @@ class Plant:
 
     def advance(self, time_s: float) -> None:
         """Go on to the grid time nearest to `time_s`; a time already reached changes nothing."""
-        missing = round(time_s / self._step_s) - self._steps
-        while missing > 0:
-            if self._air_used == self._block_steps:
-                self._draw_air()
-            row = self._steps % self._kept
-            count = min(missing, self._block_steps - self._air_used, self._kept - row)
-            self._step(self._air_used, row, count)
-            self._air_used += count
-            self._steps += count
-            missing -= count
+        wanted = round(time_s / self._step_s)
+        while self._steps < wanted:
+            if self._steps == self._room_until:
+                self._make_room()
+            steps, until = self._steps, min(wanted, self._room_until)
+            self._step(steps % self._block_steps, steps % self._kept, until - steps)
+            self._steps = until
 
     def spots_px(self, time_s: float) -> Floats:
         """Spot positions at the grid time nearest to `time_s`, shape (runs, spots, 2).
@@ -129,7 +125,7 @@ class Plant:
             If that is before what the history still holds.
         """
         self.advance(time_s)
-        step = max(1, round(time_s / self.constants.step_s))
+        step = max(1, round(time_s / self._step_s))
         self._advance_to_first_step()
         if step <= self._steps - self._kept:
             msg = f"the plant's history begins at {self.oldest_s:.3f} s, asked for {time_s:.3f} s"
@@ -158,6 +154,14 @@ class Plant:
         if self._steps == 0:
             self.advance(self.constants.step_s)
 
+    def _make_room(self) -> None:
+        """For steps up to the end of the air drawn or of the trace, whichever comes first."""
+        air_row, trace_row = self._steps % self._block_steps, self._steps % self._kept
+        if air_row == 0:
+            self._draw_air()
+        room = min(self._block_steps - air_row, self._kept - trace_row)
+        self._room_until = self._steps + room
+
     def _draw_air(self) -> None:
         # One draw for each run and spot, so that a run is the same whichever others are beside it.
         air, compiled = self.constants.air, kernels()
@@ -177,4 +181,3 @@ class Plant:
                 else:
                     compiled.air_motion(*arguments, motion_px)
         self._air_px[:, :, 1:] *= air.relative
-        self._air_used = 0

@@ -444,6 +444,7 @@ class StellarLoop:
         stack1_v, stack2_v, stack3_v = stages.stack_v.tolist()
         motor_az_rad, motor_el_rad = seen.motor_rad.tolist()
         setpoint_az_rad, setpoint_el_rad = stages.setpoint_rad.tolist()
+        sky_arcsec_per_rad = self._scale.motor_sky_arcsec_per_rad
         return Tick(
             time_s=done_s,
             loop=self.name,
@@ -476,8 +477,8 @@ class StellarLoop:
             siderostat_el_rad=motor_el_rad,
             siderostat_setpoint_az_rad=setpoint_az_rad,
             siderostat_setpoint_el_rad=setpoint_el_rad,
-            siderostat_az_sky_arcsec=motor_az_rad * self._scale.motor_sky_arcsec_per_rad,
-            siderostat_el_sky_arcsec=motor_el_rad * self._scale.motor_sky_arcsec_per_rad,
+            siderostat_az_sky_arcsec=motor_az_rad * sky_arcsec_per_rad,
+            siderostat_el_sky_arcsec=motor_el_rad * sky_arcsec_per_rad,
             search_progress=self._spiral.progress if self.mode is Mode.ACQUISITION else math.nan,
         )
 

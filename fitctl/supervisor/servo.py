@@ -23,6 +23,7 @@ from fitctl.clock import Clock
 from fitctl.config import Loop
 from fitctl.controllers.position_servo import PositionServo
 from fitctl.drivers.interface import (
+    AzEl,
     DeviceError,
     DeviceFault,
     DeviceIdentity,
@@ -35,7 +36,8 @@ from fitctl.supervisor.realtime import become_realtime
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
-_READ_AT = operator.itemgetter(0)  # of an entry of the history: when
+_READ_AT = operator.itemgetter(0)  # of a reading: when
+_STILL = (0.0, 0.0)
 _BLIND_MISSES = 2
 FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
@@ -78,7 +80,6 @@ class SiderostatServo:
         self.enabled = False
         self.opened = False
         self.threaded = False
-        self.position_rad = np.zeros(2)
         self.setpoint_rad = np.zeros(2)
         self._settings = siderostat.servo
         self._amplifiers = amplifiers
@@ -92,9 +93,10 @@ class SiderostatServo:
             2 * math.pi / siderostat.encoder_counts_per_rev,
         )
         self._stopped = True
-        self._wish_rad: Floats | None = None
+        self._position_rad: AzEl = (0.0, 0.0)
+        self._wish_rad: AzEl | None = None
         self._requests: deque[tuple[Callable[[], DeviceIdentity | None], Future]] = deque()
-        self._history: deque[tuple[float, Floats]] = deque(maxlen=round(HISTORY_S / self.period_s))
+        self._history: deque[ServoReading] = deque(maxlen=round(HISTORY_S / self.period_s))
         self._last_reading_s = 0.0
         self._missed_readings = 0
         self._misses_in_a_row = 0
@@ -105,10 +107,16 @@ class SiderostatServo:
 
     # ------------------------------------------------------------ from any thread
 
+    @property
+    def position_rad(self) -> Floats:
+        """Motor angles as last read, shape (2,)."""
+        return np.array(self._position_rad)
+
     def move_to(self, setpoint_rad: Floats) -> None:
         """Wanted motor angles one set-point period from now, shape (2,)."""
         self.setpoint_rad = setpoint_rad
-        self._wish_rad = setpoint_rad
+        az_rad, el_rad = setpoint_rad.tolist()
+        self._wish_rad = (az_rad, el_rad)
 
     def stop(self) -> None:
         """Velocity zero from the next period on, until :meth:`hold`."""
@@ -125,12 +133,14 @@ class SiderostatServo:
         history = list(self._history)  # at once: the servo's thread appends
         later = bisect.bisect_right(history, time_s, key=_READ_AT)
         if later == 0:
-            return history[0][1] if history else self.position_rad
-        t0, p0 = history[later - 1]
-        if later == len(history):
-            return p0
-        t1, p1 = history[later]
-        return p0 + (time_s - t0) / (t1 - t0) * (p1 - p0)
+            return np.array(history[0].position_rad if history else self._position_rad)
+        before_s, (az_rad, el_rad), *_ = history[later - 1]
+        if later < len(history):
+            after_s, (after_az_rad, after_el_rad), *_ = history[later]
+            part = (time_s - before_s) / (after_s - before_s)
+            az_rad += part * (after_az_rad - az_rad)
+            el_rad += part * (after_el_rad - el_rad)
+        return np.array([az_rad, el_rad])
 
     def open(self) -> DeviceIdentity:
         """Connect, clear a latched fault, read the encoders and enable; the motors stand still."""
@@ -167,7 +177,7 @@ class SiderostatServo:
         if self.fault is not None:
             # The drive must go on hearing that it shall stand still, and that we live.
             with suppress(Exception):
-                self._amplifiers.exchange(np.zeros(2))
+                self._amplifiers.exchange(_STILL)
             return
         try:
             self._exchange()
@@ -195,39 +205,29 @@ class SiderostatServo:
             raise DeviceFault(self._device, self.endpoint, "both axes enabled", got, "recover")
         if self._stopped or not self.enabled:
             self._servo.reset(reading.position_rad)
-        else:
-            self._check_following(reading)
+            return
+        following_rad = self._servo.following_error_rad(reading.position_rad)
+        if following_rad <= self._settings.following_error_limit_rad:
+            self._followed_s = reading.time_s
+        # A reversal at full speed is behind for a moment; a stuck axis stays behind.
+        elif reading.time_s - self._followed_s > FOLLOWING_S:
+            raise self._not_following(following_rad)
 
-    def _velocity_rad_s(self) -> Floats:
+    def _velocity_rad_s(self) -> AzEl:
         wish, self._wish_rad = self._wish_rad, None
         if self._stopped or not self.enabled:
-            return np.zeros(2)
+            return _STILL
         if wish is not None:
             self._servo.move_to(wish)
         if self._misses_in_a_row >= _BLIND_MISSES:
-            return np.zeros(2)  # blind motors stand still, and the reference waits for them
-        return self._servo.step(self.position_rad)
+            return _STILL  # blind motors stand still, and the reference waits for them
+        return self._servo.step(self._position_rad)
 
     def _take(self, reading: ServoReading, now_s: float) -> None:
         self._last_reading_s = now_s
         self._misses_in_a_row = 0
-        self.position_rad = reading.position_rad
-        self._history.append((reading.time_s, reading.position_rad))
-
-    def _check_following(self, reading: ServoReading) -> None:
-        """A reversal at full speed is behind for a moment; a stuck axis stays behind."""
-        limit_rad = self._settings.following_error_limit_rad
-        following_rad = self._servo.following_error_rad(reading.position_rad)
-        if following_rad <= limit_rad:
-            self._followed_s = reading.time_s
-        elif reading.time_s - self._followed_s > FOLLOWING_S:
-            raise DeviceFault(
-                self._device,
-                self.endpoint,
-                f"following error below {limit_rad:g} rad",
-                f"{following_rad:.2f} rad for {FOLLOWING_S * 1e3:.0f} ms",
-                "look for a stuck axis, then recover",
-            )
+        self._position_rad = reading.position_rad
+        self._history.append(reading)
 
     def _fail(self, error: Exception) -> None:
         self._stopped = True
@@ -244,6 +244,15 @@ class SiderostatServo:
             f"an encoder reading within {self._settings.reading_timeout_s:g} s",
             "none",
             "check the drive's power and link, then recover",
+        )
+
+    def _not_following(self, following_rad: float) -> DeviceFault:
+        return DeviceFault(
+            self._device,
+            self.endpoint,
+            f"following error below {self._settings.following_error_limit_rad:g} rad",
+            f"{following_rad:.2f} rad for {FOLLOWING_S * 1e3:.0f} ms",
+            "look for a stuck axis, then recover",
         )
 
     @property
@@ -264,17 +273,17 @@ class SiderostatServo:
 
     def _find_position(self) -> None:
         """Read the encoders before power is on: nothing is ever servoed about a place never read."""
-        last_rad, knew = self.position_rad, bool(self._history)
+        knew, (last_az_rad, last_el_rad) = bool(self._history), self._position_rad
         self._history.clear()
         deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
-        while (reading := self._amplifiers.exchange(np.zeros(2))) is None:
+        while (reading := self._amplifiers.exchange(_STILL)) is None:
             if self._clock.now_s() > deadline_s:
                 raise self._no_reading()
         self._take(reading, self._clock.now_s())
+        az_rad, el_rad = reading.position_rad
         self._servo.reset(reading.position_rad)
-        self.encoders_jumped = knew and bool(
-            np.any(np.abs(reading.position_rad - last_rad) > _ENCODER_JUMP_RAD)
-        )
+        jump_rad = max(abs(az_rad - last_az_rad), abs(el_rad - last_el_rad))
+        self.encoders_jumped = knew and jump_rad > _ENCODER_JUMP_RAD
 
     def _disable(self) -> None:
         self._stopped = True

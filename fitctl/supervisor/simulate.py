@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from fitctl.clock import VirtualClock
 from fitctl.config import Rig
 from fitctl.drivers.interface import (
+    AzEl,
     CameraCounts,
     DeviceIdentity,
     Devices,
@@ -81,17 +82,15 @@ class SimulatedAmplifiers:
     def reset_fault(self) -> None:
         """There are none."""
 
-    def exchange(self, velocity_rad_s: Floats) -> ServoReading:
+    def exchange(self, velocity_rad_s: AzEl) -> ServoReading:
         """Command and read at the present virtual time."""
         now_s = self._clock.now_s()
         self._plant.advance(now_s)
         if self._enabled:
-            self._velocity_rad_s[:] = velocity_rad_s
+            self._velocity_rad_s[0], self._velocity_rad_s[1] = velocity_rad_s
         az_rad, el_rad = self._motor_rad.tolist()
         count = self._rad_per_count
-        position_rad = np.array(
-            [math.floor(az_rad / count) * count, math.floor(el_rad / count) * count]
-        )
+        position_rad = (math.floor(az_rad / count) * count, math.floor(el_rad / count) * count)
         return ServoReading(now_s, position_rad, self._enabled, "")
 
     def close(self) -> None:
@@ -106,9 +105,11 @@ class SimulatedMirror:
         fsm = rig.loops[loop_name].fsm
         self._plant = plant
         self._clock = clock
+        self._stack_v = plant.inputs.stack_v[0]
         self._step_v = fsm.dac.full_scale_v / (2**fsm.dac.bits - 1)
         self._gain = fsm.piezo.gain
         self._limit_v = fsm.piezo.limit_v
+        self._most_v = fsm.piezo.limit_v / fsm.piezo.gain
 
     def open(self) -> DeviceIdentity:
         """Nothing to connect."""
@@ -117,16 +118,16 @@ class SimulatedMirror:
     def write_v(self, volts: Floats) -> None:
         """Set the stacks at the present virtual time."""
         self._plant.advance(self._clock.now_s())
-        output_v = np.rint(volts / self._step_v) * self._step_v
-        self._plant.inputs.stack_v[0] = np.minimum(output_v, self._limit_v / self._gain)
+        step_v, most_v = self._step_v, self._most_v
+        self._stack_v[:] = [min(round(volt / step_v) * step_v, most_v) for volt in volts.tolist()]
 
     def read_v(self) -> Floats:
         """What the D/A is set to."""
-        return self._plant.inputs.stack_v[0].copy()
+        return self._stack_v.copy()
 
     def stack_volts(self) -> Floats:
         """What the stacks have."""
-        return self._plant.inputs.stack_v[0] * self._gain
+        return self._stack_v * self._gain
 
     def limit_v(self) -> float:
         """The limit of the rig file."""
@@ -191,12 +192,13 @@ class SimulatedCamera:
         """Nothing to disconnect."""
 
     def _go_on_to(self, time_s: float) -> None:
-        while self._due[0][0] <= time_s:
-            due_s, which = self._due[0]
+        due = self._due
+        while due[0][0] <= time_s:
+            due_s, which = due[0]
             period_s, run = self.on_servo_period[which]
             self._clock.sleep_until(due_s)
             run()
-            heapq.heapreplace(self._due, (due_s + period_s, which))
+            heapq.heapreplace(due, (due_s + period_s, which))
         self._clock.sleep_until(time_s)
 
 

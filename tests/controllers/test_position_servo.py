@@ -16,24 +16,25 @@ def make_servo():
 
 def drive(servo, targets, periods_each=10):
     """Ideal motors under the servo: velocities and positions, shape (periods, 2)."""
-    position_rad = np.zeros(2)
+    position_rad = (0.0, 0.0)
     velocities, positions = [], []
     for target in targets:
-        servo.move_to(np.array(target))
+        servo.move_to(target)
         for _ in range(periods_each):
             velocity_rad_s = servo.step(position_rad)
-            position_rad = position_rad + velocity_rad_s * PERIOD_S
+            moved_rad = np.array(position_rad) + np.array(velocity_rad_s) * PERIOD_S
+            position_rad = tuple(moved_rad.tolist())
             velocities.append(velocity_rad_s)
             positions.append(position_rad)
     return np.array(velocities), np.array(positions)
 
 
 def test_at_rest_it_commands_nothing():
-    assert make_servo().step(np.zeros(2)).tolist() == [0.0, 0.0]
+    assert make_servo().step((0.0, 0.0)) == (0.0, 0.0)
 
 
 def test_a_displaced_motor_is_driven_back_in_proportion():
-    velocity_rad_s = make_servo().step(np.array([0.01, -0.02]))
+    velocity_rad_s = make_servo().step((0.01, -0.02))
     assert velocity_rad_s == pytest.approx([-GAIN_PER_S * 0.01, GAIN_PER_S * 0.02])
 
 
@@ -54,39 +55,39 @@ def test_the_motors_arrive_and_stay(targets):
 
 def test_between_set_points_the_reference_moves_in_a_straight_line():
     servo = make_servo()
-    servo.move_to(np.array([0.5, 0.0]))
+    servo.move_to((0.5, 0.0))
     references = []
     for _ in range(12):
-        servo.step(np.zeros(2))
-        references.append(servo.following_error_rad(np.zeros(2)))
+        servo.step((0.0, 0.0))
+        references.append(servo.following_error_rad((0.0, 0.0)))
     assert references[:10] == pytest.approx(np.arange(1, 11) * 0.05)
     assert references[10:] == [0.5, 0.5]
 
 
 def test_a_far_set_point_is_approached_at_the_speed_limit():
     servo = make_servo()
-    servo.move_to(np.array([30.0, 0.0]))
+    servo.move_to((30.0, 0.0))
     for _ in range(10):
-        servo.step(np.zeros(2))
-    assert servo.following_error_rad(np.zeros(2)) == pytest.approx(10 * SPEED_RAD_S * PERIOD_S)
+        servo.step((0.0, 0.0))
+    assert servo.following_error_rad((0.0, 0.0)) == pytest.approx(10 * SPEED_RAD_S * PERIOD_S)
 
 
 def test_the_following_error_is_that_of_the_worse_axis():
     servo = make_servo()
-    assert servo.following_error_rad(np.array([0.1, -0.3])) == pytest.approx(0.3)
+    assert servo.following_error_rad((0.1, -0.3)) == pytest.approx(0.3)
 
 
 def test_a_reset_forgets_the_motion():
     servo = make_servo()
     drive(servo, [(5.0, 5.0)])
-    servo.reset(np.array([7.0, 8.0]))
-    assert servo.step(np.array([7.0, 8.0])).tolist() == [0.0, 0.0]
-    assert servo.following_error_rad(np.array([7.0, 8.0])) == 0.0
+    servo.reset((7.0, 8.0))
+    assert servo.step((7.0, 8.0)) == (0.0, 0.0)
+    assert servo.following_error_rad((7.0, 8.0)) == 0.0
 
 
 def test_an_error_below_one_encoder_count_is_left_alone():
     servo = PositionServo(
         GAIN_PER_S, SPEED_RAD_S, ACCELERATION_RAD_S2, PERIOD_S, SETPOINT_PERIOD_S, 0.0016
     )
-    velocity_rad_s = servo.step(np.array([-0.0015, -0.0017]))
+    velocity_rad_s = servo.step((-0.0015, -0.0017))
     assert velocity_rad_s == pytest.approx([0.0, GAIN_PER_S * 0.0017])

@@ -123,12 +123,12 @@ def test_a_motor_turned_over_can_moves_the_star_as_the_gear_says(running, camera
     amplifiers.open()
     amplifiers.enable()
     before = star_px(camera, time.monotonic() + 0.1)
-    velocity = np.array([2.0, 0.0])
+    velocity = (2.0, 0.0)
     end_s = time.monotonic() + 0.4
     reading = None
     while time.monotonic() < end_s:
         reading = amplifiers.exchange(velocity) or reading
-    velocity = np.zeros(2)
+    velocity = (0.0, 0.0)
     for _ in range(50):
         reading = amplifiers.exchange(velocity) or reading
     after = star_px(camera, time.monotonic() + 0.1)

@@ -230,14 +230,14 @@ def test_the_position_servo_has_40_to_50_hz_of_bandwidth_on_the_plant(rig):
         period_s,
     )
     step_rad = 0.02  # small enough for no limit to be met
-    servo.move_to(np.array([step_rad, 0.0]))
-    position_rad, trail = np.zeros(2), []
+    servo.move_to((step_rad, 0.0))
+    position_rad, trail = (0.0, 0.0), []
     for period in range(500):
         velocity_rad_s = servo.step(position_rad)
         plant.advance(period * period_s)
         plant.inputs.velocity_rad_s[0] = velocity_rad_s
         # Read as the command is given: it will be used one period later.
-        position_rad = plant.state.motor_rad[0].copy()
+        position_rad = tuple(plant.state.motor_rad[0].tolist())
         trail.append(position_rad[0] / step_rad)
     assert trail[-1] == pytest.approx(1.0, abs=1e-6)
     impulse_response = np.diff(trail, prepend=0.0)

@@ -18,13 +18,11 @@ from collections import deque
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fitctl.config import Siderostat
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.protocol import NmtCommand, State
 from fitctl.drivers.interface import (
+    AzEl,
     DeviceError,
     DeviceFault,
     DeviceIdentity,
@@ -184,12 +182,12 @@ class Cia402Amplifiers:
         node.drain()
         node.error_code = 0
 
-    def exchange(self, velocity_rad_s: NDArray[np.float64]) -> ServoReading | None:
+    def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period: command both motors, read both encoders.
 
         Parameters
         ----------
-        velocity_rad_s : float array, shape (2,)
+        velocity_rad_s : pair of float
             Motor velocities, azimuth and elevation.
 
         Returns
@@ -222,7 +220,7 @@ class Cia402Amplifiers:
         if self._behind >= _BEHIND_PERIODS:
             self._find_lost()
         late, self._latched = self._latched, None
-        self._send_velocities(velocity_rad_s[0], velocity_rad_s[1])
+        self._send_velocities(*velocity_rad_s)
         sync_s = self._syncs_s[-1]
         deadline_s = sync_s + self._period_s
         while self._latched is None:
@@ -232,10 +230,10 @@ class Cia402Amplifiers:
         latched = self._latched or late
         if latched is None:
             return None
-        time_s, counts = latched
+        time_s, (az_counts, el_counts) = latched
         return ServoReading(
             time_s=time_s,
-            position_rad=np.array(counts) * self._rad_per_count,
+            position_rad=(az_counts * self._rad_per_count, el_counts * self._rad_per_count),
             enabled=all(
                 protocol.state_of(word) is State.OPERATION_ENABLED for word in self._statuswords
             ),

@@ -18,7 +18,7 @@ from fitctl.drivers.interface import (
     DeviceUnreachable,
 )
 
-STILL = np.zeros(2)
+STILL = (0.0, 0.0)
 OVER_CURRENT = 0x2310
 
 
@@ -63,7 +63,7 @@ def exchange_until(amplifiers, condition, timeout_s=3.0):
 def reading_of(amplifiers, velocity_rad_s=STILL):
     """A reading, allowing for periods that a stall of the machine ate."""
     for _ in range(50):
-        reading = amplifiers.exchange(np.asarray(velocity_rad_s))
+        reading = amplifiers.exchange(velocity_rad_s)
         if reading is not None:
             return reading
     return pytest.fail("no reading in 50 periods")
@@ -97,9 +97,8 @@ def test_positions_are_the_motor_angles_in_whole_counts(bench, amplifiers):
     count_rad = 2 * math.pi / bench.siderostat.encoder_counts_per_rev
     settled = reading_of(amplifiers)
     assert settled.position_rad == pytest.approx(bench.motors.position_rad(), abs=0.51 * count_rad)
-    assert settled.position_rad / count_rad == pytest.approx(
-        np.round(settled.position_rad / count_rad), abs=1e-6
-    )
+    counts = np.array(settled.position_rad) / count_rad
+    assert counts == pytest.approx(np.round(counts), abs=1e-6)
     assert second.position_rad[0] > first.position_rad[0]
     assert second.position_rad[1] < first.position_rad[1]
     assert first.time_s < second.time_s < time.monotonic()
@@ -295,7 +294,7 @@ def test_no_adapter_is_unreachable(siderostat, device):
 def test_a_velocity_that_is_no_number_is_not_sent(amplifiers):
     amplifiers.open()
     with pytest.raises(ValueError, match="finite"):
-        amplifiers.exchange(np.array([math.nan, 0.0]))
+        amplifiers.exchange((math.nan, 0.0))
 
 
 def test_closing_twice_is_safe_and_a_closed_driver_says_so(bench, amplifiers):
@@ -413,7 +412,7 @@ def test_positions_go_on_where_the_encoder_counter_wraps(bench, amplifiers):
     before = reading_of(amplifiers)
     bench.motors.turn_to((2**31 + 10) * count_rad)
     after = reading_of(amplifiers)
-    steps = (after.position_rad - before.position_rad) / count_rad
+    steps = np.subtract(after.position_rad, before.position_rad) / count_rad
     assert steps == pytest.approx([20.0, 20.0], abs=0.1)
 
 
