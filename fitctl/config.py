@@ -593,16 +593,36 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
         One line for each thing that is wrong: file, key, what is allowed.
     """
     document = _read_toml(path, "copy rigs/fit-mock.toml or name another with --rig")
+    base = document.pop("base", None)
+    if base is not None:
+        if not isinstance(base, str):
+            msg = f"{path}: base: must be a file name (is {base!r})"
+            raise ConfigError(msg)
+        under = _read_toml(path.parent / base, f"it is the base of {path}")
+        lay_over(under, document)
+        document = under
     fragments = document.pop("include", [])
     if not isinstance(fragments, list) or not all(isinstance(name, str) for name in fragments):
         msg = f"{path}: include: must be a list of file names (is {fragments!r})"
         raise ConfigError(msg)
+    said_in = dict.fromkeys(_problems(document), str(path))
     for name in fragments:
         fragment = path.parent / name
         lay_over(document, _read_toml(fragment, f"it is in the include list of {path}"))
+        # What is wrong from here on, and was not before, is this fragment's.
+        said_in = {what: said_in.get(what, str(fragment)) for what in _problems(document)}
     for override in overrides:
         _override(document, override)
-    return rig_from_document(document, str(path))
+    return rig_from_document(document, str(path), said_in)
+
+
+def _problems(document: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], str]]:
+    """What is wrong with a document: where, and what kind of error."""
+    try:
+        Rig.model_validate(document)
+    except ValidationError as error:
+        return [(problem["loc"], problem["type"]) for problem in error.errors()]
+    return []
 
 
 def _read_toml(path: Path, hint: str) -> dict[str, Any]:
@@ -620,21 +640,36 @@ def _read_toml(path: Path, hint: str) -> dict[str, Any]:
 
 
 def lay_over(document: dict[str, Any], fragment: Mapping[str, Any]) -> None:
-    """Lay a fragment over a document, table by table: what the fragment says holds."""
+    """Lay a fragment over a document, table by table: what the fragment says holds.
+
+    A table that names another driver is another device: nothing of what it lies on is left.
+    """
     for key, value in fragment.items():
         under = document.get(key)
-        if isinstance(value, dict) and isinstance(under, dict):
+        is_table = isinstance(value, dict) and isinstance(under, dict)
+        if is_table and value.get("driver", under.get("driver")) == under.get("driver"):
             lay_over(under, value)
         else:
             document[key] = value
 
 
-def rig_from_document(document: Mapping[str, Any], origin: str) -> Rig:
-    """Validate a rig that is already a dictionary; `origin` is what errors call it."""
+def rig_from_document(
+    document: Mapping[str, Any],
+    origin: str,
+    said_in: Mapping[tuple[tuple[int | str, ...], str], str] | None = None,
+) -> Rig:
+    """Validate a rig that is already a dictionary.
+
+    `origin` is what errors call it, but for those that `said_in` knows, by place and kind, from elsewhere.
+    """
+    known = said_in or {}
     try:
         return Rig.model_validate(document)
     except ValidationError as error:
-        lines = [_explain(origin, problem) for problem in error.errors()]
+        lines = [
+            _explain(known.get((problem["loc"], problem["type"]), origin), problem)
+            for problem in error.errors()
+        ]
         raise ConfigError("\n".join(lines)) from None
 
 

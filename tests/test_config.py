@@ -294,3 +294,39 @@ def test_an_override_that_cannot_be_is_refused(override, said):
     with pytest.raises(ConfigError, match=said) as caught:
         load_rig(default_rig_path(), [override])
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[loops.right.fsm]\nbias_x = 1.0", "loops.right.fsm.bias_x: unknown key"),
+        ("[loops.right.siderostat]\nbacklash_sky_arcsec = -1.0", "(is -1.0)"),
+        ("[loops.right.fsm.hysteresis]\nhalf_widths_v = [0.0, 1.0]", "half_widths_v 2"),
+        ("[loops.right.fsm]\nrange_rad = 1.0", "lower range_rad"),
+        ('include = ["other.toml"]', "include: unknown key"),
+        ("mocks = 3", "mocks: must be"),
+        ("a = [", "not TOML"),
+    ],
+)
+def test_what_a_fragment_has_wrong_is_told_with_its_name(tmp_path, text, said):
+    (tmp_path / "good.toml").write_text("[camera]\nframe_delay_s = 0.03\n")
+    (tmp_path / "bad.toml").write_text(text)
+    rig_file = tmp_path / "rig.toml"
+    include = 'include = ["bad.toml", "good.toml"]\n'
+    rig_file.write_text(include + default_rig_path().read_text(encoding="utf-8"))
+    with pytest.raises(ConfigError) as caught:
+        load_rig(rig_file)
+    for line in str(caught.value).splitlines():
+        assert line.startswith(f"{tmp_path / 'bad.toml'}: ")
+    assert said in str(caught.value)
+
+
+def test_what_a_rig_file_has_wrong_beside_a_fragment_keeps_its_own_name(tmp_path):
+    (tmp_path / "good.toml").write_text("[camera]\nframe_delay_s = 0.03\n")
+    rig_file = tmp_path / "rig.toml"
+    rig_file.write_text(
+        'include = ["good.toml"]\nunknown = 1\n' + default_rig_path().read_text(encoding="utf-8")
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_rig(rig_file)
+    assert str(caught.value).startswith(f"{rig_file}: unknown: unknown key")

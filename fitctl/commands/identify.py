@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,17 +14,19 @@ import tomli_w
 import typer
 
 from fitctl import demo as demos
-from fitctl.commands.instrument import FAILED
+from fitctl.commands.instrument import FAILED, interrupt
 from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, Rig
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import EXPERIMENTS, Finding, response_on_mock_bench
 from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
 from fitctl.logging.errors import LogError
+from fitctl.processes import ended_by_signals
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import service_folder
 from fitctl.supervisor.modes import Mode
 
+_PLOT_SUFFIXES = (".png", ".svg")
 _MOCK_VERNIER_S = 60.0
 _MOCK_SETTLE_S = 5.0
 _BENCH_ONLY = (
@@ -61,28 +64,45 @@ def identify(
     if loop_name not in rig.loops:
         msg = f"identify: --loop {loop_name!r}: rig {rig.name} has {', '.join(rig.loops)}"
         raise ConfigError(msg)
+    stem = f"{rig.name}-{loop_name}-{what}"
+    fragment_path = output.fragment or Path(f"{stem}.toml")
+    _insist_on_output(fragment_path)
+    plot_path = output.plot or fragment_path.with_suffix(".png")
+    if plot_path.suffix not in _PLOT_SUFFIXES:
+        msg = f"identify: {plot_path}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
+        raise ConfigError(msg)
+    _insist_on_output(plot_path)
     try:
-        with _shown(what) as progress:
+        with ended_by_signals(interrupt), _shown(what) as progress:
             finding = _found(rig, rig_path, overrides, what, loop_name, source, progress)
+        # The plot first: it shows why, where there is nothing to write for the rig.
+        _write(plot_path, lambda: finding.plot(plot_path))
         text = _fragment_text(rig, what, finding)
     except LogError as error:
         raise ConfigError(str(error)) from None
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
         typer.echo(f"identify {what}: {error}", err=True)
         return FAILED
-    stem = f"{rig.name}-{loop_name}-{what}"
-    fragment_path = output.fragment or Path(f"{stem}.toml")
-    plot_path = output.plot or fragment_path.with_suffix(".png")
-    try:
-        fragment_path.write_text(text, encoding="utf-8")
-        finding.plot(plot_path)
-    except (OSError, ValueError) as error:
-        msg = f"identify: nothing can be written as {fragment_path} and {plot_path}: {error}"
-        raise ConfigError(msg) from None
+    _write(fragment_path, lambda: fragment_path.write_text(text, encoding="utf-8"))
     for line in finding.lines():
         typer.echo(line)
     typer.echo(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
     return 0
+
+
+def _insist_on_output(path: Path) -> None:
+    """Refuse, before minutes of an experiment, what could not be written after them."""
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        msg = f"identify: {path}: nothing can be written there; name another with --out or --plot"
+        raise ConfigError(msg)
+
+
+def _write(path: Path, write: Callable[[], object]) -> None:
+    try:
+        write()
+    except OSError as error:
+        msg = f"identify: {path}: cannot be written: {error}"
+        raise ConfigError(msg) from None
 
 
 def _found(

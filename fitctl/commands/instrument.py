@@ -79,7 +79,7 @@ def run_demo(
 ) -> int:
     """Run the demo; returns the exit status."""
     rig.mock_parts()
-    with ended_by_signals(_interrupt):
+    with ended_by_signals(interrupt):
         try:
             with demos.instrument(rig_path, overrides, seed) as running:
                 if console:
@@ -90,7 +90,8 @@ def run_demo(
             return FAILED
 
 
-def _interrupt() -> None:
+def interrupt() -> None:
+    """End as Ctrl-C does, letting go of everything."""
     raise KeyboardInterrupt
 
 

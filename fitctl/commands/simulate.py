@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import typer
 
 from fitctl import demo as demos
-from fitctl.commands.instrument import FAILED, check_plant
+from fitctl.commands.instrument import FAILED, check_plant, interrupt
 from fitctl.commands.progress import progress_line
 from fitctl.config import Rig
+from fitctl.processes import ended_by_signals
 from fitctl.supervisor.campaign import (
     PERCENTILES,
     CampaignError,
@@ -66,6 +67,7 @@ def run_many(
     started = time.perf_counter()
     try:
         with (
+            ended_by_signals(interrupt),  # its workers would outlive it
             dask_executor(scheduler) if scheduler else local_executor() as (executor, workers),
             progress_line() as progress,
         ):

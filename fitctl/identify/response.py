@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,7 +215,7 @@ def read_bench(path: Path, fsm: Fsm) -> BenchRecord:
     """
     try:
         columns = _read_columns(path)
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except (OSError, EOFError, BadZipFile, ValueError, KeyError, IndexError) as error:
         msg = (
             f"{path}: not a bench record ({error}); expected NPZ or CSV with {', '.join(_COLUMNS)}"
         )

@@ -11,7 +11,7 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.logging.records import AnyRecord
 from fitctl.model.drives import Drive, experiment_s
 from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import AnyCommand, Experiment, Status, Telemetry
+from fitctl.supervisor.messages import AnyCommand, Experiment, Hold, Status, Telemetry
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.simulate import Simulation
 
@@ -70,8 +70,25 @@ def on_rig(
         If no supervisor answers.
     """
     _command(client, Experiment(loop=loop_name, name=name, drives=drives))
-    start_s, duration_s = time.monotonic(), experiment_s(drives)
-    heard_s = start_s
+    try:
+        telemetry = _followed(client, loop_name, experiment_s(drives), on_progress)
+    except KeyboardInterrupt:
+        client.send(Hold(loop=loop_name))  # nobody waits for it any more
+        raise
+    change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
+    _insist_on_end(_mode(telemetry, loop_name), change.reason if change else "")
+    if telemetry.recorder is None:
+        msg = "the supervisor has no recorder, so there is no log to learn from; see its events"
+        raise IdentifyError(msg)
+    time.sleep(rig.logging.flush_s + _FLUSH_SLACK_S)  # until the log's newest second is on disk
+    return Path(telemetry.recorder.path)
+
+
+def _followed(
+    client: Client, loop_name: str, duration_s: float, on_progress: Progress
+) -> Telemetry:
+    """Wait until the loop is out of its experiment; the message that says so."""
+    start_s = heard_s = time.monotonic()
     while True:
         telemetry = client.receive(0.5)
         now_s = time.monotonic()
@@ -84,14 +101,7 @@ def on_rig(
         on_progress(min(1.0, (now_s - start_s) / duration_s))
         # A message from before the experiment may still be under way.
         if now_s - start_s > 1.0 and _mode(telemetry, loop_name) != Mode.EXPERIMENT.name:
-            break
-    change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
-    _insist_on_end(_mode(telemetry, loop_name), change.reason if change else "")
-    if telemetry.recorder is None:
-        msg = "the supervisor has no recorder, so there is no log to learn from; see its events"
-        raise IdentifyError(msg)
-    time.sleep(rig.logging.flush_s + _FLUSH_SLACK_S)  # until the log's newest second is on disk
-    return Path(telemetry.recorder.path)
+            return telemetry
 
 
 def insist_on_vernier(client: Client, loop_name: str) -> None:

@@ -147,6 +147,11 @@ def local_executor() -> Iterator[tuple[Executor, int]]:
     executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_ctrl_c)
     try:
         yield executor, workers
+    except BaseException:
+        # Nobody waits any more for what they do, which without numba may take minutes.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
@@ -169,10 +174,12 @@ def dask_executor(address: str, workers: int = 1) -> Iterator[tuple[Executor, in
     """
     try:
         from distributed import Client
+        from distributed.comm.addressing import get_address_host_port
     except ImportError:
         msg = "--scheduler needs Dask: pip install 'fitctl[cluster]'"
         raise CampaignError(msg) from None
     try:
+        get_address_host_port(address)  # or the client would try to close what it never opened
         client = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         msg = f"scheduler {address}: {error}; start one with: dask scheduler"

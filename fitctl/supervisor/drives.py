@@ -10,24 +10,21 @@ from numpy.typing import NDArray
 from fitctl.config import Rig
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, Drive, experiment_s
 from fitctl.model.optics import scales
-from fitctl.supervisor.injector import stack_v_per_px
+from fitctl.supervisor.injector import PERIOD_S, stack_v_per_px
 
 MOST_S = 600.0
+MOST_HZ = 0.5 / PERIOD_S  # quicker, the voltages written would show another motion
 _SLACK = 1 + 1e-9
 
 
 def refused_drives(rig: Rig, loop_name: str, drives: list[Drive]) -> str:
-    """Why the motions cannot be made, or nothing: too long, or beyond a stage's range.
+    """Why the motions cannot be made, or nothing: too long, too quick, or beyond a stage's range.
 
     Motions at the same time are taken at their largest together.
     """
-    if not all(math.isfinite(value) for drive in drives for value in _numbers(drive)):
-        return "every number of a motion must be finite"
-    if any(drive.start_s < 0 or drive.duration_s <= 0 for drive in drives):
-        return "a motion must begin with the experiment or later, and last"
-    duration_s = experiment_s(drives)
-    if not 0 < duration_s <= MOST_S:
-        return f"it would take {duration_s:g} s; up to {MOST_S:g} s are allowed"
+    why_not = _refused_numbers(drives)
+    if why_not:
+        return why_not
     loop = rig.loops[loop_name]
     scale = scales(rig, loop)
     fsm = loop.fsm
@@ -44,15 +41,32 @@ def refused_drives(rig: Rig, loop_name: str, drives: list[Drive]) -> str:
     return ""
 
 
+def _refused_numbers(drives: list[Drive]) -> str:
+    """Why no rig could make the motions, or nothing."""
+    if not all(math.isfinite(value) for drive in drives for value in _numbers(drive)):
+        return "every number of a motion must be finite"
+    if any(drive.start_s < 0 or drive.duration_s <= 0 for drive in drives):
+        return "a motion must begin with the experiment or later, and last"
+    duration_s = experiment_s(drives)
+    if not 0 < duration_s <= MOST_S:
+        return f"it would take {duration_s:g} s; up to {MOST_S:g} s are allowed"
+    if not all(0 <= hz <= MOST_HZ for drive in drives for hz in _frequencies_hz(drive)):
+        return f"frequencies must lie in 0 to {MOST_HZ:.1f} Hz"
+    return ""
+
+
 def _numbers(drive: Drive) -> list[float]:
     return [
         drive.amplitude,
         drive.end_amplitude or 0.0,
-        drive.frequency_hz,
-        drive.end_frequency_hz or 0.0,
+        *_frequencies_hz(drive),
         drive.start_s,
         drive.duration_s,
     ]
+
+
+def _frequencies_hz(drive: Drive) -> tuple[float, float]:
+    return drive.frequency_hz, drive.end_frequency_hz or 0.0
 
 
 def _overlap(one: Drive, other: Drive) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import Clock
-from fitctl.drivers.interface import DeviceError, MirrorDac
+from fitctl.drivers.interface import MirrorDac
 from fitctl.model.drives import FSM, STACKS, Drive, channel_values
 from fitctl.model.optics import stack_matrix
 
@@ -52,7 +52,7 @@ class Injector:
     ) -> None:
         self.period_s = PERIOD_S
         self.threaded = False
-        self.fault: DeviceError | None = None
+        self.fault: Exception | None = None
         self.late_s: deque[float] = deque(maxlen=64)
         self._dac = dac
         self._clock = clock
@@ -96,11 +96,11 @@ class Injector:
         with self._turn:
             if not self._running.is_set():
                 return
-            wanted = self.volts(self._drives, self._clock.now_s() - self._start_s)
-            volts = np.clip(wanted, 0.0, self._full_scale_v)
             try:
+                wanted = self.volts(self._drives, self._clock.now_s() - self._start_s)
+                volts = np.clip(wanted, 0.0, self._full_scale_v)
                 self._dac.write_v(volts)
-            except DeviceError as error:
+            except Exception as error:  # else the thread would end, and nothing ever move again
                 self.fault = error
                 self._running.clear()
                 return

@@ -188,3 +188,11 @@ def test_a_mirror_without_resonance_is_refused(records):
     detector_v += 1e-4 * np.random.default_rng(0).standard_normal(detector_v.shape)
     with pytest.raises(IdentifyError, match="no resonance"):
         response.analyse([dataclasses.replace(records[AZ], detector_v=detector_v)], "right")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04torn", b"no bench"])
+def test_a_file_that_is_no_bench_record_is_refused(rig, tmp_path, content):
+    path = tmp_path / "bench.npz"
+    path.write_bytes(content)
+    with pytest.raises(IdentifyError, match="not a bench record"):
+        response.read_bench(path, rig.loops["right"].fsm)

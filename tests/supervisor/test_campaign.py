@@ -201,3 +201,23 @@ def test_no_scheduler_is_said_with_the_next_step(monkeypatch):
     monkeypatch.setattr(campaign, "_CONNECT_TIMEOUT_S", 0.5)
     with pytest.raises(CampaignError, match="dask scheduler"), dask_executor("tcp://127.0.0.1:1"):
         pass
+
+
+def test_an_interrupted_campaign_does_not_wait_for_its_runs():
+    def interrupted():
+        with local_executor() as (executor, _):
+            executor.submit(time.sleep, 60.0)
+            time.sleep(2.0)
+            raise KeyboardInterrupt
+
+    begun_s = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - begun_s < 30
+
+
+def test_an_address_that_is_none_is_one_line_at_once():
+    begun_s = time.monotonic()
+    with pytest.raises(CampaignError, match="nonsense"), dask_executor("nonsense"):
+        pass
+    assert time.monotonic() - begun_s < 10

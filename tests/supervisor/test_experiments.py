@@ -143,6 +143,14 @@ def test_a_d_a_that_fails_in_an_experiment_leads_to_safe(held):
     assert any(isinstance(r, Event) and "D/A" in r.message for r in records)
 
 
+def test_an_error_of_our_own_in_an_experiment_leads_to_safe_too(held, monkeypatch):
+    simulation, loop, _ = held()
+    begin(simulation, SWEEP)
+    monkeypatch.setattr(loop.stages.injector, "volts", lambda *_: 1 / 0)
+    simulation.run(0.1)
+    assert loop.mode is Mode.SAFE
+
+
 # ---------------------------------------------------------------- what is refused
 
 
@@ -164,6 +172,9 @@ def test_an_experiment_needs_a_star_in_hand(simulate_with):
         ({"channel": "stack1", "amplitude": 5.1}, "V about its bias"),
         ({"channel": "siderostat_az", "amplitude": 1e4}, "travel"),
         ({"duration_s": 1e4}, "up to 600 s"),
+        ({"frequency_hz": 1e308}, "Hz"),
+        ({"frequency_hz": -1.0}, "Hz"),
+        ({"end_frequency_hz": 100.0}, "Hz"),
         ({"duration_s": -1.0}, "and last"),
         ({"start_s": -1.0}, "begin with the experiment"),
     ],
