@@ -108,7 +108,12 @@ def _told_together(name: str, summary: LoopSummary) -> str:
         ("star found, s", summary.acquired_s, 1, 1.0),
         ("vernier, s", summary.vernier_s, 1, 1.0),
     ]
-    worst = ", ".join(f"{run.seed} ({run.rms_px:.4f} px)" for run in summary.worst_seeds)
+    worst = ", ".join(
+        f"{run.seed} (not judged)"
+        if math.isnan(run.rms_px)
+        else f"{run.seed} ({run.rms_px:.4f} px)"
+        for run in summary.worst_seeds
+    )
     return "\n".join(
         [
             f"loop {name}: {summary.held} of {summary.runs} runs held their star, "
