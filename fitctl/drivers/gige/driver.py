@@ -14,7 +14,13 @@ from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
 from fitctl.drivers.gige.heartbeat import Heartbeat
 from fitctl.drivers.gige.protocol import Register
 from fitctl.drivers.gige.stream import CompleteFrame, FrameAssembler
-from fitctl.drivers.gige.ticks import CameraTime
+from fitctl.drivers.gige.ticks import CameraTime, mid_exposure_s
+from fitctl.drivers.gige.transport import (
+    check_path,
+    open_stream,
+    set_packet_delay,
+    set_packet_size,
+)
 from fitctl.drivers.interface import (
     CameraCounts,
     DeviceError,
@@ -25,7 +31,6 @@ from fitctl.drivers.interface import (
     Frame,
 )
 
-RECEIVE_BUFFER_BYTES = 4 << 20  # the kernel grants what net.core.rmem_max allows
 _PACKET_BYTES_MAX = 65536
 _DRAIN_S = 0.05  # how far past its time limit a call goes on while packets keep coming
 
@@ -78,8 +83,10 @@ class GigeCamera:
             self._features = Features(channel)
             self._features.stop()  # whatever the last program has left running
             self._exposure_s = self._features.configure(self._camera)
-            _set_packet_size(channel, device.packet_size_bytes)
+            set_packet_size(channel, device.packet_size_bytes)
+            check_path(channel, device.packet_size_bytes)
             self._time = CameraTime(channel)
+            set_packet_delay(channel, device.packet_delay_s, self._time.ticks_per_s)
             self._heartbeat = Heartbeat(channel, self._time, device.heartbeat_s)
         except BaseException:
             self.close()
@@ -90,9 +97,7 @@ class GigeCamera:
         """Start the stream; frame numbers and counts begin anew."""
         self.stop()
         channel, features, heartbeat = self._opened()
-        stream = _open_stream(
-            channel
-        )  # on a port of its own: no packet of an earlier stream gets in
+        stream = open_stream(channel)  # on a port of its own: no packet of an earlier one gets in
         self._stream = stream
         self._poll = select.poll()
         self._poll.register(stream, select.POLLIN)
@@ -100,6 +105,7 @@ class GigeCamera:
         self._assembler = FrameAssembler(
             self._camera.width_px,
             self._camera.height_px,
+            protocol.PIXEL_FORMATS[self._camera.device.pixel_format],
             self._camera.device.packet_size_bytes,
             channel.endpoint,
             channel.request_resend,
@@ -131,10 +137,14 @@ class GigeCamera:
                     return self._dated(complete)
                 if time.monotonic() > deadline_s + _DRAIN_S:
                     return None
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
+            wake_s = deadline_s
+            ask_s = assembler.ask_again()
+            if ask_s is not None:
+                wake_s = min(wake_s, ask_s)
+            now_s = time.monotonic()
+            if now_s >= deadline_s:
                 return None
-            self._poll.poll(left_s * 1000)
+            self._poll.poll(max(0.0, wake_s - now_s) * 1000)
 
     def counts(self) -> CameraCounts:
         """Frames and losses so far; may be called from any thread."""
@@ -165,20 +175,18 @@ class GigeCamera:
         self._features = None  # before its channel
         channel, self._channel = self._channel, None
         if channel is not None:
-            if heartbeat is None or heartbeat.error is None:
-                with contextlib.suppress(DeviceError):
+            with contextlib.suppress(DeviceError):
+                if heartbeat is None or heartbeat.error is None:
                     channel.write_register(Register.CONTROL_PRIVILEGE, 0)
+                else:
+                    channel.release_unheard()
             channel.close()
 
     def _dated(self, complete: CompleteFrame) -> Frame:
-        """A frame with its times; from a camera without a clock, as old as the rig file says."""
         received_s = time.monotonic()
-        if self._time is not None and self._time.runs:
-            start_s = self._time.host_s(complete.leader.timestamp_ticks)
-            mid_exposure_s = start_s + 0.5 * self._exposure_s
-        else:
-            mid_exposure_s = received_s - self._camera.frame_delay_s
-        return Frame(complete.number, mid_exposure_s, received_s, complete.image)
+        ticks = complete.leader.timestamp_ticks
+        middle_s = mid_exposure_s(self._time, self._camera, self._exposure_s, ticks, received_s)
+        return Frame(complete.number, middle_s, received_s, complete.image)
 
     def _opened(self) -> tuple[ControlChannel, Features, Heartbeat]:
         if self._channel is None or self._features is None or self._heartbeat is None:
@@ -186,23 +194,6 @@ class GigeCamera:
             endpoint = f"{device.address}:{device.gvcp_port}"
             raise DeviceUnreachable(DEVICE, endpoint, "an open camera", "a closed one", "open() it")
         return self._channel, self._features, self._heartbeat
-
-
-def _open_stream(channel: ControlChannel) -> socket.socket:
-    """A socket that the camera sends its stream to."""
-    stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        stream.setblocking(False)
-        stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        stream.bind((channel.local_address, 0))
-        host, port = stream.getsockname()
-        address = int.from_bytes(socket.inet_aton(host), "big")
-        channel.write_register(Register.STREAM_DESTINATION, address)
-        channel.write_register(Register.STREAM_PORT, port)
-    except BaseException:
-        stream.close()
-        raise
-    return stream
 
 
 def _receive(stream: socket.socket, packet: bytearray) -> int:
@@ -225,21 +216,3 @@ def _take_control(channel: ControlChannel, heartbeat_s: float) -> None:
             "another program has it: end that, or wait for its heartbeat to lapse",
         ) from error
     channel.write_register(Register.HEARTBEAT_TIMEOUT_MS, round(heartbeat_s * 1000))
-
-
-def _set_packet_size(channel: ControlChannel, size_bytes: int) -> None:
-    flagged = size_bytes | protocol.PACKET_SIZE_DO_NOT_FRAGMENT
-    try:
-        channel.write_register(Register.STREAM_PACKET_SIZE, flagged)
-        value = channel.read_register(Register.STREAM_PACKET_SIZE)
-        got = f"{value & protocol.PACKET_SIZE_MASK} bytes"
-    except DeviceRefused as error:
-        got = error.got
-    if got != f"{size_bytes} bytes":
-        raise DeviceMismatch(
-            DEVICE,
-            channel.endpoint,
-            f"packets of {size_bytes} bytes",
-            got,
-            "correct camera.device.packet_size_bytes in the rig file; a multiple of 4 is usual",
-        )

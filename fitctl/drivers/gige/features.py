@@ -15,6 +15,7 @@ from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError, Device
 
 RATE_TOLERANCE = 1e-3  # cameras round the frame rate to their own clock
 EXPOSURE_TOLERANCE = 1e-2  # and the exposure to rows or microseconds
+GAIN_TOLERANCE = 1e-2
 
 _XML_BYTES_MAX = 16 << 20  # many times that of any known camera; 4 GiB would be read for hours
 _MEMORY_END = 1 << 32
@@ -22,13 +23,17 @@ _MEMORY_END = 1 << 32
 # Set where a camera has them, before anything else: free running, nothing automatic.
 _FREE_RUNNING = (
     ("AcquisitionMode", "Continuous"),
-    ("TriggerMode", "Off"),
     ("ExposureAuto", "Off"),
     ("GainAuto", "Off"),
+    ("AcquisitionFrameRateAuto", "Off"),
     ("AcquisitionFrameRateEnable", True),
+    ("AcquisitionFrameRateEnabled", True),
+    ("ChunkModeActive", False),
+    ("GevGVSPExtendedIDMode", "Off"),
 )
 _EXPOSURE = ("ExposureTime", "ExposureTimeAbs")  # microseconds; the second name is SFNC 1
 _FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_GAIN = ("Gain", "GainRaw", "GainAbs")
 
 
 class Features:
@@ -95,16 +100,18 @@ class Features:
             If the camera lacks a feature or will not have the value.
         """
         for name, value in _FREE_RUNNING:
-            if self._nodes.has_node(name):
-                self._set_if_writable(name, value)
+            self._set_if_writable(name, value)
+        self._switch_triggers_off()
         self._set_if_writable("OffsetX", 0)
         self._set_if_writable("OffsetY", 0)
         for name, wanted in (("Width", camera.width_px), ("Height", camera.height_px)):
             self._set(name, wanted)
             self._expect(name, wanted, self._get(name), tolerance=0.0)
-        self._set("PixelFormat", "Mono16")
-        payload_bytes = 2 * camera.width_px * camera.height_px
+        self._set("PixelFormat", camera.device.pixel_format)
+        pixel_bytes = protocol.PIXEL_FORMATS[camera.device.pixel_format].bytes
+        payload_bytes = pixel_bytes * camera.width_px * camera.height_px
         self._expect("PayloadSize", payload_bytes, self._get("PayloadSize"), tolerance=0.0)
+        self._set_gain(camera.device.gain)
         return self._set_timing(camera)
 
     def start(self) -> None:
@@ -116,6 +123,25 @@ class Features:
         """Stop the acquisition and unlock the transport parameters."""
         self._execute("AcquisitionStop")
         self._set_if_writable("TLParamsLocked", 0)
+
+    def _switch_triggers_off(self) -> None:
+        """Each of them: `TriggerMode` is that of the one selected."""
+        selectors: tuple[str, ...] = ()
+        if self._nodes.has_node("TriggerSelector"):
+            selectors = self._nodes.get_node("TriggerSelector").symbolics
+        for selector in selectors:
+            self._set_if_writable("TriggerSelector", selector)
+            self._set_if_writable("TriggerMode", "Off")
+        self._set_if_writable("TriggerMode", "Off")
+
+    def _set_gain(self, wanted: float) -> None:
+        """A camera without a gain to set has none."""
+        name = next((name for name in _GAIN if self._nodes.has_node(name)), None)
+        if name is None:
+            self._expect("Gain", wanted, 0.0, tolerance=0.0)
+            return
+        self._set_if_writable(name, round(wanted) if name == "GainRaw" else wanted)
+        self._expect(name, wanted, self._get(name), GAIN_TOLERANCE)
 
     def _set_timing(self, camera: Camera) -> float:
         """Exposure and frame rate limit each other: go first the way that always fits."""
@@ -151,7 +177,7 @@ class Features:
         except (self._errors, DeviceRefused) as error:
             raise self._mismatch(f"{name} = {value}", str(error)) from error
 
-    def _set_if_writable(self, name: str, value: int | str | bool) -> None:
+    def _set_if_writable(self, name: str, value: float | str | bool) -> None:
         """Set a feature that not every camera has, or has fixed."""
         if self._nodes.has_node(name):
             node = self._nodes.get_node(name)
@@ -187,7 +213,7 @@ def _download_xml(channel: ControlChannel) -> str:
         if not 0 < location.length <= min(_XML_BYTES_MAX, _MEMORY_END - location.address):
             continue
         data = channel.read_memory(location.address, location.length)
-        return _unpacked(data, channel.endpoint)
+        return unpacked(data, channel.endpoint)
     raise DeviceMismatch(
         DEVICE,
         channel.endpoint,
@@ -197,13 +223,17 @@ def _download_xml(channel: ControlChannel) -> str:
     )
 
 
-def _unpacked(data: bytes, endpoint: str) -> str:
+def unpacked(data: bytes, endpoint: str) -> str:
     """Most real cameras send a zip archive that holds the one file."""
     try:
         if data.startswith(b"PK"):
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                data = archive.read(archive.namelist()[0])
-        return data.decode("utf-8")
+                first = archive.infolist()[0]
+                if first.file_size > _XML_BYTES_MAX:
+                    msg = f"{first.file_size} bytes once unpacked"
+                    raise ValueError(msg)
+                data = archive.read(first)
+        return data.rstrip(b"\0").decode("utf-8-sig")
     except Exception as error:  # a damaged archive can raise any of a dozen kinds
         raise DeviceProtocolError(
             DEVICE,

@@ -10,7 +10,7 @@ import threading
 import time
 
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.protocol import Command, MalformedPacketError
+from fitctl.drivers.gige.protocol import Command, MalformedPacketError, Register
 from fitctl.drivers.interface import (
     DeviceProtocolError,
     DeviceRefused,
@@ -114,6 +114,11 @@ class ControlChannel:
         """
         payload = protocol.encode_resend(request)
         self._send(protocol.encode_command(Command.PACKETRESEND, self._next_id(), payload, flags=0))
+
+    def release_unheard(self) -> None:
+        """Give up control of a camera that may no longer be heard: no answer is waited for."""
+        payload = protocol.encode_words(Register.CONTROL_PRIVILEGE, 0)
+        self._send(protocol.encode_command(Command.WRITEREG, self._next_id(), payload, flags=0))
 
     def exchange(self, command: Command, payload: bytes) -> bytes:
         """Send a command and return the payload of its answer.

@@ -7,9 +7,9 @@ import threading
 import time
 
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
+from fitctl.drivers.gige.gvcp import DEVICE
 from fitctl.drivers.gige.protocol import Register
-from fitctl.drivers.gige.ticks import CameraTime
+from fitctl.drivers.gige.ticks import CameraTime, Registers
 from fitctl.drivers.interface import DeviceError, DeviceTimeout, DeviceUnreachable
 
 PERIOD_S = 0.05  # at most; short, so that a camera that has gone is noticed at once
@@ -21,7 +21,7 @@ class Heartbeat:
 
     Parameters
     ----------
-    channel : ControlChannel
+    channel : Registers
         With control of the camera.
     camera_time : CameraTime
         Refreshed about once a second.
@@ -36,9 +36,7 @@ class Heartbeat:
         Becomes readable when the link is lost.
     """
 
-    def __init__(
-        self, channel: ControlChannel, camera_time: CameraTime, heartbeat_s: float
-    ) -> None:
+    def __init__(self, channel: Registers, camera_time: CameraTime, heartbeat_s: float) -> None:
         self.error: DeviceUnreachable | None = None
         self.wake_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._channel = channel
@@ -77,7 +75,7 @@ class Heartbeat:
         os.eventfd_write(self.wake_fd, 1)
 
 
-def _check_control(channel: ControlChannel) -> None:
+def _check_control(channel: Registers) -> None:
     """Read the privilege, which refreshes the heartbeat. Raises DeviceUnreachable if it is gone."""
     privilege = channel.read_register(Register.CONTROL_PRIVILEGE)
     if not privilege & (protocol.CONTROL | protocol.CONTROL_EXCLUSIVE):

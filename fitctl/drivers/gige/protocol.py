@@ -20,7 +20,10 @@ class MalformedPacketError(ValueError):
 GVCP_PORT = 3956
 COMMAND_KEY = 0x42
 FLAG_ACKNOWLEDGE = 0x01
-MEMORY_CHUNK_BYTES = 512  # a READMEM or WRITEMEM of this size fits a 576-byte datagram
+FLAG_BROADCAST_ACKNOWLEDGE = 0x10  # of DISCOVERY: the answer may be a broadcast too
+PAYLOAD_BYTES_MAX = 540  # what a 576-byte datagram has room for
+MEMORY_BYTES_MAX = 536  # of one READMEM or WRITEMEM
+MEMORY_CHUNK_BYTES = 512  # what we ask for: some cameras take no more
 DISCOVERY_BYTES = 0xF8
 
 _COMMAND = struct.Struct(">BBHHH")  # key, flags, command, payload length, request id
@@ -28,6 +31,7 @@ _ANSWER = struct.Struct(">HHHH")  # status, command + 1, payload length, request
 _READMEM = struct.Struct(">IHH")  # address, reserved, count
 _RESEND = struct.Struct(">HHII")  # stream channel, block id, first packet, last packet
 _WRITTEN = struct.Struct(">HH")  # reserved, how many
+_FORCEIP = struct.Struct(">2x6s12x4s32x")  # MAC address, IPv4 address; then subnet mask and gateway
 
 
 class Command(IntEnum):
@@ -165,6 +169,15 @@ def encode_written(count: int) -> bytes:
     return _WRITTEN.pack(0, count)
 
 
+def decode_forceip(payload: bytes) -> tuple[bytes, bytes]:
+    """Read the payload of FORCEIP: whom it is for, and its new address. Raises MalformedPacketError."""
+    if len(payload) != _FORCEIP.size:
+        msg = f"FORCEIP with {len(payload)} bytes, not {_FORCEIP.size}"
+        raise MalformedPacketError(msg)
+    mac, address = _FORCEIP.unpack(payload)
+    return mac, address
+
+
 class Resend(NamedTuple):
     """A request to send packets of one frame again, both ends included."""
 
@@ -244,10 +257,8 @@ SERIAL_NUMBER = TextRegister(0x00D8, 16)
 USER_NAME = TextRegister(0x00E8, 16)
 XML_URL_BYTES = 512
 
-CONTROL_EXCLUSIVE = 1
-CONTROL = 2
-TIMESTAMP_RESET = 1
-TIMESTAMP_LATCH = 2
+CONTROL_EXCLUSIVE, CONTROL = 1, 2
+TIMESTAMP_RESET, TIMESTAMP_LATCH = 1, 2
 PACKET_SIZE_FIRE_TEST = 1 << 31
 PACKET_SIZE_DO_NOT_FRAGMENT = 1 << 30
 PACKET_SIZE_MASK = 0xFFFF
@@ -290,17 +301,29 @@ def decode_xml_url(url: str) -> XmlLocation:
 GVSP_HEADER = struct.Struct(">HHI")  # status, block id, format and packet id
 PACKET_OVERHEAD_BYTES = 36  # IP 20, UDP 8, GVSP 8: what SCPS counts besides pixels
 TEST_PACKET_OVERHEAD_BYTES = 28  # a test packet has no GVSP header
-FORMAT_LEADER = 1
-FORMAT_TRAILER = 2
-FORMAT_PAYLOAD = 3
+FORMAT_LEADER, FORMAT_TRAILER, FORMAT_PAYLOAD = 1, 2, 3
 EXTENDED_ID_FLAG = 0x80
 PACKET_ID_MASK = 0xFFFFFF
 BLOCK_IDS = 0xFFFF  # 1 to 65535; 0 is never used
 PAYLOAD_TYPE_IMAGE = 1
-PIXEL_FORMAT_MONO16 = 0x01100007
 
 _LEADER = struct.Struct(">HHQIIIIIHH")
 _TRAILER = struct.Struct(">HHI")
+
+
+class PixelFormat(NamedTuple):
+    """How a pixel is sent: code of the PFNC, bits that carry its value, bytes (little-endian)."""
+
+    code: int
+    bits: int
+    bytes: int
+
+
+PIXEL_FORMATS = {
+    "Mono8": PixelFormat(0x01080001, 8, 1),
+    "Mono12": PixelFormat(0x01100005, 12, 2),
+    "Mono16": PixelFormat(0x01100007, 16, 2),
+}
 
 
 class StreamHeader(NamedTuple):

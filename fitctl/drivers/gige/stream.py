@@ -1,7 +1,8 @@
-"""Stream packets to frames: any order within a frame, one resend request a frame, losses counted."""
+"""Stream packets to frames: any order within a frame, lost packets asked for again, losses counted."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from itertools import groupby
 from typing import NamedTuple
@@ -11,11 +12,19 @@ from numpy.typing import NDArray
 
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.gvcp import DEVICE
-from fitctl.drivers.gige.protocol import GVSP_HEADER, PACKET_ID_MASK, Leader, MalformedPacketError
+from fitctl.drivers.gige.protocol import (
+    GVSP_HEADER,
+    PACKET_ID_MASK,
+    Leader,
+    MalformedPacketError,
+    PixelFormat,
+)
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
 
 _HEADER_BYTES = GVSP_HEADER.size
 _OPEN_FRAMES_MAX = 4  # more than this at once and the oldest is given up
+_ASKS_MAX = 5
+ASK_AGAIN_S = 0.002  # several times what a resend takes on a local network
 _OLD_BLOCKS = protocol.BLOCK_IDS // 2  # a block id further ahead than this is one from the past
 
 
@@ -32,12 +41,14 @@ class FrameAssembler:
 
     A frame is complete with its leader and all pixels; the trailer adds nothing to an image of known
     height. When the trailer or a later frame's packet arrives first, the packets still missing are
-    asked for once. When a later frame is complete first, the frame is given up as lost.
+    asked for, and again every `ASK_AGAIN_S`, five times at most: answers get lost as well. When a later
+    frame is complete first, the frame is given up as lost.
 
     Parameters
     ----------
     width_px, height_px : int
         Size of the image.
+    pixel_format : PixelFormat
     packet_size_bytes : int
         SCPS: one packet with all its headers.
     endpoint : str
@@ -58,6 +69,7 @@ class FrameAssembler:
         self,
         width_px: int,
         height_px: int,
+        pixel_format: PixelFormat,
         packet_size_bytes: int,
         endpoint: str,
         request_resend: Callable[[protocol.Resend], None],
@@ -66,8 +78,10 @@ class FrameAssembler:
         self.lost = 0
         self.packets_lost = 0
         self._shape = (height_px, width_px)
+        self._format = pixel_format
         self._chunk = packet_size_bytes - protocol.PACKET_OVERHEAD_BYTES
-        self._packets = 1 + -(-2 * height_px * width_px // self._chunk)  # leader and pixels
+        image_bytes = pixel_format.bytes * height_px * width_px
+        self._packets = 1 + -(-image_bytes // self._chunk)  # leader and pixels
         self._endpoint = endpoint
         self._request_resend = request_resend
         self._open: dict[int, _Block] = {}
@@ -105,10 +119,27 @@ class FrameAssembler:
             return None
         block = self._open.get(block_id) or self._begin(block_id)
         if kind == protocol.FORMAT_TRAILER:
-            self._ask(block)
+            self._miss(block)
         elif packet_id < self._packets and not block.have[packet_id]:
             self._place(block, kind, packet_id, packet[_HEADER_BYTES:])
         return None if block.missing else self._complete(block)
+
+    def ask_again(self) -> float | None:
+        """Ask once more for what has been missing for too long.
+
+        Returns
+        -------
+        float or None
+            Host's monotonic time at which to call this again; None when nothing is being waited for.
+        """
+        now_s = time.monotonic()
+        for block in self._awaited():
+            if now_s >= block.ask_again_s:
+                self._ask(block)
+        return min((block.ask_again_s for block in self._awaited()), default=None)
+
+    def _awaited(self) -> list[_Block]:
+        return [b for b in self._open.values() if b.missing and 0 < b.asks < _ASKS_MAX]
 
     def _place(self, block: _Block, kind: int, packet_id: int, payload: memoryview) -> None:
         if packet_id == 0:
@@ -131,18 +162,22 @@ class FrameAssembler:
     def _begin(self, block_id: int) -> _Block:
         """A packet of a new frame came: what older frames still miss is late or lost."""
         for block in self._open.values():
-            self._ask(block)
+            self._miss(block)
         if len(self._open) >= _OPEN_FRAMES_MAX:
             del self._open[next(iter(self._open))]
-        block = _Block(block_id, self._shape, self._packets)
+        block = _Block(block_id, self._shape, self._packets, f"<u{self._format.bytes}")
         self._open[block_id] = block
         return block
 
+    def _miss(self, block: _Block) -> None:
+        """What is missing by now was lost, or is late: count it and ask for it."""
+        if block.missing and not block.asks:
+            self.packets_lost += block.missing
+            self._ask(block)
+
     def _ask(self, block: _Block) -> None:
-        if block.asked or not block.missing:
-            return
-        block.asked = True
-        self.packets_lost += block.missing
+        block.asks += 1
+        block.ask_again_s = time.monotonic() + ASK_AGAIN_S
         wanted = [i for i, have in enumerate(block.have) if not have]
         for _, run in groupby(enumerate(wanted), lambda pair: pair[1] - pair[0]):
             ids = [packet_id for _, packet_id in run]
@@ -156,7 +191,7 @@ class FrameAssembler:
                 DEVICE, self._endpoint, "an image", str(error), "switch off chunk data and others"
             ) from error
         height_px, width_px = self._shape
-        wanted = (protocol.PIXEL_FORMAT_MONO16, width_px, height_px)
+        wanted = (self._format.code, width_px, height_px)
         got = (leader.pixel_format, leader.width_px, leader.height_px)
         if got != wanted:
             raise DeviceMismatch(
@@ -175,19 +210,30 @@ class FrameAssembler:
         self._number += step
         self._block = block.block_id
         self._open = {i: other for i, other in self._open.items() if not self._is_past(i)}
-        return CompleteFrame(self._number, block.leader, block.image)
+        image = block.image.astype(np.uint16, copy=False)
+        return CompleteFrame(self._number, block.leader, image)
 
 
 class _Block:
     """A frame that is still being received."""
 
-    __slots__ = ("asked", "block_id", "have", "image", "leader", "missing", "pixels")
+    __slots__ = (
+        "ask_again_s",
+        "asks",
+        "block_id",
+        "have",
+        "image",
+        "leader",
+        "missing",
+        "pixels",
+    )
 
-    def __init__(self, block_id: int, shape: tuple[int, int], packets: int) -> None:
+    def __init__(self, block_id: int, shape: tuple[int, int], packets: int, dtype: str) -> None:
         self.block_id = block_id
         self.leader = Leader(0, 0, 0, 0)
-        self.image = np.empty(shape, np.dtype("<u2"))
+        self.image = np.empty(shape, np.dtype(dtype))
         self.pixels = self.image.data.cast("B")
         self.have = bytearray(packets)
         self.missing = packets
-        self.asked = False
+        self.asks = 0
+        self.ask_again_s = 0.0

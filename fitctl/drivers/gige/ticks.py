@@ -4,16 +4,39 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
+from fitctl.config import Camera
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.gige.protocol import Register
 
 DRIFT = 50e-6  # how much a camera's crystal may be off
 _LATCHES_KEPT = 8
 _FIRST_LATCHES = 5
 _FIRST_PAUSE_S = 0.002  # long enough for the slowest clock to tick
+
+
+class Registers(Protocol):
+    """A camera's registers by address.
+
+    Attributes
+    ----------
+    endpoint : str
+        What errors call the camera's address.
+    answered_s : float
+        Host's monotonic time of its last answer.
+    """
+
+    endpoint: str
+    answered_s: float
+
+    def read_register(self, address: int) -> int:
+        """Read one 32-bit register."""
+        ...
+
+    def write_register(self, address: int, value: int) -> None:
+        """Write one 32-bit register."""
+        ...
 
 
 class Latch(NamedTuple):
@@ -38,22 +61,24 @@ class CameraTime:
 
     Parameters
     ----------
-    channel : ControlChannel
+    channel : Registers
         With control of the camera.
 
     Attributes
     ----------
+    ticks_per_s : int
+        The clock's frequency; 0 if it has none.
     runs : bool
         Whether the camera has a clock that can be read; :meth:`host_s` means nothing otherwise.
     """
 
-    def __init__(self, channel: ControlChannel) -> None:
+    def __init__(self, channel: Registers) -> None:
         self._channel = channel
         high = channel.read_register(Register.TICK_FREQUENCY_HIGH)
-        self._ticks_per_s = high << 32 | channel.read_register(Register.TICK_FREQUENCY_LOW)
+        self.ticks_per_s = high << 32 | channel.read_register(Register.TICK_FREQUENCY_LOW)
         self._latches: deque[Latch] = deque(maxlen=_LATCHES_KEPT)
         self._best = Latch(0, 0.0, 0.0)
-        self.runs = self._ticks_per_s > 0
+        self.runs = self.ticks_per_s > 0
         if self.runs:
             for _ in range(_FIRST_LATCHES):
                 self.latch()
@@ -73,4 +98,25 @@ class CameraTime:
     def host_s(self, ticks: int) -> float:
         """The host's monotonic time of a camera timestamp; may be called from any thread."""
         best = self._best
-        return best.host_s + (ticks - best.ticks) / self._ticks_per_s
+        return best.host_s + (ticks - best.ticks) / self.ticks_per_s
+
+
+def mid_exposure_s(
+    camera_time: CameraTime | None, camera: Camera, exposure_s: float, ticks: int, received_s: float
+) -> float:
+    """Host's monotonic time of the middle of an exposure.
+
+    Parameters
+    ----------
+    camera_time : CameraTime or None
+    camera : Camera
+        Of a camera without a clock, frames are as old as the rig file says.
+    exposure_s : float
+    ticks : int
+        The camera's clock at the start of the exposure.
+    received_s : float
+        Host's monotonic time at which the frame was complete.
+    """
+    if camera_time is None or not camera_time.runs:
+        return received_s - camera.frame_delay_s
+    return camera_time.host_s(ticks) + 0.5 * exposure_s

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import zipfile
 from enum import IntEnum
 from pathlib import Path
 
+from fitctl.config import GigeMock
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.protocol import Register, Status, TextRegister
+from fitctl.drivers.gige.protocol import PIXEL_FORMATS, Register, Status, TextRegister
 
 XML_ADDRESS = 0x0010_0000
 _SPACE_BYTES = 0xB000
@@ -22,6 +25,7 @@ class Feature(IntEnum):
     OFFSET_Y = 0xA00C
     PIXEL_FORMAT = 0xA010
     PAYLOAD_SIZE = 0xA014
+    ACQUISITION_MODE = 0xA018
     ACQUISITION_START = 0xA01C
     ACQUISITION_STOP = 0xA020
     TL_PARAMS_LOCKED = 0xA024
@@ -30,9 +34,50 @@ class Feature(IntEnum):
     EXPOSURE_TIME_US = 0xA030  # float64
     FRAME_RATE_HZ = 0xA038  # float64
     TEMPERATURE_C = 0xA040  # float64
+    GAIN_DB = 0xA048  # float64
+    TRIGGER_MODE = 0xA050
+    TRIGGER_SOFTWARE = 0xA054
 
 
-DOUBLES = frozenset({Feature.EXPOSURE_TIME_US, Feature.FRAME_RATE_HZ, Feature.TEMPERATURE_C})
+TICKS_PER_S = 125_000_000
+HEARTBEAT_DEFAULT_MS = 3000
+MAC = bytes.fromhex("020000000001")  # locally administered
+OWN_ADDRESS = bytes((127, 0, 0, 1))
+SINGLE_FRAME = 1  # of ACQUISITION_MODE; 0 is continuous
+
+_WORDS_AT_START = {
+    Register.VERSION: 0x0001_0002,
+    Register.DEVICE_MODE: 0x8000_0001,  # big-endian, UTF-8
+    Register.MAC_HIGH: int.from_bytes(MAC[:2], "big"),
+    Register.MAC_LOW: int.from_bytes(MAC[2:], "big"),
+    Register.IP_CONFIGURATION_OPTIONS: 0x0000_0006,
+    Register.IP_CONFIGURATION: 0x0000_0006,
+    Register.IP_ADDRESS: int.from_bytes(OWN_ADDRESS, "big"),
+    Register.SUBNET_MASK: 0xFF00_0000,
+    Register.NETWORK_INTERFACES: 1,
+    Register.STREAM_CHANNELS: 1,
+    Register.GVCP_CAPABILITY: protocol.CAPABILITY_CONCATENATION
+    | protocol.CAPABILITY_WRITEMEM
+    | protocol.CAPABILITY_SERIAL_NUMBER
+    | protocol.CAPABILITY_USER_NAME,
+    Register.HEARTBEAT_TIMEOUT_MS: HEARTBEAT_DEFAULT_MS,
+    Register.STREAM_PACKET_SIZE: 576,
+    Feature.PIXEL_FORMAT: PIXEL_FORMATS["Mono16"].code,
+}
+_DOUBLES_AT_START = {
+    Feature.EXPOSURE_TIME_US: 5000.0,
+    Feature.FRAME_RATE_HZ: 25.0,
+    Feature.TEMPERATURE_C: 31.5,
+    Feature.GAIN_DB: 0.0,
+}
+DOUBLES = frozenset(_DOUBLES_AT_START)
+_TEXTS_AT_START = {
+    protocol.MAKER: "FIT",
+    protocol.MODEL: "MockCamera",
+    protocol.DEVICE_VERSION: "1.1",
+    protocol.MAKER_INFORMATION: "mock of a GigE Vision camera",
+    protocol.SERIAL_NUMBER: "FIT01",
+}
 _TEXTS = (
     protocol.MAKER,
     protocol.MODEL,
@@ -60,24 +105,35 @@ _WRITABLE_WORDS = frozenset(
         Feature.ACQUISITION_START,
         Feature.ACQUISITION_STOP,
         Feature.TL_PARAMS_LOCKED,
+        Feature.ACQUISITION_MODE,
+        Feature.TRIGGER_MODE,
+        Feature.TRIGGER_SOFTWARE,
     }
 )
 
 
 class RegisterError(Exception):
-    """A register access that the camera answers with an error status."""
+    """A command that the camera answers with an error status; `payload` says how far it got."""
 
-    def __init__(self, status: Status) -> None:
+    def __init__(self, status: Status, payload: bytes = b"") -> None:
         super().__init__(status.name)
         self.status = status
+        self.payload = payload
 
 
 class Memory:
-    """Bytes by address. A word that no register covers does not exist."""
+    """Bytes by address. A word that no register covers does not exist.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    settings : GigeMock
+        How the description is kept, and what the camera can do.
+    """
+
+    def __init__(self, settings: GigeMock) -> None:
         self._bytes = bytearray(_SPACE_BYTES)
-        self._xml = Path(__file__).with_name("fit_camera.xml").read_bytes()
+        name, self._xml = _description(settings.description)
+        location = protocol.XmlLocation(name, XML_ADDRESS, len(self._xml))
         self._xml += b"\0" * (-len(self._xml) % 4)
         self._exists: set[int] = {int(address) for address in (*Register, *Feature)}
         self._exists |= {address + 4 for address in DOUBLES}
@@ -87,14 +143,21 @@ class Memory:
         self._writable: set[int] = {int(address) for address in _WRITABLE_WORDS}
         self._writable |= set(range(user_name.address, user_name.address + user_name.length, 4))
         self._writable |= {
-            address + half
-            for address in (Feature.EXPOSURE_TIME_US, Feature.FRAME_RATE_HZ)
-            for half in (0, 4)
+            address + half for address in DOUBLES - {Feature.TEMPERATURE_C} for half in (0, 4)
         }
-        url = protocol.encode_xml_url(
-            protocol.XmlLocation("fit_camera.xml", XML_ADDRESS, len(self._xml))
-        )
+        for word, value in _WORDS_AT_START.items():
+            self.set_word(word, value)
+        for double, number in _DOUBLES_AT_START.items():
+            self.set_double(double, number)
+        for register, text in _TEXTS_AT_START.items():
+            self.set_text(register, text)
+        url = protocol.encode_xml_url(location)
         self.set_text(TextRegister(Register.XML_URL_1, protocol.XML_URL_BYTES), url)
+        if settings.clock:
+            self.set_word(Register.TICK_FREQUENCY_LOW, TICKS_PER_S)
+        if settings.resends:
+            can = self.word(Register.GVCP_CAPABILITY) | protocol.CAPABILITY_PACKETRESEND
+            self.set_word(Register.GVCP_CAPABILITY, can)
 
     def read(self, address: int, length: int) -> bytes:
         """Read as a client does. Raises RegisterError."""
@@ -140,3 +203,14 @@ class Memory:
     def _check_alignment(self, address: int, length: int) -> None:
         if address % 4 or length % 4:
             raise RegisterError(Status.BAD_ALIGNMENT)
+
+
+def _description(kept: str) -> tuple[str, bytes]:
+    """The GenICam description as the camera keeps it: a file's name, and what is in it."""
+    xml = Path(__file__).with_name("fit_camera.xml").read_bytes()
+    if kept == "xml":
+        return "fit_camera.xml", xml
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as writer:
+        writer.writestr(zipfile.ZipInfo("fit_camera.xml"), xml, zipfile.ZIP_DEFLATED)
+    return "fit_camera.zip", archive.getvalue()

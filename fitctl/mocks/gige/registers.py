@@ -7,61 +7,39 @@ import struct
 import time
 from collections.abc import Callable
 
-from fitctl.config import Camera
+from fitctl.config import Camera, GigeMock
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Register, Status
-from fitctl.mocks.gige.acquisition import Acquisition, StreamSettings
-from fitctl.mocks.gige.memory import DOUBLES, Feature, Memory, RegisterError
+from fitctl.mocks.gige.acquisition import Acquisition, AcquisitionSettings
+from fitctl.mocks.gige.memory import (
+    DOUBLES,
+    SINGLE_FRAME,
+    TICKS_PER_S,
+    Feature,
+    Memory,
+    RegisterError,
+)
+from fitctl.mocks.gige.stream import Stream, StreamSettings
 
-TICKS_PER_S = 125_000_000
 CLOCK_ERROR = 20e-6
 UPTIME_AT_START_S = 1000.0
-TEMPERATURE_C = 31.5
-HEARTBEAT_DEFAULT_MS = 3000
 HEARTBEAT_MIN_MS = 500
 PACKET_SIZES_BYTES = range(576, 9001, 4)
 FRAME_RATES_HZ = (1.0, 2000.0)
+GAINS_DB = (0.0, 24.0)
 EXPOSURE_MIN_US = 1.0
 SIZE_MIN_PX = 8
 _ROUNDING = 1 + 1e-9  # a period of 1 / rate and back is not exact
 
-_WORDS_AT_START = {
-    Register.VERSION: 0x0001_0002,
-    Register.DEVICE_MODE: 0x8000_0001,  # big-endian, UTF-8
-    Register.MAC_HIGH: 0x0000_0200,  # locally administered
-    Register.MAC_LOW: 0x0000_0001,
-    Register.IP_CONFIGURATION_OPTIONS: 0x0000_0006,
-    Register.IP_CONFIGURATION: 0x0000_0006,
-    Register.IP_ADDRESS: 0x7F00_0001,
-    Register.SUBNET_MASK: 0xFF00_0000,
-    Register.NETWORK_INTERFACES: 1,
-    Register.STREAM_CHANNELS: 1,
-    Register.GVCP_CAPABILITY: protocol.CAPABILITY_CONCATENATION
-    | protocol.CAPABILITY_WRITEMEM
-    | protocol.CAPABILITY_PACKETRESEND
-    | protocol.CAPABILITY_SERIAL_NUMBER
-    | protocol.CAPABILITY_USER_NAME,
-    Register.HEARTBEAT_TIMEOUT_MS: HEARTBEAT_DEFAULT_MS,
-    Register.TICK_FREQUENCY_LOW: TICKS_PER_S,
-    Register.STREAM_PACKET_SIZE: 576,
-    Feature.PIXEL_FORMAT: protocol.PIXEL_FORMAT_MONO16,
-}
-_DOUBLES_AT_START = {
-    Feature.EXPOSURE_TIME_US: 5000.0,
-    Feature.FRAME_RATE_HZ: 25.0,
-    Feature.TEMPERATURE_C: TEMPERATURE_C,
-}
-_TEXTS = {
-    protocol.MAKER: "FIT",
-    protocol.MODEL: "MockCamera",
-    protocol.DEVICE_VERSION: "1.0",
-    protocol.MAKER_INFORMATION: "mock of a GigE Vision camera",
-    protocol.SERIAL_NUMBER: "FIT01",
-}
+_FORMAT_OF_CODE = {one.code: one for one in protocol.PIXEL_FORMATS.values()}
 _LOCKED_WHILE_RUNNING = frozenset(
     {
         Register.STREAM_PACKET_SIZE,
+        Register.STREAM_PACKET_DELAY,
         Register.STREAM_DESTINATION,
+        Feature.ACQUISITION_MODE,
+        Feature.TRIGGER_MODE,
+        Feature.GAIN_DB,
         Feature.WIDTH,
         Feature.HEIGHT,
         Feature.OFFSET_X,
@@ -74,14 +52,15 @@ _LOCKED_WHILE_RUNNING = frozenset(
 
 
 class CameraClock:
-    """The camera's own clock: a little fast, and with an origin of its own."""
+    """The camera's own clock: a little fast, and with an origin of its own; or none, which shows 0."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, runs: bool) -> None:
+        self._rate_hz = (1 + CLOCK_ERROR) * TICKS_PER_S if runs else 0.0
         self._reset_s = time.monotonic() - UPTIME_AT_START_S
 
     def ticks(self, host_s: float) -> int:
         """What the clock shows at a host monotonic time."""
-        return round((host_s - self._reset_s) * (1 + CLOCK_ERROR) * TICKS_PER_S)
+        return max(0, round((host_s - self._reset_s) * self._rate_hz))
 
     def reset(self, host_s: float) -> None:
         """Start again from 0."""
@@ -98,13 +77,23 @@ class Registers:
     clock : CameraClock
         The clock behind the timestamp registers.
     acquisition : Acquisition
-        Started, stopped and set through registers.
+        Started, stopped, triggered and set through registers.
+    stream : Stream
+        Asked for test packets.
     """
 
-    def __init__(self, camera: Camera, clock: CameraClock, acquisition: Acquisition) -> None:
-        self._memory = Memory()
+    def __init__(
+        self,
+        camera: Camera,
+        settings: GigeMock,
+        clock: CameraClock,
+        acquisition: Acquisition,
+        stream: Stream,
+    ) -> None:
+        self._memory = Memory(settings)
         self._clock = clock
         self._acquisition = acquisition
+        self._stream = stream
         self._width_max_px = camera.width_px
         self._height_max_px = camera.height_px
         self._actions: dict[int, Callable[[int], None]] = {
@@ -116,22 +105,19 @@ class Registers:
             Feature.HEIGHT: self._set_size,
             Feature.OFFSET_X: self._set_size,
             Feature.OFFSET_Y: self._set_size,
-            Feature.PIXEL_FORMAT: self._set_pixel_format,
+            Feature.PIXEL_FORMAT: self._set_size,
+            Feature.ACQUISITION_MODE: _check_switch,
+            Feature.TRIGGER_MODE: _check_switch,
             Feature.ACQUISITION_START: self._start_acquisition,
-            Feature.ACQUISITION_STOP: self._stop_acquisition,
+            Feature.ACQUISITION_STOP: lambda _: acquisition.stop(),
+            Feature.TRIGGER_SOFTWARE: lambda _: acquisition.trigger(),
         }
-        for word, value in _WORDS_AT_START.items():
-            self._memory.set_word(word, value)
-        for double, number in _DOUBLES_AT_START.items():
-            self._memory.set_double(double, number)
-        for register, text in _TEXTS.items():
-            self._memory.set_text(register, text)
         for feature in (Feature.WIDTH, Feature.WIDTH_MAX):
             self._memory.set_word(feature, camera.width_px)
         for feature in (Feature.HEIGHT, Feature.HEIGHT_MAX):
             self._memory.set_word(feature, camera.height_px)
-        self._memory.set_word(Feature.PAYLOAD_SIZE, 2 * camera.width_px * camera.height_px)
-        self._memory.set_word(Register.STREAM_SOURCE_PORT, acquisition.source_port)
+        self._memory.set_word(Register.STREAM_SOURCE_PORT, stream.source_port)
+        self._set_size()
 
     @property
     def heartbeat_s(self) -> float:
@@ -161,19 +147,22 @@ class Registers:
     def check_writable(self, address: int, length: int) -> None:
         """Raise RegisterError if no client may ever write there, or not now."""
         self._memory.check_writable(address, length)
-        if self._acquisition.running and address in _LOCKED_WHILE_RUNNING:
+        written = range(address, address + length, 4)
+        if self._acquisition.running and not _LOCKED_WHILE_RUNNING.isdisjoint(written):
             raise RegisterError(Status.ACCESS_DENIED)
 
     def write(self, address: int, data: bytes) -> None:
         """Write as a client with control does. Raises RegisterError."""
         self.check_writable(address, len(data))
         if address in DOUBLES:
-            self._set_timing(address, data)
+            self._set_double(address, data)
             return
         for offset, value in enumerate(protocol.decode_words(data)):
             self._write_word(address + 4 * offset, value)
 
     def _write_word(self, address: int, value: int) -> None:
+        if not DOUBLES.isdisjoint({address, address - 4}):
+            raise RegisterError(Status.INVALID_PARAMETER)  # half a number
         before = self._memory.word(address)
         self._memory.set_word(address, value)
         try:
@@ -204,66 +193,79 @@ class Registers:
             Register.STREAM_PACKET_SIZE, value & ~protocol.PACKET_SIZE_FIRE_TEST & 0xFFFFFFFF
         )
         if value & protocol.PACKET_SIZE_FIRE_TEST:
-            self._acquisition.send_test_packet(self._destination(), size)
+            self._stream.send_test_packet(self._destination(), size)
 
     def _set_destination(self, value: int) -> None:
         if value >> 24 != 127:
             raise RegisterError(Status.INVALID_PARAMETER)
 
-    def _set_size(self, _value: int) -> None:
+    def _set_size(self, _value: int = 0) -> None:
         width, height, offset_x, offset_y = (
             self._memory.word(feature)
             for feature in (Feature.WIDTH, Feature.HEIGHT, Feature.OFFSET_X, Feature.OFFSET_Y)
         )
+        pixel_format = _FORMAT_OF_CODE.get(self._memory.word(Feature.PIXEL_FORMAT))
         fits = width + offset_x <= self._width_max_px
         fits &= height + offset_y <= self._height_max_px
-        if not fits or min(width, height) < SIZE_MIN_PX:
+        if not fits or min(width, height) < SIZE_MIN_PX or pixel_format is None:
             raise RegisterError(Status.INVALID_PARAMETER)
-        self._memory.set_word(Feature.PAYLOAD_SIZE, 2 * width * height)
+        self._memory.set_word(Feature.PAYLOAD_SIZE, pixel_format.bytes * width * height)
 
-    def _set_pixel_format(self, value: int) -> None:
-        if value != protocol.PIXEL_FORMAT_MONO16:
-            raise RegisterError(Status.INVALID_PARAMETER)
-
-    def _set_timing(self, address: int, data: bytes) -> None:
+    def _set_double(self, address: int, data: bytes) -> None:
         """Exposure and frame rate: neither may outgrow the other."""
         if len(data) != 8:
-            raise RegisterError(Status.INVALID_PARAMETER)
+            raise RegisterError(Status.INVALID_PARAMETER)  # half a number, or more than one
         (value,) = struct.unpack(">d", data)
-        period_us = 1e6 / self._memory.double(Feature.FRAME_RATE_HZ)
-        exposure_us = self._memory.double(Feature.EXPOSURE_TIME_US)
-        if address == Feature.EXPOSURE_TIME_US:
-            allowed = EXPOSURE_MIN_US <= value <= period_us * _ROUNDING
-        else:
-            low_hz, high_hz = FRAME_RATES_HZ
-            allowed = low_hz <= value <= high_hz and value * exposure_us <= 1e6 * _ROUNDING
-        if not allowed:
+        low, high = {
+            Feature.EXPOSURE_TIME_US: (
+                EXPOSURE_MIN_US,
+                1e6 / self._memory.double(Feature.FRAME_RATE_HZ) * _ROUNDING,
+            ),
+            Feature.FRAME_RATE_HZ: (
+                FRAME_RATES_HZ[0],
+                min(
+                    FRAME_RATES_HZ[1],
+                    1e6 / self._memory.double(Feature.EXPOSURE_TIME_US) * _ROUNDING,
+                ),
+            ),
+            Feature.GAIN_DB: GAINS_DB,
+        }[Feature(address)]
+        if not low <= value <= high:
             raise RegisterError(Status.INVALID_PARAMETER)
         self._memory.set_double(address, value)
 
     def _start_acquisition(self, _value: int) -> None:
-        memory = self._memory
         if self._acquisition.running:
             return
+        memory = self._memory
+        size = memory.word(Register.STREAM_PACKET_SIZE) & protocol.PACKET_SIZE_MASK
         self._acquisition.start(
+            AcquisitionSettings(
+                exposure_s=memory.double(Feature.EXPOSURE_TIME_US) / 1e6,
+                frame_rate_hz=memory.double(Feature.FRAME_RATE_HZ),
+                gain_db=memory.double(Feature.GAIN_DB),
+                single_frame=memory.word(Feature.ACQUISITION_MODE) == SINGLE_FRAME,
+                triggered=bool(memory.word(Feature.TRIGGER_MODE)),
+            ),
             StreamSettings(
                 destination=self._destination(),
-                packet_size_bytes=memory.word(Register.STREAM_PACKET_SIZE)
-                & protocol.PACKET_SIZE_MASK,
+                packet_size_bytes=size,
+                packet_gap_s=memory.word(Register.STREAM_PACKET_DELAY) / TICKS_PER_S,
+                pixel_format=_FORMAT_OF_CODE[memory.word(Feature.PIXEL_FORMAT)],
                 width_px=memory.word(Feature.WIDTH),
                 height_px=memory.word(Feature.HEIGHT),
                 offset_x_px=memory.word(Feature.OFFSET_X),
                 offset_y_px=memory.word(Feature.OFFSET_Y),
-                exposure_s=memory.double(Feature.EXPOSURE_TIME_US) / 1e6,
-                frame_rate_hz=memory.double(Feature.FRAME_RATE_HZ),
-            )
+            ),
         )
-
-    def _stop_acquisition(self, _value: int) -> None:
-        self._acquisition.stop()
 
     def _destination(self) -> tuple[str, int]:
         host = socket.inet_ntoa(
             protocol.encode_words(self._memory.word(Register.STREAM_DESTINATION))
         )
         return host, self._memory.word(Register.STREAM_PORT) & 0xFFFF
+
+
+def _check_switch(value: int) -> None:
+    if value not in {0, 1}:
+        raise RegisterError(Status.INVALID_PARAMETER)

@@ -5,21 +5,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gige_served import IMAGE, Served, camera_settings
+from gige_served import IMAGE, Served, camera_settings, mock_settings
 from numpy.typing import NDArray
 
+from fitctl.config import GigeMock
 from fitctl.drivers.gige.driver import GigeCamera
 
 
 @pytest.fixture
 def serve() -> Iterator[Callable[..., Served]]:
-    """Start mock cameras: ``serve(render, **settings)``."""
+    """Start mock cameras: ``serve(render, mock=..., **settings)``."""
     served = []
 
     def start(
-        render: Callable[[float], NDArray[np.uint16]] = lambda _: IMAGE, **changes: Any
+        render: Callable[[float], NDArray[np.uint16]] = lambda _: IMAGE,
+        *,
+        mock: GigeMock | None = None,
+        **changes: Any,
     ) -> Served:
-        served.append(Served(camera_settings(**changes), render))
+        served.append(Served(camera_settings(**changes), mock or mock_settings(), render))
         return served[-1]
 
     yield start

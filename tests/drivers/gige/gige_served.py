@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Camera, default_rig_path, load_rig
+from fitctl.config import Camera, Fault, GigeMock, default_rig_path, load_rig
 from fitctl.mocks.gige.camera import GigeCameraMock
 
 IMAGE = np.random.default_rng(1).integers(0, 65536, (40, 40), dtype=np.uint16)
@@ -25,11 +25,19 @@ def camera_settings(**changes: Any) -> Camera:
     return Camera.model_validate(settings)
 
 
+def mock_settings(**changes: Any) -> GigeMock:
+    """The default rig's mock camera with some settings changed."""
+    _, mocks = load_rig(default_rig_path()).mock_parts()
+    return mocks.camera.model_copy(update=changes)
+
+
 class Served:
     """A mock that answers at `port`; `call` runs a function in its event loop."""
 
-    def __init__(self, camera: Camera, render: Callable[[float], NDArray[np.uint16]]) -> None:
-        self.mock = GigeCameraMock(camera, render, port=0)
+    def __init__(
+        self, camera: Camera, mock: GigeMock, render: Callable[[float], NDArray[np.uint16]]
+    ) -> None:
+        self.mock = GigeCameraMock(camera, mock, render, port=0)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
@@ -40,6 +48,13 @@ class Served:
             return function()
 
         return self._run(run())
+
+    def fault(self, kind: str, **settings: Any) -> None:
+        fault = Fault(device="camera", kind=kind, **settings)
+        self.call(lambda: self.mock.faults.set(fault))
+
+    def mend(self) -> None:
+        self.call(self.mock.faults.clear)
 
     def stop(self) -> None:
         self._run(self.mock.stop())

@@ -8,11 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gige_served import IMAGE, Served, camera_settings
+from gige_served import IMAGE, Served, camera_settings, mock_settings
 from numpy.typing import NDArray
 
 from fitctl.config import Camera
 from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.discovery import discover
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.interface import (
     DeviceError,
@@ -28,7 +29,8 @@ Connect = Callable[..., GigeCamera]
 
 
 def frames(camera: GigeCamera, count: int) -> list[Frame]:
-    received = [camera.next_frame(2.0) for _ in range(count)]
+    received = [camera.next_frame(5.0) for _ in range(count)]
+    assert None not in received
     return [frame for frame in received if frame is not None]
 
 
@@ -54,6 +56,55 @@ def test_an_image_of_many_packets_arrives_bit_for_bit(serve: Serve, connect: Con
     np.testing.assert_array_equal(frame.image, image)
 
 
+@pytest.mark.parametrize(("pixel_format", "shift"), [("Mono8", 8), ("Mono12", 4)])
+def test_other_pixel_formats_arrive_as_the_numbers_that_the_camera_counts(
+    serve: Serve, connect: Connect, pixel_format: str, shift: int
+) -> None:
+    camera = connect(serve(), pixel_format=pixel_format)
+    camera.start()
+    (frame,) = frames(camera, 1)
+    np.testing.assert_array_equal(frame.image, IMAGE >> shift)
+    assert frame.image.dtype == np.uint16
+
+
+def test_the_gain_is_set(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve(lambda _: np.full((40, 40), 1000, np.uint16)), gain=20.0)
+    camera.start()
+    (frame,) = frames(camera, 1)
+    assert np.all(frame.image == 10000)
+
+
+@pytest.mark.parametrize("description", ["xml", "zip"])
+def test_the_description_is_read_plain_or_zipped(
+    serve: Serve, connect: Connect, description: str
+) -> None:
+    connect(serve(mock=mock_settings(description=description)))
+
+
+def test_a_delay_between_packets_is_set_and_kept(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve(), packet_delay_s=0.003)  # leader, three of pixels, trailer
+    camera.start()
+    for frame in frames(camera, 3):
+        assert frame.received_s - frame.mid_exposure_s >= 0.034 + 3 * 0.003
+
+
+def test_a_delay_that_no_clock_can_count_is_a_mismatch(serve: Serve, connect: Connect) -> None:
+    with pytest.raises(DeviceMismatch, match=r"0\.001 s between packets.*without a clock"):
+        connect(serve(mock=mock_settings(clock=False)), packet_delay_s=0.001)
+
+
+def test_a_camera_is_discovered(serve: Serve) -> None:
+    served = serve()
+    (found,) = discover("127.0.0.1", 0.3, port=served.port)
+    assert (found.address, found.mac) == ("127.0.0.1", "02:00:00:00:00:01")
+    assert (found.identity.model, found.identity.serial) == ("MockCamera", "FIT01")
+
+
+def test_nobody_is_discovered_where_nobody_is() -> None:
+    with pytest.raises(DeviceUnreachable, match="broadcast address"):
+        discover("camera.invalid..", 0.1)
+
+
 def test_the_frame_carries_the_middle_of_its_exposure(serve: Serve, connect: Connect) -> None:
     rendered: list[float] = []
 
@@ -73,9 +124,7 @@ def test_the_frame_carries_the_middle_of_its_exposure(serve: Serve, connect: Con
 def test_frames_of_a_camera_without_a_clock_are_as_old_as_the_rig_file_says(
     serve: Serve, connect: Connect
 ) -> None:
-    served = serve()
-    served.mock._clock.ticks = lambda _host_s: 0
-    camera = connect(served, frame_delay_s=0.03)
+    camera = connect(serve(mock=mock_settings(clock=False)), frame_delay_s=0.03)
     camera.start()
     (frame,) = frames(camera, 1)
     assert frame.received_s - frame.mid_exposure_s == pytest.approx(0.03)
@@ -86,45 +135,6 @@ def test_the_identity_is_what_the_camera_says(serve: Serve) -> None:
     identity = camera.open()
     camera.close()
     assert (identity.maker, identity.model, identity.serial) == ("FIT", "MockCamera", "FIT01")
-
-
-def test_a_lost_packet_is_healed_by_a_resend(serve: Serve, connect: Connect) -> None:
-    served = serve()
-    to_lose = {(3, 0), (3, 2), (5, 3)}
-
-    def lose(block_id: int, packet_id: int) -> bool:
-        once = (block_id, packet_id) in to_lose
-        to_lose.discard((block_id, packet_id))
-        return once
-
-    served.mock.acquisition.lose = lose
-    camera = connect(served)
-    camera.start()
-    received = frames(camera, 6)
-    assert [frame.number for frame in received] == [1, 2, 3, 4, 5, 6]
-    for frame in received:
-        np.testing.assert_array_equal(frame.image, IMAGE)
-    assert (camera.counts().lost, camera.counts().packets_lost) == (0, 3)
-
-
-def test_a_lost_frame_is_counted_and_leaves_a_gap(serve: Serve, connect: Connect) -> None:
-    served = serve()
-    served.mock.acquisition.lose = lambda block_id, packet_id: (
-        block_id == 3 or (block_id, packet_id) == (5, 1)
-    )
-    camera = connect(served)
-    camera.start()
-    received = frames(camera, 4)
-    assert [frame.number for frame in received] == [1, 2, 4, 6]
-    assert (camera.counts().frames, camera.counts().lost) == (4, 2)
-
-
-def test_no_frame_in_time_is_none(serve: Serve, connect: Connect) -> None:
-    served = serve()
-    served.mock.acquisition.lose = lambda _block, _packet: True
-    camera = connect(served)
-    camera.start()
-    assert camera.next_frame(0.1) is None
 
 
 def test_frames_after_a_new_start_are_new(serve: Serve, connect: Connect) -> None:
@@ -218,10 +228,11 @@ def test_a_camera_can_be_opened_again_after_it_came_back(serve: Serve, connect: 
         ({"width_px": 64}, "Width = 64"),
         ({"height_px": 48}, "Height = 48"),
         ({"packet_size_bytes": 1501}, "packets of 1501 bytes, got 0x8002"),
+        ({"gain": 30.0}, "Gain = 30"),
     ],
 )
 def test_a_camera_that_cannot_be_what_the_rig_file_says_is_named(
-    serve: Serve, connect: Connect, changes: dict[str, int], message: str
+    serve: Serve, connect: Connect, changes: dict[str, float], message: str
 ) -> None:
     served = serve()
     with pytest.raises(DeviceMismatch, match=message):

@@ -8,7 +8,7 @@ import zipfile
 import pytest
 
 from fitctl.drivers.gige import protocol as p
-from fitctl.drivers.gige.features import Features
+from fitctl.drivers.gige.features import Features, unpacked
 from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
 
@@ -71,3 +71,17 @@ DIRECTORY = bytes(archive()).index(b"PK\x01\x02")
 def test_a_description_that_cannot_be_unpacked_is_named(content: bytes, why: str) -> None:
     with pytest.raises(DeviceProtocolError, match=why):
         Features(Memory(f"Local:camera.zip;{XML_ADDRESS:X};{len(content):X}", content))
+
+
+def test_an_archive_that_unpacks_to_an_absurd_size_is_refused_packed() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as writer:
+        writer.writestr("a.xml", bytes(17 << 20))
+    content = buffer.getvalue()
+    assert len(content) < 1 << 20
+    with pytest.raises(DeviceProtocolError, match="17825792 bytes once unpacked"):
+        Features(Memory(f"Local:camera.zip;{XML_ADDRESS:X};{len(content):X}", content))
+
+
+def test_a_description_may_have_a_byte_order_mark_and_zeros_after_it() -> None:
+    assert unpacked(b"\xef\xbb\xbf<x/>\0\0\0", "test") == "<x/>"

@@ -7,7 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.drivers.gige import protocol as p
+from fitctl.drivers.gige.discovery import decode_found
 
+MONO16 = p.PIXEL_FORMATS["Mono16"]
 u16 = st.integers(0, 0xFFFF)
 u24 = st.integers(0, 0xFFFFFF)
 u32 = st.integers(0, 0xFFFFFFFF)
@@ -30,7 +32,7 @@ def test_a_refusal_on_the_wire() -> None:
 
 def test_a_leader_on_the_wire() -> None:
     header = p.encode_stream_header(p.StreamHeader(0, 1, p.FORMAT_LEADER, 0))
-    leader = header + p.encode_leader(p.Leader(0x1122334455667788, p.PIXEL_FORMAT_MONO16, 40, 30))
+    leader = header + p.encode_leader(p.Leader(0x1122334455667788, MONO16.code, 40, 30))
     assert leader == bytes.fromhex(
         "0000 0001 01000000"
         "0000 0001 1122334455667788 01100007 00000028 0000001e 00000000 00000000 0000 0000"
@@ -99,9 +101,11 @@ def test_noise_is_read_or_refused_but_never_crashes(noise: bytes) -> None:
         p.decode_words,
         p.decode_readmem,
         p.decode_resend,
+        p.decode_forceip,
         p.decode_pending_s,
         p.decode_stream_header,
         p.decode_leader,
+        decode_found,
         lambda data: p.decode_xml_url(data.decode("latin-1")),
     ):
         with contextlib.suppress(p.MalformedPacketError):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import random
 
 import numpy as np
@@ -9,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.stream import CompleteFrame, FrameAssembler
+from fitctl.drivers.gige.stream import ASK_AGAIN_S, CompleteFrame, FrameAssembler
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
-from fitctl.mocks.gige.acquisition import StreamSettings, frame_packets
+from fitctl.mocks.gige.stream import StreamSettings, frame_packets
 
-SETTINGS = StreamSettings(("127.0.0.1", 1), 576, 40, 30, 0, 0, 0.01, 50.0)
+MONO16 = protocol.PIXEL_FORMATS["Mono16"]
+SETTINGS = StreamSettings(("127.0.0.1", 1), 576, 0.0, MONO16, 40, 30, 0, 0)
 IMAGE = np.arange(1200, dtype=np.uint16).reshape(30, 40)
 PACKETS = 7  # leader, five of pixels, trailer
 
@@ -23,7 +25,7 @@ class Receiver:
 
     def __init__(self) -> None:
         self.asked: list[protocol.Resend] = []
-        self.assembler = FrameAssembler(40, 30, 576, "test", self.asked.append)
+        self.assembler = FrameAssembler(40, 30, MONO16, 576, "test", self.asked.append)
 
     def take(self, *packets: bytes) -> list[CompleteFrame]:
         frames = [self.assembler.add(memoryview(packet)) for packet in packets]
@@ -31,7 +33,7 @@ class Receiver:
 
 
 def packets_of(block_id: int) -> list[bytes]:
-    return frame_packets(block_id, 1000 * block_id, IMAGE, SETTINGS)
+    return frame_packets(block_id, 1000 * block_id, IMAGE.tobytes(), SETTINGS)
 
 
 @given(seed=st.integers(0, 1000))
@@ -43,7 +45,7 @@ def test_packets_may_come_in_any_order(seed: int) -> None:
     np.testing.assert_array_equal(frame.image, IMAGE)
 
 
-def test_the_trailer_shows_a_hole_which_is_asked_for_once_and_healed() -> None:
+def test_the_trailer_shows_a_hole_which_is_asked_for_and_healed() -> None:
     receiver = Receiver()
     packets = packets_of(1)
     assert receiver.take(*packets[:2], *packets[4:], packets[6]) == []
@@ -51,6 +53,32 @@ def test_the_trailer_shows_a_hole_which_is_asked_for_once_and_healed() -> None:
     (frame,) = receiver.take(packets[2], packets[3])
     np.testing.assert_array_equal(frame.image, IMAGE)
     assert (receiver.assembler.lost, receiver.assembler.packets_lost) == (0, 2)
+
+
+def test_what_is_lost_again_is_asked_for_again_five_times_at_most(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr("fitctl.drivers.gige.stream.time.monotonic", lambda: now_s[0])
+    receiver = Receiver()
+    packets = packets_of(1)
+    receiver.take(*packets[:5], packets[6])
+    for asked in (1, 2, 3, 4, 5, 5):
+        receiver.assembler.ask_again()
+        receiver.assembler.ask_again()  # not before its time
+        assert len(receiver.asked) == asked
+        now_s[0] += ASK_AGAIN_S
+    assert receiver.asked == 5 * [protocol.Resend(0, 1, 5, 5)]
+    assert receiver.assembler.ask_again() is None
+    assert len(receiver.take(packets[5])) == 1
+    assert receiver.assembler.packets_lost == 1
+
+
+def test_nothing_is_asked_for_again_once_it_has_come() -> None:
+    receiver = Receiver()
+    packets = packets_of(1)
+    receiver.take(*packets[:5], packets[6], packets[5])
+    assert receiver.assembler.ask_again() is None
 
 
 def test_each_run_of_missing_packets_is_asked_for_by_itself() -> None:
@@ -96,7 +124,7 @@ def test_noise_makes_no_frame(noise: bytes) -> None:
 
 
 def test_another_image_size_is_a_mismatch() -> None:
-    other = frame_packets(1, 0, np.zeros((30, 39), np.uint16), SETTINGS)
+    other = frame_packets(1, 0, bytes(2 * 30 * 39), dataclasses.replace(SETTINGS, width_px=39))
     with pytest.raises(DeviceMismatch, match=r"40 x 30 px.* 39 x 30 px"):
         Receiver().take(other[0])
 

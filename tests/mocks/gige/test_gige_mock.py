@@ -4,63 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import time
-from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
-from typing import Any
 
-import numpy as np
 import pytest
+from gige_asked import ME, OTHER, ask, camera_mock, read, received, scenario, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fitctl.config import default_rig_path, load_rig
+from fitctl.config import Fault
 from fitctl.drivers.gige import protocol as p
 from fitctl.mocks.gige.camera import GigeCameraMock
-from fitctl.mocks.gige.memory import Feature
-
-ME = ("127.0.0.1", 40001)
-OTHER = ("127.0.0.1", 40002)
-
-
-@asynccontextmanager
-async def started() -> AsyncIterator[GigeCameraMock]:
-    camera = load_rig(default_rig_path()).camera
-    mock = GigeCameraMock(camera, lambda _: np.zeros((40, 40), np.uint16), port=0)
-    await mock.start()
-    try:
-        yield mock
-    finally:
-        await mock.stop()
-
-
-def ask(
-    mock: GigeCameraMock, command: int, payload: bytes = b"", sender: tuple[str, int] = ME
-) -> p.AnswerPacket:
-    reply = mock.answer(p.encode_command(command, 5, payload), sender)
-    assert reply is not None
-    answer = p.decode_answer(reply)
-    assert (answer.command, answer.request_id) == (command + 1, 5)
-    return answer
-
-
-def write(mock: GigeCameraMock, register: int, value: int, sender: tuple[str, int] = ME) -> int:
-    return ask(mock, p.Command.WRITEREG, p.encode_words(register, value), sender).status
-
-
-def read(mock: GigeCameraMock, register: int, sender: tuple[str, int] = ME) -> int:
-    answer = ask(mock, p.Command.READREG, p.encode_words(register), sender)
-    return p.decode_words(answer.payload)[0] if answer.payload else answer.status
-
-
-def scenario(test: Callable[[GigeCameraMock], Coroutine[Any, Any, None] | None]) -> None:
-    async def run() -> None:
-        async with started() as mock:
-            result = test(mock)
-            if result is not None:
-                await result
-
-    asyncio.run(run())
+from fitctl.mocks.gige.memory import MAC, TICKS_PER_S, Feature
 
 
 def test_discovery_answers_with_the_first_registers() -> None:
@@ -80,15 +33,31 @@ def test_discovery_answers_with_the_first_registers() -> None:
         (p.Command.READREG, "00000a04", p.Status.INVALID_ADDRESS),
         (p.Command.READREG, "00000a01", p.Status.BAD_ALIGNMENT),
         (p.Command.READREG, "", p.Status.INVALID_HEADER),
-        (p.Command.READMEM, "00000048 0000 0204", p.Status.INVALID_PARAMETER),
+        (p.Command.READREG, "00" * 544, p.Status.INVALID_HEADER),
+        (p.Command.READMEM, "00000048 0000", p.Status.INVALID_HEADER),
+        (p.Command.READMEM, "00000048 0000 021c", p.Status.INVALID_PARAMETER),
+        (p.Command.READMEM, "00000048 0000 0000", p.Status.INVALID_PARAMETER),
+        (p.Command.READMEM, "0000b000 0000 0004", p.Status.INVALID_ADDRESS),
         (p.Command.READMEM, "00000048 0000 0003", p.Status.BAD_ALIGNMENT),
         (p.Command.WRITEREG, "00000000 00000001", p.Status.WRITE_PROTECT),
         (p.Command.WRITEREG, "0000b000 00000001", p.Status.INVALID_ADDRESS),
         (p.Command.WRITEREG, "0000a000 00000029", p.Status.INVALID_PARAMETER),
-        (p.Command.WRITEREG, "0000a010 01080001", p.Status.INVALID_PARAMETER),
+        (p.Command.WRITEREG, "0000a010 010c0006", p.Status.INVALID_PARAMETER),  # Mono12Packed
+        (p.Command.WRITEREG, "0000a050 00000002", p.Status.INVALID_PARAMETER),
+        (p.Command.WRITEREG, "0000a04c 00000000", p.Status.INVALID_PARAMETER),  # half a number
+        (p.Command.WRITEREG, "00000a00", p.Status.INVALID_HEADER),
+        (p.Command.WRITEMEM, "00000a", p.Status.INVALID_HEADER),
+        (p.Command.WRITEMEM, "000000e8", p.Status.INVALID_PARAMETER),
+        (p.Command.WRITEMEM, "000000e8 464954", p.Status.BAD_ALIGNMENT),
+        (p.Command.WRITEMEM, "00000048 46495400", p.Status.WRITE_PROTECT),
+        (p.Command.WRITEMEM, "0000b000 00000000", p.Status.INVALID_ADDRESS),
+        (p.Command.WRITEMEM, "0000a048 40390000 00000000", p.Status.INVALID_PARAMETER),  # 25 dB
+        (p.Command.WRITEMEM, "0000a030 7ff80000 00000000", p.Status.INVALID_PARAMETER),  # NaN us
+        (p.Command.WRITEMEM, "0000a03c 00000000", p.Status.INVALID_PARAMETER),
         (p.Command.WRITEREG, "00000d18 08080808", p.Status.INVALID_PARAMETER),
         (p.Command.WRITEMEM, "0000a038 40a77000 00000000", p.Status.INVALID_PARAMETER),  # 3000 Hz
-        (p.Command.FORCEIP, "", p.Status.NOT_IMPLEMENTED),
+        (p.Command.FORCEIP, "", p.Status.INVALID_HEADER),
+        (0x0100, "00" * 12, p.Status.NOT_IMPLEMENTED),  # ACTION
     ],
 )
 def test_what_a_camera_cannot_do_has_its_status(
@@ -142,68 +111,106 @@ def test_the_image_format_is_locked_while_frames_are_taken() -> None:
     scenario(check)
 
 
-def test_the_xml_url_leads_to_the_description() -> None:
+@pytest.mark.parametrize(("description", "begins"), [("xml", b"<?xml"), ("zip", b"PK")])
+def test_the_xml_url_leads_to_the_description(description: str, begins: bytes) -> None:
     def check(mock: GigeCameraMock) -> None:
         text = ask(mock, p.Command.READMEM, p.encode_readmem(p.Register.XML_URL_1, 512)).payload
         location = p.decode_xml_url(text[4:].split(b"\0")[0].decode())
         head = ask(mock, p.Command.READMEM, p.encode_readmem(location.address, 40)).payload[4:]
-        assert head.startswith(b"<?xml")
-        past = p.encode_readmem(location.address + location.length, 4)
+        assert head.startswith(begins)
+        past = p.encode_readmem(location.address + location.length + 4 & ~3, 4)
         assert ask(mock, p.Command.READMEM, past).status == p.Status.INVALID_ADDRESS
 
-    scenario(check)
+    scenario(check, description=description)
 
 
-def test_a_test_packet_has_the_size_that_was_asked_for() -> None:
-    async def check(mock: GigeCameraMock) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
-            client.bind(("127.0.0.1", 0))
-            client.settimeout(2)
-            write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL)
-            write(mock, p.Register.STREAM_DESTINATION, 0x7F000001)
-            write(mock, p.Register.STREAM_PORT, client.getsockname()[1])
-            write(mock, p.Register.STREAM_PACKET_SIZE, p.PACKET_SIZE_FIRE_TEST | 1400)
-            assert len(client.recv(2048)) == 1400 - 28
-        assert read(mock, p.Register.STREAM_PACKET_SIZE) == 1400
+def test_the_clock_is_latched_and_reset() -> None:
+    def check(mock: GigeCameraMock) -> None:
+        def latched() -> int:
+            write(mock, p.Register.TIMESTAMP_CONTROL, p.TIMESTAMP_LATCH)
+            high = read(mock, p.Register.TIMESTAMP_HIGH)
+            return high << 32 | read(mock, p.Register.TIMESTAMP_LOW)
 
-    scenario(check)
-
-
-def test_a_frame_that_is_gone_is_answered_as_unavailable() -> None:
-    async def check(mock: GigeCameraMock) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
-            client.bind(("127.0.0.1", 0))
-            client.settimeout(2)
-            write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL)
-            write(mock, p.Register.STREAM_DESTINATION, 0x7F000001)
-            write(mock, p.Register.STREAM_PORT, client.getsockname()[1])
-            write(mock, Feature.ACQUISITION_START, 1)
-            resend = p.encode_resend(p.Resend(0, 9999, 1, 2))
-            assert mock.answer(p.encode_command(0x40, 6, resend, flags=0), ME) is None
-            header = p.decode_stream_header(client.recv(2048))
-        assert header == p.StreamHeader(p.Status.PACKET_UNAVAILABLE, 9999, p.FORMAT_PAYLOAD, 1)
+        write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL)
+        first = latched()
+        assert first > 999 * TICKS_PER_S
+        assert read(mock, p.Register.TIMESTAMP_LOW) == first & 0xFFFFFFFF  # until the next
+        assert first < latched() < first + TICKS_PER_S
+        write(mock, p.Register.TIMESTAMP_CONTROL, p.TIMESTAMP_RESET)
+        assert latched() < TICKS_PER_S
 
     scenario(check)
 
 
-def test_a_mock_that_was_held_up_sends_every_frame_late_and_says_so() -> None:
+def test_forceip_is_heard_by_whom_it_is_for_and_changes_nothing() -> None:
+    def check(mock: GigeCameraMock) -> None:
+        def force(mac: bytes, address: bytes) -> bytes | None:
+            payload = bytes(2) + mac + bytes(12) + address + bytes(32)
+            return mock.answer(p.encode_command(p.Command.FORCEIP, 5, payload), ME)
+
+        assert force(bytes(6), bytes(4)) is None
+        refused = force(MAC, bytes((127, 0, 0, 2)))
+        assert refused == bytes.fromhex("8006 0005 0000 0005")
+        assert force(MAC, bytes((127, 0, 0, 1))) == bytes.fromhex("0000 0005 0000 0005")
+        assert read(mock, p.Register.IP_ADDRESS) == 0x7F000001
+
+    scenario(check)
+
+
+@pytest.mark.parametrize("number", [p.Command.READREG + 1, p.PENDING_ACK, 0xFFFF])
+def test_an_acknowledge_is_not_answered(number: int) -> None:
+    def check(mock: GigeCameraMock) -> None:
+        assert mock.answer(p.encode_command(number, 5), ME) is None
+
+    scenario(check)
+
+
+def test_several_registers_in_one_command_go_as_far_as_they_can() -> None:
+    def check(mock: GigeCameraMock) -> None:
+        write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL)
+        words = p.encode_words(Feature.WIDTH, 32, Feature.HEIGHT, 41, Feature.OFFSET_X, 1)
+        answer = ask(mock, p.Command.WRITEREG, words)
+        assert (answer.status, answer.payload) == (p.Status.INVALID_PARAMETER, b"\0\0\0\1")
+        addresses = p.encode_words(Feature.WIDTH, Feature.HEIGHT, 0xB000, Feature.WIDTH)
+        answer = ask(mock, p.Command.READREG, addresses)
+        assert answer.status == p.Status.INVALID_ADDRESS
+        assert p.decode_words(answer.payload) == (32, 40)
+        assert read(mock, Feature.OFFSET_X) == 0
+
+    scenario(check)
+
+
+def test_memory_is_written_and_read_and_ends_with_power() -> None:
     async def check(mock: GigeCameraMock) -> None:
+        write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL)
+        name = b"north".ljust(16, b"\0")
+        user_name = p.USER_NAME.address
+        answer = ask(mock, p.Command.WRITEMEM, p.encode_words(user_name) + name)
+        assert (answer.status, answer.payload) == (p.Status.SUCCESS, b"\0\0\0\x10")
+        answer = ask(mock, p.Command.READMEM, p.encode_readmem(user_name, 16))
+        assert answer.payload == p.encode_words(user_name) + name
+        mock.faults.set(Fault(device="camera", kind="reboot", value=0.01))
+        while mock.faults.active:
+            await asyncio.sleep(0.01)
+        assert read(mock, user_name) == 0
+        assert read(mock, p.Register.CONTROL_PRIVILEGE) == 0
+
+    scenario(check)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "127.255.255.255", "255.255.255.255"])
+def test_discovery_is_heard_on_the_loopback_interface_alone(address: str) -> None:
+    async def check(mock: GigeCameraMock) -> None:
+        assert mock._control is not None
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            # Whatever is sent to, no other interface is reached.
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
             client.bind(("127.0.0.1", 0))
             client.setblocking(False)
-            write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL)
-            write(mock, p.Register.STREAM_DESTINATION, 0x7F000001)
-            write(mock, p.Register.STREAM_PORT, client.getsockname()[1])
-            write(mock, Feature.ACQUISITION_START, 1)
-            time.sleep(0.3)  # the event loop stands still
-            loop = asyncio.get_running_loop()
-            blocks = set()
-            while len(blocks) < 7:
-                packet = await asyncio.wait_for(loop.sock_recv(client, 2048), 2)
-                blocks.add(p.decode_stream_header(packet).block_id)
-        assert blocks == {1, 2, 3, 4, 5, 6, 7}
-        assert mock.acquisition.late_frames >= 6
-        assert mock.acquisition.worst_late_s > 0.2
+            client.sendto(p.encode_command(p.Command.DISCOVERY, 1), (address, mock._control.port))
+            answer = p.decode_answer(await received(client))
+        assert (answer.status, len(answer.payload)) == (p.Status.SUCCESS, p.DISCOVERY_BYTES)
 
     scenario(check)
 
@@ -214,7 +221,7 @@ def test_a_mock_that_was_held_up_sends_every_frame_late_and_says_so() -> None:
         st.binary(max_size=40)
         | st.builds(
             p.encode_command,
-            st.sampled_from([*p.Command, 0x99]),
+            st.sampled_from([*p.Command, 0x99, 0xFFFE, 0xFFFF]),
             st.integers(1, 65535),
             st.binary(max_size=24),
         ),
@@ -233,11 +240,8 @@ def test_whatever_comes_the_mock_answers_or_is_silent(packets: list[bytes]) -> N
 
 def test_a_taken_port_is_an_error_and_nothing_stays_open() -> None:
     async def check(mock: GigeCameraMock) -> None:
-        assert mock._endpoint is not None
-        camera = load_rig(default_rig_path()).camera
-        second = GigeCameraMock(
-            camera, lambda _: np.zeros((40, 40), np.uint16), port=mock._endpoint.port
-        )
+        assert mock._control is not None
+        second = camera_mock(port=mock._control.port)
         with pytest.raises(OSError, match="ddress already in use"):
             await second.start()
         await second.stop()

@@ -1,0 +1,39 @@
+"""A camera asked, without taking control of it."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+from fitctl.config import Camera
+from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.gvcp import ControlChannel
+from fitctl.drivers.gige.protocol import Register
+from fitctl.drivers.interface import DeviceIdentity
+from fitctl.drivers.probe import Probe, round_trip_s
+
+
+def probe_camera(camera: Camera) -> Probe:
+    """Who a camera is, and whether it can be what the rig file says.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or not as a GigE Vision camera.
+    """
+    device = camera.device
+    channel = ControlChannel(device.address, device.gvcp_port, device.response_timeout_s)
+    with closing(channel):
+        identity = DeviceIdentity(
+            *map(
+                channel.read_text,
+                (protocol.MAKER, protocol.MODEL, protocol.SERIAL_NUMBER, protocol.DEVICE_VERSION),
+            )
+        )
+        question_s = round_trip_s(lambda: channel.read_register(Register.VERSION))
+        controlled = channel.read_register(Register.CONTROL_PRIVILEGE)
+    disagreements: tuple[str, ...] = ()
+    if controlled & (protocol.CONTROL | protocol.CONTROL_EXCLUSIVE):
+        disagreements = (
+            "another program has control of it: a running supervisor, or one to be ended first",
+        )
+    return Probe(identity, question_s, disagreements)

@@ -1,0 +1,78 @@
+"""What the sensor makes of the light: faults of star and sensor, gain, and the pixel's format."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Camera
+from fitctl.drivers.gige.protocol import PixelFormat
+from fitctl.mocks.faults import FaultKind, Faults
+
+FULL_SCALE_DN = 65535
+_HALVING_MIN_S = 1e-3
+HOT_PIXEL = (0.25, 0.75)  # its place on the sensor, across and down, in parts of its size
+
+PICTURE_FAULTS = {
+    "star_fading": FaultKind("starlight halves, again and again, each time within this", "s", 1.0),
+    "background_jump": FaultKind("every pixel reads more by this", "DN", 2000.0),
+    "hot_pixel": FaultKind("one pixel reads more by this", "DN", 20000.0),
+    "saturation": FaultKind("no pixel reads more than this", "DN", 3000.0),
+}
+
+
+class Sensor:
+    """The image as the sensor gives it.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its bias is what remains without light; its pixel noise stays when the light fades.
+    faults : Faults
+    """
+
+    def __init__(self, camera: Camera, faults: Faults) -> None:
+        self._camera = camera
+        self._faults = faults
+        self._fading_since_s = 0.0
+        self._random = np.random.default_rng(0)
+        faults.on_change(self._note)
+
+    def seen(self, image: NDArray[np.uint16], host_s: float) -> NDArray[np.uint16]:
+        """A rendered image of a host time with what is wrong with it."""
+        values = {kind: self._faults.value(kind) for kind in PICTURE_FAULTS}
+        if all(value is None for value in values.values()):
+            return image
+        dn = image.astype(float)
+        halving_s = values["star_fading"]
+        if halving_s is not None:
+            fading_s = max(0.0, host_s - self._fading_since_s)
+            dn = self._faded(dn, 0.5 ** (fading_s / max(halving_s, _HALVING_MIN_S)))
+        dn += values["background_jump"] or 0.0
+        across, down = HOT_PIXEL
+        height_px, width_px = image.shape
+        dn[int(down * height_px), int(across * width_px)] += values["hot_pixel"] or 0.0
+        most_dn = values["saturation"]
+        full_dn = FULL_SCALE_DN if most_dn is None else most_dn
+        return np.clip(np.minimum(np.rint(dn), full_dn), 0, FULL_SCALE_DN).astype(np.uint16)
+
+    def _faded(self, dn: NDArray[np.float64], left: float) -> NDArray[np.float64]:
+        """Part of the light is left, and all of the noise."""
+        bias_dn, noise_dn = self._camera.bias_dn, self._camera.pixel_noise_dn
+        noise = self._random.standard_normal(dn.shape)
+        return bias_dn + left * (dn - bias_dn) + noise_dn * math.sqrt(1 - left**2) * noise
+
+    def _note(self, kind: str) -> None:
+        if kind == "star_fading":
+            self._fading_since_s = time.monotonic()
+
+
+def pixels(image: NDArray[np.uint16], gain_db: float, pixel_format: PixelFormat) -> bytes:
+    """An image as it is sent: amplified, clipped, and cut to the format's most significant bits."""
+    if gain_db:
+        amplified = image * 10 ** (gain_db / 20)
+        image = np.clip(np.rint(amplified), 0, FULL_SCALE_DN).astype(np.uint16)
+    return (image >> (16 - pixel_format.bits)).astype(f"<u{pixel_format.bytes}").tobytes()
