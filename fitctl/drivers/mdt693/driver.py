@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NoReturn, TypeVar
+from typing import NoReturn
 
 import numpy as np
 import serial
@@ -28,6 +28,7 @@ from fitctl.drivers.mdt693.protocol import (
     Answer,
     Commands,
     is_complete,
+    is_frame_only,
     parse_answer,
     parse_identity,
     parse_limit_switch,
@@ -41,18 +42,22 @@ _POLL_S = 0.02  # how long one read waits; the time limits are counted above it
 # An answer without a prompt is complete after this silence. A slow command takes 0.15 s, a stall of
 # the machine 0.1 s.
 _QUIET_S = 0.25
+_LATE = b"\0 >*"
 _LIMIT_TOLERANCE_V = 1.0
+_AGREE_V = 1.0  # two answers in a row this near each other are believed
 
-_T = TypeVar("_T")
+_Volts = tuple[float, ...]
 
 
 class Mdt693:
     """An MDT693A or MDT693B; a :class:`~fitctl.drivers.interface.PiezoAmplifier`.
 
     At :meth:`open` it finds out which model answers, whether it echoes, and whether it can give three
-    voltages in one answer; it takes the device as it is and leaves it so. A question takes at most
-    `response_timeout_s`, and twice that after one that went wrong. Through ``socket://``, pyserial
-    itself allows 5 s to connect and takes 0.3 s to close.
+    voltages in one answer; it takes the device as it is and leaves it so. RS-232 has no checksum, so
+    every value is asked for twice; when the answers differ by more than 1 V, a third time, and then
+    the one in the middle counts. A question takes at most `response_timeout_s`, and twice that after
+    one that went wrong. Through ``socket://``, pyserial itself allows 5 s to connect and takes 0.3 s to
+    close.
 
     Parameters
     ----------
@@ -64,7 +69,7 @@ class Mdt693:
         self._piezo = piezo
         self._port: serial.Serial | None = None
         self._commands: Commands = MODEL_B
-        self._echoes = False
+        self._echoes: bool | None = None  # not known yet
         self._in_step = False
         self._all_at_once = False
 
@@ -74,7 +79,8 @@ class Mdt693:
         Raises
         ------
         DeviceMismatch
-            If the voltage-limit switch or a channel's own high limit is not `limit_v`, within 1 V.
+            If the voltage-limit switch or another high limit is not `limit_v`, or a low limit is not
+            0 V, within 1 V.
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
         self.close()
@@ -115,59 +121,86 @@ class Mdt693:
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
         if self._all_at_once:
-            return np.array(self._value(self._commands.all_voltages, parse_three_volts))
-        return np.array([self._value(command, parse_volts) for command in self._commands.voltages])
+            return np.array(self._volts(self._commands.all_voltages, _three))
+        return np.array([self._volts(command, _one)[0] for command in self._commands.voltages])
 
     def limit_v(self) -> float:
         """The voltage-limit switch as the device reports it: 75, 100 or 150 V.
 
         Raises
         ------
+        DeviceMismatch
+            If somebody moved it: it is not `limit_v` of the rig file, within 1 V.
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
-        return self._value(self._commands.limit, parse_limit_switch)
+        (volts,) = self._volts(self._commands.limit, _switch)
+        self._check_limit("the voltage-limit switch", volts, self._piezo.limit_v)
+        return volts
 
     def close(self) -> None:
         """Let go of the port; safe to call twice and after a failure."""
         self._in_step = False
+        self._echoes = None
         if self._port is not None:
             self._port.close()
             self._port = None
 
     def _identify(self) -> DeviceIdentity:
-        """Find model and dialect; the A refuses what the B is asked first."""
-        self._commands = MODEL_B
+        """Find model and dialect. Some As refuse what the B is asked first, others answer it."""
         answer = self._ask(MODEL_B.identity)
-        if answer.refused:
-            self._commands = MODEL_A
-            answer = self._ask(MODEL_A.identity)
         self._echoes = answer.echoed
+        if answer.refused:
+            answer = self._ask(MODEL_A.identity)
         try:
             model, firmware = parse_identity(answer.body)
         except ValueError as error:
             self._nonsense("the name of an MDT693", str(error))
+        self._commands = MODEL_A if model.endswith("A") else MODEL_B
         together = self._commands.all_voltages
         self._all_at_once = bool(together) and not self._ask(together).refused
         number = self._ask(self._commands.serial).body if self._commands.serial else ""
+        if number and self._ask(self._commands.serial).body != number:
+            self._nonsense("the same serial number twice", "another")
         return DeviceIdentity("Thorlabs", model, number, firmware)
 
     def _check_limits(self) -> None:
-        expected_v = self._piezo.limit_v
-        read = {"the voltage-limit switch": self.limit_v()}
-        for name, command in zip(_CHANNEL_NAMES, self._commands.high_limits, strict=True):
-            read[f"channel {name}'s high limit"] = self._value(command, parse_volts)
-        for what, volts in read.items():
-            if abs(volts - expected_v) > _LIMIT_TOLERANCE_V:
-                raise DeviceMismatch(
-                    _NAME,
-                    self._piezo.port,
-                    f"{what} at {expected_v:g} V",
-                    f"{volts:g} V",
-                    f"set {what} on the amplifier, or correct piezo.limit_v in the rig file "
-                    "if the stacks allow it",
-                )
+        self.limit_v()
+        for bound, commands, expected_v in (
+            ("high", self._commands.high_limits, self._piezo.limit_v),
+            ("low", self._commands.low_limits, 0.0),
+        ):
+            for name, command in zip(_CHANNEL_NAMES, commands, strict=True):
+                (volts,) = self._volts(command, _one)
+                self._check_limit(f"channel {name}'s {bound} limit", volts, expected_v)
+        for bound, command, expected_v in (
+            ("low", self._commands.system_low, 0.0),
+            ("high", self._commands.system_high, self._piezo.limit_v),
+        ):
+            if command and not self._ask(command).refused:  # not every firmware tells
+                (volts,) = self._volts(command, _one)
+                volts = min(volts, self._piezo.limit_v)  # beyond the switch it limits nothing
+                self._check_limit(f"the system's {bound} limit", volts, expected_v)
 
-    def _value(self, command: str, parse: Callable[[str], _T]) -> _T:
+    def _check_limit(self, what: str, volts: float, expected_v: float) -> None:
+        if abs(volts - expected_v) > _LIMIT_TOLERANCE_V:
+            raise DeviceMismatch(
+                _NAME,
+                self._piezo.port,
+                f"{what} at {expected_v:g} V",
+                f"{volts:g} V",
+                f"set {what} on the amplifier, or correct piezo.limit_v in the rig file "
+                "if the stacks allow it",
+            )
+
+    def _volts(self, command: str, parse: Callable[[str], _Volts]) -> _Volts:
+        """Ask twice and, when the answers differ, a third time: one wrong answer is never believed."""
+        first, second = self._value(command, parse), self._value(command, parse)
+        if all(abs(a - b) <= _AGREE_V for a, b in zip(first, second, strict=True)):
+            return second
+        third = self._value(command, parse)
+        return tuple(sorted(answers)[1] for answers in zip(first, second, third, strict=True))
+
+    def _value(self, command: str, parse: Callable[[str], _Volts]) -> _Volts:
         """Ask for a value and insist on one, in the dialect found at open."""
         answer = self._ask(command)
         if answer.refused:
@@ -177,10 +210,6 @@ class Mdt693:
                 f"an answer to {command}",
                 "an error",
                 "check that this is an MDT693A or MDT693B and see its manual for this command",
-            )
-        if answer.echoed != self._echoes:
-            self._nonsense(
-                f"{command} {'echoed' if self._echoes else 'not echoed'}, as at open", "otherwise"
             )
         try:
             return parse(answer.body)
@@ -196,12 +225,20 @@ class Mdt693:
         self._in_step = False
         self._send(command)
         data = self._collect(command)
-        if not data:
+        # Without echo nothing in an answer tells to which question; so nothing may follow it.
+        more = b"" if self._echoes else self._read(command)
+        if not is_frame_only(command, more):
+            self._nonsense(f"one answer to {command}", f"{(data + more)[:80]!r}")
+        # Where commands are echoed, a prompt alone came late with the answer before.
+        if not (data.strip(_LATE) if self._echoes else data):
             self._silence(f"an answer to {command}")
         try:
             answer = parse_answer(command, data)
         except ValueError as error:
             self._nonsense(f"an answer to {command}", f"{data[:80]!r} ({error})")
+        if self._echoes not in {None, answer.echoed}:
+            dialect = "echoed" if self._echoes else "not echoed"
+            self._nonsense(f"{command} {dialect}, as at open", f"{data[:80]!r}")
         self._in_step = True
         return answer
 
@@ -216,24 +253,31 @@ class Mdt693:
 
     def _collect(self, command: str, *, until_quiet: bool = False) -> bytes:
         """What comes after `command`, up to a prompt, a silence after something came, or the limit."""
-        port = self._opened()
         data = bytearray()
         heard_s = time.monotonic()
         deadline_s = heard_s + self._piezo.response_timeout_s
-        try:
-            while heard_s < deadline_s and len(data) < ANSWER_BYTES_MAX:
-                chunk = port.read(max(1, port.in_waiting))
-                now_s = time.monotonic()
-                if chunk:
-                    data += chunk
-                    heard_s = now_s
-                    if not until_quiet and is_complete(command, bytes(data)):
-                        break
-                elif now_s > (heard_s + _QUIET_S if data else deadline_s):
+        while len(data) < ANSWER_BYTES_MAX:
+            chunk = self._read(command)
+            now_s = time.monotonic()
+            if chunk:
+                data += chunk
+                heard_s = now_s
+                if not until_quiet and is_complete(command, bytes(data)):
                     break
+            elif now_s > heard_s + _QUIET_S and not is_frame_only(command, bytes(data)):
+                break
+            if now_s > deadline_s:
+                # What the time limit cuts off is no answer; a prompt alone is one without a body.
+                return bytes(data) if is_frame_only(command, bytes(data)) else b""
+        return bytes(data)
+
+    def _read(self, command: str) -> bytes:
+        """What has come; waits for the first of it, `_POLL_S` at most."""
+        port = self._opened()
+        try:
+            return port.read(max(1, port.in_waiting))
         except OSError as error:
             self._broken(f"an answer to {command or 'CR'}", error)
-        return bytes(data)
 
     def _opened(self) -> serial.Serial:
         if self._port is None:
@@ -269,3 +313,15 @@ class Mdt693:
             got,
             "check piezo.baud_rate, and that no other program uses the port",
         )
+
+
+def _one(body: str) -> _Volts:
+    return (parse_volts(body),)
+
+
+def _three(body: str) -> _Volts:
+    return tuple(parse_three_volts(body))
+
+
+def _switch(body: str) -> _Volts:
+    return (parse_limit_switch(body),)

@@ -1,12 +1,14 @@
 """What an MDT693A or MDT693B says on the wire, in every variant that public sources report.
 
-A command ends in CR. The answer is, where echo is on, the command itself; then, in some firmware, a
-``*``; then the body; then CR and a prompt: ``>``, ``> `` or ``*``. An error is ``CMD_NOT_DEFINED>``
-or ``!``. LF means nothing. Volts come with and without brackets, with one decimal or two, and the
-voltage-limit switch as volts or as a position.
+A command ends in CR. The answer is, where echo is on, the command itself, in lower case from some;
+then, from some, a ``*``; then the body; then CR and a prompt: ``>``, ``> `` or ``*``. The A has no prompt
+after its answers, and no CR after a limit. An error is ``CMD_NOT_DEFINED>`` or ``!``. LF means
+nothing, nor does a NUL, which a recorded A sends after some answers. Volts come with and without
+brackets, with no decimal to two, and the voltage-limit switch as volts or as a position.
 
-Sources: Thorlabs MDT693A and MDT693B manuals (commands), a recorded session of an MDT693B with
-firmware 1.05 (echo, leading ``*``, bodies), public drivers (errors, prompts, limit codes).
+Sources: Thorlabs MDT693A and MDT693B manuals (commands); recorded sessions of an MDT693A with firmware
+3.01 and of MDT693Bs with 1.05 and 1.10 (echo, stars, prompts, bodies, NULs); public drivers (errors,
+prompts, limit codes).
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ ACKNOWLEDGED = "*"
 
 LIMIT_SWITCH_V = (75, 100, 150)  # by position: 0, 1, 2
 LIMIT_MARGIN_V = 0.5  # the highest output is this much above what the switch says
-ANSWER_BYTES_MAX = 4096  # the longest real one is the help text of the B, below 2 kB
+ANSWER_BYTES_MAX = 4096  # the longest real one is the help text of the B, below 3 kB
+BITS_PER_BYTE = 10  # 8N1: start bit, eight data bits, stop bit
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,20 +34,37 @@ class Commands:
 
     identity: str
     limit: str
+    low_limits: tuple[str, str, str]
     high_limits: tuple[str, str, str]
     voltages: tuple[str, str, str]
-    all_voltages: str  # empty where the model has none
+    # What only some have; empty where a model has none.
+    system_low: str
+    system_high: str
+    all_voltages: str
     serial: str
 
 
-MODEL_A = Commands("I", "%", ("XH?", "YH?", "ZH?"), ("XR?", "YR?", "ZR?"), "", "")
+MODEL_A = Commands(
+    identity="I",
+    limit="%",
+    low_limits=("XL?", "YL?", "ZL?"),
+    high_limits=("XH?", "YH?", "ZH?"),
+    voltages=("XR?", "YR?", "ZR?"),
+    system_low="",
+    system_high="",
+    all_voltages="",
+    serial="",
+)
 MODEL_B = Commands(
-    "id?",
-    "vlimit?",
-    ("xmax?", "ymax?", "zmax?"),
-    ("xvoltage?", "yvoltage?", "zvoltage?"),
-    "xyzvoltage?",
-    "serial?",
+    identity="id?",
+    limit="vlimit?",
+    low_limits=("xmin?", "ymin?", "zmin?"),
+    high_limits=("xmax?", "ymax?", "zmax?"),
+    voltages=("xvoltage?", "yvoltage?", "zvoltage?"),
+    system_low="sysmin?",
+    system_high="sysmax?",
+    all_voltages="xyzvoltage?",
+    serial="serial?",
 )
 
 
@@ -67,21 +87,33 @@ class Answer:
     echoed: bool
 
 
-_COMPLETE = re.compile(rf"{REFUSED}$|CMD_[A-Z_]+\s*[>*] ?$|[^\s>*]\s*\r\s*[>*] ?$")
+_COMPLETE = re.compile(
+    rf"{REFUSED}\0?$"
+    r"|CMD_[A-Z_]+\s*[>*] ?$"
+    r"|[^\s>*]\s*\r\s*[>*] ?$"
+    r"|\*\[[^\]\r]*\]\r$"  # a star before a value: no prompt need follow, and if one does it is skipped
+)
 _ERROR = re.compile(r"CMD_[A-Z_]+")
 _NUMBER = r"-?\d{1,4}(?:\.\d{1,3})?"
 _VOLTS = re.compile(rf"\[\s*({_NUMBER})\s*\]|({_NUMBER})")
 _THREE = re.compile(rf"({_NUMBER})\s*,\s*({_NUMBER})\s*,\s*({_NUMBER})")
 _SWITCH = re.compile(r"\[\s*(\d{2,3})\s*\]|(\d{1,3})")
+_FRAME = "\r\n\0 >*"
 
 
 def is_complete(command: str, data: bytes) -> bool:
     """Whether `data`, received after `command`, ends as an answer ends.
 
-    Some firmware sends no prompt after some answers; those are complete when nothing more comes.
+    After some answers some firmware sends no prompt; those are complete when nothing more comes.
     """
     text, _ = _without_echo(command, data.decode("ascii", "replace"))
     return _COMPLETE.search(text) is not None
+
+
+def is_frame_only(command: str, data: bytes) -> bool:
+    """Whether there is nothing in `data` but what surrounds an answer: echo, prompt, line ends, NULs."""
+    text, _ = _without_echo(command, data.decode("ascii", "replace"))
+    return not text.strip(_FRAME)
 
 
 def parse_answer(command: str, data: bytes) -> Answer:
@@ -93,14 +125,14 @@ def parse_answer(command: str, data: bytes) -> Answer:
         If there is anything but ASCII in it, or neither body, error nor prompt.
     """
     text, echoed = _without_echo(command, data.decode("ascii"))
-    if _ERROR.search(text) or text.strip("\r >*") == REFUSED:
+    if _ERROR.search(text) or text.strip(_FRAME) == REFUSED:
         return Answer("", refused=True, echoed=echoed)
-    body = text.lstrip("\r >*!")
+    body = text.lstrip("\r >*!").rstrip("\0")
     body = re.sub(r"\r\s*[>*] ?$", "", body).strip("\r ")
-    if not body and not text.strip("\r "):
+    if not body and not text.strip("\r \0"):
         msg = "neither answer nor prompt"
         raise ValueError(msg)
-    if any(not character.isprintable() for character in body.replace("\r", "")):
+    if any(not character.isprintable() for character in body.replace("\r", "").replace("\t", "")):
         msg = "control characters"
         raise ValueError(msg)
     return Answer(body, refused=False, echoed=echoed)
@@ -171,21 +203,26 @@ def parse_identity(body: str) -> tuple[str, str]:
     return model[0].upper(), firmware[1] if firmware else ""
 
 
-def format_volts(volts: float) -> str:
-    """A measured voltage as the device shows it: 0.1 V, in brackets."""
-    return f"[{volts:6.1f}]"
+def format_volts(volts: float, decimals: int) -> str:
+    """A measured voltage as the B tells it, such as ``[  24.8]``."""
+    return f"[{volts:6.{decimals}f}]"
 
 
-def format_three_volts(volts: Sequence[float]) -> str:
-    """Three measured voltages in one answer."""
-    return f"[{', '.join(f'{value:5.1f}' for value in volts)}]"
+def format_three_volts(volts: Sequence[float], decimals: int) -> str:
+    """Three measured voltages in one answer, such as ``[  0.24,  0.21,  0.22]``."""
+    return f"[{','.join(f'{value:6.{decimals}f}' for value in volts)}]"
+
+
+def format_volts_a(volts: float) -> str:
+    """A measured voltage as the A tells it: to 0.1 V, but ``[     1]`` for a whole number."""
+    return f"[{round(volts, 1):6g}]"
 
 
 def _without_echo(command: str, text: str) -> tuple[str, bool]:
     """Take off LFs and the echo of the command; tell whether it was there."""
-    # The space of a ``> `` may come after the answer that it ends has been taken as complete.
-    text = text.replace("\n", "").lstrip(" ")
-    echo = f"{command}\r"
-    if text.lower().startswith(echo.lower()):
-        return text[len(echo) :], True
-    return text, False
+    text = text.replace("\n", "")
+    # What ends an answer may come after that answer has been taken as complete.
+    echo = re.match(rf"[\0 >*]*{re.escape(command)}\r", text, re.IGNORECASE)
+    if echo is None:
+        return text.lstrip("\0 "), False
+    return text[echo.end() :], True

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import tty
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from fitctl import config
-from fitctl.drivers.mdt693.protocol import ACKNOWLEDGED, NOT_DEFINED, REFUSED, TERMINATOR
-from fitctl.mocks.faults import WIRE_FAULTS, Faults
-from fitctl.mocks.mdt693.device import COMMAND_BYTES_MAX, Amplifier, CommandError, Dialect
+from fitctl.drivers.mdt693.protocol import BITS_PER_BYTE, TERMINATOR
+from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
+from fitctl.mocks.mdt693.amplifier import CHANNELS, Amplifier
+from fitctl.mocks.mdt693.controller import Controller
+from fitctl.mocks.mdt693.line import CommandSplitter, Pty, Sender, write_to
 
-FAULTS = dict(WIRE_FAULTS)
-_GARBAGE = b"\xfe[ 1\x00?\r"  # as a wrong baud rate would look
+FAULTS = WIRE_FAULTS | {
+    "silent": FaultKind("commands are obeyed and not answered: the line back is broken"),
+    "limit_switch": FaultKind("the voltage-limit switch is moved", "V", 75.0),
+    "saturated_stack": FaultKind(
+        "an output stays at its highest voltage, whatever it is told", parts=tuple(CHANNELS)
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,73 +32,52 @@ class Endpoints:
     pty_path: str
 
 
-class CommandSplitter:
-    """Bytes in, whole commands out; half a command waits for the rest."""
-
-    def __init__(self) -> None:
-        self._pending = bytearray()
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Commands that are now complete, without CR and still with their LFs.
-
-        What is longer than any command is cut one byte beyond that length, so that a flood without
-        CR needs no memory and is still too long.
-        """
-        *ends, rest = data.split(TERMINATOR)
-        commands = []
-        for end in ends:
-            self._keep(end)
-            commands.append(bytes(self._pending))
-            self._pending.clear()
-        self._keep(rest)
-        return commands
-
-    def _keep(self, data: bytes) -> None:
-        self._pending += data[: COMMAND_BYTES_MAX + 1 - len(self._pending)]
-
-
 class Mdt693Mock:
     """An MDT693A or MDT693B, whichever the settings say, on a pty and on 127.0.0.1 at once.
 
-    Fails on command: `silent`, `garbled`, :meth:`drop_links`, and `amplifier.set_limit_switch_v`.
+    The pty is an RS-232 port, TCP the terminal server before one. Bytes pass at the baud rate both
+    ways. What goes wrong on command is in `FAULTS`: while it lasts, `disconnect` closes TCP connections
+    at once, and on the pty, whose path must stay, is a pulled cable; `reboot` takes the stacks to 0 V.
 
     Known limitations
     -----------------
-    - The output follows its inputs at once: no bandwidth, no current limit, no ripple; the measured
-      voltages are exact to their 0.1 V.
+    - The outputs follow their inputs at once: no bandwidth, no current limit, no ripple. What is
+      measured of them follows as the settings say.
     - The echo comes with the answer, not byte by byte while the command is typed.
-    - Of the 693B it lacks intensity, friendly name, master scan, dacstep, sysmin and sysmax, rotary
-      mode and push disable, arrow keys, and the front panel. Nothing survives a restart.
+    - Display, knob modes and push-to-turn are numbers that are kept, without effect. Nothing survives
+      a restart.
     - An RS-232 line has one client; here pty and TCP clients each get the answers to their own
-      commands, one command at a time. The pty has no baud rate and cannot be unplugged.
+      commands, one command at a time. A pty's client with another baud rate is not understood; a
+      real device would make noise of it.
+    - The recorded A sends a NUL after some answers, the mock after none.
 
     Invented constants
     ------------------
-    The identity's lines but model and firmware; what `restore` resets; `CMD_NOT_DEFINED>` also for
-    a value out of range; commands of at most 64 bytes; firmware 1 speaks as recorded from 1.05 and
-    every other one as the manual describes firmware 2; zero volts at the external inputs until told.
+    Serial number and friendly name; the wording of the help text; what `restore` resets (not echo,
+    nor compatibility mode), to which values; power-up values; the same errors for a value out of range
+    as for an unknown command; commands of at most 64 bytes; the answer to `D`; plain numbers as the
+    answers to `msvoltage?`, `sysmin?` and `sysmax?`; arrow keys without an answer of their own but the
+    prompt, and their step of 150 V / 65536; zero volts at the external inputs until told; noise and
+    settling of what is measured (rig file).
 
     Parameters
     ----------
     settings : config.Mdt693Mock
-        Model, firmware, voltage-limit switch, time to answer.
     piezo : config.Mdt693Device
         The gain from external input to output; its port is not used.
     on_outputs : callable
         Gets the three stack voltages, once at start and whenever one changes.
     port : int
         TCP port to listen on; 0 for any free port.
-    dialect : Dialect or None
-        To speak as another firmware of the B; None for that of `settings.firmware`.
+    now_s : callable
+        The time.
 
     Attributes
     ----------
     amplifier : Amplifier
+    controller : Controller
         The device behind the wire.
-    silent : bool
-        Neither act on commands nor answer them.
-    garbled : bool
-        Answer with noise.
+    faults : Faults
     """
 
     def __init__(
@@ -102,19 +87,20 @@ class Mdt693Mock:
         on_outputs: Callable[[Sequence[float]], None],
         *,
         port: int,
-        dialect: Dialect | None = None,
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.amplifier = Amplifier(settings, piezo, on_outputs, dialect)
+        self.amplifier = Amplifier(settings, piezo.gain, on_outputs, now_s)
+        self.controller = Controller(settings, self.amplifier)
         self.faults = Faults(FAULTS)
-        self.silent = False
-        self.garbled = False
-        self._reply_s = settings.reply_s
+        self.faults.on_change(self._fault_changed)
+        self._settings = settings
         self._on_outputs = on_outputs
         self._port = port
         self._busy = asyncio.Lock()
         self._listener: asyncio.Server | None = None
         self._links: dict[asyncio.StreamWriter, asyncio.Task[None] | None] = {}
-        self._pty: _Pty | None = None
+        self._pty: Pty | None = None
+        self._pty_task: asyncio.Task[None] | None = None
 
     def set_external_input_v(self, volts: Sequence[float]) -> None:
         """The D/A's three outputs, at the external inputs; acts on the stacks before it returns."""
@@ -129,109 +115,84 @@ class Mdt693Mock:
             If the port is taken.
         """
         self._listener = await asyncio.start_server(self._serve_tcp, "127.0.0.1", self._port)
-        self._pty = await _Pty.open(self._serve)
+        self._pty = pty = Pty(self._settings.baud_rate)
+        await pty.open()
+        self._pty_task = asyncio.create_task(
+            self._serve(pty.reader, pty.write, pty.is_at_our_baud_rate)
+        )
         self._on_outputs(self.amplifier.outputs_v)
-        return Endpoints(self._listener.sockets[0].getsockname()[1], self._pty.path)
+        return Endpoints(self._listener.sockets[0].getsockname()[1], pty.path)
 
     async def stop(self) -> None:
         """Close both ends and wait for what was under way; safe to call twice."""
+        self.faults.close()
         if self._listener is not None:
             self._listener.close()
             self._listener = None
-        tasks = [task for task in self._links.values() if task is not None]
+        tasks = [task for task in [*self._links.values(), self._pty_task] if task is not None]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        self._pty_task = None
         if self._pty is not None:
             await self._pty.close()
             self._pty = None
 
-    def drop_links(self) -> None:
-        """Close every TCP connection, as a terminal server does that restarts."""
-        for writer in self._links:
-            writer.transport.abort()
-
     async def _serve_tcp(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        async def send(data: bytes) -> None:
-            writer.write(data)
-            await writer.drain()
-
+        if self.faults.value("disconnect") is not None:
+            writer.transport.abort()
+            return
         self._links[writer] = asyncio.current_task()
         try:
             # A cancelled task would be reported as a failure by Python 3.11's stream server.
             with suppress(ConnectionError, asyncio.CancelledError):
-                await self._serve(reader, send)
+                await self._serve(reader, lambda data: write_to(writer, data), lambda: True)
         finally:
             del self._links[writer]
             writer.transport.abort()
 
     async def _serve(
-        self, reader: asyncio.StreamReader, send: Callable[[bytes], Awaitable[None]]
+        self,
+        reader: asyncio.StreamReader,
+        write: Callable[[bytes], None],
+        is_understood: Callable[[], bool],
     ) -> None:
         splitter = CommandSplitter()
-        while data := await reader.read(1024):
-            for command in splitter.feed(data):
-                if self.silent:
-                    continue
-                async with self._busy:
-                    await asyncio.sleep(self._reply_s)
-                    answer = self._answer(command)
-                await send(answer)
-
-    def _answer(self, command: bytes) -> bytes:
-        if self.garbled:
-            return _GARBAGE
-        amplifier = self.amplifier
-        echo = command + TERMINATOR if amplifier.echo else b""
+        sender = Sender(self._settings.baud_rate, write)
+        wire = Wire(self.faults, sender.send)
         try:
-            body = amplifier.execute(command.replace(b"\n", b"").decode("ascii", "replace"))
-        except CommandError:
-            return echo + (REFUSED if amplifier.speaks_a else NOT_DEFINED).encode("ascii")
-        if body:
-            # Firmware 1.05 was recorded with a second star, before the answer, while echo was on.
-            lead = ACKNOWLEDGED if echo and amplifier.prompt == ACKNOWLEDGED else ""
-            body = f"{lead}{body}\r"
-        return echo + (body + amplifier.prompt).encode("ascii")
+            while data := await reader.read(1024):
+                if wire.dead or not is_understood():
+                    splitter.clear()
+                    continue
+                for command in splitter.feed(data):
+                    await self._execute(command, wire)
+        finally:
+            wire.close()
+            sender.close()
 
+    async def _execute(self, command: bytes, wire: Wire) -> None:
+        arrival_s = len(command + TERMINATOR) * BITS_PER_BYTE / self._settings.baud_rate
+        async with self._busy:
+            await asyncio.sleep(arrival_s + self._settings.reply_s)
+            if wire.dead:
+                return
+            answer = self.controller.answer(command.decode("latin-1"))
+        if not self.faults.strikes("silent"):
+            wire.send(answer.encode("latin-1"))
 
-class _Pty:
-    """A raw pty whose far end is given to clients by its path."""
-
-    def __init__(self, master: int, slave: int) -> None:
-        self.path = os.ttyname(slave)
-        self._master = master
-        self._slave = slave  # kept open, so that the master sees no error when a client leaves
-        self._transport: asyncio.ReadTransport | None = None
-        self._task: asyncio.Task[None] | None = None
-
-    @classmethod
-    async def open(
-        cls,
-        serve: Callable[
-            [asyncio.StreamReader, Callable[[bytes], Awaitable[None]]], Coroutine[None, None, None]
-        ],
-    ) -> _Pty:
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        self = cls(master, slave)
-        reader = asyncio.StreamReader()
-        loop = asyncio.get_running_loop()
-        self._transport, _ = await loop.connect_read_pipe(
-            lambda: asyncio.StreamReaderProtocol(reader), os.fdopen(master, "rb", buffering=0)
-        )
-        self._task = loop.create_task(serve(reader, self._send))
-        return self
-
-    async def _send(self, data: bytes) -> None:
-        # Without flow control, what nobody reads is lost.
-        with suppress(BlockingIOError):
-            os.write(self._master, data)
-
-    async def close(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
-        if self._transport is not None:
-            self._transport.close()
-            await asyncio.sleep(0)  # the transport closes the master on the loop's next turn
-        os.close(self._slave)
+    def _fault_changed(self, kind: str) -> None:
+        if kind == "limit_switch":
+            moved_v = self.faults.value("limit_switch")
+            self.amplifier.set_switch_v(
+                self._settings.limit_switch_v if moved_v is None else moved_v
+            )
+        elif kind == "saturated_stack":
+            hit = [one for one in CHANNELS if self.faults.value("saturated_stack", one) is not None]
+            self.amplifier.set_saturated(hit)
+        elif kind == "reboot":
+            self.amplifier.set_powered(self.faults.value("reboot") is None)
+            self.controller.power_up()
+        elif kind == "disconnect":
+            for writer in self._links:
+                writer.transport.abort()

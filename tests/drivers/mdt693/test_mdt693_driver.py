@@ -1,72 +1,42 @@
+import itertools
 import os
 import threading
-import time
 import tty
 from contextlib import contextmanager
 
 import pytest
+from mdt693_bench import PIEZO, opened
 
-from fitctl import config
-from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import (
     DeviceMismatch,
     DeviceProtocolError,
     DeviceRefused,
-    DeviceTimeout,
     DeviceUnreachable,
 )
 from fitctl.drivers.mdt693.driver import Mdt693
-from fitctl.mocks.mdt693.device import Dialect
-from fitctl.mocks.mdt693.server import Mdt693Mock
 
-PIEZO = (
-    load_rig(default_rig_path())
-    .loops["right"]
-    .fsm.piezo.model_copy(update={"response_timeout_s": 0.4})
-)
-
-
-@pytest.fixture
-def start(in_loop):
-    """Start a mock; more are stopped at the end."""
-    mocks = []
-
-    def started(model="MDT693B", firmware="2.04", switch_v=150, dialect=None):
-        async def made():
-            settings = config.Mdt693Mock(
-                model=model, firmware=firmware, limit_switch_v=switch_v, reply_s=0.005
-            )
-            return Mdt693Mock(settings, PIEZO, lambda volts: None, port=0, dialect=dialect)
-
-        mock = in_loop(made())
-        mock.ends = in_loop(mock.start())
-        mocks.append(mock)
-        return mock
-
-    yield started
-    for mock in mocks:
-        in_loop(mock.stop())
-
-
-@contextmanager
-def opened(port, **changes):
-    driver = Mdt693(PIEZO.model_copy(update={"port": port, **changes}))
-    try:
-        driver.identity = driver.open()
-        yield driver
-    finally:
-        driver.close()
-
-
-def tcp(mock):
-    return f"socket://127.0.0.1:{mock.ends.tcp_port}"
+A_301 = {"model": "MDT693A", "firmware": "3.01"}
+B_105 = {"model": "MDT693B", "firmware": "1.05", "prompt": "*"}
+B_110 = {
+    "model": "MDT693B",
+    "firmware": "1.10",
+    "prompt": ">",
+    "decimals": 2,
+    "xyzvoltage": True,
+}
+ODD = {"model": "MDT693B", "firmware": "1.23", "prompt": "> ", "vlimit_as": "position"}
+COMPATIBLE = B_110 | {"compatibility_mode": True}
 
 
 @contextmanager
 def scripted_amplifier(answers):
-    """A pty that answers commands from a table, and nothing to what is not in it."""
+    """A pty that answers commands from a table, in turn, and nothing to what is not in it."""
     master, slave = os.openpty()
     tty.setraw(slave)
+    turns = {
+        command: itertools.cycle([turn] if isinstance(turn, bytes) else turn)
+        for command, turn in answers.items()
+    }
 
     def serve():
         pending = b""
@@ -76,7 +46,8 @@ def scripted_amplifier(answers):
             for command in commands:
                 if command == b"end":
                     return
-                os.write(master, answers.get(command, b""))
+                if command in turns:
+                    os.write(master, next(turns[command]))
 
     thread = threading.Thread(target=serve)
     thread.start()
@@ -89,125 +60,160 @@ def scripted_amplifier(answers):
         os.close(slave)
 
 
-@pytest.mark.parametrize(("wire", "echo"), [("tcp", True), ("pty", False)])
+B_SESSION = {
+    b"": b"!",
+    b"id?": b"id?\r*\r\r\rModel MDT693B\rFirmware Version: 1.05\r\r*",
+    b"xyzvoltage?": b"xyzvoltage?\r!",
+    b"serial?": b"serial?\r140421-07\r*",
+    b"vlimit?": b"vlimit?\r*[ 100]\r*",
+    b"sysmin?": b"sysmin?\r!",
+    b"sysmax?": b"sysmax?\r!",
+    **{f"{name}max?".encode(): f"{name}max?\r*100.5\r*".encode() for name in "xyz"},
+    **{f"{name}min?".encode(): f"{name}min?\r*0\r*".encode() for name in "xyz"},
+    b"xvoltage?": b"xvoltage?\r*[  24.8]\r*",
+    b"yvoltage?": b"yvoltage?\r*[   1.4]\r*",
+    b"zvoltage?": b"zvoltage?\r*[   0.2]\r*",
+}
+A_SESSION = {
+    b"": b"\r!\0",
+    b"id?": b"id?\r!\0",
+    b"I": b"i\r*     \r\r\rModel MDT693A Piezo Control Module\rFirmware Version: 3.01\r\r",
+    b"%": b"%\r*[ 150]\r",
+    **{f"{name}H?".encode(): f"{name}h?\r*150".lower().encode() for name in "XYZ"},
+    **{f"{name}L?".encode(): f"{name}l?\r*0\0".lower().encode() for name in "XYZ"},
+    b"XR?": b"xr?\r*[   1.6]\r",
+    b"YR?": b"yr?\r*[     1]\r",
+    b"ZR?": b"zr?\r*[  50.5]\r",
+}
+
+
 @pytest.mark.parametrize(
-    ("model", "firmware", "dialect"),
+    ("dialect", "wire", "echo"),
     [
-        ("MDT693A", "1.0", None),
-        ("MDT693B", "1.05", None),
-        ("MDT693B", "2.04", None),
-        ("MDT693B", "2.04", Dialect("> ", all_voltages=False, limit_as_position=True)),
+        (A_301, "pty", False),
+        (B_105, "pty", True),
+        (B_105, "tcp", False),
+        (B_110, "tcp", True),
+        (B_110, "pty", False),
+        (ODD, "pty", True),
+        (ODD, "tcp", False),
+        (COMPATIBLE, "pty", True),
+        (COMPATIBLE, "tcp", False),
     ],
-    ids=["693A", "693B firmware 1", "693B firmware 2", "693B, the odd one"],
+    ids=str,
 )
-def test_every_dialect_is_understood(start, model, firmware, dialect, wire, echo):
-    mock = start(model, firmware, dialect=dialect)
-    mock.amplifier.echo = echo
-    mock.set_external_input_v([5.0, 0.0, 3.3])
-    with opened(tcp(mock) if wire == "tcp" else mock.ends.pty_path) as piezo:
-        assert (piezo.identity.model, piezo.identity.firmware) == (model, firmware)
+def test_every_dialect_is_understood_and_left_as_it_is(start, dialect, wire, echo):
+    bench = start(**dialect, echo=echo)
+    bench.mock.set_external_input_v([5.0, 0.0, 3.3])
+    with bench.opened(getattr(bench, wire)) as piezo:
+        identity = piezo.identity
+        assert (identity.model, identity.firmware) == (dialect["model"], dialect["firmware"])
         assert piezo.stack_volts() == pytest.approx([75.0, 0.0, 49.5])
         assert piezo.limit_v() == 150.0
-        assert mock.amplifier.echo is echo
+    assert bench.controller.echo is echo
+    assert bench.controller.compatible is dialect.get("compatibility_mode", False)
 
 
-def test_a_693b_in_compatibility_mode_is_understood_and_left_so(start):
-    mock = start()
-    mock.amplifier.compatible = True
-    with opened(mock.ends.pty_path) as piezo:
-        assert piezo.stack_volts() == pytest.approx([0.0, 0.0, 0.0])
-    assert mock.amplifier.compatible
+def test_the_recorded_b_is_understood():
+    with scripted_amplifier(B_SESSION) as path, opened(path, limit_v=100.5) as piezo:
+        assert (piezo.identity.serial, piezo.identity.firmware) == ("140421-07", "1.05")
+        assert piezo.limit_v() == 100.0
+        assert piezo.stack_volts() == pytest.approx([24.8, 1.4, 0.2])
+
+
+def test_the_recorded_a_is_understood_with_its_nuls_and_without_prompts():
+    with scripted_amplifier(A_SESSION) as path, opened(path) as piezo:
+        assert (piezo.identity.model, piezo.identity.firmware) == ("MDT693A", "3.01")
+        assert piezo.limit_v() == 150.0
+        assert piezo.stack_volts() == pytest.approx([1.6, 1.0, 50.5])
+
+
+def test_one_wrong_answer_is_not_believed():
+    turns = {b"xvoltage?": [b"xvoltage?\r*[  %s.8]\r*" % n for n in (b"24", b"64", b"25")]}
+    with (
+        scripted_amplifier(B_SESSION | turns) as path,
+        opened(path, limit_v=100.5) as piezo,
+    ):
+        assert piezo.stack_volts()[0] == pytest.approx(25.8)
+
+
+def test_a_device_without_a_serial_number_is_taken():
+    nameless = {
+        command: answer.replace(command + b"\r", b"") for command, answer in B_SESSION.items()
+    }
+    with (
+        scripted_amplifier(nameless | {b"serial?": b"*"}) as path,
+        opened(path, limit_v=100.5) as piezo,
+    ):
+        assert piezo.identity.serial == ""
+
+
+# ---------------------------------------------------------------- limits
 
 
 def test_a_wrong_limit_switch_is_a_mismatch_that_says_what_to_do(start):
-    mock = start(switch_v=100)
+    bench = start(limit_switch_v=100)
     expected = r"voltage-limit switch at 150\.5 V, got 100 V; set .* or correct piezo\.limit_v"
-    with pytest.raises(DeviceMismatch, match=expected), opened(mock.ends.pty_path):
+    with pytest.raises(DeviceMismatch, match=expected), bench.opened():
         pass
-    with opened(mock.ends.pty_path, limit_v=100.5) as piezo:
+    with bench.opened(limit_v=100.5) as piezo:
         assert piezo.limit_v() == 100.0
 
 
-def test_one_channels_wrong_high_limit_is_named(start):
-    mock = start()
-    mock.amplifier.execute("ymax=120")
-    expected = r"channel y's high limit at 150\.5 V, got 120 V"
-    with pytest.raises(DeviceMismatch, match=expected), opened(mock.ends.pty_path):
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("ymax=120", r"channel y's high limit at 150\.5 V, got 120 V"),
+        ("zmin=20", r"channel z's low limit at 0 V, got 20 V"),
+        ("sysmax=120", r"channel x's high limit at 150\.5 V, got 120 V"),
+        ("sysmin=20", r"channel x's low limit at 0 V, got 20 V"),
+    ],
+)
+def test_whichever_limit_is_wrong_is_named(start, command, expected):
+    bench = start()
+    bench.do(bench.controller.answer, command)
+    with pytest.raises(DeviceMismatch, match=expected), bench.opened():
         pass
 
 
+def test_a_limit_of_the_system_that_no_channel_shows_is_found_too():
+    told = {b"sysmin?": b"sysmin?\r*0\r*", b"sysmax?": b"sysmax?\r*90.0\r*"}
+    with (
+        scripted_amplifier(B_SESSION | told) as path,
+        pytest.raises(DeviceMismatch, match=r"the system's high limit at 100\.5 V, got 90 V"),
+        opened(path, limit_v=100.5),
+    ):
+        pass
+
+
+# ---------------------------------------------------------------- what is no MDT693
+
+
 def test_what_an_earlier_client_left_half_typed_does_no_harm(start):
-    mock = start()
-    left = os.open(mock.ends.pty_path, os.O_RDWR | os.O_NOCTTY)
+    bench = start()
+    left = os.open(bench.pty, os.O_RDWR | os.O_NOCTTY)
     os.write(left, b"xvolta")
-    with opened(mock.ends.pty_path) as piezo:
+    with bench.opened() as piezo:
         assert piezo.identity.model == "MDT693B"
     os.close(left)
 
 
-def test_silence_is_a_timeout_and_the_driver_finds_its_way_back(start):
-    mock = start()
-    with opened(mock.ends.pty_path) as piezo:
-        mock.silent = True
-        started_s = time.monotonic()
-        with pytest.raises(DeviceTimeout, match=r"within 0\.4 s, got none"):
+def test_a_command_refused_after_open_is_named():
+    refused_later = {b"vlimit?": [b"vlimit?\r*[ 100]\r*"] * 2 + [b"vlimit?\r!"]}
+    with (
+        scripted_amplifier(B_SESSION | refused_later) as path,
+        opened(path, limit_v=100.5) as piezo,
+        pytest.raises(DeviceRefused, match="an answer to vlimit"),
+    ):
+        piezo.limit_v()
+
+
+def test_echo_that_someone_else_changes_is_noticed(start):
+    bench = start()
+    with bench.opened() as piezo:
+        bench.controller.echo = False
+        with pytest.raises(DeviceProtocolError, match="echoed, as at open"):
             piezo.limit_v()
-        assert 0.3 < time.monotonic() - started_s < 2
-        mock.silent = False
-        assert piezo.limit_v() == 150.0
-
-
-def test_garbage_is_a_protocol_error_and_the_driver_finds_its_way_back(start):
-    mock = start()
-    with opened(mock.ends.pty_path) as piezo:
-        mock.garbled = True
-        with pytest.raises(DeviceProtocolError, match="baud_rate"):
-            piezo.stack_volts()
-        mock.garbled = False
-        assert piezo.stack_volts() == pytest.approx([0.0, 0.0, 0.0])
-
-
-def test_a_late_answer_is_not_taken_for_the_next_one(start):
-    mock = start()
-    mock.amplifier.echo = False
-    with opened(mock.ends.pty_path) as piezo:
-        mock._reply_s = 0.5
-        with pytest.raises(DeviceTimeout):
-            piezo.limit_v()
-        mock._reply_s = 0.005
-        assert piezo.stack_volts() == pytest.approx([0.0, 0.0, 0.0])
-
-
-def test_a_command_refused_after_open_is_named(start):
-    mock = start()
-    with opened(mock.ends.pty_path) as piezo:
-        mock.amplifier.is_a = True
-        with pytest.raises(DeviceRefused, match="an answer to vlimit"):
-            piezo.limit_v()
-
-
-def test_a_lost_link_is_unreachable_until_opened_again(start, in_loop):
-    mock = start()
-
-    async def drop():
-        mock.drop_links()
-
-    with opened(tcp(mock)) as piezo:
-        in_loop(drop())
-        with pytest.raises(DeviceUnreachable, match="broken link"):
-            piezo.stack_volts()
-        with pytest.raises(DeviceUnreachable, match="open it again"):
-            piezo.stack_volts()
-        piezo.open()
-        assert piezo.limit_v() == 150.0
-
-
-def test_no_port_is_unreachable_and_close_is_always_safe():
-    driver = Mdt693(PIEZO.model_copy(update={"port": "/dev/no-such-port"}))
-    with pytest.raises(DeviceUnreachable, match=r"piezo\.port"):
-        driver.open()
-    driver.close()
-    driver.close()
 
 
 def test_a_device_that_is_no_mdt693_is_not_used():
@@ -220,15 +226,9 @@ def test_a_device_that_is_no_mdt693_is_not_used():
         pass
 
 
-def test_answers_without_a_prompt_are_complete_when_nothing_more_comes():
-    answers = {
-        b"": b"!",
-        b"id?": b"id?\r*\r\r\rModel MDT693B\rFirmware Version: 1.05\r\r*",
-        b"xyzvoltage?": b"xyzvoltage?\r!",
-        b"serial?": b"serial?\r140421-07\r*",
-        b"vlimit?": b"vlimit?\r*[ 100]\r*",
-        **{f"{name}max?".encode(): f"{name}max?\r*100.5".encode() for name in "xyz"},
-    }
-    with scripted_amplifier(answers) as path, opened(path, limit_v=100.5) as piezo:
-        assert piezo.identity.serial == "140421-07"
-        assert piezo.limit_v() == 100.0
+def test_no_port_is_unreachable_and_close_is_always_safe():
+    driver = Mdt693(PIEZO.model_copy(update={"port": "/dev/no-such-port"}))
+    with pytest.raises(DeviceUnreachable, match=r"piezo\.port"):
+        driver.open()
+    driver.close()
+    driver.close()

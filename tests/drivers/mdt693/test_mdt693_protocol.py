@@ -1,3 +1,5 @@
+from contextlib import suppress
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -6,7 +8,9 @@ from fitctl.drivers.mdt693.protocol import (
     Answer,
     format_three_volts,
     format_volts,
+    format_volts_a,
     is_complete,
+    is_frame_only,
     parse_answer,
     parse_identity,
     parse_limit_switch,
@@ -30,6 +34,13 @@ TRANSCRIPT = [
     ("xyzvoltage?", b"xyzvoltage?\rCMD_NOT_DEFINED\r> ", Answer("", refused=True, echoed=True)),
     ("id?", b"id?\r!", Answer("", refused=True, echoed=True)),
     ("", b"\n\r!", Answer("", refused=True, echoed=True)),
+    ("XR?", b"*[   0.9]\r", Answer("[   0.9]", **PLAIN)),
+    ("XR?", b"xr?\r*[   0.9]\r", Answer("[   0.9]", **ECHO)),
+    ("%", b"*[ 150]\r", Answer("[ 150]", **PLAIN)),
+    ("XV0", b"xv0\r!\0", Answer("", refused=True, echoed=True)),
+    ("serial?", b"150226175403\r>", Answer("150226175403", **PLAIN)),
+    ("xmax?", b"150.50\r>", Answer("150.50", **PLAIN)),
+    ("xyzvoltage?", b"[  0.24,  0.21,  0.22]\r>", Answer("[  0.24,  0.21,  0.22]", **PLAIN)),
     ("XV10", b"*", Answer("", **PLAIN)),
 ]
 
@@ -42,12 +53,22 @@ def test_every_recorded_variant_is_understood(command, data, answer):
 @pytest.mark.parametrize(("command", "data", "_"), TRANSCRIPT[:-1], ids=str)
 def test_an_answer_is_complete_at_its_last_byte_and_not_before(command, data, _):
     assert is_complete(command, data)
-    # ``> `` may be cut to ``>``, and ``MDT693B\r\r*`` has no shorter end
-    assert not any(is_complete(command, data[:n]) for n in range(len(data.rstrip())))
+    # ``> `` may be cut to ``>``; ``MDT693B\r\r*`` has no shorter end; a star after a value that came
+    # with one, and a NUL, say nothing
+    end = len(data.rstrip(b" \0")) - data.endswith(b"]\r*")
+    assert not any(is_complete(command, data[:n]) for n in range(end))
+
+
+def test_what_follows_an_answer_that_was_complete_without_it_does_no_harm():
+    assert parse_answer("XR?", b"*xr?\r*[   0.9]\r") == Answer("[   0.9]", **ECHO)
+    assert parse_answer("XR?", b"\0*[   0.9]\r") == Answer("[   0.9]", **PLAIN)
+    assert is_frame_only("XL?", b"*xl?\r\n\0> *")
+    assert not is_frame_only("XL?", b"*0")
 
 
 def test_an_answer_without_a_prompt_is_understood_too():
     assert parse_answer("xmax?", b"xmax?\r*100.5") == Answer("100.5", **ECHO)
+    assert parse_answer("XL?", b"*0\0") == Answer("0", **PLAIN)
     assert not is_complete("xmax?", b"xmax?\r*100.5")
 
 
@@ -57,24 +78,36 @@ def test_noise_is_no_answer(noise):
         parse_answer("xvoltage?", noise)
 
 
-@given(st.binary(max_size=60))
-def test_any_bytes_are_an_answer_or_a_value_error(data):
-    try:
-        answer = parse_answer("xvoltage?", data)
-        parse_volts(answer.body)
-    except ValueError:
-        pass
-    is_complete("xvoltage?", data)
+@given(
+    st.sampled_from(["", "%", "I", "id?", "XL?", "xvoltage?", "xyzvoltage?"]),
+    st.binary(max_size=60),
+)
+def test_any_bytes_are_an_answer_or_a_value_error(command, data):
+    is_complete(command, data)
+    is_frame_only(command, data)
+    for parse in (parse_volts, parse_three_volts, parse_limit_switch, parse_identity):
+        with suppress(ValueError):
+            parse(parse_answer(command, data).body)
 
 
-@given(st.floats(-1, 151))
-def test_measured_volts_come_back_within_half_their_resolution(volts):
-    assert abs(parse_volts(format_volts(volts)) - volts) <= 0.0501
+@given(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20))
+def test_a_recorded_answer_is_read_after_whatever_was_asked(command):
+    for echo in (b"", command.encode() + b"\r"):
+        answer = parse_answer(command, echo + b"*[  24.8]\r*")
+        assert parse_volts(answer.body) == 24.8
+        assert answer.echoed is bool(echo)
+
+
+@given(st.floats(-1, 151), st.sampled_from([1, 2]))
+def test_measured_volts_come_back_within_half_their_resolution(volts, decimals):
+    told = parse_volts(format_volts(volts, decimals))
+    assert abs(told - volts) <= 0.501 * 10**-decimals
+    assert abs(parse_volts(format_volts_a(volts)) - volts) <= 0.0501
 
 
 @given(st.lists(st.floats(0, 151), min_size=3, max_size=3))
 def test_three_measured_volts_come_back(volts):
-    assert parse_three_volts(format_three_volts(volts)) == pytest.approx(volts, abs=0.0501)
+    assert parse_three_volts(format_three_volts(volts, 2)) == pytest.approx(volts, abs=0.00501)
 
 
 @pytest.mark.parametrize(
