@@ -1,1 +1,1 @@
-"""Three D/A channels of a Modbus/TCP remote I/O station, behind the fast steering mirror."""
+"""Three D/A channels of a Modbus remote I/O station, behind the fast steering mirror."""

@@ -9,10 +9,17 @@ import math
 from collections.abc import Sequence
 
 CHANNELS = 3
+PDU_BYTES_MAX = 253
 
+READ_COILS = 1
+READ_DISCRETE_INPUTS = 2
 READ_HOLDING_REGISTERS = 3
+READ_INPUT_REGISTERS = 4
+WRITE_SINGLE_COIL = 5
 WRITE_SINGLE_REGISTER = 6
+WRITE_MULTIPLE_COILS = 15
 WRITE_MULTIPLE_REGISTERS = 16
+READ_WRITE_MULTIPLE_REGISTERS = 23
 READ_DEVICE_IDENTIFICATION = 43
 
 ILLEGAL_FUNCTION = 0x01
@@ -26,11 +33,26 @@ EXCEPTIONS = {
     ILLEGAL_FUNCTION: ("illegal function", "this station cannot write several registers at once"),
     ILLEGAL_ADDRESS: ("illegal data address", "check dac.first_register"),
     ILLEGAL_VALUE: ("illegal data value", "check dac.bits"),
-    DEVICE_FAILURE: ("device failure", "check dac.device_id and the station's own indicators"),
+    DEVICE_FAILURE: (
+        "device failure",
+        "see whether its watchdog has tripped and how it is reset, and check dac.bits and dac.device_id",
+    ),
+    0x05: ("acknowledge", "the station needs longer than a D/A may; see its manual"),
     DEVICE_BUSY: ("device busy", "see whether another master writes to it"),
+    0x08: ("memory parity error", "the station needs service"),
     0x0A: ("gateway path unavailable", "check dac.device_id"),
     NO_SUCH_DEVICE: ("gateway target does not respond", "check dac.device_id"),
 }
+
+_SILENT_CHARACTERS = 3.5
+_SILENCE_FROM_19200_BAUD_S = 1.75e-3
+
+
+def rtu_silence_s(baud_rate: int) -> float:
+    """The silence between two RTU frames (MODBUS over Serial Line V1.02, section 2.5.1.1)."""
+    if baud_rate > 19200:
+        return _SILENCE_FROM_19200_BAUD_S
+    return _SILENT_CHARACTERS * 11 / baud_rate
 
 
 def counts_max(bits: int) -> int:

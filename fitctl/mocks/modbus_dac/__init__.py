@@ -1,1 +1,1 @@
-"""A mock Modbus/TCP D/A converter."""
+"""A mock Modbus D/A converter."""

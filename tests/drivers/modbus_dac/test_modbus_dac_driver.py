@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fitctl.config import DacMock, default_rig_path, load_rig
+from fitctl.config import ConfigError, Fault, default_rig_path, load_rig
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceProtocolError,
@@ -19,7 +19,9 @@ from fitctl.drivers.interface import (
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
 
-DAC = load_rig(default_rig_path()).loops["right"].fsm.dac
+RIG = load_rig(default_rig_path())
+DAC = RIG.loops["right"].fsm.dac
+SETTINGS = RIG.mocks.loops["right"].dac.model_copy(update={"watchdog_s": 30.0})
 MID = np.full(3, 5.0)
 COUNT_V = 10 / 65535
 
@@ -31,17 +33,36 @@ def station_at(port, **changes):
 @pytest.fixture
 def mock(in_loop):
     async def made():
-        return ModbusDacMock(DAC, DacMock(watchdog_s=30.0, safe_v=5.0), lambda volts: None, port=0)
+        return ModbusDacMock(DAC, SETTINGS, lambda volts: None, port=0)
 
     device = in_loop(made())
-    device.port = in_loop(device.start())
+    device.ends = in_loop(device.start())
     yield device
     in_loop(device.stop())
 
 
 @pytest.fixture
-def dac(mock):
-    driver = ModbusDac(station_at(mock.port, response_timeout_s=0.5))
+def wrong(mock, in_loop):
+    """Begin a fault of the mock, or end all without a kind."""
+
+    async def change(kind="", **settings):
+        if kind:
+            mock.faults.set(Fault(device="right.dac", kind=kind, **settings))
+        else:
+            mock.faults.clear()
+
+    return lambda *arguments, **settings: in_loop(change(*arguments, **settings))
+
+
+@pytest.fixture(params=["tcp", "rtu"])
+def station(request, mock):
+    """The mock as the rig file would name it, by either wire."""
+    return station_at(mock.ends.tcp_port, transport=request.param, serial_port=mock.ends.pty_path)
+
+
+@pytest.fixture
+def dac(station):
+    driver = ModbusDac(station)
     driver.open()
     yield driver
     driver.close()
@@ -100,12 +121,127 @@ def test_volts_out_of_range_are_never_sent(mock, dac, bad_v):
     assert mock.outputs_v == before
 
 
-def test_a_refusal_is_named(mock, dac):
-    mock.refuse_with = 6
-    with pytest.raises(DeviceRefused, match="exception 06, device busy"):
+# ---------------------------------------------------------------- faults
+
+
+def test_a_tripped_watchdog_is_refused_with_a_next_step_and_the_outputs_are_read_as_they_are(
+    mock, dac, wrong
+):
+    dac.write_v(np.zeros(3))
+    wrong("watchdog_trip")
+    with pytest.raises(DeviceRefused, match=r"exception 04, device failure; .*watchdog"):
         dac.write_v(MID)
-    mock.refuse_with = 0
+    with pytest.raises(DeviceRefused):
+        dac.read_v()
+    wrong()
+    assert dac.read_v() == pytest.approx(MID, abs=COUNT_V)
+    dac.write_v(np.zeros(3))
+    assert mock.outputs_v == [0, 0, 0]
+
+
+def test_a_watchdog_that_ran_out_unseen_shows_when_the_outputs_are_read(mock, dac, wrong):
+    dac.write_v(np.zeros(3))
+    wrong("watchdog_trip", for_s=1e-3)
+    threading.Event().wait(0.01)
+    assert dac.read_v() == pytest.approx(MID, abs=COUNT_V)
+
+
+@pytest.mark.parametrize("kind", ["drop", "freeze"])
+def test_silence_is_a_timeout_and_the_next_write_works(mock, dac, wrong, kind):
+    wrong(kind)
+    started_s = time.monotonic()
+    with pytest.raises(DeviceTimeout, match=r"within 0\.25 s, got none"):
+        dac.write_v(np.zeros(3))
+    assert 0.2 < time.monotonic() - started_s < 2
+    wrong()
     dac.write_v(MID)
+    assert mock.outputs_v == pytest.approx(MID, abs=COUNT_V)
+
+
+def test_a_late_answer_within_the_time_limit_is_an_answer(dac, wrong):
+    wrong("delay", value=0.05)
+    dac.write_v(np.array([1.0, 2.0, 3.0]))
+    assert dac.read_v() == pytest.approx([1, 2, 3], abs=COUNT_V)
+
+
+def test_an_answer_that_is_too_late_is_never_taken_for_the_next_ones(mock, dac, wrong):
+    dac.write_v(np.zeros(3))
+    wrong("delay", value=0.35)
+    with pytest.raises(DeviceTimeout):
+        dac.read_v()  # its answer, zeros, is still on its way
+    wrong()
+    dac.write_v(np.array([1.0, 2.0, 3.0]))
+    assert dac.read_v() == pytest.approx([1, 2, 3], abs=COUNT_V)
+
+
+def test_answers_that_come_twice_or_swapped_do_no_harm(dac, wrong):
+    for kind, volts in (("duplicate", [1.0, 2.0, 3.0]), ("reorder", [4.0, 5.0, 6.0])):
+        wrong(kind)
+        dac.write_v(np.array(volts))
+        assert dac.read_v() == pytest.approx(volts, abs=COUNT_V)
+
+
+def test_a_turned_bit_is_an_error_or_harmless_and_never_another_voltage(station, wrong):
+    volts = np.array([1.0, 2.0, 3.0])
+    hurried = station.model_copy(update={"response_timeout_s": 0.05})
+    driver = ModbusDac(hurried)
+    seen = set()
+    for _ in range(8):
+        wrong()
+        driver.open()
+        driver.write_v(volts)
+        wrong("corrupt")
+        try:
+            assert driver.read_v() == pytest.approx(volts, abs=COUNT_V)
+        except DeviceError as error:
+            seen.add(type(error))
+    driver.close()
+    assert seen
+    assert seen <= {DeviceProtocolError, DeviceRefused, DeviceTimeout}
+
+
+@pytest.mark.parametrize("kind", ["disconnect", "reboot"])
+def test_a_lost_link_over_tcp_is_an_error_until_it_is_opened_again(mock, wrong, kind):
+    dac = ModbusDac(station_at(mock.ends.tcp_port))
+    dac.open()
+    wrong(kind, value=30.0 if kind == "reboot" else None)
+    for _ in range(3):
+        started_s = time.monotonic()
+        with pytest.raises(DeviceUnreachable):
+            dac.write_v(MID)
+        assert time.monotonic() - started_s < 0.3
+    with pytest.raises(DeviceUnreachable):
+        dac.open()
+    wrong()
+    dac.open()
+    dac.write_v(MID)
+    dac.close()
+
+
+@pytest.mark.parametrize("kind", ["disconnect", "reboot"])
+def test_an_unplugged_serial_line_is_silent_until_it_is_plugged_in_again(mock, wrong, kind):
+    dac = ModbusDac(station_at(1, transport="rtu", serial_port=mock.ends.pty_path))
+    dac.open()
+    wrong(kind, value=30.0 if kind == "reboot" else None)
+    with pytest.raises(DeviceTimeout):
+        dac.write_v(MID)
+    wrong()
+    dac.write_v(MID)
+    dac.close()
+
+
+def test_a_serial_port_that_goes_away_is_unreachable(mock, in_loop):
+    dac = ModbusDac(station_at(1, transport="rtu", serial_port=mock.ends.pty_path))
+    dac.open()
+    in_loop(mock.stop())
+    with pytest.raises(DeviceUnreachable, match="broken connection"):
+        dac.write_v(MID)
+    with pytest.raises(DeviceUnreachable, match="open it again"):
+        dac.write_v(MID)
+    dac.close()
+
+
+# ---------------------------------------------------------------- what is not as it should be
 
 
 @pytest.mark.parametrize(
@@ -113,36 +249,43 @@ def test_a_refusal_is_named(mock, dac):
     [({"first_register": 40}, "first_register"), ({"device_id": 9}, "device_id")],
 )
 def test_opening_the_wrong_registers_or_station_names_the_key_to_correct(mock, changes, says):
-    driver = ModbusDac(station_at(mock.port, **changes))
+    driver = ModbusDac(station_at(mock.ends.tcp_port, **changes))
     with pytest.raises(DeviceRefused, match=says):
         driver.open()
     with pytest.raises(DeviceUnreachable):
         driver.write_v(MID)
 
 
-def test_silence_is_a_timeout_and_the_next_write_works(mock, dac):
-    mock.silent = True
-    started_s = time.monotonic()
-    with pytest.raises(DeviceTimeout, match=r"within 0\.5 s, got none"):
-        dac.write_v(np.zeros(3))
-    assert 0.4 < time.monotonic() - started_s < 2
-    mock.silent = False
-    dac.write_v(MID)
-    assert mock.outputs_v == pytest.approx(MID, abs=COUNT_V)
+@pytest.mark.parametrize(
+    ("changes", "says"), [({"device_id": 9}, "device_id"), ({"baud_rate": 9600}, "baud_rate")]
+)
+def test_over_rtu_the_wrong_unit_or_baud_rate_is_silence(mock, changes, says):
+    port = mock.ends.pty_path
+    driver = ModbusDac(station_at(1, transport="rtu", serial_port=port, **changes))
+    with pytest.raises(DeviceTimeout, match=says):
+        driver.open()
 
 
-def test_a_lost_link_is_an_error_until_it_is_opened_again(mock, dac, in_loop):
-    async def drop():
-        mock.drop_links()
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["transport='rtu'"], "serial_port must name a port"),
+        (["transport='rtu'", "serial_port='/dev/ttyUSB0'", "device_id=0"], "device_id must be"),
+        (["serial_format='7E1'"], "serial_format"),
+        (["first_register=65534"], "first_register"),
+    ],
+)
+def test_a_rig_file_that_cannot_reach_it_is_refused(overrides, says):
+    sets = [f"loops.right.fsm.dac.{override}" for override in overrides]
+    with pytest.raises(ConfigError, match=says):
+        load_rig(default_rig_path(), sets)
 
-    in_loop(drop())
-    for _ in range(3):
-        started_s = time.monotonic()
-        with pytest.raises(DeviceUnreachable):
-            dac.write_v(MID)
-        assert time.monotonic() - started_s < 0.3
-    dac.open()
-    dac.write_v(MID)
+
+def test_a_serial_port_that_does_not_exist_is_unreachable():
+    driver = ModbusDac(station_at(1, transport="rtu", serial_port="/dev/no-such-port"))
+    with pytest.raises(DeviceUnreachable, match=r"/dev/no-such-port.*dac\.serial_port"):
+        driver.open()
+    driver.close()
 
 
 def test_nobody_there_is_unreachable_and_close_is_always_safe():
@@ -164,7 +307,7 @@ def test_a_station_without_identification_is_usable():
 
 
 @pytest.mark.parametrize(
-    "lie", ["10 00 00 00 02", "10 00 05 00 03", "06 00 00 00 03", "47 00"], ids=str
+    "lie", ["10 00 00 00 02", "10 00 05 00 03", "06 00 00 00 03", "47 00", "83 02"], ids=str
 )
 def test_an_answer_that_does_not_fit_the_write_is_a_protocol_error(lie):
     def answer(function_code, data):

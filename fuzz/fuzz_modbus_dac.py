@@ -1,0 +1,164 @@
+"""Fuzz what reads Modbus: the mock's framing and functions, and the driver over both wires.
+
+The first byte chooses who reads the rest. ``python fuzz/fuzz_modbus_dac.py CORPUS`` runs atheris.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import numpy as np
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.drivers.interface import DeviceError
+from fitctl.drivers.modbus_dac.driver import ModbusDac
+from fitctl.mocks.faults import WIRE_FAULTS, Faults
+from fitctl.mocks.modbus import rtu, tcp
+from fitctl.mocks.modbus.pdu import (
+    COILS,
+    DISCRETE_INPUTS,
+    HOLDING_REGISTERS,
+    INPUT_REGISTERS,
+    DataModel,
+    answer,
+)
+
+_DAC = (
+    load_rig(default_rig_path())
+    .loops["right"]
+    .fsm.dac.model_copy(update={"response_timeout_s": 0.001})
+)
+_TABLES = (COILS, DISCRETE_INPUTS, HOLDING_REGISTERS, INPUT_REGISTERS)
+
+
+_MODEL = DataModel(
+    dict.fromkeys(_TABLES, range(2000)),
+    lambda table, address, count: [1] * count,
+    lambda table, address, values: None,
+    (b"maker", b"model", b"1.0"),
+)
+
+
+def _must(hold: object) -> None:
+    if not hold:
+        raise AssertionError
+
+
+def read_pdu(data: bytes) -> None:
+    """A request gets its own answer or an exception of the standard."""
+    if not data:
+        return
+    got = answer(data[:253], _MODEL)
+    _must(len(got) <= 253)
+    _must(got[0] & 0x7F == data[0] & 0x7F)
+    if got[0] & 0x80:
+        _must(len(got) == 2)
+        _must(1 <= got[1] <= 4)
+
+
+def read_tcp(data: bytes) -> None:
+    """A stream gives whole messages, each with an answer, or is out of step."""
+    server = tcp.ModbusTcpServer(_MODEL, Faults(WIRE_FAULTS), unit=1, unknown_unit="refuse", port=0)
+    pending = bytearray(data)
+    try:
+        for message in tcp.take_messages(pending):
+            (back,) = tcp.take_messages(bytearray(server.respond(message)))
+            _must((back.transaction, back.unit) == (message.transaction, message.unit))
+    except tcp.OutOfStep:
+        return
+    _must(len(pending) < 260)
+
+
+def read_rtu(data: bytes) -> None:
+    """What comes between two silences gets a sound frame or nothing, whatever its check is."""
+    server = rtu.ModbusRtuServer(_MODEL, Faults(WIRE_FAULTS), unit=1, baud_rate=115200)
+    for frame in (data, data + rtu.crc16(data)):
+        framed = server.respond(frame)
+        _must(not framed or rtu.parse_frame(framed) is not None)
+
+
+def _use(dac: ModbusDac) -> None:
+    """Nothing but device errors come out, and no voltage that the D/A does not have."""
+    for request in (dac._identify, dac.read_v, lambda: dac.write_v(np.zeros(3))):
+        try:
+            got = request()
+        except DeviceError:
+            continue
+        if isinstance(got, np.ndarray):
+            _must(got.shape == (3,))
+            _must(np.all((got >= 0) & (got <= _DAC.full_scale_v)))
+
+
+def drive_tcp(data: bytes) -> None:
+    """The driver, and a station that says `data` whatever it is asked."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        theirs.sendall(data[:4096])
+        theirs.shutdown(socket.SHUT_WR)
+        dac = ModbusDac(_DAC)
+        dac._client = dac._make_client()
+        dac._client.socket = ours
+        _use(dac)
+        dac.close()
+
+
+class _Port:
+    """A serial port whose far end answers every request by the same bytes."""
+
+    is_open = True
+
+    def __init__(self, data: bytes) -> None:
+        self._answer = data
+        self._buffer = b""
+
+    @property
+    def in_waiting(self) -> int:
+        return len(self._buffer)
+
+    def write(self, request: bytes) -> int:
+        self._buffer = self._answer
+        return len(request)
+
+    def read(self, size: int) -> bytes:
+        got, self._buffer = self._buffer[:size], self._buffer[size:]
+        return got
+
+    def close(self) -> None:
+        self._buffer = b""
+
+
+def drive_rtu(data: bytes) -> None:
+    """The driver on a serial port; once as the bytes are, once with a right check at their end."""
+    for said in (data, data + rtu.crc16(data)):
+        rtu_dac = _DAC.model_copy(update={"transport": "rtu", "serial_port": "none"})
+        dac = ModbusDac(rtu_dac)
+        dac._client = dac._make_client()
+        dac._client.socket = _Port(said)
+        # Polling sleeps a millisecond at a time, which would be all that the fuzzer does.
+        dac._client._recv_interval = 0.0
+        dac._silence_s = dac._late_s = 0.0
+        _use(dac)
+        dac.close()
+
+
+_READERS = (read_pdu, read_tcp, read_rtu, drive_tcp, drive_rtu)
+
+
+def TestOneInput(data: bytes) -> None:  # noqa: N802 - the name that fuzzers call
+    """Run one input."""
+    if data:
+        _READERS[data[0] % len(_READERS)](data[1:])
+
+
+def main() -> None:
+    """Fuzz until stopped; arguments as libFuzzer's."""
+    import atheris
+
+    atheris.instrument_all()
+    atheris.Setup(sys.argv, TestOneInput)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()
