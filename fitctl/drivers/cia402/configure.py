@@ -6,13 +6,20 @@ from fitctl.config import Cia402Device
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.node import Node
 from fitctl.drivers.cia402.protocol import NmtCommand
-from fitctl.drivers.interface import DeviceIdentity, DeviceMismatch
+from fitctl.drivers.interface import DeviceIdentity, DeviceMismatch, DeviceRefused
 
 _PREFERRED_MODES = (protocol.CYCLIC_SYNCHRONOUS_VELOCITY, protocol.PROFILE_VELOCITY)
 
 
-def configure(node: Node, device: Cia402Device) -> DeviceIdentity:
+def configure(node: Node, device: Cia402Device, position_limit_counts: int) -> DeviceIdentity:
     """Bring the drive to PRE-OPERATIONAL, check it and set it; no motor has current afterwards.
+
+    Parameters
+    ----------
+    node : Node
+    device : Cia402Device
+    position_limit_counts : int
+        The drive's own limit of both axes, each way; 0 leaves what it has.
 
     Raises
     ------
@@ -25,17 +32,23 @@ def configure(node: Node, device: Cia402Device) -> DeviceIdentity:
     profile = node.read(protocol.DEVICE_TYPE, 0, "I") & 0xFFFF
     if profile != protocol.DRIVE_PROFILE:
         raise _mismatch(node, "device profile 402 in object 1000", str(profile))
-    identity = _identity(node)
+    identity = drive_identity(node)
     node.guard(on=False)
     for name, offset in zip(protocol.AXES, (0, protocol.AXIS_OFFSET), strict=True):
         _configure_axis(node, name, offset)
+        _watch_over_link(node, offset)
+        if position_limit_counts:
+            limits = protocol.POSITION_LIMITS + offset
+            node.write(limits, 1, "i", -position_limit_counts)
+            node.write(limits, 2, "i", position_limit_counts)
     _configure_pdos(node, device.node_id)
     heartbeat_ms = round(device.drive_heartbeat_s * 1e3)
     node.write(protocol.HEARTBEAT_PRODUCER, 0, "H", heartbeat_ms)
     return identity
 
 
-def _identity(node: Node) -> DeviceIdentity:
+def drive_identity(node: Node) -> DeviceIdentity:
+    """Maker, model, serial number and firmware, from objects 1018, 1008 and 100A."""
     vendor, product, _revision, serial = (
         node.read(protocol.IDENTITY, subindex, "I") for subindex in (1, 2, 3, 4)
     )
@@ -47,16 +60,31 @@ def _identity(node: Node) -> DeviceIdentity:
     )
 
 
+def velocity_modes(node: Node, offset: int) -> list[int]:
+    """The velocity modes of the axis whose objects begin at `offset`, the better one first."""
+    supported = node.read(protocol.SUPPORTED_MODES + offset, 0, "I")
+    return [mode for mode in _PREFERRED_MODES if supported >> (mode - 1) & 1]
+
+
 def _configure_axis(node: Node, name: str, offset: int) -> None:
     node.write(protocol.CONTROLWORD + offset, 0, "H", protocol.CW_DISABLE_VOLTAGE)
-    supported = node.read(protocol.SUPPORTED_MODES + offset, 0, "I")
-    modes = [mode for mode in _PREFERRED_MODES if supported >> (mode - 1) & 1]
+    modes = velocity_modes(node, offset)
     if not modes:
         expected = f"{name}: mode 9 or 3 in object {protocol.SUPPORTED_MODES + offset:04X}"
-        raise _mismatch(node, expected, f"0x{supported:08X}")
+        raise _mismatch(node, expected, "neither")
     node.write(protocol.UNIT_VELOCITY + offset, 0, "I", protocol.UNIT_MILLI_RPM)
     node.write(protocol.MODE + offset, 0, "b", modes[0])
     node.write(protocol.TARGET_VELOCITY + offset, 0, "i", 0)
+
+
+def _watch_over_link(node: Node, offset: int) -> None:
+    """See that a lost connection stops the axis; without object 6007, that is the maker's choice."""
+    try:
+        option = node.read(protocol.ABORT_OPTION + offset, 0, "h")
+    except DeviceRefused:
+        return
+    if option == protocol.ABORT_IS_NOTHING:
+        node.write(protocol.ABORT_OPTION + offset, 0, "h", protocol.ABORT_IS_FAULT)
 
 
 def _configure_pdos(node: Node, node_id: int) -> None:

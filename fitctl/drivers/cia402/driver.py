@@ -2,10 +2,8 @@
 
 Three frames a servo period: an RPDO with both target velocities, the SYNC that makes the drive act on it
 and latch its encoders, and the TPDO with both positions. Statuswords come in a TPDO of their own, on
-change and ten times a second. Each SYNC is answered by one TPDO, in order: the driver counts both, so
-that a late TPDO is dated with the SYNC at which its encoders were latched. While the amplifiers are
-enabled the drive watches our heartbeat, which :meth:`Cia402Amplifiers.exchange` sends: it must be called
-at least every `master_heartbeat_timeout_s`.
+change and ten times a second. While the amplifiers are enabled the drive watches our heartbeat, which
+:meth:`Cia402Amplifiers.exchange` sends: it must be called at least every `master_heartbeat_timeout_s`.
 """
 
 from __future__ import annotations
@@ -14,12 +12,12 @@ import contextlib
 import math
 import struct
 import time
-from collections import deque
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from fitctl.config import Siderostat
 from fitctl.drivers.cia402 import protocol
+from fitctl.drivers.cia402.positions import Encoders
 from fitctl.drivers.cia402.protocol import NmtCommand, State
 from fitctl.drivers.interface import (
     AzEl,
@@ -38,7 +36,6 @@ if TYPE_CHECKING:
 _POLL_S = 0.001
 _STATUS_LIMIT_S = 5 * protocol.STATUS_EVERY_MS / 1e3
 _BEHIND_PERIODS = 10
-_MOST_OUTSTANDING = 1000  # the drive's heartbeat is missed long before
 _PAIR = struct.Struct("<ii")
 _STATUS_PAIR = struct.Struct("<HH")
 
@@ -78,12 +75,11 @@ class Cia402Amplifiers:
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
         self._node: Node | None = None
         self._rpdo_id = protocol.RPDO1_BASE + self._device.node_id
+        self._position_limit_counts = int(self._device.position_limit_rad / self._rad_per_count)
+        self._encoders = Encoders(siderostat.velocity_limit_rad_s / self._rad_per_count)
         self._statuswords = [0, 0]
         self._status_s = 0.0
-        self._syncs_s: deque[float] = deque(maxlen=_MOST_OUTSTANDING)
         self._behind = 0
-        self._counts: tuple[int, ...] | None = None
-        self._latched: tuple[float, tuple[int, ...]] | None = None
 
     def open(self) -> DeviceIdentity:
         """Connect, check and configure the drive, start the node; nothing moves, no motor has current.
@@ -103,12 +99,12 @@ class Cia402Amplifiers:
         from fitctl.drivers.cia402.node import Node
 
         self.close()
-        self._syncs_s.clear()
-        self._counts = None
+        self._encoders.restart()
+        self._behind = 0
         link = CanLink(self._device)
         try:
             self._node = Node(link, self._device)
-            identity = configure(self._node, self._device)
+            identity = configure(self._node, self._device, self._position_limit_counts)
             self._node.handlers |= {
                 protocol.TPDO1_BASE + self._device.node_id: self._on_positions,
                 protocol.TPDO2_BASE + self._device.node_id: self._on_statuswords,
@@ -181,6 +177,7 @@ class Cia402Amplifiers:
                 self._write(axis, protocol.CONTROLWORD, "H", protocol.CW_DISABLE_VOLTAGE)
         node.drain()
         node.error_code = 0
+        self._encoders.trust()
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period: command both motors, read both encoders.
@@ -205,29 +202,34 @@ class Cia402Amplifiers:
             The drive's heartbeat or its statuswords are missing, or, when positions are behind, the
             answer to an SDO request.
         DeviceFault
-            The drive left the operational state of CANopen. A fault of an axis does not raise: the
-            reading carries it.
+            The drive left the operational state of CANopen, or an encoder jumped. A fault of an axis
+            does not raise: the reading carries it.
+        DeviceProtocolError
+            What came is no CAN frame, or no PDO as configured.
         ValueError
             A velocity is not finite.
+
+        Whatever it raises but ValueError, the velocities have been sent before, if they could be.
         """
-        node = self._opened()
-        self._latched = None
-        node.drain()
-        node.check_alive()
-        self._check_status()
-        node.beat()
-        self._behind = self._behind + 1 if self._syncs_s else 0
-        if self._behind >= _BEHIND_PERIODS:
+        node, encoders = self._opened(), self._encoders
+        encoders.latched = None
+        try:
+            node.drain()
             self._find_lost()
-        late, self._latched = self._latched, None
-        self._send_velocities(*velocity_rad_s)
-        sync_s = self._syncs_s[-1]
+        finally:
+            # Also when nothing sound comes back, the drive must hear what it shall do, and that we live.
+            node.beat()
+            sync_s = self._send_velocities(*velocity_rad_s)
+        late, encoders.latched = encoders.latched, None
         deadline_s = sync_s + self._period_s
-        while self._latched is None:
+        while encoders.latched is None:
             left_s = deadline_s - time.monotonic()
             if not node.pump(max(0.0, left_s)) or left_s <= 0:
                 break
-        latched = self._latched or late
+        node.check_alive()
+        self._check_status()
+        self._check_encoders()
+        latched = encoders.latched or late
         if latched is None:
             return None
         time_s, (az_counts, el_counts) = latched
@@ -292,30 +294,30 @@ class Cia402Amplifiers:
             self._write(axis, protocol.TARGET_VELOCITY, "i", 0)
         self._send_velocities(0.0, 0.0)
 
-    def _send_velocities(self, az_rad_s: float, el_rad_s: float) -> None:
+    def _send_velocities(self, az_rad_s: float, el_rad_s: float) -> float:
+        """Send both velocities and a SYNC; returns the time of the SYNC."""
         to_wire = protocol.velocity_to_wire
         velocities = _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
+        sync_s = time.monotonic()
         self._opened().link.send((self._rpdo_id, velocities), (protocol.SYNC_ID, b""))
-        # The drive latches its encoders at SYNC; its sending is the nearest that the host can know.
-        self._syncs_s.append(time.monotonic())
+        self._encoders.sync_sent(sync_s)
+        return sync_s
 
     def _find_lost(self) -> None:
-        """Tell a TPDO that was lost from a slow link; on both the oldest SYNC stays unanswered.
+        """Once behind for long, tell a TPDO that was lost from a slow link.
 
-        By the time that the drive answers a request it has long sent its TPDOs of earlier SYNCs: those
-        that have not come before the answer never will. It costs a round trip, but only when behind.
+        On both the oldest SYNC stays unanswered. By the time that the drive answers a request it has
+        long sent its TPDOs of earlier SYNCs: those that have not come before the answer never will. It
+        costs a round trip, but only when behind.
         """
-        self._opened().read(protocol.ERROR_REGISTER, 0, "B")
-        self._syncs_s.clear()
-        self._behind = 0
+        self._behind = self._behind + 1 if self._encoders.outstanding else 0
+        if self._behind >= _BEHIND_PERIODS:
+            self._behind = 0
+            self._opened().read(protocol.ERROR_REGISTER, 0, "B")
+            self._encoders.give_up()
 
     def _on_positions(self, data: bytes) -> None:
-        raw = _PAIR.unpack(self._sized(data, _PAIR.size, "both positions"))
-        # The counters are int32 and wrap; the sum of their steps does not.
-        old = self._counts or raw
-        self._counts = tuple(o + protocol.wrap_int32(n - o) for o, n in zip(old, raw, strict=True))
-        if self._syncs_s:
-            self._latched = self._syncs_s.popleft(), self._counts
+        self._encoders.take(_PAIR.unpack(self._sized(data, _PAIR.size, "both positions")))
 
     def _on_statuswords(self, data: bytes) -> None:
         sized = self._sized(data, _STATUS_PAIR.size, "both statuswords")
@@ -331,6 +333,16 @@ class Cia402Amplifiers:
                 f"the TPDO with the statuswords within {_STATUS_LIMIT_S:g} s",
                 f"none for {silent_s:.2f} s",
                 "another CANopen master changed it; recover",
+            )
+
+    def _check_encoders(self) -> None:
+        if self._encoders.jumped:
+            raise DeviceFault(
+                protocol.DEVICE,
+                self._endpoint,
+                "encoders that move as their motors can",
+                self._encoders.jumped,
+                "look at the encoder and its cable, recover, and acquire again",
             )
 
     # ------------------------------------------------------------ errors

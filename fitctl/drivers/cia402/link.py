@@ -24,7 +24,10 @@ from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 _SEND_TIMEOUT_S = 0.1
 _END_OF_LINE = re.compile(rb"[\r\a]")
 _LONGEST_LINE = 64  # a frame with a timestamp takes 31 bytes
-_ACKNOWLEDGEMENTS = {b"\r", b"z\r", b"Z\r", b"\a"}
+_FRAME = re.compile(
+    rb"(?:[tr][0-7][0-9A-Fa-f]{2}|[TR][01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)\r"
+)
+_STAMP_DIGITS = 4
 
 
 class BulkSlcanBus(slcanBus):
@@ -64,15 +67,15 @@ class BulkSlcanBus(slcanBus):
         return self._recv_internal(timeout)[0]
 
     def _read(self, timeout: float | None) -> str | None:
-        """The next line that is more than an acknowledgement, or None when none came in time.
+        """The next line that is a frame, or None when none came in time.
 
-        Bytes that are waiting are looked at once even if `timeout` is 0. A frame that the adapter
-        refuses (BEL) shows as an answer of the drive that does not come.
+        Bytes that are waiting are looked at once even if `timeout` is 0. What else an adapter says is
+        passed over: a frame that it refuses (BEL) shows as an answer of the drive that does not come.
 
         Raises
         ------
         ValueError
-            If bytes keep coming without a line end.
+            If bytes keep coming without a line end, or a frame is broken: python-can would take some.
         """
         deadline_s = None if timeout is None else time.monotonic() + timeout
         left_s = timeout
@@ -81,8 +84,8 @@ class BulkSlcanBus(slcanBus):
             while end := _END_OF_LINE.search(self._buffer):
                 line = bytes(self._buffer[: end.end()])
                 del self._buffer[: end.end()]
-                if line not in _ACKNOWLEDGEMENTS:
-                    return line.decode("ascii", "replace")
+                if line[:1] in b"tTrR":
+                    return _checked(line)
             if (length := len(self._buffer)) > _LONGEST_LINE:
                 self._buffer.clear()
                 msg = f"{length} bytes without a line end"
@@ -110,6 +113,18 @@ class BulkSlcanBus(slcanBus):
             super().shutdown()
         finally:
             self.serialPortOrig.close()
+
+
+def _checked(line: bytes) -> str:
+    """A frame's line that is exactly as long as it says, with or without a time stamp."""
+    match = _FRAME.fullmatch(line)
+    if match:
+        remote = line[:1] in b"rR"
+        surplus = len(match[2]) - (0 if remote else 2 * int(match[1]))
+        if surplus in {0, _STAMP_DIGITS}:
+            return line.decode("ascii")
+    msg = f"a broken SLCAN frame {line!r}"
+    raise ValueError(msg)
 
 
 class CanLink:

@@ -25,7 +25,6 @@ from fitctl.drivers.interface import (
 _MISSED_HEARTBEATS = 3
 _DRAIN_FRAMES = 100  # more than a full 1 Mbit/s bus carries in five periods of a 500 Hz servo
 _LONGEST_UPLOAD = 4096
-_ABORT_TIMED_OUT = 0x0504_0000
 
 
 class Node:
@@ -245,7 +244,7 @@ class Node:
             return self._answer is not None and (segment or self._answer[1:4] == request[1:4])
 
         if not self.pump_until(answered, left_s):
-            timed_out = struct.pack("<I", _ABORT_TIMED_OUT)
+            timed_out = struct.pack("<I", protocol.AbortCode.TIMED_OUT)
             abort = bytes([protocol.SDO_ABORT]) + request[1:4] + timed_out
             self.link.send((can_id, abort))
             raise DeviceTimeout(

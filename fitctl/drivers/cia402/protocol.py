@@ -26,7 +26,8 @@ EMCY_BASE = 0x080
 TPDO1_BASE = 0x180
 RPDO1_BASE = 0x200
 TPDO2_BASE = 0x280
-RPDO2_BASE = 0x300
+PDO_BASE_STEP = 0x100
+"""From one PDO's identifier to the next one's; there are four each way by default."""
 SDO_RESPONSE_BASE = 0x580
 SDO_REQUEST_BASE = 0x600
 HEARTBEAT_BASE = 0x700
@@ -35,8 +36,18 @@ PDO_DISABLED = 0x8000_0000
 """Bit of a PDO's COB-ID that takes it out of service."""
 PDO_NO_RTR = 0x4000_0000
 """Bit of a TPDO's COB-ID: it may not be asked for by a remote frame."""
+ACYCLIC_SYNC = 0
+"""Transmission type of a TPDO: sent at the next SYNC after a change."""
 EVERY_SYNC = 1
 """Transmission type: sent, or acted on, at each SYNC."""
+LAST_SYNC = 240
+"""Transmission types up to this one: sent at every so many SYNCs."""
+RTR_AT_SYNC = 252
+"""Transmission type of a TPDO: sampled at SYNC, sent when asked for by a remote frame."""
+RTR_ONLY = 253
+"""Transmission type of a TPDO: sampled and sent when asked for by a remote frame."""
+MAKERS_EVENT = 254
+"""Transmission type: as `ON_EVENT`, with events of the maker's own."""
 ON_EVENT = 255
 """Transmission type: sent on change and by the event timer; acted on at once."""
 STATUS_EVERY_MS = 100
@@ -70,6 +81,7 @@ def master_node_id(drive_node_id: int) -> int:
 # ---------------------------------------------------------------- object dictionary
 DEVICE_TYPE = 0x1000
 ERROR_REGISTER = 0x1001
+ERROR_HISTORY = 0x1003
 SYNC_COB_ID = 0x1005
 DEVICE_NAME = 0x1008
 HARDWARE_VERSION = 0x1009
@@ -79,6 +91,7 @@ HEARTBEAT_CONSUMER = 0x1016
 HEARTBEAT_PRODUCER = 0x1017
 IDENTITY = 0x1018
 ERROR_BEHAVIOUR = 0x1029
+SDO_SERVER = 0x1200
 RPDO_COMMUNICATION = 0x1400
 RPDO_MAPPING = 0x1600
 TPDO_COMMUNICATION = 0x1800
@@ -88,15 +101,26 @@ AXES = ("azimuth", "elevation")
 AXIS_OFFSET = 0x800
 """The second axis' objects stand this much higher."""
 
+ABORT_OPTION = 0x6007
 ERROR_CODE = 0x603F
 CONTROLWORD = 0x6040
 STATUSWORD = 0x6041
 QUICK_STOP_OPTION = 0x605A
+SHUTDOWN_OPTION = 0x605B
+DISABLE_OPTION = 0x605C
+HALT_OPTION = 0x605D
+FAULT_REACTION_OPTION = 0x605E
 MODE = 0x6060
 MODE_DISPLAY = 0x6061
 POSITION = 0x6064
+VELOCITY_DEMAND = 0x606B
 VELOCITY_ACTUAL = 0x606C
+POSITION_LIMITS = 0x607D
+ACCELERATION = 0x6083
+DECELERATION = 0x6084
+QUICK_STOP_DECELERATION = 0x6085
 UNIT_VELOCITY = 0x60A9
+UNIT_ACCELERATION = 0x60AA
 TARGET_VELOCITY = 0x60FF
 SUPPORTED_MODES = 0x6502
 SINGLE_DEVICE_TYPE = 0x67FF
@@ -108,6 +132,15 @@ CYCLIC_SYNCHRONOUS_VELOCITY = 9
 UNIT_RPM = 0x00B44700
 """Object 60A9: revolutions (B4) per minute (47); the top byte is a signed power of ten."""
 UNIT_MILLI_RPM = 0xFDB44700
+UNIT_RPM_PER_S = 0x00B44703
+"""Object 60AA: revolutions (B4) per minute (47) and second (03)."""
+
+ABORT_IS_NOTHING = 0
+ABORT_IS_FAULT = 1
+ABORT_DISABLES = 2
+ABORT_IS_QUICK_STOP = 3
+"""Object 6007: what a lost connection, as that to the master's heartbeat, does to an axis."""
+
 MILLI_RPM_PER_RAD_S = 60e3 / (2 * math.pi)
 
 _INT32_MAX = 0x7FFF_FFFF
@@ -158,14 +191,21 @@ POWERED_STATES = frozenset(
 """States in which the motor has current."""
 
 CW_DISABLE_VOLTAGE = 0x00
-CW_QUICK_STOP = 0x02
 CW_SHUTDOWN = 0x06
 CW_SWITCH_ON = 0x07
 CW_ENABLE_OPERATION = 0x0F
 CW_FAULT_RESET = 0x80
+CW_HALT = 0x0100
+"""Profile velocity mode: slow down to a stop and stay enabled."""
 
 SW_VOLTAGE_ENABLED = 0x0010
 SW_REMOTE = 0x0200
+SW_TARGET_REACHED = 0x0400
+"""Profile velocity mode: the demand is the target."""
+SW_INTERNAL_LIMIT = 0x0800
+"""The drive holds the axis back: at a software position limit, for one."""
+SW_SPEED_ZERO = 0x1000
+"""Profile velocity mode."""
 SW_FOLLOWS_COMMAND = 0x1000
 """Cyclic synchronous modes: the axis follows its target."""
 
@@ -189,6 +229,9 @@ def state_name(statusword: int) -> str:
 # ---------------------------------------------------------------- emergency messages
 EMCY_NO_ERROR = 0x0000
 EMCY_HEARTBEAT_LOST = 0x8130
+EMCY_PDO_TOO_SHORT = 0x8210
+ERROR_OVER_CURRENT = 0x2310
+ERROR_FOLLOWING = 0x8611
 ERROR_REGISTER_GENERIC = 0x01
 ERROR_REGISTER_COMMUNICATION = 0x10
 
@@ -205,6 +248,7 @@ _ERROR_TEXTS = {
     0x8120: "CAN error passive",
     0x8130: "heartbeat of the master lost",
     0x8140: "recovered from bus off",
+    0x8210: "PDO too short",
     0x8400: "velocity control",
     0x8611: "following error",
 }
@@ -243,6 +287,8 @@ SDO_UPLOAD = 0x40
 SDO_UPLOAD_SEGMENT = 0x60
 SDO_DOWNLOAD = 0x20
 SDO_DOWNLOADED = 0x60
+SDO_DOWNLOAD_SEGMENT = 0x00
+SDO_SEGMENT_DOWNLOADED = 0x20
 SDO_EXPEDITED = 0x02
 SDO_SIZE_GIVEN = 0x01
 SDO_TOGGLE = 0x10
@@ -254,16 +300,21 @@ class AbortCode(IntEnum):
     """Why an SDO transfer was given up."""
 
     TOGGLE_BIT = 0x0503_0000
+    TIMED_OUT = 0x0504_0000
     COMMAND_SPECIFIER = 0x0504_0001
+    OUT_OF_MEMORY = 0x0504_0005
     WRITE_ONLY = 0x0601_0001
     READ_ONLY = 0x0601_0002
     NO_OBJECT = 0x0602_0000
     NOT_MAPPABLE = 0x0604_0041
     MAPPING_TOO_LONG = 0x0604_0042
     WRONG_LENGTH = 0x0607_0010
+    TOO_LONG = 0x0607_0012
+    TOO_SHORT = 0x0607_0013
     NO_SUBINDEX = 0x0609_0011
     INVALID_VALUE = 0x0609_0030
     DEVICE_STATE = 0x0800_0022
+    NO_DATA = 0x0800_0024
 
 
 def abort_text(code: int) -> str:
@@ -321,11 +372,11 @@ def announced_size(frame: SdoFrame) -> int | None:
 
 
 def encode_segment(chunk: bytes, toggle: int, *, last: bool) -> bytes:
-    """One segment of an upload, up to seven bytes."""
+    """One segment, up to seven bytes: of an upload, or of a download, whose request looks the same."""
     command = toggle | (7 - len(chunk)) << 1 | (SDO_LAST_SEGMENT if last else 0)
     return struct.pack("<B7s", command, chunk)
 
 
 def decode_segment(frame: bytes) -> tuple[bytes, bool]:
-    """Data of an upload's segment, and whether it was the last."""
+    """Data of a segment of either direction, and whether it was the last."""
     return frame[1 : 8 - (frame[0] >> 1 & 7)], bool(frame[0] & SDO_LAST_SEGMENT)

@@ -1,7 +1,7 @@
 """The mock drive's object dictionary and its SDO server (CiA 301).
 
-Known limitations: downloads are expedited only (no object is longer than four bytes and writable); no
-block transfer.
+Known limitations: no block transfer (aborted as an unknown command); a transfer that its client leaves
+half done waits for the next one instead of timing out.
 """
 
 from __future__ import annotations
@@ -81,19 +81,37 @@ def write(dictionary: Dictionary, index: int, subindex: int, data: bytes) -> Non
     entry = find(dictionary, index, subindex)
     if entry.write is None:
         raise SdoAbortError(AbortCode.READ_ONLY)
-    if len(data) * 8 != entry.bits:
-        raise SdoAbortError(AbortCode.WRONG_LENGTH)
+    check_length(entry, len(data))
     (value,) = struct.unpack("<" + entry.code, data)
     entry.write(value)
 
 
+def check_length(entry: Entry, length: int) -> None:
+    """Let pass what is exactly as long as the object, or the abort."""
+    if length * 8 > entry.bits:
+        raise SdoAbortError(AbortCode.TOO_LONG)
+    if length * 8 < entry.bits:
+        raise SdoAbortError(AbortCode.TOO_SHORT)
+
+
 class SdoServer:
-    """Answers requests on one dictionary; keeps the segmented upload that is under way."""
+    """Answers requests on one dictionary; keeps the segmented transfer that is under way."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
         self._object = (0, 0)
-        self._left = b""
+        self._services: dict[int, Callable[[protocol.SdoFrame, bytes], bytes]] = {
+            protocol.SDO_UPLOAD: self._upload,
+            protocol.SDO_UPLOAD_SEGMENT: self._upload_segment,
+            protocol.SDO_DOWNLOAD: self._download,
+            protocol.SDO_DOWNLOAD_SEGMENT: self._download_segment,
+        }
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the transfer that is under way."""
+        self._to_send: bytes | None = None
+        self._received: bytes | None = None
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes | None:
@@ -103,50 +121,79 @@ class SdoServer:
         except ValueError:
             return None
         if frame.command == protocol.SDO_ABORT:
-            self._left = b""
+            self.reset()
             return None
+        if frame.command & protocol.SDO_SPECIFIER not in _SEGMENTS:
+            self.reset()
+            self._object = frame.index, frame.subindex
         try:
-            return self._serve(frame)
+            service = self._services.get(frame.command & protocol.SDO_SPECIFIER, _refuse)
+            return service(frame, request)
         except SdoAbortError as abort:
-            self._left = b""
+            self.reset()
             return protocol.encode_sdo(
                 protocol.SDO_ABORT, *self._object, struct.pack("<I", abort.code)
             )
 
-    def _serve(self, frame: protocol.SdoFrame) -> bytes:
-        service = frame.command & protocol.SDO_SPECIFIER
-        if service == protocol.SDO_UPLOAD_SEGMENT:
-            return self._segment(frame.command & protocol.SDO_TOGGLE)
-        self._left = b""
-        self._object = frame.index, frame.subindex
-        if service == protocol.SDO_UPLOAD:
-            return self._upload()
-        if service == protocol.SDO_DOWNLOAD and frame.command & protocol.SDO_EXPEDITED:
-            write(self._dictionary, *self._object, self._sized(frame))
-            return protocol.encode_sdo(protocol.SDO_DOWNLOADED, *self._object)
-        raise SdoAbortError(AbortCode.COMMAND_SPECIFIER)
-
-    def _sized(self, frame: protocol.SdoFrame) -> bytes:
-        """The data of a download, cut to the object where the client gave no size."""
-        data = protocol.expedited_data(frame)
-        if frame.command & protocol.SDO_SIZE_GIVEN:
-            return data
-        return data[: find(self._dictionary, frame.index, frame.subindex).bits // 8]
-
-    def _upload(self) -> bytes:
+    # ------------------------------------------------------------ the client reads
+    def _upload(self, _frame: protocol.SdoFrame, _request: bytes) -> bytes:
         data = read(self._dictionary, *self._object)
         if 1 <= len(data) <= 4:
             command = protocol.expedited_command(protocol.SDO_UPLOAD, len(data))
             return protocol.encode_sdo(command, *self._object, data)
-        self._left, self._toggle = data, 0
+        self._to_send = data
         command = protocol.SDO_UPLOAD | protocol.SDO_SIZE_GIVEN
         return protocol.encode_sdo(command, *self._object, struct.pack("<I", len(data)))
 
-    def _segment(self, toggle: int) -> bytes:
-        if not self._left:
+    def _upload_segment(self, frame: protocol.SdoFrame, _request: bytes) -> bytes:
+        if self._to_send is None:
             raise SdoAbortError(AbortCode.COMMAND_SPECIFIER)
+        toggle = self._take_toggle(frame)
+        chunk, rest = self._to_send[:7], self._to_send[7:]
+        self._to_send = rest or None
+        return protocol.encode_segment(chunk, toggle, last=not rest)
+
+    # ------------------------------------------------------------ the client writes
+    def _download(self, frame: protocol.SdoFrame, _request: bytes) -> bytes:
+        entry = find(self._dictionary, *self._object)
+        if entry.write is None:
+            raise SdoAbortError(AbortCode.READ_ONLY)
+        if frame.command & protocol.SDO_EXPEDITED:
+            data = protocol.expedited_data(frame)
+            if not frame.command & protocol.SDO_SIZE_GIVEN:
+                data = data[: entry.bits // 8]
+            write(self._dictionary, *self._object, data)
+        else:
+            size = protocol.announced_size(frame)
+            if size is not None:
+                check_length(entry, size)
+            self._received = b""
+        return protocol.encode_sdo(protocol.SDO_DOWNLOADED, *self._object)
+
+    def _download_segment(self, frame: protocol.SdoFrame, request: bytes) -> bytes:
+        if self._received is None:
+            raise SdoAbortError(AbortCode.COMMAND_SPECIFIER)
+        toggle = self._take_toggle(frame)
+        chunk, last = protocol.decode_segment(request)
+        self._received += chunk
+        if last:
+            data, self._received = self._received, None
+            write(self._dictionary, *self._object, data)
+        elif len(self._received) * 8 > find(self._dictionary, *self._object).bits:
+            raise SdoAbortError(AbortCode.TOO_LONG)
+        return protocol.encode_sdo(protocol.SDO_SEGMENT_DOWNLOADED | toggle, 0, 0)
+
+    def _take_toggle(self, frame: protocol.SdoFrame) -> int:
+        toggle = frame.command & protocol.SDO_TOGGLE
         if toggle != self._toggle:
             raise SdoAbortError(AbortCode.TOGGLE_BIT)
-        chunk, self._left = self._left[:7], self._left[7:]
         self._toggle ^= protocol.SDO_TOGGLE
-        return protocol.encode_segment(chunk, toggle, last=not self._left)
+        return toggle
+
+
+_SEGMENTS = frozenset({protocol.SDO_UPLOAD_SEGMENT, protocol.SDO_DOWNLOAD_SEGMENT})
+"""Services that do not name their object."""
+
+
+def _refuse(_frame: protocol.SdoFrame, _request: bytes) -> bytes:
+    raise SdoAbortError(AbortCode.COMMAND_SPECIFIER)

@@ -1,55 +1,56 @@
 """The mock drive as one CANopen node: NMT, heartbeats, SYNC, PDOs, SDO, EMCY, and its two axes.
 
 The drive reads its encoders and commands its motors; how the motors move is the plant's business.
+`fit_drive.eds` beside this file lists its objects for other CANopen tools.
 
-Known limitations: those of the modules beside this one, and: SYNC has no counter, remote frames are not
-answered, no LSS, no TIME, no parameter store, no limit switches or brake; controlwords are obeyed in every
-NMT state but STOPPED; actual velocity (606C) is the encoder's difference between the last two SYNCs. All
-links down does not stop it by itself: the loss of the master's heartbeat does, once it was seen.
-Invented constants: identity, names and versions (objects.py); the axis number in the EMCY's first
-manufacturer byte (0: whole drive); `QUICK_STOP_S` (axis.py).
+Known limitations: those of the modules beside this one, and: SYNC has no counter, no node guarding (only
+heartbeats), no LSS, no TIME, no parameter store, no limit switches or brake; controlwords are obeyed in
+every NMT state but STOPPED; actual velocity (606C) is the encoder's difference between the last two SYNCs.
+All links down does not stop it by itself: the loss of the master's heartbeat does, once it was seen.
+Invented constants: identity, names and versions (objects.py); that leaving NMT state OPERATIONAL is a quick
+stop; that its encoders count from where the motors stand when power comes back (`reboot`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from typing import Protocol
 
 from fitctl.config import Siderostat
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.protocol import NmtCommand, NmtState
-from fitctl.mocks.cia402.axis import Axis
+from fitctl.mocks.cia402.axis import Axis, Command
 from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoServer, constant
+from fitctl.mocks.cia402.emergency import Emergencies
 from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
-from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter
+from fitctl.mocks.cia402.shafts import PARTS, Motors, Shafts
+from fitctl.mocks.cia402.slcan import SlcanAdapter
+from fitctl.mocks.cia402.slcan_frames import CanFrame
 from fitctl.mocks.cia402.timers import Periodic, Watchdog
-from fitctl.mocks.faults import WIRE_FAULTS, Faults
+from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 
-FAULTS = dict(WIRE_FAULTS)
+FAULTS = WIRE_FAULTS | {
+    "link_loss": FaultKind("the CAN cable between adapter and drive is cut"),
+    "amplifier_fault": FaultKind(
+        "an amplifier is in fault, whatever is reset",
+        "error code of CiA 402",
+        protocol.ERROR_OVER_CURRENT,
+        PARTS,
+    ),
+    "following_error": FaultKind(
+        "the drive finds that a motor does not follow: fault 0x8611", parts=PARTS
+    ),
+    "encoder_jump": FaultKind("an encoder counts that much more", "counts", 1000, PARTS),
+    "stuck_axis": FaultKind("a motor stands still, whatever it is told", parts=PARTS),
+}
 BOTH_VELOCITY_MODES = 1 << (protocol.PROFILE_VELOCITY - 1) | 1 << (
     protocol.CYCLIC_SYNCHRONOUS_VELOCITY - 1
 )
-_EMCY_PDO_LENGTH = 0x8210
-
-
-class Motors(Protocol):
-    """The plant's side of the drive: azimuth is axis 0, elevation axis 1."""
-
-    def position_rad(self) -> Sequence[float]:
-        """Both motors' angles now."""
-        ...
-
-    def command_velocity_rad_s(self, az: float, el: float) -> None:
-        """Drive the motors at these velocities; said again at every SYNC."""
-        ...
-
-    def set_enabled(self, axis: int, enabled: bool) -> None:
-        """Give one motor current, or take it away."""
-        ...
+PDOS_EACH_WAY = 4
+_CONTROL_S = 0.002  # how often the axes' ramps go on also without SYNC
 
 
 class Cia402DriveMock:
@@ -65,6 +66,12 @@ class Cia402DriveMock:
         TCP port on 127.0.0.1; 0 for a free one.
     supported_modes : int
         Object 6502 of both axes; bit n is mode n + 1.
+
+    Attributes
+    ----------
+    faults : Faults
+    dictionary : dict
+        Its objects, by index and subindex.
     """
 
     def __init__(
@@ -76,11 +83,12 @@ class Cia402DriveMock:
         supported_modes: int = BOTH_VELOCITY_MODES,
     ) -> None:
         self.faults = Faults(FAULTS)
-        self._motors = motors
         self._port = port
         self._node_id = siderostat.device.node_id
-        self._counts_per_rad = siderostat.encoder_counts_per_rev / (2 * math.pi)
-        self._adapter = SlcanAdapter(siderostat.device.bitrate, self._receive)
+        self._shafts = Shafts(
+            motors, self.faults, siderostat.encoder_counts_per_rev / (2 * math.pi)
+        )
+        self._adapter = SlcanAdapter(siderostat.device.bitrate, self.faults, self._receive)
         self.nmt_state = NmtState.STOPPED
         self.axes = tuple(
             Axis(partial(motors.set_enabled, number), self._axis_changed)
@@ -88,52 +96,41 @@ class Cia402DriveMock:
         )
         self.heartbeat_ms = 0
         self.consumer = 0
-        self._counts = (0, 0)
-        self._at_syncs = [(0.0, (0, 0)), (0.0, (0, 0))]
-        self._in_error = False
+        self._controlled_s = 0.0
+        self._emergencies = Emergencies(self.axes, self._send_emcy)
         self._heartbeat = Periodic(self._send_heartbeat)
+        self._control = Periodic(self._go_on)
         self._master = Watchdog(self._master_lost)
-        self._dictionary = self._objects(supported_modes)
-        self._sdo = SdoServer(self._dictionary)
-        self._rpdos = (self._rpdo(0, protocol.RPDO1_BASE), self._rpdo(1, protocol.RPDO2_BASE))
-        self._tpdos = (self._tpdo(0, protocol.TPDO1_BASE), self._tpdo(1, protocol.TPDO2_BASE))
+        self.dictionary = self._objects(supported_modes)
+        self._sdo = SdoServer(self.dictionary)
+        self._rpdos = self._pdos(
+            protocol.RPDO_COMMUNICATION, protocol.RPDO_MAPPING, protocol.RPDO1_BASE, sends=False
+        )
+        self._tpdos = self._pdos(
+            protocol.TPDO_COMMUNICATION, protocol.TPDO_MAPPING, protocol.TPDO1_BASE, sends=True
+        )
         self._events = tuple(Periodic(partial(self._send_pdo, tpdo)) for tpdo in self._tpdos)
-        self._sent: dict[Pdo, bytes] = {}
         self._handlers: dict[int, Callable[[bytes], None]] = {}
+        self.faults.on_change(self._take_fault)
 
     async def start(self) -> int:
         """Power up: listen, boot, wait in PRE-OPERATIONAL. Returns the TCP port."""
         port = await self._adapter.start(self._port)
+        self._control.set_period(_CONTROL_S)
         self._reset_communication()
         return port
 
     async def stop(self) -> None:
         """Power down: motors without current, every connection closed."""
-        self._enter(NmtState.STOPPED)
-        self._heartbeat.set_period(0)
-        self._master.set_timeout(0)
-        for axis in self.axes:
-            axis.power_off()
+        self.faults.close()
+        self._power_off()
+        self._control.set_period(0)
         await self._adapter.stop()
-
-    def inject_fault(self, axis: int, error_code: int, *, persists: bool = False) -> None:
-        """Make an axis fail as if by itself; a cause that `persists` defeats the fault reset."""
-        self.axes[axis].fault_persists = persists
-        self.axes[axis].fault(error_code)
-        self._send_emcy(error_code, axis + 1)
-
-    def remove_fault_cause(self, axis: int) -> None:
-        """Let the next fault reset of this axis succeed."""
-        self.axes[axis].fault_persists = False
-
-    def drop_links(self) -> None:
-        """Cut every SLCAN connection; clients may connect again."""
-        self._adapter.drop_clients()
 
     # ------------------------------------------------------------ the objects
     def _objects(self, supported_modes: int) -> Dictionary:
-        dictionary = identity_objects(self._node_id) | {
-            (protocol.ERROR_REGISTER, 0): Entry("B", self._error_register, mappable=True),
+        dictionary = identity_objects(self._node_id) | self._emergencies.objects()
+        dictionary |= {
             (protocol.HEARTBEAT_CONSUMER, 0): constant("B", 1),
             (protocol.HEARTBEAT_CONSUMER, 1): Entry("I", lambda: self.consumer, self._set_consumer),
             (protocol.HEARTBEAT_PRODUCER, 0): Entry(
@@ -147,29 +144,22 @@ class Cia402DriveMock:
                 supported_modes=supported_modes,
                 statusword=partial(self._statusword, axis),
                 position_counts=partial(self._position_counts, number),
-                velocity_rad_s=partial(self._velocity_rad_s, number),
+                velocity_rad_s=partial(self._shafts.velocity_rad_s, number),
                 changed=self._command_motors,
             )
         return dictionary
 
-    def _rpdo(self, number: int, base: int) -> Pdo:
-        return Pdo(
-            self._dictionary,
-            protocol.RPDO_COMMUNICATION + number,
-            protocol.RPDO_MAPPING + number,
-            base + self._node_id,
-            sends=False,
-            changed=self._rewire,
-        )
-
-    def _tpdo(self, number: int, base: int) -> Pdo:
-        return Pdo(
-            self._dictionary,
-            protocol.TPDO_COMMUNICATION + number,
-            protocol.TPDO_MAPPING + number,
-            base + self._node_id,
-            sends=True,
-            changed=self._rewire,
+    def _pdos(self, communication: int, mapping: int, base: int, *, sends: bool) -> tuple[Pdo, ...]:
+        return tuple(
+            Pdo(
+                self.dictionary,
+                communication + number,
+                mapping + number,
+                base + number * protocol.PDO_BASE_STEP + self._node_id,
+                sends=sends,
+                changed=self._rewire,
+            )
+            for number in range(PDOS_EACH_WAY)
         )
 
     def _set_heartbeat_ms(self, heartbeat_ms: int) -> None:
@@ -185,21 +175,7 @@ class Cia402DriveMock:
         return axis.statusword(remote=self.nmt_state is NmtState.OPERATIONAL)
 
     def _position_counts(self, axis: int) -> int:
-        return self._counts[axis]
-
-    def _velocity_rad_s(self, axis: int) -> float:
-        (earlier_s, earlier), (later_s, later) = self._at_syncs
-        if later_s <= earlier_s:
-            return 0.0
-        moved = protocol.wrap_int32(later[axis] - earlier[axis])
-        return moved / (later_s - earlier_s) / self._counts_per_rad
-
-    def _error_register(self) -> int:
-        codes = [axis.error_code for axis in self.axes]
-        register = protocol.ERROR_REGISTER_GENERIC if any(codes) else 0
-        if any(code >> 8 == 0x81 for code in codes):
-            register |= protocol.ERROR_REGISTER_COMMUNICATION
-        return register
+        return self._shafts.counts[axis]
 
     # ------------------------------------------------------------ what comes in
     def _rewire(self) -> None:
@@ -223,9 +199,21 @@ class Cia402DriveMock:
             event.set_period(tpdo.event_ms / 1e3 if runs else 0)
 
     def _receive(self, frame: CanFrame) -> None:
+        if frame.extended:
+            return
+        if frame.remote_length is not None:
+            self._on_remote(frame.can_id)
+            return
         handler = self._handlers.get(frame.can_id)
-        if handler and not frame.extended and frame.remote_length is None:
+        if handler:
             handler(frame.data)
+
+    def _on_remote(self, can_id: int) -> None:
+        if self.nmt_state is NmtState.OPERATIONAL:
+            for tpdo in self._tpdos:
+                if tpdo.in_service and tpdo.can_id == can_id and tpdo.answers_remote:
+                    self._shafts.sample()
+                    self._adapter.send(can_id, tpdo.remote_answer())
 
     def _on_nmt(self, data: bytes) -> None:
         if len(data) < 2 or data[1] not in {0, self._node_id}:
@@ -238,16 +226,16 @@ class Cia402DriveMock:
             case NmtCommand.PRE_OPERATIONAL:
                 self._enter(NmtState.PRE_OPERATIONAL)
             case NmtCommand.RESET_NODE:
-                for axis in self.axes:
-                    axis.power_off()
+                self._power_off()
                 self._reset_communication()
+                self._look_for_causes()
             case NmtCommand.RESET_COMMUNICATION:
                 self._reset_communication()
 
     def _on_sdo(self, data: bytes) -> None:
         if self.nmt_state is NmtState.STOPPED:
             return
-        self._sample()
+        self._shafts.sample()
         answer = self._sdo.answer(data)
         self._command_motors()
         if answer is not None:
@@ -262,63 +250,99 @@ class Cia402DriveMock:
 
     def _apply(self, rpdo: Pdo, data: bytes) -> None:
         if not rpdo.apply(data):
-            self._send_emcy(_EMCY_PDO_LENGTH, 0)
+            self._emergencies.tell(protocol.EMCY_PDO_TOO_SHORT, 0)
 
     def _on_sync(self, _data: bytes) -> None:
+        self._shafts.sample()
+        self._shafts.latch(asyncio.get_running_loop().time())
         for rpdo in self._rpdos:
             if rpdo.received is not None:
                 data, rpdo.received = rpdo.received, None
                 self._apply(rpdo, data)
         self._command_motors()
-        self._sample()
-        self._at_syncs = [self._at_syncs[1], (asyncio.get_running_loop().time(), self._counts)]
         for tpdo in self._tpdos:
             if tpdo.in_service and tpdo.due():
                 self._send_pdo(tpdo)
 
     # ------------------------------------------------------------ what goes out
     def _send_pdo(self, tpdo: Pdo) -> None:
-        data = tpdo.pack()
-        self._sent[tpdo] = data
-        self._adapter.send(tpdo.can_id, data)
+        self._adapter.send(tpdo.can_id, tpdo.message())
+
+    def _send_events(self) -> None:
+        """The TPDOs that are sent on change, as far as they would tell something new."""
+        if self.nmt_state is NmtState.OPERATIONAL:
+            for tpdo in self._tpdos:
+                if tpdo.in_service and tpdo.on_event and tpdo.changed:
+                    self._send_pdo(tpdo)
 
     def _send_heartbeat(self) -> None:
         self._adapter.send(protocol.HEARTBEAT_BASE + self._node_id, bytes([self.nmt_state]))
 
-    def _send_emcy(self, code: int, axis_number: int) -> None:
+    def _send_emcy(self, data: bytes) -> None:
         if self.nmt_state is not NmtState.STOPPED:
-            data = protocol.encode_emcy(code, self._error_register(), bytes([axis_number]))
             self._adapter.send(protocol.EMCY_BASE + self._node_id, data)
 
-    # ------------------------------------------------------------ what happens
-    def _sample(self) -> None:
-        az_rad, el_rad = self._motors.position_rad()
-        scale = self._counts_per_rad
-        self._counts = (
-            protocol.wrap_int32(math.floor(az_rad * scale + 0.5)),
-            protocol.wrap_int32(math.floor(el_rad * scale + 0.5)),
-        )
-
+    # ------------------------------------------------------------ the motors
     def _command_motors(self) -> None:
         # Also when nothing changed: a command holds for one time-out only.
-        az, el = self.axes
-        self._motors.command_velocity_rad_s(az.velocity_rad_s, el.velocity_rad_s)
+        now_s = asyncio.get_running_loop().time()
+        elapsed_s, self._controlled_s = now_s - self._controlled_s, now_s
+        for axis, counts in zip(self.axes, self._shafts.counts, strict=True):
+            axis.advance(elapsed_s, counts, 1 / self._shafts.counts_per_rad)
+        self._shafts.command([axis.demand_rad_s for axis in self.axes])
 
+    def _go_on(self) -> None:
+        """Ramps and limits also without SYNC; at 500 Hz there is nothing left to do here."""
+        since_s = asyncio.get_running_loop().time() - self._controlled_s
+        if since_s >= _CONTROL_S and any(axis.moves for axis in self.axes):
+            self._shafts.sample()
+            self._command_motors()
+            self._send_events()
+
+    # ------------------------------------------------------------ what happens
     def _axis_changed(self) -> None:
         self._command_motors()
-        in_error = any(axis.error_code for axis in self.axes)
-        if self._in_error and not in_error:
-            self._send_emcy(protocol.EMCY_NO_ERROR, 0)
-        self._in_error = in_error
-        if self.nmt_state is NmtState.OPERATIONAL:
-            for tpdo in self._tpdos:
-                if tpdo.in_service and tpdo.on_event and tpdo.pack() != self._sent.get(tpdo):
-                    self._send_pdo(tpdo)
+        self._emergencies.look()
+        self._send_events()
+
+    def _take_fault(self, kind: str) -> None:
+        self._adapter.severed = self.faults.value("link_loss") is not None
+        without_power = self.faults.value("reboot") is not None
+        if kind == "reboot":
+            self._power_off()
+            if not without_power:
+                self._shafts.count_from_here()
+                self._reset_communication()
+        if not without_power:
+            self._look_for_causes()
+            self._command_motors()
+
+    def _look_for_causes(self) -> None:
+        """A cause puts its axis in fault, and no reset helps before it is gone."""
+        for number, (axis, part) in enumerate(zip(self.axes, PARTS, strict=True)):
+            cause = self._cause(part)
+            axis.fault_persists = cause is not None
+            if cause is not None and axis.fault(cause):
+                self._emergencies.tell(cause, number + 1)
+
+    def _cause(self, part: str) -> int | None:
+        """Error code of what is wrong with an axis now."""
+        code = self.faults.value("amplifier_fault", part)
+        if code is not None:
+            return int(code)
+        fails = self.faults.value("following_error", part) is not None
+        return protocol.ERROR_FOLLOWING if fails else None
 
     def _master_lost(self) -> None:
+        """The master's heartbeat is missing: each axis does what its object 6007 says."""
         for axis in self.axes:
-            axis.fault(protocol.EMCY_HEARTBEAT_LOST)
-        self._send_emcy(protocol.EMCY_HEARTBEAT_LOST, 0)
+            if axis.abort_option == protocol.ABORT_IS_FAULT:
+                axis.fault(protocol.EMCY_HEARTBEAT_LOST)
+            elif axis.abort_option == protocol.ABORT_DISABLES:
+                axis.command(Command.DISABLE_VOLTAGE)
+            elif axis.abort_option == protocol.ABORT_IS_QUICK_STOP:
+                axis.command(Command.QUICK_STOP)
+        self._emergencies.tell(protocol.EMCY_HEARTBEAT_LOST, 0)
 
     def _enter(self, state: NmtState) -> None:
         """Change the NMT state; leaving OPERATIONAL stops the motors, entering it sends event TPDOs."""
@@ -327,17 +351,24 @@ class Cia402DriveMock:
         self.nmt_state = state
         if state is not NmtState.OPERATIONAL:
             for axis in self.axes:
-                axis.quick_stop()
+                axis.command(Command.QUICK_STOP)
         self._rewire()
-        if state is NmtState.OPERATIONAL:
-            for tpdo in self._tpdos:
-                if tpdo.in_service and tpdo.on_event:
-                    self._send_pdo(tpdo)
+        self._send_events()
+
+    def _power_off(self) -> None:
+        """Motors without current, and nothing remembered."""
+        self._enter(NmtState.STOPPED)
+        self._heartbeat.set_period(0)
+        self._master.set_timeout(0)
+        for axis in self.axes:
+            axis.power_off()
+        self._emergencies.power_off()
 
     def _reset_communication(self) -> None:
         self._enter(NmtState.PRE_OPERATIONAL)
         self._set_heartbeat_ms(0)
         self._set_consumer(0)
+        self._sdo.reset()
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.reset()
         self._rewire()

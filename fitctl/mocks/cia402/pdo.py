@@ -3,8 +3,8 @@
 A PDO is configured as on a real drive: out of service (bit 31 of the COB-ID), mapping emptied, filled and
 counted, put back. Its objects are looked up once, when its mapping is counted, not at each frame.
 
-Known limitations: transmission types 1 to 240, 254 and 255 (no acyclic 0, no remote-frame types); no
-inhibit time, no SYNC start value, no dummy entries.
+Known limitations: no inhibit time, no SYNC start value, no dummy entries, no time limit of an RPDO
+(its event timer). Of an RPDO, transmission types 0 to 240 are the same: acted on at the next SYNC.
 """
 
 from __future__ import annotations
@@ -19,6 +19,16 @@ from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoAbortError, fin
 
 ENTRIES = 8
 _CAN_ID = 0x7FF
+_EXTENDED = 0x2000_0000
+_RESTRICTED = (
+    range(0x081),
+    range(0x101, 0x181),
+    range(0x581, 0x600),
+    range(0x601, 0x680),
+    range(0x6E0, 0x700),
+    range(0x701, 0x800),
+)
+"""CiA 301: identifiers that no PDO may have."""
 
 
 class Pdo:
@@ -72,6 +82,8 @@ class Pdo:
         self.event_ms = 0
         self.received: bytes | None = None
         self.syncs = 0
+        self._last: bytes | None = None
+        self._sampled: bytes | None = None
         self._count = 0
         self._slots[:] = [0] * ENTRIES
         self._resolve()
@@ -88,16 +100,41 @@ class Pdo:
 
     @property
     def on_event(self) -> bool:
-        """Sent on change and by its event timer."""
-        return self.transmission >= 254
+        """Sent on change and by its event timer; acted on at once."""
+        return self.transmission >= protocol.MAKERS_EVENT
+
+    @property
+    def answers_remote(self) -> bool:
+        """Sent when a remote frame asks for it."""
+        return not self.cob_id & protocol.PDO_NO_RTR
 
     def due(self) -> bool:
-        """Count a SYNC; True if this TPDO is sent at this one."""
+        """Take note of a SYNC; True if this TPDO is sent at this one."""
+        if self.transmission == protocol.ACYCLIC_SYNC:
+            return self.changed
+        if self.transmission == protocol.RTR_AT_SYNC:
+            self._sampled = self.pack()
         self.syncs += 1
-        if self.on_event or self.syncs < self.transmission:
+        if self.transmission > protocol.LAST_SYNC or self.syncs < self.transmission:
             return False
         self.syncs = 0
         return True
+
+    @property
+    def changed(self) -> bool:
+        """It would tell something else than the last time."""
+        return self.pack() != self._last
+
+    def message(self) -> bytes:
+        """The mapped objects' values, to be sent now."""
+        self._last = self.pack()
+        return self._last
+
+    def remote_answer(self) -> bytes:
+        """What a remote frame gets."""
+        if self.transmission == protocol.RTR_AT_SYNC:
+            return self._sampled or self.message()
+        return self.message()
 
     def pack(self) -> bytes:
         """The mapped objects' values."""
@@ -146,16 +183,26 @@ class Pdo:
     def _set_cob_id(self, cob_id: int) -> None:
         if self.in_service and not cob_id & protocol.PDO_DISABLED and cob_id != self.cob_id:
             raise SdoAbortError(AbortCode.INVALID_VALUE)
+        goes_into_service = not cob_id & protocol.PDO_DISABLED
+        if goes_into_service and (cob_id & _EXTENDED or _is_restricted(cob_id & _CAN_ID)):
+            raise SdoAbortError(AbortCode.INVALID_VALUE)
         self.cob_id = cob_id
-        self.received = None
+        self.received = self._last = self._sampled = None
         self.syncs = 0
         self._changed()
 
     def _set_transmission(self, transmission: int) -> None:
-        if not (1 <= transmission <= 240 or transmission >= 254):
+        remote = {protocol.RTR_AT_SYNC, protocol.RTR_ONLY} if self._sends else set()
+        known = transmission <= protocol.LAST_SYNC or transmission >= protocol.MAKERS_EVENT
+        if not known and transmission not in remote:
             raise SdoAbortError(AbortCode.INVALID_VALUE)
         self.transmission = transmission
+        self._changed()
 
     def _set_event_ms(self, event_ms: int) -> None:
         self.event_ms = event_ms
         self._changed()
+
+
+def _is_restricted(can_id: int) -> bool:
+    return any(can_id in identifiers for identifiers in _RESTRICTED)

@@ -3,18 +3,21 @@
 Source: LAWICEL CANUSB and CAN232 manuals. Commands end in CR; the answer is CR (or a value and CR) for
 yes, BEL for no. A frame that is received comes as the same line as one that is sent.
 
-Known limitations: no listen-only (``L``), no time stamps (``Z``), no acceptance filters (``M``, ``m``), no
-bit-timing registers (``s``): all answer BEL. The bus has no arbitration, no bit time and no errors.
+Known limitations: no acceptance filters (``M``, ``m``), no bit-timing registers (``s``), no polling
+(``P``, ``A``, ``X``): all answer BEL. Each connection is an adapter of its own, whose settings are gone
+when it closes. The bus has no arbitration, no bit time, and no errors but those of faults.
 Invented constants: version and serial number; what a client may leave unread (`UNREAD_LIMIT_BYTES`).
 """
 
 from __future__ import annotations
 
 import asyncio
-import re
 import socket
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import cast
+
+from fitctl.mocks.cia402.slcan_frames import CanFrame, decode_frame, encode_frame
+from fitctl.mocks.faults import Faults, Wire
 
 OK = b"\r"
 BELL = b"\a"
@@ -35,66 +38,7 @@ FLAG_RECEIVE_FULL = 0x01
 FLAG_BUS_ERROR = 0x80
 LONGEST_LINE_BYTES = 32
 UNREAD_LIMIT_BYTES = 65536
-
-_FRAME = re.compile(
-    rb"(?:[tr]([0-7][0-9A-Fa-f]{2})|[TR]([01][0-9A-Fa-f]{7}))([0-8])((?:[0-9A-Fa-f]{2})*)"
-)
-
-
-class CanFrame(NamedTuple):
-    """One classic CAN frame.
-
-    Attributes
-    ----------
-    can_id : int
-        11 bits, or 29 if `extended`.
-    data : bytes
-        Up to eight; empty in a remote frame.
-    extended : bool
-        29-bit identifier.
-    remote_length : int or None
-        None for a data frame; the length asked for by a remote frame.
-    """
-
-    can_id: int
-    data: bytes
-    extended: bool = False
-    remote_length: int | None = None
-
-
-def encode_frame(frame: CanFrame) -> bytes:
-    """A frame as a line, CR included."""
-    can_id = b"%08X" % frame.can_id if frame.extended else b"%03X" % frame.can_id
-    if frame.remote_length is not None:
-        return (b"R" if frame.extended else b"r") + can_id + b"%d\r" % frame.remote_length
-    kind = b"T" if frame.extended else b"t"
-    return b"%b%b%d%b\r" % (kind, can_id, len(frame.data), frame.data.hex().upper().encode())
-
-
-def decode_frame(line: bytes) -> CanFrame:
-    """A line, without its CR, as a frame.
-
-    Raises
-    ------
-    ValueError
-        If it is not exactly one frame: wrong digits, or data that do not fit the length.
-    """
-    match = _FRAME.fullmatch(line)
-    if match is None:
-        msg = f"not an SLCAN frame: {line!r}"
-        raise ValueError(msg)
-    standard, extended, length_digit, digits = match.groups()
-    length = int(length_digit)
-    remote = line[:1] in {b"r", b"R"}
-    if len(digits) != (0 if remote else 2 * length):
-        msg = f"length {length} does not fit the data of {line!r}"
-        raise ValueError(msg)
-    return CanFrame(
-        int(extended or standard, 16),
-        bytes.fromhex(digits.decode()),
-        extended is not None,
-        length if remote else None,
-    )
+_STAMP_MS = 60000
 
 
 class _Client(asyncio.Protocol):
@@ -106,7 +50,10 @@ class _Client(asyncio.Protocol):
         self._answers = bytearray()
         self._collecting = False
         self._bitrate: int | None = None
+        self._stamps = False
+        self._listens_only = False
         self._flags = 0
+        self._wire = Wire(adapter.faults, self._out)
         self.transport: asyncio.Transport | None = None
         self.is_open = False
 
@@ -115,16 +62,23 @@ class _Client(asyncio.Protocol):
         """Open at the bit rate of the bus; at another one nothing can be heard."""
         return self.is_open and self._bitrate == self._adapter.bitrate
 
+    # ------------------------------------------------------------ the connection
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._adapter.clients.add(self)
+        if self._adapter.away:
+            self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self.transport = None
+        self._wire.close()
         self._adapter.clients.discard(self)
 
     def data_received(self, data: bytes) -> None:
+        if self._wire.dead:
+            self._unfinished = b""
+            return
         # What one segment brings is answered in one segment: RPDO and SYNC often come together.
         self._collecting = True
         *lines, self._unfinished = (self._unfinished + data).split(b"\r")
@@ -132,19 +86,22 @@ class _Client(asyncio.Protocol):
             self._command(line)
         if len(self._unfinished) > LONGEST_LINE_BYTES:
             self._unfinished = b""
-            self.send(BELL)
+            self._wire.send(BELL)
         self._collecting = False
         self._flush()
 
-    def deliver(self, line: bytes) -> None:
+    def deliver(self, frame: CanFrame, line: bytes) -> None:
         """Pass on a frame of the bus, unless this client has stopped reading."""
         if self.transport and self.transport.get_write_buffer_size() > UNREAD_LIMIT_BYTES:
             self._flags |= FLAG_RECEIVE_FULL
+        elif self._stamps:
+            milliseconds = int(asyncio.get_running_loop().time() * 1e3) % _STAMP_MS
+            self._wire.send(encode_frame(frame, b"%04X" % milliseconds))
         else:
-            self.send(line)
+            self._wire.send(line)
 
-    def send(self, answer: bytes) -> None:
-        """Answer, at once or with the rest of this segment's answers."""
+    def _out(self, answer: bytes) -> None:
+        """What the wire lets pass goes at once, or with the rest of this segment's answers."""
         self._answers += answer
         if not self._collecting:
             self._flush()
@@ -154,43 +111,82 @@ class _Client(asyncio.Protocol):
             self.transport.write(bytes(self._answers))
         self._answers.clear()
 
+    # ------------------------------------------------------------ the commands
     def _command(self, line: bytes) -> None:
-        kind = line[:1]
-        if kind in b"tTrR" and kind:
-            self._transmit(kind, line)
-        elif line in BITRATES and not self.is_open:
-            self._bitrate = BITRATES[line]
-            self.send(OK)
-        elif line == b"O" and not self.is_open and self._bitrate is not None:
-            self.is_open = True
-            self.send(OK)
-        elif line == b"C" and self.is_open:
-            self.is_open = False
-            self.send(OK)
-        elif line == b"V":
-            self.send(VERSION + OK)
-        elif line == b"N":
-            self.send(SERIAL_NUMBER + OK)
-        elif line == b"F" and self.is_open:
-            flags = self._flags | (0 if self.on_bus else FLAG_BUS_ERROR)
-            self._flags = 0
-            self.send(b"F%02X" % flags + OK)
-        else:
+        if not line:
             # An empty line is how clients clear a half-typed command; it is no error.
-            self.send(BELL if line else OK)
+            self._wire.send(OK)
+        elif line[:1] in b"tTrR":
+            self._transmit(line)
+        else:
+            answer = _COMMANDS.get(line[:1], _refuse)(self, line)
+            self._wire.send(BELL if answer is None else answer + OK)
 
-    def _transmit(self, kind: bytes, line: bytes) -> None:
+    def _set_bitrate(self, line: bytes) -> bytes | None:
+        if line not in BITRATES or self.is_open:
+            return None
+        self._bitrate = BITRATES[line]
+        return b""
+
+    def _set_stamps(self, line: bytes) -> bytes | None:
+        if line not in {b"Z0", b"Z1"} or self.is_open:
+            return None
+        self._stamps = line == b"Z1"
+        return b""
+
+    def _open(self, line: bytes) -> bytes | None:
+        if line not in {b"O", b"L"} or self.is_open or self._bitrate is None:
+            return None
+        self.is_open = True
+        self._listens_only = line == b"L"
+        return b""
+
+    def _close(self, line: bytes) -> bytes | None:
+        if line != b"C" or not self.is_open:
+            return None
+        self.is_open = False
+        return b""
+
+    def _status(self, line: bytes) -> bytes | None:
+        if line != b"F" or not self.is_open:
+            return None
+        no_bus = self._adapter.severed or not self.on_bus
+        flags = self._flags | (FLAG_BUS_ERROR if no_bus else 0)
+        self._flags = 0
+        return b"F%02X" % flags
+
+    def _version(self, line: bytes) -> bytes | None:
+        return {b"V": VERSION, b"N": SERIAL_NUMBER}.get(line)
+
+    def _transmit(self, line: bytes) -> None:
         try:
             frame = decode_frame(line)
         except ValueError:
-            self.send(BELL)
+            self._wire.send(BELL)
             return
-        if not self.is_open:
-            self.send(BELL)
+        if not self.is_open or self._listens_only:
+            self._wire.send(BELL)
             return
-        self.send(b"z\r" if kind in b"tr" else b"Z\r")
+        self._wire.send(b"Z\r" if frame.extended else b"z\r")
         if self.on_bus:
             self._adapter.from_client(self, frame)
+
+
+def _refuse(_client: _Client, _line: bytes) -> None:
+    return None
+
+
+_COMMANDS: dict[bytes, Callable[[_Client, bytes], bytes | None]] = {
+    b"S": _Client._set_bitrate,
+    b"Z": _Client._set_stamps,
+    b"O": _Client._open,
+    b"L": _Client._open,
+    b"C": _Client._close,
+    b"F": _Client._status,
+    b"V": _Client._version,
+    b"N": _Client._version,
+}
+"""Each takes its line and gives what stands before the CR of a yes, or None for a no."""
 
 
 class SlcanAdapter:
@@ -200,15 +196,30 @@ class SlcanAdapter:
     ----------
     bitrate : int
         Of the bus; a client that opens at another one hears nothing.
+    faults : Faults
+        With `WIRE_FAULTS` among its kinds.
     received : callable
         Called with each :class:`CanFrame` that a client puts on the bus.
+
+    Attributes
+    ----------
+    severed : bool
+        The CAN cable between the adapter and the drive is cut.
     """
 
-    def __init__(self, bitrate: int, received: Callable[[CanFrame], None]) -> None:
+    def __init__(self, bitrate: int, faults: Faults, received: Callable[[CanFrame], None]) -> None:
         self.bitrate = bitrate
+        self.faults = faults
         self.clients: set[_Client] = set()
+        self.severed = False
         self._received = received
         self._server: asyncio.Server | None = None
+        faults.on_change(self._cut_connections)
+
+    @property
+    def away(self) -> bool:
+        """Cut off or without power."""
+        return any(self.faults.value(kind) is not None for kind in ("disconnect", "reboot"))
 
     async def start(self, port: int) -> int:
         """Listen on 127.0.0.1; returns the port, which is a free one if `port` is 0."""
@@ -217,32 +228,37 @@ class SlcanAdapter:
         return int(self._server.sockets[0].getsockname()[1])
 
     async def stop(self) -> None:
-        """Stop listening and drop every client."""
+        """Stop listening and drop every client; safe to call twice."""
         if self._server is None:
             return
         self._server.close()
-        self.drop_clients()
+        self._drop_clients()
         await self._server.wait_closed()
         self._server = None
 
-    def drop_clients(self) -> None:
-        """Cut every connection, as a pulled cable would; clients may connect again."""
-        for client in list(self.clients):
-            if client.transport:
-                client.transport.abort()
-
     def send(self, can_id: int, data: bytes) -> None:
         """Put a frame with an 11-bit identifier on the bus, from the drive."""
-        line = encode_frame(CanFrame(can_id, data))
-        for client in self.clients:
-            if client.on_bus:
-                client.deliver(line)
+        if not self.severed:
+            self._deliver(CanFrame(can_id, data), None)
 
     def from_client(self, sender: _Client, frame: CanFrame) -> None:
         """Put a client's frame on the bus: the other clients hear it, and so does the drive."""
         if len(self.clients) > 1:
-            line = encode_frame(frame)
-            for client in self.clients:
-                if client is not sender and client.on_bus:
-                    client.deliver(line)
-        self._received(frame)
+            self._deliver(frame, sender)
+        if not self.severed:
+            self._received(frame)
+
+    def _deliver(self, frame: CanFrame, sender: _Client | None) -> None:
+        line = encode_frame(frame)
+        for client in self.clients:
+            if client is not sender and client.on_bus:
+                client.deliver(frame, line)
+
+    def _cut_connections(self, _kind: str) -> None:
+        if self.away:
+            self._drop_clients()
+
+    def _drop_clients(self) -> None:
+        for client in list(self.clients):
+            if client.transport:
+                client.transport.abort()

@@ -19,13 +19,19 @@ class IntegratingMotors:
         self.enabled = [False, False]
         self._angle_rad = [0.0, 0.0]
         self._at_s = time.monotonic()
+        self._lock = threading.Lock()  # the test looks while the mock's thread turns them
+
+    def where(self) -> tuple[float, list[float]]:
+        """The time now, and both angles."""
+        with self._lock:
+            now_s = time.monotonic()
+            for axis, velocity in enumerate(self.velocity_rad_s):
+                self._angle_rad[axis] += velocity * (now_s - self._at_s)
+            self._at_s = now_s
+            return now_s, list(self._angle_rad)
 
     def position_rad(self) -> list[float]:
-        now_s = time.monotonic()
-        for axis, velocity in enumerate(self.velocity_rad_s):
-            self._angle_rad[axis] += velocity * (now_s - self._at_s)
-        self._at_s = now_s
-        return list(self._angle_rad)
+        return self.where()[1]
 
     def turn_to(self, angle_rad: float) -> None:
         self._angle_rad = [angle_rad, angle_rad]
@@ -63,6 +69,14 @@ class Bench:
             action(*args, **kwargs)
 
         self._run(run())
+
+    def fault(self, kind: str, **settings) -> None:
+        """Begin a fault of the drive."""
+        self.call(self.mock.faults.set, config.Fault(device="right.drive", kind=kind, **settings))
+
+    def heal(self) -> None:
+        """End all faults."""
+        self.call(self.mock.faults.clear)
 
     def close(self) -> None:
         self._run(self.mock.stop())
