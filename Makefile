@@ -5,9 +5,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+PEERS := $(VENV)/.peers
+FUZZ_S ?= 120
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow bench-sim lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices fuzz bench-sim lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -43,12 +45,32 @@ pytest: $(READY)
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
+test-faults: $(READY)  ## The whole instrument, in real time, under each fault of each device
+	$(BIN)/pytest -m fault tests/system $(ARGS)
+
+test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
+	$(BIN)/pytest -m peer tests/peers $(ARGS)
+
+$(PEERS): $(READY) requirements/peers.lock tests/peers/install tests/peers/canopen/package-lock.json
+	@echo "Getting the peers ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/peers.lock
+	@tests/peers/install
+	@touch $(PEERS)
+
+fuzz: $(READY)  ## Coverage-guided fuzzing of every parser, FUZZ_S seconds each (needs atheris)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/fuzz.lock
+	@for target in fuzz/fuzz_*.py; do $(BIN)/python $$target -max_total_time=$(FUZZ_S) || exit 1; done
+
 bench-sim: $(READY)  ## How many times real time the simulation and the batch run
 	$(BIN)/python -m benchmarks.simulate $(ARGS)
 
+LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+    --custom-compile-command "make lock" --quiet
+
 lock: $(READY)  ## Resolve the requirements anew (needs uv)
-	uv pip compile pyproject.toml --extra fast --extra cluster --group dev --universal --python-version 3.11 \
-	    --generate-hashes --no-annotate --custom-compile-command "make lock" --quiet -o requirements/dev.lock
+	uv pip compile pyproject.toml --extra fast --extra cluster --group dev $(LOCK) -o requirements/dev.lock
+	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
+	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
 
 clean:  ## Remove .venv and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

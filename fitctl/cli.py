@@ -140,6 +140,33 @@ def mocks(
     run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
 
 
+@app.command()
+def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+    """Ask every device of the rig who it is; nothing is set, nothing moves.
+
+    Exit status 1 if one is missing or is not as the rig file says.
+    """
+    from fitctl.commands.doctor import run_doctor
+
+    raise typer.Exit(run_doctor(_rig(rig, overrides), as_json=as_json))
+
+
+@app.command()
+def discover(
+    broadcast: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where cameras are asked to say who they are.")
+    ] = "255.255.255.255",
+    wait_s: Annotated[
+        float, typer.Option("--wait", min=0.01, max=60.0, help="For their answers, seconds.")
+    ] = 1.0,
+    as_json: JsonOption = False,
+) -> None:
+    """List cameras, serial ports and CAN interfaces. Cameras are asked by a broadcast."""
+    from fitctl.commands.doctor import run_discover
+
+    run_discover(broadcast, wait_s, as_json=as_json)
+
+
 DeviceArgument = Annotated[
     str, typer.Argument(help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.")
 ]
@@ -255,7 +282,9 @@ def simulate(
     overrides: SetOption = None,
     controller: ControllerOption = None,
     seed: SeedOption = 0,
-    duration: Annotated[float, typer.Option(min=1.0, help="Seconds of virtual time.")] = 120.0,
+    duration: Annotated[
+        float, typer.Option(min=1.0, max=1e6, help="Seconds of virtual time.")
+    ] = 120.0,
     runs: Annotated[
         int, typer.Option(min=1, help="How many, with seeds from --seed on, on every core.")
     ] = 1,
@@ -312,6 +341,9 @@ def identify(
 
     if what not in EXPERIMENTS:
         msg = f"identify: {what} cannot be identified; there are {', '.join(EXPERIMENTS)}"
+        raise ConfigError(msg)
+    if (log is not None) + simulated + mock > 1:
+        msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
         raise ConfigError(msg)
     settings = _rig(rig, overrides)
     path = rig or default_rig_path()

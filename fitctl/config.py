@@ -12,7 +12,7 @@ import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -81,10 +81,13 @@ class Optics(Settings):
 class GigeDevice(Settings):
     """Where a GigE Vision camera answers."""
 
-    driver: Literal["gige"]
+    driver: Literal["gige", "aravis"]
     address: str
     gvcp_port: Annotated[int, Field(ge=1, le=65535)]
+    pixel_format: Literal["Mono8", "Mono12", "Mono16"]
+    gain: NonNegative
     packet_size_bytes: Annotated[int, Field(ge=576, le=9000)]
+    packet_delay_s: Annotated[float, Field(ge=0, le=0.01)]
     response_timeout_s: TimeoutS
     heartbeat_s: Annotated[float, Field(ge=0.5, le=60)]
 
@@ -154,10 +157,83 @@ class Cia402Device(Settings):
     response_timeout_s: TimeoutS
     drive_heartbeat_s: Annotated[float, Field(ge=0.01, le=10)]
     master_heartbeat_timeout_s: Annotated[float, Field(ge=0.02, le=10)]
+    position_limit_rad: NonNegative
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return self.channel
 
 
-class Siderostat(Settings):
-    """The coarse stage: geometry, limits, servo, amplifiers."""
+class EnsembleDevice(Settings):
+    """An Aerotech Ensemble with two axes, spoken to in its ASCII commands."""
+
+    driver: Literal["ensemble"]
+    port: str
+    baud_rate: Count
+    axes: Annotated[list[Annotated[int, Field(ge=0, le=9)]], Field(min_length=2, max_length=2)]
+    response_timeout_s: TimeoutS
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return self.port
+
+
+class BalAnalogDevice(Settings):
+    """Two analogue velocity amplifiers behind Modbus/TCP I/O.
+
+    Attributes
+    ----------
+    first_output_register : int
+        Velocity commands of az and el, then a word with the enable lines: bit 0 az, bit 1 el.
+    first_input_register : int
+        Encoder counters of az and el, then a word with the fault lines, as the enable lines.
+    full_scale_counts, full_scale_v : int, float
+        Of the analogue outputs, both ways from zero.
+    velocity_rad_s_per_v : AxisPair
+        What the amplifiers are adjusted to; negative where a motor turns the other way.
+    """
+
+    driver: Literal["bal_analog"]
+    host: str
+    port: Annotated[int, Field(ge=1, le=65535)]
+    device_id: Annotated[int, Field(ge=0, le=255)]
+    first_output_register: Annotated[int, Field(ge=0, le=65533)]
+    first_input_register: Annotated[int, Field(ge=0, le=65533)]
+    full_scale_counts: Annotated[int, Field(ge=100, le=32767)]
+    full_scale_v: Positive
+    velocity_rad_s_per_v: AxisPair
+    enabled_level: Literal["high", "low"]
+    fault_level: Literal["high", "low"]
+    response_timeout_s: TimeoutS
+
+    @model_validator(mode="after")
+    def _can_be_commanded(self) -> BalAnalogDevice:
+        if 0 in {self.velocity_rad_s_per_v.az, self.velocity_rad_s_per_v.el}:
+            msg = "velocity_rad_s_per_v must not be 0"
+            raise ValueError(msg)
+        return self
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return f"{self.host}:{self.port}"
+
+
+SiderostatDevice = Annotated[
+    Cia402Device | EnsembleDevice | BalAnalogDevice, Field(discriminator="driver")
+]
+_TAGGED: dict[str, type[Settings]] = {
+    "cia402": Cia402Device,
+    "ensemble": EnsembleDevice,
+    "bal_analog": BalAnalogDevice,
+}
+AmplifierDevice = TypeVar("AmplifierDevice", bound=Settings)
+
+
+class Siderostat(Settings, Generic[AmplifierDevice]):
+    """The coarse stage: geometry, limits, servo, amplifiers; generic in what its amplifiers are."""
 
     encoder_counts_per_rev: Count
     spur_gear_ratio: Positive
@@ -167,21 +243,43 @@ class Siderostat(Settings):
     velocity_limit_rad_s: Positive
     acceleration_limit_rad_s2: Positive
     servo: ServoSettings
-    device: Cia402Device
+    device: AmplifierDevice
     backlash_sky_arcsec: NonNegative | None = None
 
 
+AnySiderostat = Siderostat[SiderostatDevice]
+
+
 class ModbusDacDevice(Settings):
-    """A Modbus/TCP D/A converter: consecutive holding registers, one a channel."""
+    """A Modbus D/A converter: consecutive holding registers, one a channel."""
 
     driver: Literal["modbus_dac"]
+    transport: Literal["tcp", "rtu"]
     host: str
     port: Annotated[int, Field(ge=1, le=65535)]
-    device_id: Annotated[int, Field(ge=0, le=247)]
-    first_register: Annotated[int, Field(ge=0, le=65535)]
+    serial_port: str
+    baud_rate: Annotated[int, Field(ge=1200, le=4_000_000)]
+    serial_format: Literal["8E1", "8O1", "8N1", "8N2"]
+    device_id: Annotated[int, Field(ge=0, le=255)]
+    first_register: Annotated[int, Field(ge=0, le=65533)]
     full_scale_v: Positive
     bits: Annotated[int, Field(ge=8, le=16)]
     response_timeout_s: TimeoutS
+
+    @model_validator(mode="after")
+    def _can_be_reached(self) -> ModbusDacDevice:
+        if self.transport == "rtu" and not self.serial_port:
+            msg = "serial_port must name a port, such as /dev/ttyUSB0, where transport is rtu"
+            raise ValueError(msg)
+        if self.transport == "rtu" and not 1 <= self.device_id <= 247:
+            msg = "device_id must be from 1 to 247 where transport is rtu: to 0, nobody answers"
+            raise ValueError(msg)
+        return self
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return self.serial_port if self.transport == "rtu" else f"{self.host}:{self.port}"
 
 
 class Mdt693Device(Settings):
@@ -340,7 +438,7 @@ class Loop(Settings):
     star_flux_dn: Positive
     flux_range: Range
     requirement_px: Positive
-    siderostat: Siderostat
+    siderostat: AnySiderostat
     fsm: Fsm
     acquisition: Acquisition
     coarse: Coarse
@@ -440,16 +538,118 @@ class DacMock(Settings):
     """Settings of the mock D/A."""
 
     watchdog_s: Positive
+    watchdog_latches: bool
     safe_v: NonNegative
+    unknown_unit: Literal["refuse", "ignore", "serve"]
 
 
 class Mdt693Mock(Settings):
-    """Settings of the mock piezo amplifier."""
+    """Settings of the mock piezo amplifier; from `prompt` on they are what firmware of the B differs in.
+
+    Attributes
+    ----------
+    firmware : str
+        What the device says of itself.
+    knobs_v : list of float
+        Front knobs: volts that they add to each output.
+    readback_offset_v, readback_noise_v, readback_settling_s : float
+        Of the measured voltages: reads this much too high; one standard deviation; time constant.
+    baud_rate : int
+        Of the device; a pty's client with another one is not understood.
+    reply_s : float
+        From a command's last byte to the first of its answer.
+    prompt : str
+        After an answer; the A and the compatibility mode have their own.
+    vlimit_as : str
+        How `vlimit?` tells the switch: in volts, or as its position.
+    decimals : int
+        Of the voltages that the B tells.
+    xyzvoltage : bool
+        It knows `xyzvoltage?` and `xyzvoltage=`.
+    dacstep_max : int
+        Largest step of the arrow keys.
+    push_command : str
+        What the command is called that says whether knobs must be pushed.
+    """
 
     model: Literal["MDT693A", "MDT693B"]
     firmware: str
+    echo: bool
+    compatibility_mode: bool
     limit_switch_v: Literal[75, 100, 150]
+    knobs_v: Annotated[list[NonNegative], Field(min_length=3, max_length=3)]
+    readback_offset_v: Finite
+    readback_noise_v: NonNegative
+    readback_settling_s: NonNegative
+    baud_rate: Count
     reply_s: NonNegative
+    prompt: Literal[">", "> ", "*"]
+    vlimit_as: Literal["volts", "position"]
+    decimals: Annotated[Count, Field(le=2)]
+    xyzvoltage: bool
+    dacstep_max: Literal[1000, 5000]
+    push_command: Literal["pushdisable", "disablepush"]
+
+
+class GigeMock(Settings):
+    """Settings of the mock camera."""
+
+    description: Literal["xml", "zip"]
+    resends: bool
+    clock: bool
+
+
+class EnsembleMock(Settings):
+    """Settings of the mock Ensemble controller.
+
+    Attributes
+    ----------
+    tcp_port : int
+    axis_names : list of str
+        Beside ``@0`` and ``@1``.
+    counts_per_unit : float
+        Encoder counts in one of the controller's own units.
+    software_limit_units : float
+        Each way from zero; 0 is none.
+    position_error_units : float
+        A larger one disables an axis.
+    reply_s : float
+        From a command to its answer.
+    idle_timeout_s : float
+        A connection over which nothing came for so long is closed.
+    always_send_eos : bool
+        Whether answers without a value end in a newline too.
+    """
+
+    tcp_port: Port
+    axis_names: Annotated[
+        list[Annotated[str, Field(pattern="^[A-Z]+$")]], Field(min_length=2, max_length=2)
+    ]
+    counts_per_unit: Positive
+    software_limit_units: NonNegative
+    position_error_units: Positive
+    reply_s: NonNegative
+    idle_timeout_s: Positive
+    always_send_eos: bool
+
+
+class BalAnalogMock(Settings):
+    """Settings of the mock analogue amplifiers and of the I/O station before them.
+
+    Attributes
+    ----------
+    modbus_port : int
+    watchdog_s : float
+        Without a write for so long, the outputs go to 0 V and the amplifiers are disabled.
+    counters_at_start : list of int
+        Where the encoder counters stand at power-up, az and el.
+    """
+
+    modbus_port: Port
+    watchdog_s: Positive
+    counters_at_start: Annotated[
+        list[Annotated[int, Field(ge=0, le=65535)]], Field(min_length=2, max_length=2)
+    ]
 
 
 class LoopMocks(Settings):
@@ -459,6 +659,8 @@ class LoopMocks(Settings):
     modbus_port: Port
     mdt693_port: Port
     drive_command_timeout_s: Positive
+    ensemble: EnsembleMock | None = None  # where siderostat.device is one
+    bal_analog: BalAnalogMock | None = None  # likewise
     dac: DacMock
     mdt693: Mdt693Mock
 
@@ -498,6 +700,7 @@ class Mocks(Settings):
 
     gvcp_port: Port
     bench_port: Port
+    camera: GigeMock
     loops: Annotated[dict[str, LoopMocks], Field(min_length=1)]
     faults: list[Fault] = []
 
@@ -542,6 +745,13 @@ class Rig(Settings):
             if part is not None and set(part.loops) != set(self.loops):
                 msg = f"{section}.loops must name the same loops as loops: {', '.join(self.loops)}"
                 raise ValueError(msg)
+        for name, mocks in (self.mocks.loops if self.mocks else {}).items():
+            driver = self.loops[name].siderostat.device.driver
+            if driver in {"ensemble", "bal_analog"} and getattr(mocks, driver) is None:
+                msg = (
+                    f"mocks.loops.{name}.{driver} is missing: siderostat.device.driver is {driver}"
+                )
+                raise ValueError(msg)
         return self
 
     @property
@@ -577,7 +787,10 @@ def default_rig_path() -> Path:
 
 
 def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
-    """Read and validate a rig file, with the fragments of its ``include`` list laid over it, in order.
+    """Read and validate a rig file.
+
+    It is laid over the rig file that its ``base`` names, if it names one; then the fragments of its
+    ``include`` list are laid over it, in order.
 
     Parameters
     ----------
@@ -646,11 +859,14 @@ def lay_over(document: dict[str, Any], fragment: Mapping[str, Any]) -> None:
     """
     for key, value in fragment.items():
         under = document.get(key)
-        is_table = isinstance(value, dict) and isinstance(under, dict)
-        if is_table and value.get("driver", under.get("driver")) == under.get("driver"):
+        if isinstance(value, dict) and isinstance(under, dict) and _same_device(value, under):
             lay_over(under, value)
         else:
             document[key] = value
+
+
+def _same_device(table: dict[str, Any], under: dict[str, Any]) -> bool:
+    return "driver" not in table or table["driver"] == under.get("driver")
 
 
 def rig_from_document(
@@ -693,14 +909,20 @@ def _override(document: dict[str, Any], text: str) -> None:
 
 
 def _explain(origin: str, problem: Any) -> str:
-    location = [str(part) for part in problem["loc"]]
+    location = _without_tags([str(part) for part in problem["loc"]])
+    if problem["type"] in {"union_tag_not_found", "union_tag_invalid"}:
+        location.append("driver")
     key = ".".join(location)
+    if problem["type"] == "union_tag_invalid":
+        context = problem["ctx"]
+        allowed_tags = context["expected_tags"]
+        return f"{origin}: {key}: must be one of {allowed_tags} (is {context['tag']!r})"
     if problem["type"] == "extra_forbidden":
-        allowed = _allowed_keys(location[:-1])
+        allowed = _allowed_keys([str(part) for part in problem["loc"][:-1]])
         near = difflib.get_close_matches(location[-1], allowed, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         return f"{origin}: {key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
-    if problem["type"] == "missing":
+    if problem["type"] in {"missing", "union_tag_not_found"}:
         return f"{origin}: {key}: is missing; rigs/fit-mock.toml shows every key with its unit"
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     given = problem.get("input")
@@ -710,11 +932,19 @@ def _explain(origin: str, problem: Any) -> str:
     return f"{where}: {message}{shown}"
 
 
+def _without_tags(location: Sequence[str]) -> list[str]:
+    """A place in the rig file without what pydantic adds: which kind of `device` it took it for."""
+    pairs = zip(["", *location], location, strict=False)
+    return [part for before, part in pairs if not (before == "device" and part in _TAGGED)]
+
+
 def _allowed_keys(location: Sequence[str]) -> list[str]:
     """The keys that the rig file may have at `location`, by walking the settings' own fields."""
     annotation: Any = Rig
     for part in location:
-        if isinstance(annotation, type) and issubclass(annotation, Settings):
+        if part in _TAGGED:
+            annotation = _TAGGED[part]
+        elif isinstance(annotation, type) and issubclass(annotation, Settings):
             annotation = annotation.model_fields[part].annotation
         elif get_origin(annotation) in {dict, list}:
             annotation = get_args(annotation)[-1]

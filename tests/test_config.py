@@ -121,7 +121,7 @@ def test_a_number_in_quotes_or_a_truth_value_is_not_a_number(path):
         ("camera.width_px", 15, "must be greater than or equal to 16 (is 15)"),
         ("camera.pixel_noise_dn", 0.0, "must be greater than 0 (is 0.0)"),
         ("camera.device.gvcp_port", 70000, "must be less than or equal to 65535 (is 70000)"),
-        ("camera.device.driver", "usb", "must be 'gige' (is 'usb')"),
+        ("camera.device.driver", "usb", "must be 'gige' or 'aravis' (is 'usb')"),
         ("logging.compression", "rar", "must be 'zstd', 'lz4' or 'none' (is 'rar')"),
         ("loops.right.siderostat.device.node_id", 128, "must be less than or equal to 127"),
         ("loops.right.fsm.dac.bits", 24, "must be less than or equal to 16 (is 24)"),
@@ -330,3 +330,61 @@ def test_what_a_rig_file_has_wrong_beside_a_fragment_keeps_its_own_name(tmp_path
     with pytest.raises(ConfigError) as caught:
         load_rig(rig_file)
     assert str(caught.value).startswith(f"{rig_file}: unknown: unknown key")
+
+
+# ---------------------------------------------------------------- rigs that differ in a few tables
+
+
+def based(tmp_path, text, base="base.toml"):
+    (tmp_path / "base.toml").write_text(default_rig_path().read_text(encoding="utf-8"))
+    path = tmp_path / "mine.toml"
+    path.write_text(f'base = "{base}"\nname = "mine"\n{text}')
+    return path
+
+
+def test_a_rig_is_laid_over_its_base(tmp_path, rig):
+    mine = load_rig(based(tmp_path, "[camera]\nframe_rate_hz = 40.0\n"), ["camera.width_px=50"])
+    assert (mine.name, mine.camera.frame_rate_hz, mine.camera.width_px) == ("mine", 40.0, 50)
+    assert mine.loops == rig.loops
+
+
+def test_another_driver_leaves_nothing_of_the_device_in_the_base(tmp_path):
+    device = "[loops.right.siderostat.device]\ndriver = 'ensemble'\nport = 'socket://x:8000'\n"
+    with pytest.raises(ConfigError) as caught:
+        load_rig(based(tmp_path, device))
+    missing = {line.split(": ")[1].rpartition(".")[2] for line in str(caught.value).splitlines()}
+    assert missing == {"baud_rate", "axes", "response_timeout_s"}
+
+
+def test_a_base_that_is_not_there_is_named(tmp_path):
+    said = r"gone\.toml: no such rig file; it is the base of .*mine\.toml"
+    with pytest.raises(ConfigError, match=said):
+        load_rig(based(tmp_path, "", "gone.toml"))
+
+
+def test_a_base_must_be_a_name(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("base = 3\n")
+    with pytest.raises(ConfigError, match=r"mine\.toml: base: must be a file name \(is 3\)"):
+        load_rig(path)
+
+
+def test_an_amplifiers_mock_that_is_not_described_is_asked_for():
+    document = copy.deepcopy(DOCUMENT)
+    document["loops"]["right"]["siderostat"]["device"] = {
+        "driver": "ensemble",
+        "port": "socket://127.0.0.1:8000",
+        "baud_rate": 115200,
+        "axes": [0, 1],
+        "response_timeout_s": 0.5,
+    }
+    assert "mocks.loops.right.ensemble is missing" in complaint(document)
+
+
+@pytest.mark.parametrize("driver", ["gpib", 3])
+def test_an_amplifier_that_nobody_knows_is_named_with_those_there_are(driver):
+    text = complaint(changed(("loops", "right", "siderostat", "device", "driver"), driver))
+    assert text == (
+        "my.toml: loops.right.siderostat.device.driver: must be one of 'cia402', 'ensemble', "
+        f"'bal_analog' (is '{driver}')"
+    )

@@ -28,10 +28,12 @@ from documents import (
 )
 
 from fitctl.cli import app
+from fitctl.commands.fault import kinds as fault_kinds
 from fitctl.commands.instrument import command_of
 from fitctl.config import default_rig_path, load_rig, rig_from_document
 from fitctl.logging.records import RecorderStatus
 from fitctl.logging.writer import LogWriter
+from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.supervisor.messages import Acquire, Shutdown, Status
 from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
 from fitctl.supervisor.run import run_info
@@ -263,6 +265,28 @@ def test_the_console_keys_are_those_of_the_console():
     rows = [[f"`{command.key}`", command.label, command.help] for command in OPERATOR_COMMANDS]
 
     assert between("operating.md", "keys") == table(["key", "command", "what it does"], rows)
+
+
+def test_the_faults_are_those_of_the_mocks():
+    tables = {"every device": WIRE_FAULTS} | {
+        device: {name: kind for name, kind in kinds.items() if name not in WIRE_FAULTS}
+        for device, kinds in fault_kinds().items()
+    }
+    rows = [
+        [
+            device,
+            f"`{name}`",
+            kind.text,
+            f"{kind.value:g} {kind.unit}" if kind.unit else "",
+            ", ".join(kind.parts),
+        ]
+        for device, kinds in tables.items()
+        for name, kind in kinds.items()
+    ]
+
+    assert between("devices.md", "faults") == table(
+        ["device", "fault", "what happens", "value, if none is given", "parts"], rows
+    )
 
 
 def test_the_layers_are_those_of_the_import_contract():

@@ -18,6 +18,8 @@ from fitctl.mocks.faults import FaultKind
 _MOCKS = {
     "camera": "fitctl.mocks.gige.camera",
     "drive": "fitctl.mocks.cia402.drive",
+    "drive (ensemble)": "fitctl.mocks.ensemble.controller",
+    "drive (bal_analog)": "fitctl.mocks.bal_analog.station",
     "dac": "fitctl.mocks.modbus_dac.server",
     "mdt693": "fitctl.mocks.mdt693.server",
 }

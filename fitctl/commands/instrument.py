@@ -18,7 +18,7 @@ import zmq
 
 from fitctl import demo as demos
 from fitctl.commands.progress import progress_line
-from fitctl.config import ConfigError, Rig
+from fitctl.config import ConfigError, LoopMocks, Rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import RecorderStatus
@@ -188,14 +188,20 @@ def run_mocks(
 
 def _with_free_ports(rig: Rig) -> Rig:
     _, mocks = rig.mock_parts()
-    loops = {
-        name: loop.model_copy(update={"slcan_port": 0, "modbus_port": 0, "mdt693_port": 0})
-        for name, loop in mocks.loops.items()
-    }
+    loops = {name: _loop_with_free_ports(loop) for name, loop in mocks.loops.items()}
     # The bench keeps its port where it can: there `fitctl fault` finds the mocks of a demo.
     bench_port = mocks.bench_port if _is_free(mocks.bench_port) else 0
     free = mocks.model_copy(update={"gvcp_port": 0, "bench_port": bench_port, "loops": loops})
     return rig.model_copy(update={"mocks": free})
+
+
+def _loop_with_free_ports(loop: LoopMocks) -> LoopMocks:
+    update: dict[str, Any] = {"slcan_port": 0, "modbus_port": 0, "mdt693_port": 0}
+    if loop.ensemble is not None:
+        update["ensemble"] = loop.ensemble.model_copy(update={"tcp_port": 0})
+    if loop.bal_analog is not None:
+        update["bal_analog"] = loop.bal_analog.model_copy(update={"modbus_port": 0})
+    return loop.model_copy(update=update)
 
 
 def _is_free(port: int) -> bool:

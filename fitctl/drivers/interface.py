@@ -222,7 +222,7 @@ class PiezoAmplifier(Protocol):
         ...
 
     def limit_v(self) -> float:
-        """The voltage-limit switch as the device reports it."""
+        """The voltage-limit switch as the device reports it. Raises DeviceMismatch if it was moved."""
         ...
 
     def close(self) -> None:

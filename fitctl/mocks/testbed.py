@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import LoopMocks, Rig
+from fitctl.mocks.amplifiers import amplifier_mock, endpoint_keys
 from fitctl.mocks.bench import Bench, FaultTable
-from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
@@ -89,12 +89,13 @@ class LivePlant:
 
 
 class LoopTestbed:
-    """Mock devices of one loop: drive, D/A and piezo amplifier, wired to its plant."""
+    """Mock devices of one loop: amplifiers, D/A and piezo amplifier, wired to its plant."""
 
     def __init__(self, rig: Rig, name: str, mocks: LoopMocks, live: LivePlant) -> None:
         loop = rig.loops[name]
         gain = loop.fsm.piezo.gain
-        self.drive = Cia402DriveMock(loop.siderostat, live, port=mocks.slcan_port)
+        self.drive_name = loop.siderostat.device.driver
+        self.drive = amplifier_mock(loop.siderostat, mocks, live)
         self.piezo = Mdt693Mock(
             mocks.mdt693,
             loop.fsm.piezo,
@@ -138,7 +139,9 @@ class Testbed:
         )
         self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
         self._exposures = 0
-        self._camera = GigeCameraMock(rig.true_camera, self._render, port=mocks.gvcp_port)
+        self._camera = GigeCameraMock(
+            rig.true_camera, mocks.camera, self._render, port=mocks.gvcp_port
+        )
         self._fault_plan = mocks.faults
         devices = {"camera": self._camera.faults}
         for name, loop in self._loops.items():
@@ -167,8 +170,10 @@ class Testbed:
             want the pty or the bench.
         """
         self._faults.schedule(self._fault_plan)
+        seen_s = time.monotonic()
         for live in self._plants.values():
             live.advance()  # compiles the kernels before anyone waits for an answer
+        self._render(seen_s)  # and the camera's
         endpoints: dict[str, Any] = {
             "camera.device.address": "127.0.0.1",
             "camera.device.gvcp_port": await self._camera.start(),
@@ -176,13 +181,15 @@ class Testbed:
         }
         for name, loop in self._loops.items():
             piezo = await loop.piezo.start()
-            slcan_port = await loop.drive.start()
+            drive = await loop.drive.start()
+            dac = await loop.dac.start()
             prefix = f"loops.{name}"
+            endpoints |= endpoint_keys(loop.drive_name, name, drive)
             endpoints |= {
-                f"{prefix}.siderostat.device.channel": f"socket://127.0.0.1:{slcan_port}",
                 f"{prefix}.fsm.dac.host": "127.0.0.1",
-                f"{prefix}.fsm.dac.port": await loop.dac.start(),
+                f"{prefix}.fsm.dac.port": dac.tcp_port,
                 f"{prefix}.fsm.piezo.port": f"socket://127.0.0.1:{piezo.tcp_port}",
+                f"mocks.loops.{name}.dac_pty": dac.pty_path,
                 f"mocks.loops.{name}.mdt693_pty": piezo.pty_path,
             }
         self._housekeeping = asyncio.create_task(self._keep_up())

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from fitctl.config import Rig
+from collections.abc import Callable
+from typing import Any
+
+from fitctl.config import Rig, Siderostat
+from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
+from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
+from fitctl.drivers.gige.aravis import AravisCamera
 from fitctl.drivers.gige.driver import GigeCamera
-from fitctl.drivers.interface import Devices, LoopDevices
+from fitctl.drivers.interface import Devices, LoopDevices, ServoAmplifiers
 from fitctl.drivers.mdt693.driver import Mdt693
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 
-CAMERAS = {"gige": GigeCamera}
-AMPLIFIERS = {"cia402": Cia402Amplifiers}
+CAMERAS: dict[str, type[AravisCamera | GigeCamera]] = {"gige": GigeCamera, "aravis": AravisCamera}
+AMPLIFIERS: dict[str, Callable[[Siderostat[Any]], ServoAmplifiers]] = {
+    "cia402": Cia402Amplifiers,
+    "ensemble": EnsembleAmplifiers,
+    "bal_analog": BalAnalogAmplifiers,
+}
 DACS = {"modbus_dac": ModbusDac}
 PIEZOS = {"mdt693": Mdt693}
 

@@ -47,7 +47,7 @@ def loop_health(
         ),
         _health(
             f"{name} D/A",
-            f"{dac.host}:{dac.port}",
+            dac.endpoint,
             loop.stages.ready,
             "written every tick" if loop.stages.ready else "not written",
             identities,

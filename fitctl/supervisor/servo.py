@@ -74,7 +74,7 @@ class SiderostatServo:
     ) -> None:
         siderostat = loop.siderostat
         self.name = name
-        self.endpoint = siderostat.device.channel
+        self.endpoint = siderostat.device.endpoint
         self.period_s = 1.0 / siderostat.servo.rate_hz
         self.fault: DeviceError | None = None
         self.enabled = False

@@ -36,7 +36,7 @@ class Running:
 
     def __init__(self, *overrides):
         self.loop = asyncio.new_event_loop()
-        self.thread = threading.Thread(target=self.loop.run_forever)
+        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
         self.testbed = MockTestbed(load_rig(default_rig_path(), [*FREE, *overrides]), seed=1)
         self.endpoints = self.call(self.testbed.start())

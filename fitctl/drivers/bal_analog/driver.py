@@ -1,0 +1,315 @@
+"""The siderostat's two amplifiers as the paper's rig has them: +-10 V of velocity command, lines, encoders.
+
+One transaction of function 23 a servo period writes both commands and the enable lines, and reads both
+encoder counters and the fault lines. The counters have 16 bits: the driver counts on across their wrap,
+and says so where it has been blind for longer than they are unambiguous.
+
+The amplifiers themselves watch nobody: the station's output watchdog must take commands and enable lines
+away when we are gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import deque
+
+from fitctl.config import BalAnalogDevice, Siderostat
+from fitctl.drivers.bal_analog.link import DEVICE, ModbusLink
+from fitctl.drivers.bal_analog.protocol import (
+    COUNTER_MODULUS,
+    EXCEPTION_FLAG,
+    EXCEPTIONS,
+    Message,
+    decode_identity,
+    decode_registers,
+    encode_exchange,
+    encode_identify,
+    lines,
+    signed,
+    unwrap,
+    velocity_to_counts,
+    word_of,
+)
+from fitctl.drivers.interface import (
+    AzEl,
+    DeviceError,
+    DeviceFault,
+    DeviceIdentity,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+    ServoReading,
+)
+
+_NAMES = ("azimuth", "elevation")
+_STILL = (0.0, 0.0)
+_SLACK = 1.5  # of what a motor can turn between two readings
+_MARGIN_RAD = 0.05
+_MOST_OUTSTANDING = 100
+
+
+class BalAnalogAmplifiers:
+    """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
+
+    An axis has no line that says that it is enabled: it counts as enabled while it is told to be and
+    reports no fault.
+
+    Parameters
+    ----------
+    siderostat : Siderostat[BalAnalogDevice]
+        Encoder, limits, servo rate and device settings of the rig.
+    """
+
+    def __init__(self, siderostat: Siderostat[BalAnalogDevice]) -> None:
+        self._device = siderostat.device
+        self._period_s = 1.0 / siderostat.servo.rate_hz
+        self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
+        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
+        self._most_rad_s = _SLACK * siderostat.velocity_limit_rad_s
+        self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / self._most_rad_s
+        self._link: ModbusLink | None = None
+        self._enable = False
+        self._counts: tuple[int, int] | None = None
+        self._asked_s = -math.inf
+        self._answered_s = 0.0
+        self._asked: deque[tuple[int, float]] = deque(maxlen=_MOST_OUTSTANDING)
+
+    def open(self) -> DeviceIdentity:
+        """Connect, disable both amplifiers and read their encoders.
+
+        The counters' turns are kept from before, where they were read before; else the motors are taken
+        to be less than half the counters' range from zero.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
+        """
+        self.close()
+        self._enable = False
+        self._asked.clear()
+        self._asked_s = -math.inf
+        self._link = ModbusLink(self._device)
+        try:
+            texts = decode_identity(self._link.ask(encode_identify()))
+            self._settle()
+        except BaseException:
+            self._drop()
+            raise
+        return DeviceIdentity(texts[0] or "unknown", texts[1] or "Modbus I/O", "", texts[2])
+
+    def enable(self) -> None:
+        """Power both axes at zero velocity.
+
+        Raises
+        ------
+        DeviceFault
+            An axis is in fault; then neither has power.
+        """
+        self._enable = True
+        try:
+            self._settle()
+            reading = self._settle()  # the first answers were on their way when the lines changed
+            if reading.fault:
+                raise self._fault("both axes enabled", reading.fault)
+        except DeviceError:
+            with contextlib.suppress(DeviceError):
+                self.disable()
+            raise
+
+    def disable(self) -> None:
+        """Command zero velocity and take the enable lines away; a latched fault stays."""
+        self._enable = False
+        self._settle()
+
+    def reset_fault(self) -> None:
+        """Take the enable lines away, which resets an amplifier, and see that its fault goes.
+
+        Raises
+        ------
+        DeviceFault
+            A fault stays, because its cause does.
+        """
+        self._enable = False
+        deadline_s = time.monotonic() + self._device.response_timeout_s
+        while (reading := self._settle()).fault:
+            if time.monotonic() > deadline_s:
+                raise self._fault("no fault after a reset", reading.fault)
+
+    def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
+        """One servo period: command both motors, read both encoders and fault lines.
+
+        Returns
+        -------
+        ServoReading or None
+            The newest that has come by the end of the period; its time is midway between request and
+            answer.
+
+        Raises
+        ------
+        DeviceUnreachable
+            The link broke.
+        DeviceTimeout
+            No answer for `response_timeout_s`, or for so long that the counters may have wrapped unseen.
+        DeviceRefused, DeviceProtocolError
+            The station refuses, or what comes is no answer.
+        DeviceFault
+            A counter says what no motor can do.
+        ValueError
+            A velocity is not finite.
+        """
+        link = self._opened()
+        sent_s = self._request(link, velocity_rad_s)
+        newest: ServoReading | None = None
+        while self._asked:
+            message = link.receive(sent_s + self._period_s)
+            if message is None:
+                break
+            newest = self._take(message) or newest
+        if newest is None and sent_s - self._answered_s > self._device.response_timeout_s:
+            raise self._silent()
+        return newest
+
+    def close(self) -> None:
+        """Disable if possible and disconnect; safe to call twice and after a failure."""
+        if self._link is None:
+            return
+        with contextlib.suppress(DeviceError):
+            self.disable()
+        self._drop()
+
+    def _drop(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    # ------------------------------------------------------------ requests
+    def _request(self, link: ModbusLink, velocity_rad_s: AzEl) -> float:
+        """Send one transaction, velocities within the motors' limit; returns when."""
+        most_rad_s = self._velocity_limit_rad_s
+        if not all(map(math.isfinite, velocity_rad_s)):
+            msg = f"velocities must be finite numbers of rad/s, not {velocity_rad_s}"
+            raise ValueError(msg)
+        device = self._device
+        scale = device.velocity_rad_s_per_v
+        az, el = (
+            velocity_to_counts(
+                max(-most_rad_s, min(most_rad_s, wanted_rad_s)),
+                rad_s_per_v,
+                device.full_scale_v,
+                device.full_scale_counts,
+            )
+            for wanted_rad_s, rad_s_per_v in zip(velocity_rad_s, (scale.az, scale.el), strict=True)
+        )
+        enable = word_of(self._enable, self._enable, device.enabled_level)
+        pdu = encode_exchange(
+            device.first_input_register, device.first_output_register, [az, el, enable]
+        )
+        sent_s = time.monotonic()
+        if not self._asked:
+            self._answered_s = sent_s
+        self._asked.append((link.send(pdu), sent_s))
+        return sent_s
+
+    def _settle(self) -> ServoReading:
+        """Stand still until the station has answered a request that says so."""
+        link = self._opened()
+        sent_s = self._request(link, _STILL)
+        number = self._asked[-1][0]
+        while (message := link.receive(sent_s + self._device.response_timeout_s)) is not None:
+            reading = self._take(message)
+            if reading is not None and message.transaction == number:
+                return reading
+        raise self._silent()
+
+    # ------------------------------------------------------------ answers
+    def _take(self, message: Message) -> ServoReading | None:
+        """What an answer says; None where it answers nothing that was asked."""
+        sent_s = next((sent for number, sent in self._asked if number == message.transaction), None)
+        if sent_s is None:
+            return None
+        while self._asked.popleft()[0] != message.transaction:
+            pass
+        now_s = self._answered_s = time.monotonic()
+        self._check_unit_and_exception(message)
+        try:
+            az, el, faults = decode_registers(message.pdu)
+        except ValueError as error:
+            raise self._opened().nonsense("three registers", str(error)) from None
+        self._counts = self._count((az, el), now_s)
+        self._asked_s = sent_s
+        az_counts, el_counts = self._counts
+        fault = "; ".join(
+            f"{name}: fault line"
+            for name, is_up in zip(_NAMES, lines(faults, self._device.fault_level), strict=True)
+            if is_up
+        )
+        return ServoReading(
+            time_s=(sent_s + now_s) / 2,
+            position_rad=(az_counts * self._rad_per_count, el_counts * self._rad_per_count),
+            enabled=self._enable and not fault,
+            fault=fault,
+        )
+
+    def _check_unit_and_exception(self, message: Message) -> None:
+        if message.unit != self._device.device_id:
+            got = f"unit {message.unit}"
+            raise self._opened().nonsense(f"unit {self._device.device_id}", got)
+        if len(message.pdu) == 2 and message.pdu[0] & EXCEPTION_FLAG:
+            code = message.pdu[1]
+            raise DeviceRefused(
+                DEVICE,
+                self._device.endpoint,
+                "function 23 to be carried out",
+                f"exception {code:02X}, {EXCEPTIONS.get(code, 'see the station manual')}",
+                "check device_id, first_output_register and first_input_register",
+            )
+
+    def _count(self, counters: tuple[int, int], now_s: float) -> tuple[int, int]:
+        """Both counters, counted on across their wrap."""
+        since_s = now_s - self._asked_s
+        near = self._counts
+        if near is None:
+            return signed(counters[0]), signed(counters[1])
+        az, el = unwrap(counters[0], near[0]), unwrap(counters[1], near[1])
+        if math.isinf(since_s):
+            return az, el
+        if since_s > self._blind_s:
+            expected = (
+                f"a reading within {self._blind_s:.2f} s, for the counters not to wrap unseen"
+            )
+            raise self._timeout(expected, f"one after {since_s:.2f} s")
+        most_counts = (_MARGIN_RAD + self._most_rad_s * since_s) / self._rad_per_count
+        for name, before, now in zip(_NAMES, near, (az, el), strict=True):
+            if abs(now - before) > most_counts:
+                raise DeviceFault(
+                    DEVICE,
+                    self._device.endpoint,
+                    f"{name} to turn at most {most_counts:.0f} counts in {since_s:.3f} s",
+                    f"{now - before}",
+                    "check the encoder, its cable and its counter, then recover",
+                )
+        return az, el
+
+    # ------------------------------------------------------------ errors
+    def _opened(self) -> ModbusLink:
+        if self._link is None:
+            expected = "an open connection"
+            raise DeviceUnreachable(
+                DEVICE, self._device.endpoint, expected, "none", "open it again"
+            )
+        return self._link
+
+    def _fault(self, expected: str, got: str) -> DeviceFault:
+        hint = "look at the amplifier's lamps, remove the cause, then recover"
+        return DeviceFault(DEVICE, self._device.endpoint, expected, got, hint)
+
+    def _silent(self) -> DeviceTimeout:
+        return self._timeout(f"an answer within {self._device.response_timeout_s:g} s", "none")
+
+    def _timeout(self, expected: str, got: str) -> DeviceTimeout:
+        hint = (
+            "check the I/O station's power and load, and siderostat.device.device_id; then recover"
+        )
+        return DeviceTimeout(DEVICE, self._device.endpoint, expected, got, hint)

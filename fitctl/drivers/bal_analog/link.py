@@ -1,0 +1,123 @@
+"""The Modbus/TCP connection to the I/O station: requests out, answers in, told apart by their number.
+
+Own code and not pymodbus, whose client waits for each answer as long as its time limit: a servo goes on
+after one period, and takes a late answer when it comes.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+
+from fitctl.config import BalAnalogDevice
+from fitctl.drivers.bal_analog.protocol import Message, frame, take_message
+from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
+
+DEVICE = "siderostat amplifiers"
+_MESSAGE_BYTES_MAX = 260
+
+
+class ModbusLink:
+    """One connection; closed after anything that is no Modbus message.
+
+    Parameters
+    ----------
+    device : BalAnalogDevice
+
+    Raises
+    ------
+    DeviceUnreachable
+        If nobody listens there.
+    """
+
+    def __init__(self, device: BalAnalogDevice) -> None:
+        self._device = device
+        self._pending = bytearray()
+        self._transaction = 0
+        try:
+            self._socket = socket.create_connection(
+                (device.host, device.port), device.response_timeout_s
+            )
+        except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all
+            raise DeviceUnreachable(
+                DEVICE,
+                device.endpoint,
+                "a Modbus I/O station",
+                str(error),
+                "check its power and cable, and siderostat.device.host and .port",
+            ) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def send(self, pdu: bytes) -> int:
+        """Send a request; returns the number that its answer will have.
+
+        Raises
+        ------
+        DeviceUnreachable
+        """
+        self._transaction = self._transaction + 1 & 0xFFFF
+        try:
+            self._socket.sendall(frame(self._transaction, self._device.device_id, pdu))
+        except OSError as error:
+            raise self._broken(str(error)) from error
+        return self._transaction
+
+    def receive(self, deadline_s: float) -> Message | None:
+        """The next answer; None when none is complete by `deadline_s`.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceProtocolError
+        """
+        while True:
+            try:
+                message = take_message(self._pending)
+            except ValueError as error:
+                raise self.nonsense("a Modbus header", str(error)) from None
+            if message is not None:
+                return message
+            try:
+                left_s = max(0.0, deadline_s - time.monotonic())
+                if not select.select([self._socket], [], [], left_s)[0]:
+                    return None
+                data = self._socket.recv(_MESSAGE_BYTES_MAX)
+            except (OSError, ValueError) as error:  # ValueError: closed before
+                raise self._broken(str(error)) from error
+            if not data:
+                raise self._broken("closed by the station")
+            self._pending += data
+
+    def ask(self, pdu: bytes) -> bytes:
+        """The answer to a request; empty when none comes within `response_timeout_s`.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceProtocolError
+        """
+        number = self.send(pdu)
+        deadline_s = time.monotonic() + self._device.response_timeout_s
+        while (message := self.receive(deadline_s)) is not None:
+            if message.transaction == number:
+                return message.pdu
+        return b""
+
+    def close(self) -> None:
+        """Disconnect; safe to call twice."""
+        self._socket.close()
+
+    def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
+        """The error for an answer that cannot be; the link is closed."""
+        self.close()
+        hint = "check that siderostat.device.host and .port lead to the I/O station, then recover"
+        return DeviceProtocolError(DEVICE, self._device.endpoint, expected, got, hint)
+
+    def _broken(self, got: str) -> DeviceUnreachable:
+        self.close()
+        return DeviceUnreachable(
+            DEVICE,
+            self._device.endpoint,
+            "a connection",
+            f"a broken one ({got})",
+            "check the I/O station's power and cable, then recover",
+        )

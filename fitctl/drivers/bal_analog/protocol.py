@@ -1,0 +1,175 @@
+"""The I/O station before the analogue amplifiers as both sides see it: registers, counts, Modbus frames.
+
+Function 23 (Read/Write Multiple Registers) of the MODBUS Application Protocol Specification V1.1b3, in the
+frame of MODBUS Messaging on TCP/IP V1.0b. Outputs are two analogue channels and a word of digital ones;
+inputs two counters and a word of digital ones: analogue before digital, as stations map them.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import NamedTuple
+
+REGISTERS = 3
+AXES = 2
+COUNTER_MODULUS = 1 << 16
+
+READ_HOLDING_REGISTERS = 3
+READ_WRITE_MULTIPLE_REGISTERS = 23
+READ_DEVICE_IDENTIFICATION = 43
+EXCEPTION_FLAG = 0x80
+
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol, length from the unit on, unit
+_PDU_BYTES_MAX = 253
+_MEI_IDENTIFICATION = 0x0E
+_BASIC_STREAM = 1
+_OBJECTS = 3
+
+EXCEPTIONS = {
+    0x01: "illegal function: the station does not know function 23",
+    0x02: "illegal data address",
+    0x03: "illegal data value",
+    0x04: "device failure",
+    0x06: "device busy",
+    0x0A: "gateway path unavailable",
+    0x0B: "gateway target does not respond",
+}
+
+
+class Message(NamedTuple):
+    """One answer, taken out of its frame."""
+
+    transaction: int
+    unit: int
+    pdu: bytes
+
+
+def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
+    """A PDU in its frame."""
+    return _HEADER.pack(transaction, 0, 1 + len(pdu), unit) + pdu
+
+
+def take_message(pending: bytearray) -> Message | None:
+    """Take the first whole message off `pending`; None while there is none.
+
+    Raises
+    ------
+    ValueError
+        If what is there is no Modbus header.
+    """
+    if len(pending) < _HEADER.size:
+        return None
+    transaction, protocol, length, unit = _HEADER.unpack_from(pending)
+    if protocol != 0 or not 2 <= length <= 1 + _PDU_BYTES_MAX:
+        msg = f"protocol {protocol}, length {length}"
+        raise ValueError(msg)
+    end = _HEADER.size - 1 + length
+    if len(pending) < end:
+        return None
+    pdu = bytes(pending[_HEADER.size : end])
+    del pending[:end]
+    return Message(transaction, unit, pdu)
+
+
+def encode_exchange(first_input: int, first_output: int, outputs: Sequence[int]) -> bytes:
+    """The request of function 23: write three registers, then read three."""
+    return struct.pack(
+        f">BHHHHB{REGISTERS}H",
+        READ_WRITE_MULTIPLE_REGISTERS,
+        first_input,
+        REGISTERS,
+        first_output,
+        REGISTERS,
+        2 * REGISTERS,
+        *outputs,
+    )
+
+
+def encode_read(first_input: int) -> bytes:
+    """The request of function 03 for the three input registers."""
+    return struct.pack(">BHH", READ_HOLDING_REGISTERS, first_input, REGISTERS)
+
+
+def decode_registers(pdu: bytes, function_code: int = READ_WRITE_MULTIPLE_REGISTERS) -> list[int]:
+    """The three registers in the answer of a function.
+
+    Raises
+    ------
+    ValueError
+        If it is not that answer.
+    """
+    try:
+        code, size, *registers = struct.unpack(f">BB{REGISTERS}H", pdu)
+    except struct.error:
+        code, size, registers = 0, 0, []
+    if (code, size) != (function_code, 2 * REGISTERS):
+        msg = f"{len(pdu)} bytes: {pdu[:16].hex(' ')}"
+        raise ValueError(msg)
+    return registers
+
+
+def encode_identify() -> bytes:
+    """The request for a station's basic identification."""
+    return bytes([READ_DEVICE_IDENTIFICATION, _MEI_IDENTIFICATION, _BASIC_STREAM, 0])
+
+
+def decode_identity(pdu: bytes) -> list[str]:
+    """Vendor, product and revision; empty where the answer does not have them."""
+    texts = [""] * _OBJECTS
+    if pdu[:2] != bytes([READ_DEVICE_IDENTIFICATION, _MEI_IDENTIFICATION]):
+        return texts
+    rest = pdu[7:]
+    while len(rest) >= 2 and len(rest) >= 2 + rest[1]:
+        number, size = rest[0], rest[1]
+        if number < _OBJECTS:
+            texts[number] = rest[2 : 2 + size].decode("ascii", "replace")
+        rest = rest[2 + size :]
+    return texts
+
+
+def velocity_to_counts(
+    velocity_rad_s: float, rad_s_per_v: float, full_scale_v: float, full_scale_counts: int
+) -> int:
+    """The register of a velocity command: two's complement, held within full scale.
+
+    Raises
+    ------
+    ValueError
+        If the velocity is not a finite number.
+    """
+    if not math.isfinite(velocity_rad_s):
+        msg = f"velocity must be a finite number of rad/s, not {velocity_rad_s}"
+        raise ValueError(msg)
+    part = max(-1.0, min(1.0, velocity_rad_s / rad_s_per_v / full_scale_v))
+    return round(part * full_scale_counts) & 0xFFFF
+
+
+def counts_to_volts(register: int, full_scale_v: float, full_scale_counts: int) -> float:
+    """What a station's output gives for a register, held within full scale."""
+    counts = signed(register)
+    return max(-1.0, min(1.0, counts / full_scale_counts)) * full_scale_v
+
+
+def signed(register: int) -> int:
+    """A register as two's complement."""
+    return ((register + 0x8000) & 0xFFFF) - 0x8000
+
+
+def unwrap(counter: int, near: int) -> int:
+    """The count nearest to `near` that a 16-bit counter shows as `counter`."""
+    return near + signed(counter - near & 0xFFFF)
+
+
+def lines(word: int, level: str) -> tuple[bool, bool]:
+    """Which of both axes' lines, bits 0 and 1 of a word, are at the level that means yes."""
+    if level == "low":
+        word = ~word
+    return bool(word & 1), bool(word & 2)
+
+
+def word_of(az: bool, el: bool, level: str) -> int:
+    """The word in which both axes' lines are at their level; the other way round of `lines`."""
+    word = az | el << 1
+    return word if level == "high" else ~word & 0b11

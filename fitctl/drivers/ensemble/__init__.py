@@ -1,0 +1,1 @@
+"""Siderostat amplifiers as an Aerotech Ensemble controller, spoken to in its ASCII commands."""

@@ -1,0 +1,156 @@
+"""The line to an Ensemble: one command, one answer, each within the time limit."""
+
+from __future__ import annotations
+
+import time
+
+import serial
+
+from fitctl.config import EnsembleDevice
+from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, PROBE, Reply
+from fitctl.drivers.interface import DeviceProtocolError, DeviceTimeout, DeviceUnreachable
+
+DEVICE = "siderostat amplifiers"
+_REPLIES = {reply.value: reply for reply in Reply}
+_BLANKS = b"\r\n "
+_POLL_S = 0.02  # how long one read waits; the time limit is counted above it
+
+
+class EnsembleLink:
+    """A serial port or TCP connection; after anything but an answer it is closed, being out of step.
+
+    Through ``socket://``, pyserial itself allows 5 s to connect and takes 0.3 s to close.
+
+    Parameters
+    ----------
+    device : EnsembleDevice
+
+    Raises
+    ------
+    DeviceUnreachable
+        If there is no such port, or nobody listens there.
+    """
+
+    def __init__(self, device: EnsembleDevice) -> None:
+        self.endpoint = device.port
+        self._device = device
+        try:
+            self._port = serial.serial_for_url(
+                device.port,
+                baudrate=device.baud_rate,
+                timeout=_POLL_S,
+                write_timeout=device.response_timeout_s,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise DeviceUnreachable(
+                DEVICE,
+                device.port,
+                "an Ensemble controller",
+                str(error),
+                "check its power and cable, its Ethernet socket's set-up, and siderostat.device.port",
+            ) from error
+
+    def probe(self) -> None:
+        """See that a controller answers, whatever it was saying before.
+
+        Raises
+        ------
+        DeviceTimeout, DeviceUnreachable
+        """
+        deadline_s = self._send(PROBE)
+        while self._byte(PROBE, deadline_s) != Reply.NOT_UNDERSTOOD.value:
+            pass
+
+    def command(self, text: str) -> Reply:
+        """Have a command done; returns what became of it.
+
+        Raises
+        ------
+        DeviceTimeout, DeviceUnreachable, DeviceProtocolError
+        """
+        return self._reply(text, self._send(text))
+
+    def query(self, text: str) -> str | Reply:
+        """Ask for a value; where there is none, returns why.
+
+        A bare acknowledgement before the value is passed over: some firmware sends one.
+
+        Raises
+        ------
+        DeviceTimeout, DeviceUnreachable, DeviceProtocolError
+        """
+        deadline_s = self._send(text)
+        while True:
+            reply = self._reply(text, deadline_s)
+            if reply is not Reply.DONE:
+                return reply
+            value = self._line(text, deadline_s)
+            if value:
+                return value
+
+    def close(self) -> None:
+        """Let go of the port; safe to call twice."""
+        self._port.close()
+
+    def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
+        """The error for an answer that cannot be; the link is closed."""
+        self.close()
+        hint = "check that nobody else uses this port of the controller, then recover"
+        return DeviceProtocolError(DEVICE, self._device.port, expected, got, hint)
+
+    def _send(self, text: str) -> float:
+        """Send a command; returns the time by which its answer must be here."""
+        try:
+            unasked = b""
+            while self._port.is_open and self._port.in_waiting:
+                unasked += self._port.read(1)
+                if unasked.strip(_BLANKS):
+                    raise self.nonsense(f"nothing before {text}", repr(unasked))
+            self._port.write(text.encode("ascii") + EOS)
+        except OSError as error:
+            raise self._broken(text, error) from error
+        return time.monotonic() + self._device.response_timeout_s
+
+    def _reply(self, text: str, deadline_s: float) -> Reply:
+        first = self._byte(text, deadline_s)
+        while first in _BLANKS:
+            first = self._byte(text, deadline_s)
+        if first not in _REPLIES:
+            raise self.nonsense(f"one of {b''.join(_REPLIES).decode()} to {text}", repr(first))
+        return _REPLIES[first]
+
+    def _line(self, text: str, deadline_s: float) -> str:
+        line = b""
+        while (byte := self._byte(text, deadline_s)) != EOS:
+            line += byte
+            if len(line) > COMMAND_BYTES_MAX:
+                raise self.nonsense(f"an answer to {text}", f"{len(line)} bytes without an end")
+        return line.decode("ascii", "replace").strip()
+
+    def _byte(self, text: str, deadline_s: float) -> bytes:
+        while time.monotonic() <= deadline_s:
+            try:
+                byte: bytes = self._port.read(1)
+            except OSError as error:
+                raise self._broken(text, error) from error
+            if byte:
+                return byte
+        self.close()
+        raise DeviceTimeout(
+            DEVICE,
+            self._device.port,
+            f"an answer to {text} within {self._device.response_timeout_s:g} s",
+            "none",
+            "check the controller's power and its ASCII command set-up, then recover",
+        )
+
+    def _broken(self, text: str, error: OSError) -> DeviceUnreachable:
+        self.close()
+        return DeviceUnreachable(
+            DEVICE,
+            self._device.port,
+            f"to send {text}",
+            f"a broken connection ({error})",
+            "check power and cable, and the timeout of the controller's socket; then recover",
+        )

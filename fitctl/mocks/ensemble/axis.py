@@ -1,0 +1,172 @@
+"""One axis of the mock controller: a trajectory with ramps, a position loop about it, and its faults.
+
+Everything in the controller's own units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter
+
+LOOP_GAIN_PER_S = 30.0
+DEFAULT_SPEED = 1.0
+_IN_POSITION_PART = 0.1  # of the position error threshold
+
+_DISABLING = (
+    AxisFault.POSITION_ERROR
+    | AxisFault.AMPLIFIER
+    | AxisFault.OVER_CURRENT
+    | AxisFault.EMERGENCY_STOP
+)
+
+
+class Axis:
+    """State of one axis.
+
+    Parameters
+    ----------
+    parameters : mapping of int to float
+        By parameter number; what SETPARM changes shows here at once.
+
+    Attributes
+    ----------
+    causes : AxisFault
+        What cannot be acknowledged away, because it is so now.
+    """
+
+    def __init__(self, parameters: Mapping[int, float]) -> None:
+        self.enabled = False
+        self.faults = AxisFault(0)
+        self.causes = AxisFault(0)
+        self.ramp_rate = parameters[Parameter.DEFAULT_RAMP_RATE]
+        self.speed = DEFAULT_SPEED
+        self.command = 0.0
+        self.velocity = 0.0
+        self.feedback = 0.0
+        self._parameters = parameters
+        self._goal_velocity = 0.0
+        self._goal: float | None = None
+        self._rate = self.ramp_rate
+        self._changes = 0.0
+
+    # ------------------------------------------------------------ what it is told; False is refused
+    def enable(self) -> bool:
+        """Power up, holding where it is."""
+        self._judge()
+        if self.faults:
+            return False
+        if not self.enabled:
+            self.enabled = True
+            self._rest_at(self.feedback)
+        return True
+
+    def disable(self) -> None:
+        """Power down at once."""
+        self.enabled = False
+        self._rest_at(self.feedback)
+
+    def acknowledge(self) -> None:
+        """Clear the faults whose cause is gone."""
+        self.faults = AxisFault(0)
+        self._judge()
+
+    def free_run(self, velocity: float) -> bool:
+        """Run at a velocity from now on, for good."""
+        if not self.enabled or self.faults:
+            return False
+        self._goal, self._goal_velocity, self._rate = None, velocity, self.ramp_rate
+        return True
+
+    def move_to(self, position: float, speed: float) -> bool:
+        """Move to a place and stay there."""
+        if not self.enabled or self.faults:
+            return False
+        self._goal, self._goal_velocity, self._rate = position, abs(speed), self.ramp_rate
+        return True
+
+    def abort(self) -> None:
+        """Stop, at the rate for that."""
+        self._goal, self._goal_velocity = None, 0.0
+        self._rate = self._parameters[Parameter.ABORT_DECEL_RATE]
+
+    # ------------------------------------------------------------ what it says
+    @property
+    def moving(self) -> bool:
+        """Its trajectory is not at its end."""
+        return self.velocity != 0 or self._goal is not None or self._goal_velocity != 0
+
+    @property
+    def status(self) -> AxisStatus:
+        """As AXISSTATUS tells it."""
+        near = _IN_POSITION_PART * self._parameters[Parameter.POSITION_ERROR_THRESHOLD]
+        flags = {
+            AxisStatus.ENABLED: self.enabled,
+            AxisStatus.IN_POSITION: self.enabled and abs(self.error) < near and not self.moving,
+            AxisStatus.MOVING: self.moving,
+            AxisStatus.ACCELERATING: self._changes > 0,
+            AxisStatus.DECELERATING: self._changes < 0,
+            AxisStatus.CLOCKWISE: self.velocity > 0,
+            AxisStatus.EMERGENCY_STOP: bool(self.causes & AxisFault.EMERGENCY_STOP),
+        }
+        return AxisStatus(sum(flag for flag, holds in flags.items() if holds))
+
+    @property
+    def error(self) -> float:
+        """Position error: where the trajectory is, less where the encoder is."""
+        return self.command - self.feedback
+
+    @property
+    def motor_velocity(self) -> float:
+        """What the position loop asks of the motor."""
+        return self.velocity + LOOP_GAIN_PER_S * self.error if self.enabled else 0.0
+
+    # ------------------------------------------------------------ time
+    def step(self, feedback: float, period_s: float) -> None:
+        """One period of the controller, with what the encoder reads now."""
+        self.feedback = feedback
+        if self.enabled:
+            self._advance(period_s)
+        else:
+            self.command = feedback
+        self._judge()
+
+    def _advance(self, period_s: float) -> None:
+        wanted = self._goal_velocity
+        if self._goal is not None:
+            left = self._goal - self.command
+            wanted = math.copysign(min(wanted, math.sqrt(2 * self._rate * abs(left))), left)
+            if abs(left) <= abs(self.velocity) * period_s or abs(left) < self._rate * period_s**2:
+                self._rest_at(self._goal)
+                return
+        most = self._rate * period_s
+        change = max(-most, min(most, wanted - self.velocity))
+        self._changes = change * self.velocity if self.velocity else abs(change)
+        self.velocity += change
+        self.command += self.velocity * period_s
+        low, high = self._software_limits
+        if not low <= self.command <= high and (self.command > high) == (self.velocity > 0):
+            beyond_high = self.command > high
+            self.faults |= (
+                AxisFault.CW_SOFTWARE_LIMIT if beyond_high else AxisFault.CCW_SOFTWARE_LIMIT
+            )
+            self.abort()
+
+    def _judge(self) -> None:
+        """Take up the faults that are so now; the grave ones take the power."""
+        self.faults |= self.causes
+        if self.enabled and abs(self.error) > self._parameters[Parameter.POSITION_ERROR_THRESHOLD]:
+            self.faults |= AxisFault.POSITION_ERROR
+        if self.enabled and self.faults & _DISABLING:
+            self.disable()
+
+    @property
+    def _software_limits(self) -> tuple[float, float]:
+        low = self._parameters[Parameter.SOFTWARE_LIMIT_LOW]
+        high = self._parameters[Parameter.SOFTWARE_LIMIT_HIGH]
+        return (low, high) if low < high else (-math.inf, math.inf)
+
+    def _rest_at(self, position: float) -> None:
+        self.command, self.velocity, self._changes = position, 0.0, 0.0
+        self._goal, self._goal_velocity = None, 0.0

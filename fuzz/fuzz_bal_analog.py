@@ -1,0 +1,52 @@
+"""Coverage-guided fuzzing of what parses the analogue I/O station's wire on the driver's side.
+
+The mock's side is the Modbus server of all mocks: see fuzz_modbus_dac.py.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from fitctl.drivers.bal_analog.protocol import (
+    READ_HOLDING_REGISTERS,
+    READ_WRITE_MULTIPLE_REGISTERS,
+    decode_identity,
+    decode_registers,
+    frame,
+    take_message,
+    unwrap,
+)
+
+
+def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
+    """Any bytes are messages, the start of one, or an error."""
+    pending = bytearray(data)
+    try:
+        while (message := take_message(pending)) is not None:
+            assert take_message(bytearray(frame(*message))) == message
+            decode_identity(message.pdu)
+            _read(message.pdu)
+    except ValueError:
+        return
+
+
+def _read(pdu: bytes) -> None:
+    for function_code in (READ_HOLDING_REGISTERS, READ_WRITE_MULTIPLE_REGISTERS):
+        try:
+            for register in decode_registers(pdu, function_code):
+                assert unwrap(register, 1_000_000) & 0xFFFF == register
+        except ValueError:
+            continue
+
+
+def main() -> None:
+    """Fuzz until told to stop; libFuzzer's options."""
+    import atheris
+
+    atheris.instrument_all()
+    atheris.Setup(sys.argv, TestOneInput)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

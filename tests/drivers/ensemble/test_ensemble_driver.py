@@ -1,0 +1,330 @@
+"""The Ensemble driver against controllers that differ from the mock, and on its other wires."""
+
+import contextlib
+import socket
+import threading
+import time
+
+import pytest
+
+from fitctl import config
+from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
+from fitctl.drivers.ensemble.probe import probe_ensemble
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceFault,
+    DeviceMismatch,
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
+
+STILL = (0.0, 0.0)
+MOCK = "mocks.loops.right.ensemble"
+WELL = {
+    "NONE": "!\n",
+    "GETPARM(@0, 2)": "%1000.000000\n",
+    "GETPARM(@1, 2)": "%-2000.000000\n",
+    "GETPARM(@0, 37)": "%-10.0\n",
+    "GETPARM(@1, 37)": "%-10.0\n",
+    "GETPARM(@0, 38)": "%10.0\n",
+    "GETPARM(@1, 38)": "%10.0\n",
+    "AXISSTATUS(@0)": "%1\n",
+    "AXISSTATUS(@1)": "%1\n",
+    "AXISFAULT(@0)": "%0\n",
+    "AXISFAULT(@1)": "%0\n",
+    "PFBKPROG(@0)": "%1.5\n",
+    "PFBKPROG(@1)": "%0.25\n",
+}
+
+
+class Script:
+    """A controller that answers by a table; a command that is not in it is acknowledged."""
+
+    def __init__(self, answers):
+        self.answers = WELL | answers
+        self.heard = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+        self.port = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
+
+    def _serve(self):
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                with client, client.makefile("rb") as lines, contextlib.suppress(OSError):
+                    for line in lines:
+                        command = line.decode().strip()
+                        self.heard.append(command)
+                        client.sendall(self.answers.get(command, "%\n").encode())
+
+    def close(self):
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._thread.join(5)
+
+
+@pytest.fixture
+def settings():
+    rig = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
+    return rig.loops["right"].siderostat
+
+
+@pytest.fixture
+def scripted(settings, bench_of):
+    """Makes a driver and the scripted controller that it speaks to."""
+    with contextlib.ExitStack() as stack:
+
+        def make(**update):
+            script = Script(update.pop("answers", {}))
+            stack.callback(script.close)
+            device = settings.device.model_copy(
+                update={"port": script.port, "response_timeout_s": 0.2} | update
+            )
+            driver = EnsembleAmplifiers(settings.model_copy(update={"device": device}))
+            stack.callback(driver.close)
+            return driver, script
+
+        yield make
+
+
+def test_the_wire_when_it_is_opened(scripted):
+    driver, script = scripted()
+    driver.open()
+    # 6000 rad/s2 of a motor with 4000 counts a revolution; a unit is 1000 counts, and -2000 of them.
+    assert script.heard == [
+        "NONE",
+        "GETPARM(@0, 2)",
+        "GETPARM(@0, 37)",
+        "GETPARM(@0, 38)",
+        "ABORT @0",
+        "DISABLE @0",
+        "RAMP MODE @0 RATE",
+        "RAMP RATE @0 3819.71863",
+        "AXISSTATUS(@0)",
+        "AXISFAULT(@0)",
+        "GETPARM(@1, 2)",
+        "GETPARM(@1, 37)",
+        "GETPARM(@1, 38)",
+        "ABORT @1",
+        "DISABLE @1",
+        "RAMP MODE @1 RATE",
+        "RAMP RATE @1 1909.859317",
+        "AXISSTATUS(@1)",
+        "AXISFAULT(@1)",
+        "WAIT MODE NOWAIT",
+    ]
+
+
+def test_a_period_on_the_wire(scripted):
+    driver, script = scripted()
+    driver.open()
+    del script.heard[:]
+    reading = driver.exchange((1.0, 1.0))
+    driver.exchange((1.0, 2.0))
+    assert script.heard == [
+        "FREERUN @0 0.63662",
+        "FREERUN @1 -0.318310",  # a negative scale turns the sense
+        "PFBKPROG(@0)",
+        "PFBKPROG(@1)",
+        "AXISSTATUS(@0)",
+        "FREERUN @1 -0.636620",  # the other one is as it was
+        "PFBKPROG(@0)",
+        "PFBKPROG(@1)",
+        "AXISFAULT(@0)",
+    ]
+    assert reading.position_rad == pytest.approx((2.356194, -0.785398), abs=1e-6)
+    assert reading.enabled
+    assert reading.fault == ""
+
+
+def test_velocities_are_held_within_the_motors_limit(scripted, settings):
+    driver, script = scripted()
+    driver.open()
+    del script.heard[:]
+    driver.exchange((1e9, -1e9))
+    most = settings.velocity_limit_rad_s * 4000 / 6.283185307 / 1000
+    assert float(script.heard[0].split()[-1]) == pytest.approx(most, rel=1e-5)
+
+
+def test_other_axes_of_a_larger_controller(scripted):
+    answers = {
+        command.replace("@1", "@4").replace("@0", "@3"): answer for command, answer in WELL.items()
+    }
+    driver, script = scripted(answers=answers, axes=[3, 4])
+    assert "@3 and @4" in driver.open().model
+    assert not any("@0" in heard or "@1" in heard for heard in script.heard)
+
+
+@pytest.mark.parametrize(
+    "style",
+    [
+        {"ABORT @0": "%", "DISABLE @0": "%", "WAIT MODE NOWAIT": "%"},  # no newline
+        {"PFBKPROG(@0)": "%\n%1.5\n"},  # a bare acknowledgement first
+        {"PFBKPROG(@0)": "% 1.5 \r\n"},
+        {"AXISSTATUS(@0)": "%4294967295\n"},
+    ],
+)
+def test_what_controllers_differ_in_is_taken(scripted, style):
+    driver, _ = scripted(answers=style)
+    driver.open()
+    assert driver.exchange(STILL).position_rad[0] == pytest.approx(2.356194, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("answers", "error", "said"),
+    [
+        ({"NONE": ""}, DeviceTimeout, "NONE within 0.2 s"),
+        ({"GETPARM(@1, 2)": "!\n"}, DeviceRefused, r"GETPARM\(@1, 2\) .* not understood"),
+        ({"GETPARM(@0, 2)": "%0.0\n"}, DeviceMismatch, "azimuth: .*CountsPerUnit"),
+        ({"GETPARM(@1, 38)": "%-10.0\n"}, DeviceMismatch, "elevation: software limits"),
+        ({"GETPARM(@0, 2)": "%nan\n"}, DeviceProtocolError, "a number"),
+        ({"GETPARM(@0, 2)": "?\n"}, DeviceProtocolError, "one of"),
+        ({"GETPARM(@0, 2)": "%" + "1" * 2000}, DeviceProtocolError, "without an end"),
+        ({"RAMP MODE @1 RATE": "#\n"}, DeviceRefused, "RAMP MODE @1 RATE .* fault"),
+        ({"WAIT MODE NOWAIT": "$\n"}, DeviceRefused, "timeout"),
+    ],
+)
+def test_what_is_wrong_at_open_is_said(scripted, answers, error, said):
+    driver, _ = scripted(answers=answers)
+    with pytest.raises(error, match=said):
+        driver.open()
+    with pytest.raises(DeviceUnreachable, match="open"):
+        driver.exchange(STILL)
+
+
+def test_an_answer_that_nobody_asked_for_is_an_error(scripted):
+    driver, script = scripted()
+    driver.open()
+    script.answers["PFBKPROG(@1)"] = "%0.25\n%0.25\n"
+    with pytest.raises(DeviceProtocolError, match=r"nothing before .*, got b'%'"):
+        driver.exchange(STILL)
+
+
+def test_after_an_answer_that_did_not_come_nothing_is_asked_before_it_is_opened_anew(scripted):
+    driver, script = scripted()
+    driver.open()
+    answer = script.answers.pop("PFBKPROG(@0)")
+    script.answers["PFBKPROG(@0)"] = ""
+    with pytest.raises(DeviceTimeout):
+        driver.exchange(STILL)
+    script.answers["PFBKPROG(@0)"] = answer
+    with pytest.raises(DeviceUnreachable):
+        driver.exchange(STILL)
+    driver.open()
+    driver.exchange(STILL)
+
+
+def test_an_angle_that_no_motor_can_reach_in_the_time_is_an_error(scripted):
+    driver, script = scripted()
+    driver.open()
+    driver.exchange(STILL)
+    script.answers["PFBKPROG(@1)"] = "%8.25\n"
+    with pytest.raises(DeviceFault, match="elevation to turn at most"):
+        driver.exchange(STILL)
+
+
+def test_a_refused_run_of_an_axis_without_fault_is_an_error(scripted):
+    driver, script = scripted()
+    driver.open()
+    script.answers["FREERUN @0 0.63662"] = "!\n"
+    with pytest.raises(DeviceRefused, match=r"FREERUN @0 0\.63662"):
+        driver.exchange((1.0, 0.0))
+
+
+def test_an_axis_that_does_not_come_up_is_an_error_and_both_are_disabled(scripted):
+    driver, script = scripted()
+    driver.open()
+    script.answers["AXISSTATUS(@1)"] = "%0\n"
+    del script.heard[:]
+    with pytest.raises(DeviceError):
+        driver.enable()
+    assert script.heard.index("ENABLE @1") < script.heard.index("DISABLE @0")
+    assert "DISABLE @1" in script.heard
+
+
+# ---------------------------------------------------------------- with the mock
+
+
+def test_over_its_serial_port_it_is_the_same(bench_of):
+    bench = bench_of("ensemble")
+    port = bench.endpoints["mocks.loops.right.ensemble_pty"]
+    device = bench.siderostat.device.model_copy(update={"port": port})
+    driver = EnsembleAmplifiers(bench.siderostat.model_copy(update={"device": device}))
+    driver.open()
+    driver.enable()
+    while driver.exchange((5.0, 0.0)).position_rad[0] < 0.2:
+        pass
+    driver.close()
+    assert bench.motors.enabled == [False, False]
+
+
+def test_without_newlines_behind_acknowledgements_it_is_the_same(bench_of):
+    bench = bench_of("ensemble", f"{MOCK}.always_send_eos=false")
+    bench.driver.open()
+    bench.driver.enable()
+    while bench.driver.exchange((5.0, 0.0)).position_rad[0] < 0.2:
+        pass
+
+
+def test_polling_keeps_the_connection_and_silence_loses_it(bench_of):
+    bench = bench_of("ensemble", f"{MOCK}.idle_timeout_s=0.3")
+    bench.driver.open()
+    end_s = time.monotonic() + 0.5
+    while time.monotonic() < end_s:
+        bench.driver.exchange(STILL)
+    time.sleep(0.6)
+    with pytest.raises(DeviceUnreachable, match="timeout of the controller's socket"):
+        bench.driver.exchange(STILL)
+
+
+def test_a_following_error_is_a_fault_by_name(bench_of):
+    bench = bench_of("ensemble")
+    bench.driver.open()
+    bench.driver.enable()
+    bench.fault("following_error", "az")
+    for _ in range(8):
+        reading = bench.driver.exchange(STILL)
+    assert reading.fault == "azimuth: position error"
+    assert not reading.enabled
+
+
+def test_a_stuck_axis_becomes_the_controllers_position_error(bench_of):
+    bench = bench_of("ensemble")
+    bench.driver.open()
+    bench.driver.enable()
+    bench.fault("stuck_axis", "el")
+    end_s = time.monotonic() + 5
+    while not (reading := bench.driver.exchange((0.0, 5.0))).fault:
+        assert time.monotonic() < end_s
+    assert reading.fault == "elevation: position error"
+
+
+def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of):
+    bench = bench_of("ensemble")  # two revolutions
+    bench.driver.open()
+    bench.driver.enable()
+    end_s = time.monotonic() + 5
+    while not (reading := bench.driver.exchange((30.0, 0.0))).fault:
+        assert time.monotonic() < end_s
+    assert reading.fault == "azimuth: cw software limit"
+    bench.driver.reset_fault()
+    bench.driver.enable()
+    while bench.driver.exchange((-10.0, 0.0)).position_rad[0] > 11.0:
+        assert time.monotonic() < end_s
+
+
+def test_asked_only_it_tells_what_disagrees_and_stays_as_it_is(bench_of):
+    bench = bench_of("ensemble", f"{MOCK}.software_limit_units=0.0")
+    bench.fault("amplifier_fault", "el")
+    time.sleep(0.05)
+    probe = probe_ensemble(bench.siderostat)
+    assert probe.identity.maker == "Aerotech"
+    assert 0 < probe.round_trip_s < 1
+    assert [text.split(":")[0] for text in probe.disagreements] == [
+        "axis @0 has no software limits",
+        "axis @1 has no software limits",
+        "axis @1 is in fault (amplifier)",
+    ]

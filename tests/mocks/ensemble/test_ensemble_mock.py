@@ -1,0 +1,370 @@
+"""The mock controller as a client of its wire sees it."""
+
+import asyncio
+import functools
+import os
+
+import hypothesis
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fitctl import config
+from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
+from fitctl.mocks.ensemble.axis import Axis
+from fitctl.mocks.ensemble.commands import Interpreter, words_of
+from fitctl.mocks.ensemble.controller import EnsembleControllerMock
+from fitctl.mocks.ensemble.line import LineSplitter
+
+RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
+SIDEROSTAT = RIG.loops["right"].siderostat
+SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
+PERIOD_S = 0.002
+
+
+class StillMotors:
+    """Motors that obey nobody."""
+
+    def __init__(self):
+        self.enabled = [False, False]
+
+    def position_rad(self):
+        return (0.0, 0.0)
+
+    def command_velocity_rad_s(self, az, el):
+        self.velocity_rad_s = (az, el)
+
+    def set_enabled(self, axis, enabled):
+        self.enabled[axis] = enabled
+
+
+def spoken(test=None, **update):
+    """Run a test with a connection to a mock: ``say(command)`` gives the whole answer."""
+
+    def decorate(test):
+        @functools.wraps(test)
+        def run():
+            asyncio.run(serve(test))
+
+        del run.__wrapped__  # pytest would take its arguments for fixtures
+        return run
+
+    async def serve(test):
+        settings = SETTINGS.model_copy(update=update)
+        mock = EnsembleControllerMock(SIDEROSTAT, settings, StillMotors())
+        ends = await mock.start()
+        reader, writer = await asyncio.open_connection("127.0.0.1", ends.tcp_port)
+
+        async def say(command):
+            writer.write(command.encode("latin-1") + b"\n")
+            return (await asyncio.wait_for(reader.readuntil(b"\n"), 5)).decode()
+
+        try:
+            await test(mock, say, reader, writer)
+        finally:
+            writer.close()
+            await mock.stop()
+            await mock.stop()
+        await asyncio.sleep(0)
+        assert len(asyncio.all_tasks()) == 1
+
+    return decorate(test) if test else decorate
+
+
+# ---------------------------------------------------------------- transcripts
+
+
+@spoken
+async def test_what_epics_motor_asks_at_start(mock, say, *_):
+    assert await say("NONE") == "!\n"
+    assert await say("GETPARM(@0, 140)") == "%X\n"
+    assert await say("GETPARM(@1, 99)") == "%Y\n"
+    assert (await say("GETPARM(@2, 140)"))[0] == "!"
+    assert await say("GETPARM(@0, 47)") == "%1.000000\n"
+    assert await say("GETPARM(@0, 2)") == "%4000.000000\n"
+    for number in (77, 75, 61, 1):
+        assert await say(f"GETPARM(@0, {number})") == "%0.000000\n"
+    assert await say("RAMP MODE @0 RATE") == "%\n"
+
+
+@spoken
+async def test_what_epics_motor_polls(mock, say, *_):
+    assert await say("AXISSTATUS(@0)") == "%0\n"
+    assert await say("PLANESTATUS(0)") == "%0\n"
+    assert await say("PFBKPROG(@0)") == "%0.000000\n"
+    assert await say("PCMDPROG(@0)") == "%0.000000\n"
+    assert await say("AXISFAULT(@0)") == "%0\n"
+    assert await say("VFBK(@0)") == "%0.000000\n"
+
+
+@spoken
+async def test_what_epics_motor_says_to_enable_jog_and_move(mock, say, *_):
+    assert await say("AXISFAULT @0") == "%0\n"
+    assert await say("ENABLE @0") == "%\n"
+    assert mock._motors._motors.enabled == [True, False]
+    assert await say("WAIT MODE NOWAIT") == "%\n"
+    assert await say("SETPARM @0, 73, 250.00000") == "%\n"
+    assert await say("GETPARM(@0, 73)") == "%250.000000\n"
+    assert await say("RAMP RATE @0 0.10000") == "%\n"
+    assert await say("FREERUN @0 0.01000") == "%\n"
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & (AxisStatus.ENABLED | AxisStatus.MOVING) == 9
+    assert await say("PLANESTATUS(0)") == "%1\n"
+    assert await say("ABORT @0") == "%\n"
+    assert await say("ABS") == "%\n"
+    assert await say("RAMP RATE 0.10000") == "%\n"
+    assert await say("LINEAR @0 0.10000 F0.01000") == "%\n"
+    assert await say("DISABLE @0") == "%\n"
+    assert await say("AXISSTATUS(@0)") == "%0\n"
+
+
+@spoken
+async def test_what_other_public_clients_say(mock, say, *_):
+    assert await say("enable X") == "%\n"
+    assert await say("ENABLE Y") == "%\n"
+    assert await say("MOVEABS X0.100000 XF0.01 Y0.200000 YF0.01") == "%\n"
+    assert await say("MOVEINC X 0 XF 0.02") == "%\n"
+    assert await say("MOVEABS X 0.1") == "%\n"
+    assert await say("PFBK X") == "%0.000000\n"
+    assert await say("ACKNOWLEDGEALL") == "%\n"
+    assert await say("FREERUN X 0.01 Y -0.01") == "%\n"
+    assert await say("HOME X") == "!\n"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ENABLE",
+        "ENABLE Z",
+        "FREERUN @0",
+        "FREERUN @0 fast",
+        "FREERUN @0 1 2",
+        "FREERUN 1",
+        "LINEAR F2",
+        "LINEAR @0 1 G2",
+        "RAMP MODE TIME",
+        "RAMP",
+        "WAIT MODE",
+        "AXISSTATUS",
+        "AXISSTATUS(@0, @1)",
+        "GETPARM(@0)",
+        "GETPARM(@0, 9999)",
+        "GETPARM(@0, 2, 3)",
+        "SETPARM @0, 73",
+        "PLANESTATUS(1)",
+        "ABS 1",
+        "ENABLE @0; DISABLE @0",
+        "\x80",
+    ],
+)
+def test_what_is_no_command_is_not_understood(line):
+    assert interpreter().answer(line) == (Reply.NOT_UNDERSTOOD, "")
+
+
+@spoken
+async def test_what_cannot_be_done_now_is_a_fault(mock, say, *_):
+    assert await say("FREERUN @0 1.0") == "#\n"
+    assert await say("MOVEABS X 1") == "#\n"
+    assert await say("RAMP RATE @0 0") == "#\n"
+    assert await say("SETPARM @0, 32, -1") == "#\n"
+
+
+@spoken(always_send_eos=False)
+async def test_without_always_send_eos_only_values_end_in_a_newline(mock, say, reader, writer):
+    writer.write(b"ENABLE @0\nNONE\nAXISFAULT(@0)\n")
+    assert await asyncio.wait_for(reader.readexactly(5), 5) == b"%!%0\n"
+
+
+@spoken(reply_s=0.05)
+async def test_answers_come_one_after_the_other_in_the_controllers_time(mock, say, reader, writer):
+    loop = asyncio.get_running_loop()
+    before_s = loop.time()
+    writer.write(b"NONE\nAXISFAULT(@0)\nAXIS")
+    writer.write(b"STATUS(@1)\n")
+    assert await asyncio.wait_for(reader.readexactly(8), 5) == b"!\n%0\n%0\n"
+    assert loop.time() - before_s >= 3 * 0.05
+
+
+@spoken(idle_timeout_s=0.05)
+async def test_a_connection_over_which_nothing_comes_is_closed(mock, say, reader, writer):
+    assert await say("NONE") == "!\n"
+    assert await asyncio.wait_for(reader.read(), 5) == b""
+
+
+@spoken
+async def test_a_line_without_end_is_not_kept(mock, say, reader, writer):
+    writer.write(b"E" * 100_000)
+    assert await say("") == "!\n"
+    assert await say("AXISFAULT(@0)") == "%0\n"
+
+
+@spoken
+async def test_the_serial_port_speaks_the_same(mock, say, reader, writer):
+    path = mock._pty.path
+    end = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(end, b"AXISFAULT(@1)\n")
+        answer = await asyncio.get_running_loop().run_in_executor(None, os.read, end, 100)
+    finally:
+        os.close(end)
+    assert answer == b"%0\n"
+
+
+# ---------------------------------------------------------------- faults
+
+
+def set_fault(mock, kind, **settings):
+    mock.faults.set(config.Fault(device="right.drive", kind=kind, **settings))
+
+
+@spoken
+async def test_an_amplifiers_fault_disables_and_comes_back_while_its_cause_is_there(mock, say, *_):
+    await say("ENABLE @1")
+    set_fault(mock, "amplifier_fault", part="el")
+    assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
+    assert await say("AXISFAULT(@0)") == "%0\n"
+    assert await say("AXISSTATUS(@1)") == "%0\n"
+    assert await say("FAULTACK @1") == "%\n"
+    assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
+    assert await say("ENABLE @1") == "#\n"
+    mock.faults.clear()
+    assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
+    assert await say("FAULTACK @1") == "%\n"
+    assert await say("ENABLE @1") == "%\n"
+
+
+@spoken
+async def test_a_motor_that_does_not_follow_is_a_position_error(mock, say, *_):
+    await say("ENABLE @0")
+    await say("RAMP RATE @0 1000")
+    await say("FREERUN @0 10")
+    end_s = asyncio.get_running_loop().time() + 5
+    while await say("AXISFAULT(@0)") != f"%{AxisFault.POSITION_ERROR}\n":
+        assert asyncio.get_running_loop().time() < end_s
+    assert await say("FREERUN @0 10") == "#\n"
+    assert mock._motors._motors.enabled == [False, False]
+
+
+@spoken
+async def test_a_jumped_encoder_reads_that_much_more(mock, say, *_):
+    set_fault(mock, "encoder_jump", part="az", value=400)
+    assert await say("PFBK X") == "%0.100000\n"
+    assert await say("PFBK Y") == "%0.000000\n"
+
+
+@spoken
+async def test_after_a_reboot_it_is_as_at_power_up(mock, say, reader, writer):
+    await say("ENABLE @0")
+    await say("SETPARM @0, 32, 3.0")
+    set_fault(mock, "reboot", value=0.01)
+    assert await asyncio.wait_for(reader.read(), 5) == b""
+    await asyncio.sleep(0.05)
+    assert mock._motors._motors.enabled == [False, False]
+    assert mock._interpreter.answer("GETPARM(@0, 32)") == (Reply.DONE, "0.250000")
+
+
+# ---------------------------------------------------------------- one axis
+
+
+def parameters(**update):
+    return {
+        Parameter.POSITION_ERROR_THRESHOLD: 1.0,
+        Parameter.SOFTWARE_LIMIT_LOW: -5.0,
+        Parameter.SOFTWARE_LIMIT_HIGH: 5.0,
+        Parameter.DEFAULT_RAMP_RATE: 10.0,
+        Parameter.ABORT_DECEL_RATE: 1000.0,
+    } | update
+
+
+def interpreter():
+    tables = [parameters(), parameters()]
+    return Interpreter([Axis(table) for table in tables], tables, ["X", "Y"])
+
+
+def enabled_axis():
+    axis = Axis(parameters())
+    assert axis.enable()
+    return axis
+
+
+def run(axis, seconds):
+    """A motor that follows exactly."""
+    for _ in range(round(seconds / PERIOD_S)):
+        axis.step(axis.feedback + axis.motor_velocity * PERIOD_S, PERIOD_S)
+
+
+def test_a_free_run_ramps_up_and_stays():
+    axis = enabled_axis()
+    axis.free_run(2.0)
+    run(axis, 0.1)
+    assert axis.velocity == pytest.approx(1.0)  # 10 units a second, a second
+    run(axis, 0.5)
+    assert axis.velocity == pytest.approx(2.0)
+    assert axis.motor_velocity == pytest.approx(2.0, rel=1e-3)
+    assert axis.status & AxisStatus.CLOCKWISE
+
+
+@hypothesis.settings(max_examples=20)
+@given(st.floats(-4.9, 4.9), st.floats(0.5, 20.0))
+def test_a_move_ends_where_it_should_and_rests(position, speed):
+    axis = enabled_axis()
+    axis.move_to(position, speed)
+    run(axis, 4 + abs(position) / speed)
+    assert axis.command == position
+    assert axis.feedback == pytest.approx(position, abs=1e-3)
+    assert axis.status & AxisStatus.IN_POSITION
+    assert not axis.moving
+    assert not axis.faults
+
+
+def test_beyond_a_software_limit_it_stops_and_only_leads_back():
+    axis = enabled_axis()
+    axis.free_run(4.0)
+    run(axis, 3.0)
+    assert axis.faults == AxisFault.CW_SOFTWARE_LIMIT
+    assert axis.command == pytest.approx(5.0, abs=0.1)
+    assert not axis.free_run(-1.0)
+    axis.acknowledge()
+    assert axis.free_run(-1.0)
+    run(axis, 1.0)
+    assert axis.command < 4.8
+    assert not axis.faults
+
+
+def test_without_software_limits_it_runs_on():
+    table = parameters() | {Parameter.SOFTWARE_LIMIT_LOW: 0.0, Parameter.SOFTWARE_LIMIT_HIGH: 0.0}
+    axis = Axis(table)
+    axis.enable()
+    axis.free_run(4.0)
+    run(axis, 10.0)
+    assert axis.command > 30
+
+
+# ---------------------------------------------------------------- any bytes
+
+
+@given(st.lists(st.binary(max_size=50), max_size=8))
+def test_lines_do_not_depend_on_how_their_bytes_come(pieces):
+    whole, parts = LineSplitter(), LineSplitter()
+    lines = [line for piece in pieces for line in parts.feed(piece)]
+    assert lines == whole.feed(b"".join(pieces))
+
+
+@given(st.text(max_size=60))
+def test_any_line_is_answered(line):
+    reply, value = interpreter().answer(line)
+    assert reply in Reply
+    assert "\n" not in value
+
+
+WORDS = ["FREERUN", "MOVEABS", "RAMP", "RATE", "@0", "X", "YF", "F", "1.5", "-2E1", "GETPARM", "2"]
+
+
+@given(st.lists(st.sampled_from(WORDS), max_size=6))
+def test_any_order_of_known_words_is_answered(words):
+    assert interpreter().answer(" ".join(words))[0] in Reply
+
+
+def test_words_are_the_same_however_they_are_set_apart():
+    assert words_of("getparm(@0, 2)") == words_of("GETPARM @0,2") == ["GETPARM", "@0", "2"]
+    assert words_of("MOVEABS X1.5 XF10") == ["MOVEABS", "X", "1.5", "XF", "10"]
+    assert words_of('PROGRAM RUN 5, "x"') == []

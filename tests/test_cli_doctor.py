@@ -1,0 +1,121 @@
+"""`fitctl doctor` and `fitctl discover` as a stranger meets them."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from fitctl.cli import main
+
+
+@pytest.fixture(scope="module")
+def mocks():
+    """Where mock devices listen, as --set arguments."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fitctl", "mocks", "--free-ports", "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        endpoints = json.loads(process.stdout.readline())
+        yield [
+            part
+            for key, value in endpoints.items()
+            if not key.startswith("mocks.")
+            for part in ("--set", f"{key}={value}")
+        ]
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+@pytest.fixture
+def doctor(capsys):
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["doctor", *arguments])
+        return end.value.code or 0, capsys.readouterr().out
+
+    return run
+
+
+def devices(out):
+    return {one["device"]: one for one in json.loads(out)["devices"]}
+
+
+def test_every_device_says_who_it_is_and_how_soon(doctor, mocks):
+    status, out = doctor("--json", *mocks)
+    found = devices(out)
+    assert status == 0
+    assert list(found) == ["camera", "right siderostat", "right D/A", "right piezo amplifier"]
+    for one in found.values():
+        assert one["found"]
+        assert one["identity"]["model"]
+        assert one["identity"]["firmware"]
+        assert one["round_trip_ms"] > 0
+        assert one["disagreements"] == []
+    # It answers after 30 ms, asked twice for what has no checksum.
+    assert found["right piezo amplifier"]["round_trip_ms"] > 30
+
+
+def test_people_get_a_table_that_fits_their_terminal(doctor, mocks):
+    status, out = doctor(*mocks)
+    assert status == 0
+    assert max(map(len, out.splitlines())) <= 118
+    assert "MDT693B" in out
+
+
+def test_what_is_not_as_the_rig_file_says_is_told_with_what_to_do(doctor, mocks):
+    status, out = doctor("--json", *mocks, "--set", "loops.right.fsm.piezo.limit_v=100.5")
+    (told,) = devices(out)["right piezo amplifier"]["disagreements"]
+    assert status == 1
+    assert devices(out)["right piezo amplifier"]["found"]
+    assert "expected the voltage-limit switch at 100.5 V, got 150 V" in told
+    assert "set the voltage-limit switch" in told
+
+
+def test_what_is_not_there_is_not_found_and_told_where_it_was_looked_for(doctor, mocks):
+    status, out = doctor("--json", *mocks, "--set", "loops.right.fsm.dac.port=1")
+    found = devices(out)
+    assert status == 1
+    assert not found["right D/A"]["found"]
+    assert "127.0.0.1:1" in found["right D/A"]["disagreements"][0]
+    assert found["camera"]["found"]
+
+
+def test_asking_changes_nothing(doctor, mocks):
+    first, again = (doctor("--json", *mocks)[1] for _ in range(2))
+    identities = [[one["identity"] for one in devices(out).values()] for out in (first, again)]
+    assert identities[0] == identities[1]
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or not shutil.which("unshare"), reason="needs root and unshare"
+)
+def test_a_camera_alone_in_its_network_is_discovered(tmp_path):
+    """The broadcast leaves on every interface: in here there is none but loopback."""
+    program = (
+        "ip link set lo up || exit 77\n"
+        f"{sys.executable} -m fitctl mocks --set mocks.gvcp_port=3956 --set mocks.bench_port=0 --json"
+        " >mocks.out & mocks=$!\n"
+        "for i in $(seq 100); do [ -s mocks.out ] && break; sleep 0.1; done\n"
+        f"{sys.executable} -m fitctl discover --broadcast 127.0.0.1 --wait 2 --json; status=$?\n"
+        "kill $mocks; wait $mocks; exit $status\n"
+    )
+    result = subprocess.run(
+        ["unshare", "-n", "sh", "-c", program],
+        check=False,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    if result.returncode == 77 or "unshare" in result.stderr:
+        pytest.skip(f"no network namespace: {result.stderr.strip()}")
+    assert result.returncode == 0, result.stderr
+    (camera,) = json.loads(result.stdout)["cameras"]
+    assert camera["model"] == "MockCamera"
+    assert camera["address"] == "127.0.0.1"
