@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -183,15 +182,13 @@ def run_mocks(
     if free_ports:
         rig = _with_free_ports(rig)
     end_with_parent(parent_pid)
-    asyncio.run(_serve_mocks(rig, seed, as_json=as_json))
+    asyncio.run(_serve_mocks(rig, seed, as_json=as_json, free_ports=free_ports))
 
 
 def _with_free_ports(rig: Rig) -> Rig:
     _, mocks = rig.mock_parts()
     loops = {name: _loop_with_free_ports(loop) for name, loop in mocks.loops.items()}
-    # The bench keeps its port where it can: there `fitctl fault` finds the mocks of a demo.
-    bench_port = mocks.bench_port if _is_free(mocks.bench_port) else 0
-    free = mocks.model_copy(update={"gvcp_port": 0, "bench_port": bench_port, "loops": loops})
+    free = mocks.model_copy(update={"gvcp_port": 0, "loops": loops})
     return rig.model_copy(update={"mocks": free})
 
 
@@ -204,16 +201,7 @@ def _loop_with_free_ports(loop: LoopMocks) -> LoopMocks:
     return loop.model_copy(update=update)
 
 
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return False
-    return True
-
-
-async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
+async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool, free_ports: bool) -> None:
     from fitctl.mocks.faults import UnknownFault
     from fitctl.mocks.testbed import Testbed
 
@@ -221,7 +209,8 @@ async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool) -> None:
     loop = asyncio.get_running_loop()
     for number in ENDING_SIGNALS:
         loop.add_signal_handler(number, ending.set)
-    testbed = Testbed(rig, seed)
+    # The bench has its own port where it can: there `fitctl fault` finds the mocks of a demo.
+    testbed = Testbed(rig, seed, bench_at_any_port=free_ports)
     try:
         endpoints = await testbed.start()
     except UnknownFault as error:

@@ -143,12 +143,19 @@ class Bench:
     """Answers questions about the truth until stopped."""
 
     def __init__(
-        self, plants: Mapping[str, Plant], faults: FaultTable, started_s: float, port: int
+        self,
+        plants: Mapping[str, Plant],
+        faults: FaultTable,
+        started_s: float,
+        port: int,
+        *,
+        or_any_port: bool = False,
     ) -> None:
         self._plants = plants
         self._faults = faults
         self._started_s = started_s
         self._port = port
+        self._or_any_port = or_any_port
         self._context = zmq.asyncio.Context()
         self._socket = self._context.socket(zmq.REP)
         self._task: asyncio.Task | None = None
@@ -157,10 +164,14 @@ class Bench:
         """Listen; returns the port."""
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, _MAX_QUESTION_BYTES)
-        if self._port:
-            self._socket.bind(f"tcp://127.0.0.1:{self._port}")
-        else:
-            self._port = self._socket.bind_to_random_port("tcp://127.0.0.1")
+        try:
+            self._socket.bind(f"tcp://127.0.0.1:{self._port or '*'}")
+        except zmq.ZMQError:
+            if not self._or_any_port:
+                raise
+            self._socket.bind("tcp://127.0.0.1:*")
+        endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._port = int(endpoint.rpartition(":")[2])
         self._task = asyncio.create_task(self._serve())
         return self._port
 

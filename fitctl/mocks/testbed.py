@@ -116,9 +116,11 @@ class Testbed:
         Must have its ``plant`` and ``mocks`` sections.
     seed : int
         Of everything random in the plants.
+    bench_at_any_port : bool
+        Where the bench's own port is taken.
     """
 
-    def __init__(self, rig: Rig, seed: int) -> None:
+    def __init__(self, rig: Rig, seed: int, *, bench_at_any_port: bool = False) -> None:
         truth, mocks = rig.mock_parts()
         started_s = time.monotonic()
         self._plants = {
@@ -152,7 +154,9 @@ class Testbed:
             }
         self._faults = FaultTable(devices)
         plants = {name: live.plant for name, live in self._plants.items()}
-        self._bench = Bench(plants, self._faults, started_s, mocks.bench_port)
+        self._bench = Bench(
+            plants, self._faults, started_s, mocks.bench_port, or_any_port=bench_at_any_port
+        )
         self._housekeeping: asyncio.Task | None = None
 
     async def start(self) -> dict[str, Any]:
