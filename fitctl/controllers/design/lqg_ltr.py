@@ -22,6 +22,7 @@ Complexes = NDArray[np.complex128]
 
 # Where compensators are compared, rad/s.
 COMPARED_RAD_S: Floats = np.geomspace(0.01, 100.0, 2001)
+_ROUNDING = 1e-9
 _REMOVED = 2
 
 
@@ -126,7 +127,7 @@ def recovered(plant: NominalPlant, kalman: Floats, control_weight: float) -> Com
     regulator, *_ = control.lqr(plant.a, plant.b, plant.c.T @ plant.c, [[control_weight]])
     a = plant.a - kalman @ plant.c - plant.b @ regulator
     lqg = control.ss(a, kalman, regulator, 0.0)
-    lqg_poles, lqg_zeros = control.poles(lqg), control.zeros(lqg)
+    lqg_poles, lqg_zeros = in_pairs(control.poles(lqg)), in_pairs(control.zeros(lqg))
     # The nominal plant is the shaping alone: the mirror does not move the air path.
     zeros = np.concatenate([lqg_zeros, plant.shaping_zeros])
     poles = np.concatenate([lqg_poles, plant.shaping_poles])
@@ -135,6 +136,25 @@ def recovered(plant: NominalPlant, kalman: Floats, control_weight: float) -> Com
     return Compensator(
         zeros, poles, float((regulator @ kalman)[0, 0]) * shaping_gain, np.empty(0, complex)
     )
+
+
+def in_pairs(roots: Complexes) -> Complexes:
+    """Roots of a real polynomial with complex ones exactly in pairs; rounding may leave them apart.
+
+    Raises
+    ------
+    ArithmeticError
+        If they are farther apart than that.
+    """
+    real = np.abs(roots.imag) <= _ROUNDING * np.abs(roots)
+    upper, lower = roots[~real & (roots.imag > 0)], roots[~real & (roots.imag < 0)]
+    apart = (
+        np.sort_complex(upper) - np.sort_complex(lower.conj()) if len(upper) == len(lower) else 1
+    )
+    if np.any(np.abs(apart) > _ROUNDING * np.abs(roots).max(initial=1.0)):
+        msg = "roots of a real polynomial do not come in pairs"
+        raise ArithmeticError(msg)
+    return np.concatenate([roots[real].real, upper, upper.conj()])
 
 
 def without_fast_poles(compensator: Compensator, count: int = _REMOVED) -> Compensator:

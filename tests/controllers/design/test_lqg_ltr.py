@@ -10,6 +10,7 @@ from fitctl.controllers.design.lqg_ltr import (
     design_lqg_ltr,
     distance_db_deg,
     distance_from_eq20,
+    in_pairs,
     kalman_gain,
     nominal_plant,
     recovered,
@@ -106,3 +107,16 @@ def test_more_measurement_noise_lowers_the_crossover(fit):
 def test_the_design_is_stable_by_itself(fit, flight):
     for basis in (fit, flight):
         assert np.abs(np.linalg.eigvals(design_lqg_ltr(basis).a)).max() < 1
+
+
+def test_roots_that_rounding_has_left_apart_become_pairs():
+    """The zeros of a system come from a generalized eigenvalue problem, which does not promise pairs."""
+    found = in_pairs(np.array([-1 + 1e-14j, -2 + 3.0000000000001j, -2 - 3j]))
+    assert np.all(np.poly(found).imag == 0)
+    assert found == pytest.approx([-1, -2 + 3j, -2 - 3j])
+
+
+@pytest.mark.parametrize("roots", [[-1 + 1j], [-1 + 1j, -2 - 1j]])
+def test_roots_that_are_no_pairs_are_refused(roots):
+    with pytest.raises(ArithmeticError, match="pairs"):
+        in_pairs(np.array(roots))
