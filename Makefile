@@ -67,10 +67,17 @@ bench-sim: $(READY)  ## How many times real time the simulation and the batch ru
 LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
     --custom-compile-command "make lock" --quiet
 
+bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN servo cycle, the camera's stream
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
+	$(BIN)/python -m benchmarks.roundtrips
+	$(BIN)/python -m benchmarks.can
+	$(BIN)/python -m benchmarks.gvsp
+
 lock: $(READY)  ## Resolve the requirements anew (needs uv)
 	uv pip compile pyproject.toml --extra fast --extra cluster --group dev $(LOCK) -o requirements/dev.lock
 	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
+	uv pip compile --group bench $(LOCK) --constraint requirements/dev.lock -o requirements/bench.lock
 
 clean:  ## Remove .venv and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

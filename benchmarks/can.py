@@ -18,28 +18,16 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.motors import StillMotors
 from fitctl.clock import MonotonicClock
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.mocks.cia402.drive import Cia402DriveMock
+from fitctl.mocks.event_loop import run_on_time
 from fitctl.supervisor.realtime import become_realtime, lock_memory, quiet_interpreter
 
 PRIORITY = 60
 PERCENTILES = (50, 99, 100)
-
-
-class StillMotors:
-    """Motors that stand."""
-
-    def position_rad(self) -> tuple[float, float]:
-        """Both at zero."""
-        return 0.0, 0.0
-
-    def command_velocity_rad_s(self, az: float, el: float) -> None:
-        """Nothing turns."""
-
-    def set_enabled(self, axis: int, enabled: bool) -> None:
-        """Nothing has current."""
 
 
 def serve(pipe: Connection) -> None:
@@ -52,7 +40,7 @@ def serve(pipe: Connection) -> None:
         await asyncio.to_thread(pipe.recv)
         await mock.stop()
 
-    asyncio.run(run())
+    run_on_time(run())
 
 
 def cycle(amplifiers: Cia402Amplifiers, rate_hz: float, duration_s: float) -> NDArray[np.float64]:

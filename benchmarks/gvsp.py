@@ -19,6 +19,7 @@ import numpy as np
 from fitctl.config import Camera, default_rig_path, load_rig
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.interface import Frame
+from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.gige.camera import GigeCameraMock
 
 RATES_HZ = (50.0, 500.0, 2000.0)
@@ -38,7 +39,7 @@ def serve(pipe: Connection) -> None:
         pipe.send((mock.acquisition.late_frames, mock.acquisition.worst_late_s))
         await mock.stop()
 
-    asyncio.run(run())
+    run_on_time(run())
 
 
 def settings(rate_hz: float, port: int) -> Camera:

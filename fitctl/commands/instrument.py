@@ -179,10 +179,12 @@ def run_mocks(
     rig: Rig, seed: int, *, as_json: bool, free_ports: bool, parent_pid: int | None
 ) -> None:
     """Serve the mock testbed until a signal comes."""
+    from fitctl.mocks.event_loop import run_on_time
+
     if free_ports:
         rig = _with_free_ports(rig)
     end_with_parent(parent_pid)
-    asyncio.run(_serve_mocks(rig, seed, as_json=as_json, free_ports=free_ports))
+    run_on_time(_serve_mocks(rig, seed, as_json=as_json, free_ports=free_ports))
 
 
 def _with_free_ports(rig: Rig) -> Rig:

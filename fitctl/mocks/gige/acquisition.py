@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
 from collections import deque
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 from fitctl.drivers.gige import protocol
 from fitctl.mocks.gige.picture import pixels
 from fitctl.mocks.gige.stream import Stream, StreamSettings, frame_packets
-from fitctl.mocks.gige.timer import AbsoluteTimer
 
 LATE_S = 0.002
 
@@ -83,7 +83,7 @@ class Acquisition:
         self._exposures = 0
         self._block_id = 0
         self._in_flight: deque[_InFlight] = deque()
-        self._timer = AbsoluteTimer(self._advance)
+        self._timer: asyncio.TimerHandle | None = None
 
     @property
     def running(self) -> bool:
@@ -118,13 +118,7 @@ class Acquisition:
         self._running = None
         self._in_flight.clear()
         self._stream.clear()
-        self._timer.disarm()
-
-    def close(self) -> None:
-        """Stop, and give the timer back; safe to call twice."""
-        if self._running is not None:
-            self.stop()
-        self._timer.close()
+        self._disarm()
 
     def _advance(self) -> None:
         if self._running is None:
@@ -140,15 +134,20 @@ class Acquisition:
 
     def _arm(self) -> None:
         """Wake for whatever comes next."""
+        self._disarm()
         if self._running is None:
             return
         due_s = min(self._next_start_s + 0.5 * self._running[0].exposure_s, self._stream.due_s)
         if self._in_flight:
             due_s = min(due_s, self._in_flight[0].due_s)
         if math.isfinite(due_s):
-            self._timer.arm(due_s)
-        else:
-            self._timer.disarm()
+            # The event loop's clock is the monotonic one.
+            self._timer = asyncio.get_running_loop().call_at(due_s, self._advance)
+
+    def _disarm(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
     def _expose(self, settings: AcquisitionSettings, stream: StreamSettings) -> None:
         start_s = self._next_start_s

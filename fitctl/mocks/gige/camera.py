@@ -109,7 +109,7 @@ class GigeCameraMock:
         if self._started is not None:
             self._release_control()
             stream, acquisition, _ = self._started
-            acquisition.close()
+            acquisition.stop()
             stream.close()
             self._started = None
         if self._control is not None:
