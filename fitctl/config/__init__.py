@@ -1,0 +1,81 @@
+"""Rig files: TOML in, frozen and validated settings with units in their names out.
+
+Every key is required, so that a rig file shows everything that fitctl will use. A wrong file ends in a
+:class:`ConfigError` whose lines each name the file, the key and what is allowed.
+"""
+
+from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range
+from fitctl.config.devices import (
+    HALF_WINDOW_PX,
+    BalAnalogDevice,
+    Camera,
+    Cia402Device,
+    EnsembleDevice,
+    Fsm,
+    Mdt693Device,
+    ModbusDacDevice,
+    Siderostat,
+    StackHysteresis,
+    Structure,
+)
+from fitctl.config.loops import (
+    CONTROLLERS,
+    AirPathModel,
+    ControllerName,
+    Logging,
+    Loop,
+    LqgLtr,
+    Vernier,
+)
+from fitctl.config.mocks import (
+    BalAnalogMock,
+    DacMock,
+    EnsembleMock,
+    Fault,
+    GigeMock,
+    LoopMocks,
+    Mdt693Mock,
+)
+from fitctl.config.plant import AirPath, Hysteresis, Spot
+from fitctl.config.reading import lay_over, load_rig, rig_from_document
+from fitctl.config.rig import Rig, default_rig_path
+
+__all__ = [
+    "ARCSEC_PER_RAD",
+    "CONTROLLERS",
+    "HALF_WINDOW_PX",
+    "AirPath",
+    "AirPathModel",
+    "AxisPair",
+    "BalAnalogDevice",
+    "BalAnalogMock",
+    "Camera",
+    "Cia402Device",
+    "ConfigError",
+    "ControllerName",
+    "DacMock",
+    "EnsembleDevice",
+    "EnsembleMock",
+    "Fault",
+    "Fsm",
+    "GigeMock",
+    "Hysteresis",
+    "Logging",
+    "Loop",
+    "LoopMocks",
+    "LqgLtr",
+    "Mdt693Device",
+    "Mdt693Mock",
+    "ModbusDacDevice",
+    "Range",
+    "Rig",
+    "Siderostat",
+    "Spot",
+    "StackHysteresis",
+    "Structure",
+    "Vernier",
+    "default_rig_path",
+    "lay_over",
+    "load_rig",
+    "rig_from_document",
+]

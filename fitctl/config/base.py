@@ -1,0 +1,50 @@
+"""What every part of a rig file is made of: numbers with their ranges, and settings that are frozen."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+ARCSEC_PER_RAD = 180 * 3600 / math.pi
+
+
+class ConfigError(Exception):
+    """A rig file that cannot be used; ``str()`` gives one line for each thing that is wrong."""
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+TimeoutS = Annotated[float, Field(gt=0, le=60)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Settings(BaseModel):
+    """A part of a rig file: frozen; unknown keys are errors, and so are numbers given as text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class AxisPair(Settings):
+    """One number for each axis."""
+
+    az: Finite
+    el: Finite
+
+
+class Range(Settings):
+    """A closed range."""
+
+    low: NonNegative
+    high: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Range:
+        if self.low >= self.high:
+            msg = "low must be below high"
+            raise ValueError(msg)
+        return self

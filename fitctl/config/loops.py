@@ -1,0 +1,143 @@
+"""The rig file's loops: acquisition, controllers, and the settings of supervisor, service and log."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, field_validator
+
+from fitctl.config.base import (
+    AxisPair,
+    Count,
+    Fraction,
+    NonNegative,
+    Positive,
+    Range,
+    Settings,
+    TimeoutS,
+)
+from fitctl.config.devices import AnySiderostat, Fsm
+
+ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
+CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
+
+
+class Acquisition(Settings):
+    """How the star is searched for, and when it counts as found or lost."""
+
+    search_radius_sky_arcsec: Positive
+    detection_sigma: Annotated[float, Field(ge=3, le=100)]
+    found_frames: Count
+    lost_frames: Count
+    field_overlap: Annotated[float, Field(ge=0.05, le=0.6)]
+    settle_s: NonNegative
+    confirm_timeout_s: Positive
+
+
+class Coarse(Settings):
+    """The siderostat's integrator, and when it hands over to the mirror."""
+
+    gain_rad_per_m: Positive
+    reach_fraction: Fraction
+    reach_frames: Count
+
+
+class AirPathModel(Settings):
+    """Eq. 8: gain / (b1 s^2 + b2 s + 1), px, driven by unit-intensity white noise."""
+
+    gain_px: NonNegative
+    b1_s2: Positive
+    b2_s: Positive
+
+
+class LqgLtr(Settings):
+    """Design parameters of Eq. 10-19."""
+
+    omega_n_rad_s: Positive
+    zeta: Positive
+    omega_notch_rad_s: Positive
+    zeta_zero: Positive
+    zeta_pole: Positive
+    process_noise: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    measurement_noise: Positive
+    control_weight: Positive
+
+
+class MinimumVariance(Settings):
+    """Design parameters of the minimum-variance pair."""
+
+    drift_px_per_sqrt_s: Positive
+    offload_per_s: Positive
+
+
+class Fslq(Settings):
+    """Design parameters of the frequency-shaped LQ pair."""
+
+    crossover_hz: Positive
+    control_weight: Positive
+    drift_px_per_sqrt_s: Positive
+
+
+class Vernier(Settings):
+    """Which design drives mirror and siderostat in VERNIER, and what designs are made from."""
+
+    controller: str
+    air_path: AirPathModel
+    lqg_ltr: LqgLtr
+    minimum_variance: MinimumVariance
+    fslq: Fslq
+
+    @field_validator("controller")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in CONTROLLERS and not name.endswith(".json"):
+            msg = f"must be one of {', '.join(CONTROLLERS)}, or a file *.json that `fitctl design` saved"
+            raise ValueError(msg)
+        return name
+
+
+class Prefilter(Settings):
+    """The filter on commanded beam angle."""
+
+    time_constant_s: Positive
+
+
+class Loop(Settings):
+    """One stellar loop."""
+
+    target_px: AxisPair
+    star_flux_dn: Positive
+    flux_range: Range
+    requirement_px: Positive
+    siderostat: AnySiderostat
+    fsm: Fsm
+    acquisition: Acquisition
+    coarse: Coarse
+    vernier: Vernier
+    prefilter: Prefilter
+
+
+class Supervisor(Settings):
+    """Time limits and rates of the supervisor."""
+
+    frame_timeout_s: TimeoutS
+    late_tick_s: Positive
+    stall_s: Positive
+    safe_disable_after_s: NonNegative
+    telemetry_hz: Annotated[float, Field(ge=1, le=100)]
+
+
+class Service(Settings):
+    """Where the supervisor's sockets live."""
+
+    folder: str
+
+
+class Logging(Settings):
+    """The log: where, and how much may be lost."""
+
+    folder: str
+    chunk_bytes: Annotated[int, Field(ge=4096, le=16_777_216)]
+    flush_s: Annotated[float, Field(gt=0, le=60)]
+    queue_records: Annotated[int, Field(ge=16, le=1_000_000)]
+    compression: Literal["zstd", "lz4", "none"]

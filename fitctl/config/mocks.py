@@ -1,0 +1,180 @@
+"""The rig file's mock devices, and the faults that they start with."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from fitctl.config.base import Count, Finite, Fraction, NonNegative, Port, Positive, Settings
+
+
+class DacMock(Settings):
+    """Settings of the mock D/A."""
+
+    watchdog_s: Positive
+    watchdog_latches: bool
+    safe_v: NonNegative
+    unknown_unit: Literal["refuse", "ignore", "serve"]
+
+
+class Mdt693Mock(Settings):
+    """Settings of the mock piezo amplifier; from `prompt` on they are what firmware of the B differs in.
+
+    Attributes
+    ----------
+    firmware : str
+        What the device says of itself.
+    knobs_v : list of float
+        Front knobs: volts that they add to each output.
+    readback_offset_v, readback_noise_v, readback_settling_s : float
+        Of the measured voltages: reads this much too high; one standard deviation; time constant.
+    baud_rate : int
+        Of the device; a pty's client with another one is not understood.
+    reply_s : float
+        From a command's last byte to the first of its answer.
+    prompt : str
+        After an answer; the A and the compatibility mode have their own.
+    vlimit_as : str
+        How `vlimit?` tells the switch: in volts, or as its position.
+    decimals : int
+        Of the voltages that the B tells.
+    xyzvoltage : bool
+        It knows `xyzvoltage?` and `xyzvoltage=`.
+    dacstep_max : int
+        Largest step of the arrow keys.
+    push_command : str
+        What the command is called that says whether knobs must be pushed.
+    """
+
+    model: Literal["MDT693A", "MDT693B"]
+    firmware: str
+    echo: bool
+    compatibility_mode: bool
+    limit_switch_v: Literal[75, 100, 150]
+    knobs_v: Annotated[list[NonNegative], Field(min_length=3, max_length=3)]
+    readback_offset_v: Finite
+    readback_noise_v: NonNegative
+    readback_settling_s: NonNegative
+    baud_rate: Count
+    reply_s: NonNegative
+    prompt: Literal[">", "> ", "*"]
+    vlimit_as: Literal["volts", "position"]
+    decimals: Annotated[Count, Field(le=2)]
+    xyzvoltage: bool
+    dacstep_max: Literal[1000, 5000]
+    push_command: Literal["pushdisable", "disablepush"]
+
+
+class GigeMock(Settings):
+    """Settings of the mock camera."""
+
+    description: Literal["xml", "zip"]
+    resends: bool
+    clock: bool
+
+
+class EnsembleMock(Settings):
+    """Settings of the mock Ensemble controller.
+
+    Attributes
+    ----------
+    tcp_port : int
+    axis_names : list of str
+        Beside ``@0`` and ``@1``.
+    counts_per_unit : float
+        Encoder counts in one of the controller's own units.
+    software_limit_units : float
+        Each way from zero; 0 is none.
+    position_error_units : float
+        A larger one disables an axis.
+    reply_s : float
+        From a command to its answer.
+    idle_timeout_s : float
+        A connection over which nothing came for so long is closed.
+    always_send_eos : bool
+        Whether answers without a value end in a newline too.
+    """
+
+    tcp_port: Port
+    axis_names: Annotated[
+        list[Annotated[str, Field(pattern="^[A-Z]+$")]], Field(min_length=2, max_length=2)
+    ]
+    counts_per_unit: Positive
+    software_limit_units: NonNegative
+    position_error_units: Positive
+    reply_s: NonNegative
+    idle_timeout_s: Positive
+    always_send_eos: bool
+
+
+class BalAnalogMock(Settings):
+    """Settings of the mock analogue amplifiers and of the I/O station before them.
+
+    Attributes
+    ----------
+    modbus_port : int
+    watchdog_s : float
+        Without a write for so long, the outputs go to 0 V and the amplifiers are disabled.
+    counters_at_start : list of int
+        Where the encoder counters stand at power-up, az and el.
+    """
+
+    modbus_port: Port
+    watchdog_s: Positive
+    counters_at_start: Annotated[
+        list[Annotated[int, Field(ge=0, le=65535)]], Field(min_length=2, max_length=2)
+    ]
+
+
+class LoopMocks(Settings):
+    """Where the mock devices of one loop listen, and how they are."""
+
+    slcan_port: Port
+    modbus_port: Port
+    mdt693_port: Port
+    drive_command_timeout_s: Positive
+    ensemble: EnsembleMock | None = None  # where siderostat.device is one
+    bal_analog: BalAnalogMock | None = None  # likewise
+    dac: DacMock
+    mdt693: Mdt693Mock
+
+
+class Fault(Settings):
+    """Something that goes wrong with a mock device.
+
+    Attributes
+    ----------
+    at_s : float
+        When it begins, from the start of the mocks.
+    device : str
+        ``camera``, or a loop's device such as ``right.mdt693``.
+    kind : str
+        What goes wrong; `fitctl fault kinds` shows what can.
+    part : str
+        Of the device, where the kind has parts; empty is all of it.
+    value : float, optional
+        In the kind's unit; absent is the kind's own.
+    for_s : float, optional
+        How long it lasts; absent is until it is cleared.
+    probability : float
+        That it hits a message, or whatever the kind acts on, each time.
+    """
+
+    at_s: NonNegative = 0.0
+    device: str
+    kind: str
+    part: str = ""
+    value: Finite | None = None
+    for_s: Positive | None = None
+    probability: Fraction = 1.0
+
+
+class Mocks(Settings):
+    """Where the mock devices listen, always on 127.0.0.1; port 0 means any free one."""
+
+    gvcp_port: Port
+    bench_port: Port
+    camera: GigeMock
+    loops: Annotated[dict[str, LoopMocks], Field(min_length=1)]
+    faults: list[Fault] = Field(default_factory=list)

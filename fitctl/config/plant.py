@@ -1,0 +1,76 @@
+"""The rig file's plant: what is true of the simulated instrument."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from fitctl.config.base import AxisPair, NonNegative, Positive, Settings
+from fitctl.config.devices import Structure
+from fitctl.config.loops import AirPathModel
+
+_MOST_HISTORY_STEPS = 10_000_000  # some hundred megabytes
+
+
+class Hysteresis(Settings):
+    """Play operators of one stack."""
+
+    full_swing_stroke_m: Positive
+    loop_width_fraction: Annotated[float, Field(ge=0, le=0.5)]
+    breakpoints_from: Literal["virgin", "swept"]
+    breakpoints_v: Annotated[list[NonNegative], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _ascending_from_zero(self) -> Hysteresis:
+        points = self.breakpoints_v
+        if points[0] != 0 or any(b <= a for a, b in itertools.pairwise(points)):
+            msg = "breakpoints_v must start at 0 and ascend"
+            raise ValueError(msg)
+        return self
+
+
+class AirPath(AirPathModel):
+    """The air path as it truly is."""
+
+    relative_rms_px: NonNegative
+
+
+class Spot(Settings):
+    """One spot on the focal plane."""
+
+    name: str
+    offset_px: AxisPair
+    flux_dn: Positive
+    diameter_px: Positive
+
+
+class LoopPlant(Settings):
+    """What one loop's hardware truly is; nothing but mocks and simulation reads it."""
+
+    star_offset_sky_arcsec_max: NonNegative
+    backlash_sky_arcsec: NonNegative
+    amplifier_bandwidth_hz: Positive
+    hysteresis: Hysteresis
+    structure: Structure
+    air_path: AirPath
+    spots: Annotated[list[Spot], Field(min_length=1)]
+
+
+class PlantTruth(Settings):
+    """The simulated hardware."""
+
+    step_s: Annotated[float, Field(gt=0, le=1e-3)]
+    frame_delay_s: NonNegative | None = (
+        None  # where the truth is not what camera.frame_delay_s says
+    )
+    history_s: Annotated[float, Field(ge=1, le=3600)]
+    loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _history_fits_in_memory(self) -> PlantTruth:
+        if self.history_s / self.step_s > _MOST_HISTORY_STEPS:
+            msg = f"history_s may be at most {_MOST_HISTORY_STEPS * self.step_s:g} at this step_s"
+            raise ValueError(msg)
+        return self

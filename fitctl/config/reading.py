@@ -1,0 +1,190 @@
+"""Rig files: TOML in, a rig or one line for each thing that is wrong out."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin
+
+from pydantic import ValidationError
+
+from fitctl.config.base import ConfigError, Settings
+from fitctl.config.devices import DEVICE_BY_TAG
+from fitctl.config.rig import Rig
+
+
+def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
+    """Read and validate a rig file.
+
+    It is laid over the rig file that its ``base`` names, if it names one; then the fragments of its
+    ``include`` list are laid over it, in order.
+
+    Parameters
+    ----------
+    path : Path
+        The TOML file.
+    overrides : sequence of str
+        ``key.path=value`` texts that replace values of the file; the value is read as TOML, or as
+        plain text where it is not TOML.
+
+    Raises
+    ------
+    ConfigError
+        One line for each thing that is wrong: file, key, what is allowed.
+    """
+    document = _read_toml(path, "copy rigs/fit-mock.toml or name another with --rig")
+    base = document.pop("base", None)
+    if base is not None:
+        if not isinstance(base, str):
+            msg = f"{path}: base: must be a file name (is {base!r})"
+            raise ConfigError(msg)
+        under = _read_toml(path.parent / base, f"it is the base of {path}")
+        lay_over(under, document)
+        document = under
+    fragments = document.pop("include", [])
+    if not isinstance(fragments, list) or not all(isinstance(name, str) for name in fragments):
+        msg = f"{path}: include: must be a list of file names (is {fragments!r})"
+        raise ConfigError(msg)
+    said_in = dict.fromkeys(_problems(document), str(path))
+    for name in fragments:
+        fragment = path.parent / name
+        lay_over(document, _read_toml(fragment, f"it is in the include list of {path}"))
+        # What is wrong from here on, and was not before, is this fragment's.
+        said_in = {what: said_in.get(what, str(fragment)) for what in _problems(document)}
+    for override in overrides:
+        _override(document, override)
+    return rig_from_document(document, str(path), said_in)
+
+
+def _problems(document: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], str]]:
+    """What is wrong with a document: where, and what kind of error."""
+    try:
+        Rig.model_validate(document)
+    except ValidationError as error:
+        return [(problem["loc"], problem["type"]) for problem in error.errors()]
+    return []
+
+
+def _read_toml(path: Path, hint: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        msg = f"{path}: no such rig file; {hint}"
+        raise ConfigError(msg) from None
+    except (OSError, UnicodeDecodeError) as error:
+        msg = f"{path}: cannot be read: {error}"
+        raise ConfigError(msg) from None
+    except tomllib.TOMLDecodeError as error:
+        msg = f"{path}: not TOML: {error}"
+        raise ConfigError(msg) from None
+
+
+def lay_over(document: dict[str, Any], fragment: Mapping[str, Any]) -> None:
+    """Lay a fragment over a document, table by table: what the fragment says holds.
+
+    A table that names another driver is another device: nothing of what it lies on is left.
+    """
+    for key, value in fragment.items():
+        under = document.get(key)
+        if isinstance(value, dict) and isinstance(under, dict) and _same_device(value, under):
+            lay_over(under, value)
+        else:
+            document[key] = value
+
+
+def _same_device(table: dict[str, Any], under: dict[str, Any]) -> bool:
+    return "driver" not in table or table["driver"] == under.get("driver")
+
+
+def rig_from_document(
+    document: Mapping[str, Any],
+    origin: str,
+    said_in: Mapping[tuple[tuple[int | str, ...], str], str] | None = None,
+) -> Rig:
+    """Validate a rig that is already a dictionary.
+
+    `origin` is what errors call it, but for those that `said_in` knows, by place and kind, from elsewhere.
+    """
+    known = said_in or {}
+    try:
+        return Rig.model_validate(document)
+    except ValidationError as error:
+        lines = [
+            _explain(known.get((problem["loc"], problem["type"]), origin), problem)
+            for problem in error.errors()
+        ]
+        raise ConfigError("\n".join(lines)) from None
+
+
+def _override(document: dict[str, Any], text: str) -> None:
+    key, equals, value_text = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        msg = f"--set {text}: expected key.path=value, for example camera.frame_rate_hz=50.0"
+        raise ConfigError(msg)
+    try:
+        value = tomllib.loads(f"value = {value_text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = value_text
+    table: Any = document
+    for depth, part in enumerate(parts[:-1]):
+        table = table.setdefault(part, {}) if isinstance(table, dict) else None
+        if not isinstance(table, dict):
+            msg = f"--set {text}: {'.'.join(parts[: depth + 1])} is not a table"
+            raise ConfigError(msg)
+    table[parts[-1]] = value
+
+
+def _explain(origin: str, problem: Any) -> str:
+    location = _without_tags([str(part) for part in problem["loc"]])
+    if problem["type"] in {"union_tag_not_found", "union_tag_invalid"}:
+        location.append("driver")
+    key = ".".join(location)
+    if problem["type"] == "union_tag_invalid":
+        context = problem["ctx"]
+        allowed_tags = context["expected_tags"]
+        return f"{origin}: {key}: must be one of {allowed_tags} (is {context['tag']!r})"
+    if problem["type"] == "extra_forbidden":
+        allowed = _allowed_keys([str(part) for part in problem["loc"][:-1]])
+        near = difflib.get_close_matches(location[-1], allowed, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        return f"{origin}: {key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
+    if problem["type"] in {"missing", "union_tag_not_found"}:
+        return f"{origin}: {key}: is missing; rigs/fit-mock.toml shows every key with its unit"
+    message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    given = problem.get("input")
+    shown = f" (is {given!r})" if isinstance(given, str | int | float | list) else ""
+    # What concerns the whole file names its key itself.
+    where = f"{origin}: {key}" if key else origin
+    return f"{where}: {message}{shown}"
+
+
+def _without_tags(location: Sequence[str]) -> list[str]:
+    """A place in the rig file without what pydantic adds: which kind of `device` it took it for."""
+    pairs = zip(["", *location], location, strict=False)
+    return [part for before, part in pairs if not (before == "device" and part in DEVICE_BY_TAG)]
+
+
+def _allowed_keys(location: Sequence[str]) -> list[str]:
+    """The keys that the rig file may have at `location`, by walking the settings' own fields."""
+    annotation: Any = Rig
+    for part in location:
+        if part in DEVICE_BY_TAG:
+            annotation = DEVICE_BY_TAG[part]
+        elif isinstance(annotation, type) and issubclass(annotation, Settings):
+            annotation = annotation.model_fields[part].annotation
+        elif get_origin(annotation) in {dict, list}:
+            annotation = get_args(annotation)[-1]
+        annotation = _without_none(annotation)
+    is_settings = isinstance(annotation, type) and issubclass(annotation, Settings)
+    return sorted(annotation.model_fields) if is_settings else []
+
+
+def _without_none(annotation: Any) -> Any:
+    """``X`` of ``X | None`` and of ``Annotated[X, ...]``."""
+    if get_origin(annotation) is Annotated:
+        return get_args(annotation)[0]
+    options = [option for option in get_args(annotation) if option is not type(None)]
+    return options[0] if type(None) in get_args(annotation) else annotation
