@@ -233,6 +233,7 @@ class Mdt693Device(Settings):
     gain: Positive
     limit_v: Annotated[float, Field(gt=0, le=151)]
     poll_s: Annotated[float, Field(ge=0.2, le=60)]
+    follow_tolerance_v: Positive
 
 
 class Structure(Settings):

@@ -79,7 +79,7 @@ class StarSensor:
                 # Once more about its own centre, so that the window does not cut the spot.
                 candidate = self._centroid(image, candidate.az_px, candidate.el_px)
             star = self._accepted(candidate)
-            if star is not None and self._is_centred(star) and self._is_spread(star, peak_dn):
+            if star is not None and self._is_centred(star):
                 return star
             search[
                 max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
@@ -90,6 +90,7 @@ class StarSensor:
     def _centroid(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
     ) -> Star | None:
+        """Eq. 7; None where there is no light, or one pixel has most of it."""
         az = min(max(round(window_az_px), HALF_WINDOW_PX), self._largest_az_px)
         el = min(max(round(window_el_px), HALF_WINDOW_PX), self._largest_el_px)
         window = image[
@@ -98,7 +99,9 @@ class StarSensor:
         ].astype(np.float64)
         light_dn, az_moment, el_moment = _SUMS.dot(window.ravel()).tolist()
         flux_dn = light_dn - self._window_bias_dn  # the bias has no moment about the middle
-        if flux_dn <= 0:
+        if (
+            float(window.max()) - self._bias_dn > LARGEST_PEAK * flux_dn
+        ):  # also where there is no light
             return None
         return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
 
@@ -113,6 +116,3 @@ class StarSensor:
             abs(star.az_px - star.window_az_px) <= 1.0
             and abs(star.el_px - star.window_el_px) <= 1.0
         )
-
-    def _is_spread(self, star: Star, peak_dn: float) -> bool:
-        return peak_dn <= LARGEST_PEAK * star.flux_dn

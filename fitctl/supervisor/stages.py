@@ -69,6 +69,7 @@ class Stages:
         self._most_slew_v = loop.fsm.slew_v_per_s * rig.camera.period_s
         self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
         shortest_s = min(rig.camera.period_s, self.injector.period_s)
+        self._lowest_v, self._highest_v = self.stack_v.copy(), self.stack_v.copy()
         self._mirror_history: deque[tuple[float, Floats]] = deque(
             [(-math.inf, np.zeros(2))], maxlen=math.ceil(HISTORY_S / shortest_s)
         )
@@ -96,6 +97,7 @@ class Stages:
         self._mirror.assume(stack_v)
         self.stack_v = self._mirror.stack_v
         self.mirror_rad = self._mirror.angles_rad
+        self.take_told_range()
         self.ready = True
 
     def at_bias(self) -> bool:
@@ -127,13 +129,25 @@ class Stages:
         self._dac.write_v(self.stack_v)
         self.ready = True
         self._mirror.written(self.stack_v)
+        self._extend_told_range(self.stack_v)
         self._mirror_history.append((self._clock.now_s(), self._mirror.angles_rad))
+
+    def take_told_range(self) -> tuple[Floats, Floats]:
+        """Lowest and highest voltages, shape (3,) each, that the D/A was told since last asked."""
+        told = self._lowest_v, self._highest_v
+        self._lowest_v, self._highest_v = self.stack_v.copy(), self.stack_v.copy()
+        return told
+
+    def _extend_told_range(self, stack_v: Floats) -> None:
+        np.minimum(self._lowest_v, stack_v, out=self._lowest_v)
+        np.maximum(self._highest_v, stack_v, out=self._highest_v)
 
     def take_injections(self) -> list[Injection]:
         """What an experiment has written since last asked."""
         injections = self.injector.take_written()
         for time_s, stack_v in injections:
             self._mirror.written(stack_v)
+            self._extend_told_range(stack_v)
             self.stack_v, self.mirror_rad = stack_v, self._mirror.angles_rad
             self._mirror_history.append((time_s, self.mirror_rad))
         return injections

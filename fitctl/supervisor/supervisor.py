@@ -21,6 +21,7 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
+    DeviceMismatch,
     Devices,
     DeviceTimeout,
     Frame,
@@ -29,7 +30,6 @@ from fitctl.logging.records import (
     AnyRecord,
     Event,
     FrameRecord,
-    PiezoReading,
     Severity,
 )
 from fitctl.supervisor.drives import refused_drives
@@ -50,6 +50,7 @@ from fitctl.supervisor.messages import (
     Stop,
 )
 from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
+from fitctl.supervisor.piezo import disagreement, read_piezo
 from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices
 from fitctl.supervisor.servo import Periodic, SiderostatServo
 from fitctl.supervisor.timing import TimingBook
@@ -359,6 +360,7 @@ class Supervisor:
             loop = self.loops[name]
             loop.start_from(opened.stack_v[name])
             self._piezo_read_s[name] = self._clock.now_s()
+            self._piezo_error[name] = ""
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
             self.servos[name].take_timing()
             loop.fire(trigger, "all devices open, checked and enabled")
@@ -433,28 +435,26 @@ class Supervisor:
                 and self._job is None
             ):
                 self._piezo_read_s[name] = now_s
-                future = self._executor.submit(self._read_piezo, name)
+                future = self._executor.submit(
+                    read_piezo, self._devices.loops[name].piezo, name, self._clock
+                )
                 self._polls[name] = Job(future, partial(self._piezo_was_read, name))
 
-    def _read_piezo(self, name: str) -> PiezoReading:
-        piezo = self._devices.loops[name].piezo
-        volts, limit_v = piezo.stack_volts(), piezo.limit_v()
-        return PiezoReading(
-            time_s=self._clock.now_s(),
-            loop=name,
-            stack1_v=float(volts[0]),
-            stack2_v=float(volts[1]),
-            stack3_v=float(volts[2]),
-            limit_v=limit_v,
-        )
-
     def _piezo_was_read(self, name: str, future: Future) -> None:
-        error = future.exception()
-        self._piezo_error[name] = "" if error is None else _told(error)
+        loop, error = self.loops[name], future.exception()
+        settings, told_v = loop.settings.fsm.piezo, loop.stages.take_told_range()
         if error is None:
             self._record(future.result())
-        else:
-            self.loops[name].fail(_told(error))
+            error = disagreement(future.result(), settings, *told_v)
+        before = self._piezo_error[name]
+        self._piezo_error[name] = "" if error is None else _told(error)
+        if error is None:
+            return
+        if before or isinstance(error, DeviceMismatch):
+            loop.fail(_told(error))
+        else:  # on a line without checksum one bad answer says little
+            self._event("warning", name, f"{_told(error)}; asking again")
+            self._piezo_read_s[name] -= settings.poll_s
 
     def _event(self, severity: Severity, source: str, message: str) -> None:
         self._record(

@@ -97,6 +97,20 @@ def test_a_hot_pixel_is_not_the_star(sensor, expose, hot_dn, with_star):
         assert star is None
 
 
+@pytest.mark.parametrize("hot_dn", [300, 8_000, 16_800, 28_000, 44_800, 64_000])
+def test_a_hot_pixel_in_the_window_is_not_held_for_the_star_that_has_gone(sensor, expose, hot_dn):
+    image = expose(NOWHERE)
+    image[20, 25] += hot_dn
+    assert sensor.measure(image, 24.0, 19.5) is None
+
+
+@pytest.mark.parametrize("hot_dn", [17_000, 28_000, 44_800, 64_000])
+def test_a_hot_pixel_beside_the_star_is_no_measurement(sensor, expose, hot_dn):
+    image = expose((24.0, 19.5))
+    image[20, 26] += hot_dn
+    assert sensor.measure(image, 24.0, 19.5) is None
+
+
 def test_noise_alone_is_never_a_star(sensor, expose):
     assert not any(sensor.find(expose(NOWHERE, seed=seed)) for seed in range(300))
 

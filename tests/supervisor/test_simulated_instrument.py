@@ -233,8 +233,42 @@ def test_a_fault_in_safe_is_told_once(vernier, monkeypatch):
     vernier.run(5.0)
 
     told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
-    assert len(told) == 1
-    assert told[0].severity == "error"
+    assert [event.severity for event in told] == ["warning", "error"]
+
+
+def test_one_bad_answer_of_the_piezo_amplifier_is_asked_for_again(vernier, monkeypatch):
+    piezo = vernier.supervisor._devices.loops["right"].piezo
+    answers = iter(
+        [fail("stack_volts", DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none"))]
+    )
+    measured = piezo.stack_volts
+
+    def once_bad():
+        return next(answers, measured)()
+
+    monkeypatch.setattr(piezo, "stack_volts", once_bad)
+    vernier.run(5.0)
+
+    assert vernier.supervisor.loops["right"].mode is Mode.VERNIER
+    told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
+    assert [event.severity for event in told] == ["warning"]
+
+
+@pytest.mark.parametrize("stack", [0, 1, 2])
+def test_a_stack_that_is_not_where_it_was_told_makes_the_loop_safe(vernier, monkeypatch, stack):
+    piezo = vernier.supervisor._devices.loops["right"].piezo
+    measured = piezo.stack_volts
+
+    def saturated():
+        volts = measured()
+        volts[stack] = 150.0
+        return volts
+
+    monkeypatch.setattr(piezo, "stack_volts", saturated)
+    until(vernier, Mode.SAFE, limit_s=1.5)
+
+    assert f"expected stack {stack + 1} within 5 V of" in events_of(vernier)[-1].message
+    assert "got 150.0 V" in events_of(vernier)[-1].message
 
 
 def test_a_device_that_cannot_be_closed_keeps_no_other_from_being_closed(vernier, monkeypatch):
