@@ -40,7 +40,12 @@ contract: $(READY)
 	$(BIN)/lint-imports
 
 pytest: $(READY)
+ifdef ARGS
 	$(BIN)/pytest $(ARGS)
+else  # those of the whole instrument run in real time, and alone
+	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system
+	$(BIN)/pytest tests/system
+endif
 
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
