@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -19,7 +20,7 @@ AXIS_FAULTS = {
 
 
 class Motors(Protocol):
-    """The plant's side of an amplifier."""
+    """The plant's side of an amplifier: azimuth is axis 0, elevation axis 1."""
 
     def position_rad(self) -> Sequence[float]:
         """Both motors' angles now."""
@@ -35,26 +36,31 @@ class Motors(Protocol):
 
 
 class FaultyMotors:
-    """Motors and encoders as `AXIS_FAULTS` have them: a jumped encoder, a stuck axis.
+    """Motors and incremental encoders as `AXIS_FAULTS` have them: a jumped encoder, a stuck axis.
+
+    The encoders count from where the motors stood when power came: at zero first, and after each
+    `reboot` wherever it found them.
 
     Parameters
     ----------
     motors : Motors
     faults : Faults
-        With `AXIS_FAULTS` among its kinds.
+        With `WIRE_FAULTS` and `AXIS_FAULTS` among its kinds.
     counts_per_rad : float
         Of the encoders.
     """
 
     def __init__(self, motors: Motors, faults: Faults, counts_per_rad: float) -> None:
+        self.counts_per_rad = counts_per_rad
         self._motors = motors
-        self._counts_per_rad = counts_per_rad
         self._faults = faults
+        self._zero_rad: Sequence[float] = (0.0, 0.0)
+        faults.on_change(self._take_fault)
 
-    def position_rad(self) -> tuple[float, float]:
-        """What the encoders say."""
+    def position_counts(self) -> tuple[int, int]:
+        """What both encoders say: counts, however many bits they take."""
         az_rad, el_rad = self._motors.position_rad()
-        return az_rad + self._jump_rad("az"), el_rad + self._jump_rad("el")
+        return self._counts(0, az_rad), self._counts(1, el_rad)
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
         """Drive the motors that turn."""
@@ -68,5 +74,10 @@ class FaultyMotors:
         """Give one motor current, or take it away."""
         self._motors.set_enabled(axis, enabled)
 
-    def _jump_rad(self, axis: str) -> float:
-        return (self._faults.value("encoder_jump", axis) or 0.0) / self._counts_per_rad
+    def _counts(self, axis: int, angle_rad: float) -> int:
+        turned = math.floor((angle_rad - self._zero_rad[axis]) * self.counts_per_rad + 0.5)
+        return turned + round(self._faults.value("encoder_jump", AXES[axis]) or 0.0)
+
+    def _take_fault(self, kind: str) -> None:
+        if kind == "reboot" and self._faults.value("reboot") is None:
+            self._zero_rad = tuple(self._motors.position_rad())

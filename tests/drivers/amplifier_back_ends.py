@@ -49,7 +49,7 @@ class SimulatedMotors:
     @property
     def moving(self) -> bool:
         return any(
-            on and abs(velocity) > 0.02
+            on and abs(velocity) > 0.05  # a position loop hunts within half a count of its encoder
             for on, velocity in zip(self.enabled, self.velocity_rad_s, strict=True)
         )
 

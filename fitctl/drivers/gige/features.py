@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import io
-import zipfile
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 from fitctl.config import Camera
 from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.description import download_xml
 from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
-from fitctl.drivers.gige.protocol import MalformedPacketError, Register
-from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError, DeviceRefused
+from fitctl.drivers.interface import DeviceMismatch, DeviceRefused
 
 RATE_TOLERANCE = 1e-3  # cameras round the frame rate to their own clock
 EXPOSURE_TOLERANCE = 1e-2  # and the exposure to rows or microseconds
 GAIN_TOLERANCE = 1e-2
-
-_XML_BYTES_MAX = 16 << 20  # many times that of any known camera; 4 GiB would be read for hours
-_MEMORY_END = 1 << 32
 
 # Set where a camera has them, before anything else: free running, nothing automatic.
 _FREE_RUNNING = (
@@ -31,9 +28,17 @@ _FREE_RUNNING = (
     ("ChunkModeActive", False),
     ("GevGVSPExtendedIDMode", "Off"),
 )
-_EXPOSURE = ("ExposureTime", "ExposureTimeAbs")  # microseconds; the second name is SFNC 1
-_FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-_GAIN = ("Gain", "GainRaw", "GainAbs")
+EXPOSURE = ("ExposureTime", "ExposureTimeAbs")  # microseconds; the second name is SFNC 1
+FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+GAIN = ("Gain", "GainRaw", "GainAbs")
+
+
+class Limits(NamedTuple):
+    """What a feature may be, in its own unit; a step of 0 is none."""
+
+    low: float
+    high: float
+    step: int
 
 
 class Features:
@@ -76,10 +81,12 @@ class Features:
 
         self._endpoint = channel.endpoint
         self._errors: type[Exception] = genapi.GenericException
+        self._integer: type[Any] = genapi.IInteger
+        self._readable = {genapi.EAccessMode.RW, genapi.EAccessMode.RO}
         self._writable = {genapi.EAccessMode.RW, genapi.EAccessMode.WO}
         self._port = Port()  # the node map does not keep it alive
         self._nodes = genapi.NodeMap()
-        xml = _download_xml(channel)
+        xml = download_xml(channel)
         try:
             self._nodes.load_xml_from_string(xml)
             self._nodes.connect(self._port, "Device")
@@ -106,13 +113,58 @@ class Features:
         self._set_if_writable("OffsetY", 0)
         for name, wanted in (("Width", camera.width_px), ("Height", camera.height_px)):
             self._set(name, wanted)
-            self._expect(name, wanted, self._get(name), tolerance=0.0)
+            self._expect(name, wanted, self.value(name), tolerance=0.0)
         self._set("PixelFormat", camera.device.pixel_format)
         pixel_bytes = protocol.PIXEL_FORMATS[camera.device.pixel_format].bytes
         payload_bytes = pixel_bytes * camera.width_px * camera.height_px
-        self._expect("PayloadSize", payload_bytes, self._get("PayloadSize"), tolerance=0.0)
+        self._expect("PayloadSize", payload_bytes, self.value("PayloadSize"), tolerance=0.0)
         self._set_gain(camera.device.gain)
         return self._set_timing(camera)
+
+    def first_of(self, names: tuple[str, ...]) -> str | None:
+        """Which of a feature's names the camera knows; None where it knows none."""
+        return next(filter(self._nodes.has_node, names), None)
+
+    def value(self, name: str) -> Any:
+        """The value in the camera, not the one that the node map remembers.
+
+        Raises
+        ------
+        DeviceMismatch
+            If it cannot be read.
+        """
+        with self._read(name) as node:
+            return node.get_value(False, True)
+
+    def limits(self, name: str) -> Limits | None:
+        """What a number may be, as the camera is set now; None where it has no such number to read.
+
+        Raises
+        ------
+        DeviceMismatch
+            If its description makes no sense.
+        """
+        if not self._nodes.has_node(name):
+            return None
+        with self._read(name) as node:
+            if node.get_access_mode() not in self._readable:
+                return None
+            return Limits(node.min, node.max, node.inc if isinstance(node, self._integer) else 0)
+
+    def choices(self, name: str) -> list[str]:
+        """The entries of an enumeration that the camera has.
+
+        Raises
+        ------
+        DeviceMismatch
+            If it has no such enumeration.
+        """
+        with self._read(name) as node:
+            return [
+                entry.symbolic
+                for entry in node.entries
+                if entry.get_access_mode() in self._readable
+            ]
 
     def start(self) -> None:
         """Lock the transport parameters and start the acquisition."""
@@ -136,40 +188,33 @@ class Features:
 
     def _set_gain(self, wanted: float) -> None:
         """A camera without a gain to set has none."""
-        name = next((name for name in _GAIN if self._nodes.has_node(name)), None)
+        name = self.first_of(GAIN)
         if name is None:
             self._expect("Gain", wanted, 0.0, tolerance=0.0)
             return
         self._set_if_writable(name, round(wanted) if name == "GainRaw" else wanted)
-        self._expect(name, wanted, self._get(name), GAIN_TOLERANCE)
+        self._expect(name, wanted, self.value(name), GAIN_TOLERANCE)
 
     def _set_timing(self, camera: Camera) -> float:
         """Exposure and frame rate limit each other: go first the way that always fits."""
-        exposure = self._first(_EXPOSURE)
-        rate = self._first(_FRAME_RATE)
+        exposure = self._needed(EXPOSURE)
+        rate = self._needed(FRAME_RATE)
         exposure_us = camera.exposure_s * 1e6
         steps = [(exposure, exposure_us), (rate, camera.frame_rate_hz)]
-        if exposure_us > self._get(exposure):
+        if exposure_us > self.value(exposure):
             steps.reverse()
         for name, value in steps:
             self._set(name, value)
-        actual_us = float(self._get(exposure))
+        actual_us = float(self.value(exposure))
         self._expect(exposure, exposure_us, actual_us, EXPOSURE_TOLERANCE)
-        self._expect(rate, camera.frame_rate_hz, self._get(rate), RATE_TOLERANCE)
+        self._expect(rate, camera.frame_rate_hz, self.value(rate), RATE_TOLERANCE)
         return actual_us / 1e6
 
-    def _first(self, names: tuple[str, ...]) -> str:
-        for name in names:
-            if self._nodes.has_node(name):
-                return name
-        raise self._mismatch(f"feature {names[0]}", "a camera without it")
-
-    def _get(self, name: str) -> Any:
-        """The value in the camera, not the one that the node map remembers."""
-        try:
-            return self._nodes.get_node(name).get_value(False, True)
-        except self._errors as error:
-            raise self._mismatch(f"feature {name} to be readable", str(error)) from error
+    def _needed(self, names: tuple[str, ...]) -> str:
+        name = self.first_of(names)
+        if name is None:
+            raise self._mismatch(f"feature {names[0]}", "a camera without it")
+        return name
 
     def _set(self, name: str, value: float | str | bool) -> None:
         try:
@@ -183,6 +228,13 @@ class Features:
             node = self._nodes.get_node(name)
             if node.get_access_mode() in self._writable:
                 self._set(name, value)
+
+    @contextlib.contextmanager
+    def _read(self, name: str) -> Iterator[Any]:
+        try:
+            yield self._nodes.get_node(name)
+        except self._errors as error:
+            raise self._mismatch(f"feature {name} to be readable", str(error)) from error
 
     def _execute(self, name: str) -> None:
         try:
@@ -198,47 +250,3 @@ class Features:
         return DeviceMismatch(
             DEVICE, self._endpoint, expected, got, "correct [camera] in the rig file to this camera"
         )
-
-
-def _download_xml(channel: ControlChannel) -> str:
-    """The description from the camera's memory, by its first URL or else its second."""
-    urls = []
-    for register in (Register.XML_URL_1, Register.XML_URL_2):
-        text = channel.read_text(protocol.TextRegister(register, protocol.XML_URL_BYTES))
-        urls.append(text)
-        try:
-            location = protocol.decode_xml_url(text)
-        except MalformedPacketError:
-            continue
-        if not 0 < location.length <= min(_XML_BYTES_MAX, _MEMORY_END - location.address):
-            continue
-        data = channel.read_memory(location.address, location.length)
-        return unpacked(data, channel.endpoint)
-    raise DeviceMismatch(
-        DEVICE,
-        channel.endpoint,
-        "a GenICam description of 1 byte to 16 MiB in the camera's memory, Local:NAME;ADDRESS;LENGTH",
-        " and ".join(repr(url) for url in urls),
-        "fitctl cannot read a description kept elsewhere; update the camera's firmware",
-    )
-
-
-def unpacked(data: bytes, endpoint: str) -> str:
-    """Most real cameras send a zip archive that holds the one file."""
-    try:
-        if data.startswith(b"PK"):
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                first = archive.infolist()[0]
-                if first.file_size > _XML_BYTES_MAX:
-                    msg = f"{first.file_size} bytes once unpacked"
-                    raise ValueError(msg)
-                data = archive.read(first)
-        return data.rstrip(b"\0").decode("utf-8-sig")
-    except Exception as error:  # a damaged archive can raise any of a dozen kinds
-        raise DeviceProtocolError(
-            DEVICE,
-            endpoint,
-            "a readable GenICam description",
-            f"{type(error).__name__}: {error}",
-            "update its firmware",
-        ) from error

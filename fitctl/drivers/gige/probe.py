@@ -6,10 +6,15 @@ from contextlib import closing
 
 from fitctl.config import Camera
 from fitctl.drivers.gige import protocol
+from fitctl.drivers.gige.features import Features
 from fitctl.drivers.gige.gvcp import ControlChannel
+from fitctl.drivers.gige.limits import disagreements
 from fitctl.drivers.gige.protocol import Register
-from fitctl.drivers.interface import DeviceIdentity
+from fitctl.drivers.interface import DeviceError, DeviceIdentity
 from fitctl.drivers.probe import Probe, round_trip_s
+
+_ANY_CONTROL = protocol.CONTROL | protocol.CONTROL_EXCLUSIVE
+_CONTROLLED = "another program has control of it: a running supervisor, or one to be ended first"
 
 
 def probe_camera(camera: Camera) -> Probe:
@@ -31,9 +36,9 @@ def probe_camera(camera: Camera) -> Probe:
         )
         question_s = round_trip_s(lambda: channel.read_register(Register.VERSION))
         controlled = channel.read_register(Register.CONTROL_PRIVILEGE)
-    disagreements: tuple[str, ...] = ()
-    if controlled & (protocol.CONTROL | protocol.CONTROL_EXCLUSIVE):
-        disagreements = (
-            "another program has control of it: a running supervisor, or one to be ended first",
-        )
-    return Probe(identity, question_s, disagreements)
+        told = [_CONTROLLED] if controlled & _ANY_CONTROL else []
+        try:
+            told += disagreements(Features(channel), camera)
+        except DeviceError as error:
+            told.append(str(error))
+    return Probe(identity, question_s, tuple(told))

@@ -79,8 +79,9 @@ class BalAnalogMockStation:
         self.enabled = [False, False]
         self._device = device = siderostat.device
         self._settings = settings
-        self._counts_per_rad = siderostat.encoder_counts_per_rev / (2 * math.pi)
-        self._motors = FaultyMotors(motors, self.faults, self._counts_per_rad)
+        self._motors = FaultyMotors(
+            motors, self.faults, siderostat.encoder_counts_per_rev / (2 * math.pi)
+        )
         self._latched = [False, False]
         self._safe = [0, 0, word_of(False, False, device.enabled_level)]
         self._outputs = list(self._safe)
@@ -143,9 +144,9 @@ class BalAnalogMockStation:
 
     def _inputs(self) -> list[int]:
         counters = [
-            math.floor(angle_rad * self._counts_per_rad + 0.5) + start
-            for angle_rad, start in zip(
-                self._motors.position_rad(), self._settings.counters_at_start, strict=True
+            counts + start
+            for counts, start in zip(
+                self._motors.position_counts(), self._settings.counters_at_start, strict=True
             )
         ]
         self._judge()

@@ -8,7 +8,7 @@ heartbeats), no LSS, no TIME, no parameter store, no limit switches or brake; co
 every NMT state but STOPPED; actual velocity (606C) is the encoder's difference between the last two SYNCs.
 All links down does not stop it by itself: the loss of the master's heartbeat does, once it was seen.
 Invented constants: identity, names and versions (objects.py); that leaving NMT state OPERATIONAL is a quick
-stop; that its encoders count from where the motors stand when power comes back (`reboot`).
+stop.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from fitctl.drivers.cia402.protocol import NmtCommand, NmtState
 from fitctl.mocks.cia402.axis import Axis, Command
 from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoServer, constant
 from fitctl.mocks.cia402.emergency import Emergencies
+from fitctl.mocks.cia402.encoders import Encoders
 from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
-from fitctl.mocks.cia402.shafts import PARTS, Motors, Shafts
 from fitctl.mocks.cia402.slcan import SlcanAdapter
 from fitctl.mocks.cia402.slcan_frames import CanFrame
 from fitctl.mocks.cia402.timers import Periodic, Watchdog
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
+from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 
-FAULTS = WIRE_FAULTS | {
-    "link_loss": FaultKind("the CAN cable between adapter and drive is cut"),
-    "amplifier_fault": FaultKind(
-        "an amplifier is in fault, whatever is reset",
-        "error code of CiA 402",
-        protocol.ERROR_OVER_CURRENT,
-        PARTS,
-    ),
-    "following_error": FaultKind(
-        "the drive finds that a motor does not follow: fault 0x8611", parts=PARTS
-    ),
-    "encoder_jump": FaultKind("an encoder counts that much more", "counts", 1000, PARTS),
-    "stuck_axis": FaultKind("a motor stands still, whatever it is told", parts=PARTS),
-}
+FAULTS = (
+    WIRE_FAULTS
+    | AXIS_FAULTS
+    | {
+        "link_loss": FaultKind("the CAN cable between adapter and drive is cut"),
+        "amplifier_fault": AXIS_FAULTS["amplifier_fault"]._replace(
+            unit="error code of CiA 402", value=protocol.ERROR_OVER_CURRENT
+        ),
+        "following_error": FaultKind(
+            "the drive finds that a motor does not follow: fault 0x8611", parts=AXES
+        ),
+    }
+)
 BOTH_VELOCITY_MODES = 1 << (protocol.PROFILE_VELOCITY - 1) | 1 << (
     protocol.CYCLIC_SYNCHRONOUS_VELOCITY - 1
 )
@@ -85,13 +85,14 @@ class Cia402DriveMock:
         self.faults = Faults(FAULTS)
         self._port = port
         self._node_id = siderostat.device.node_id
-        self._shafts = Shafts(
+        self._motors = FaultyMotors(
             motors, self.faults, siderostat.encoder_counts_per_rev / (2 * math.pi)
         )
+        self._encoders = Encoders(self._motors)
         self._adapter = SlcanAdapter(siderostat.device.bitrate, self.faults, self._receive)
         self.nmt_state = NmtState.STOPPED
         self.axes = tuple(
-            Axis(partial(motors.set_enabled, number), self._axis_changed)
+            Axis(partial(self._motors.set_enabled, number), self._axis_changed)
             for number in range(len(protocol.AXES))
         )
         self.heartbeat_ms = 0
@@ -144,7 +145,7 @@ class Cia402DriveMock:
                 supported_modes=supported_modes,
                 statusword=partial(self._statusword, axis),
                 position_counts=partial(self._position_counts, number),
-                velocity_rad_s=partial(self._shafts.velocity_rad_s, number),
+                velocity_rad_s=partial(self._encoders.velocity_rad_s, number),
                 changed=self._command_motors,
             )
         return dictionary
@@ -175,7 +176,7 @@ class Cia402DriveMock:
         return axis.statusword(remote=self.nmt_state is NmtState.OPERATIONAL)
 
     def _position_counts(self, axis: int) -> int:
-        return self._shafts.counts[axis]
+        return self._encoders.counts[axis]
 
     # ------------------------------------------------------------ what comes in
     def _rewire(self) -> None:
@@ -212,7 +213,7 @@ class Cia402DriveMock:
         if self.nmt_state is NmtState.OPERATIONAL:
             for tpdo in self._tpdos:
                 if tpdo.in_service and tpdo.can_id == can_id and tpdo.answers_remote:
-                    self._shafts.sample()
+                    self._encoders.sample()
                     self._adapter.send(can_id, tpdo.remote_answer())
 
     def _on_nmt(self, data: bytes) -> None:
@@ -235,7 +236,7 @@ class Cia402DriveMock:
     def _on_sdo(self, data: bytes) -> None:
         if self.nmt_state is NmtState.STOPPED:
             return
-        self._shafts.sample()
+        self._encoders.sample()
         answer = self._sdo.answer(data)
         self._command_motors()
         if answer is not None:
@@ -253,8 +254,8 @@ class Cia402DriveMock:
             self._emergencies.tell(protocol.EMCY_PDO_TOO_SHORT, 0)
 
     def _on_sync(self, _data: bytes) -> None:
-        self._shafts.sample()
-        self._shafts.latch(asyncio.get_running_loop().time())
+        self._encoders.sample()
+        self._encoders.latch(asyncio.get_running_loop().time())
         for rpdo in self._rpdos:
             if rpdo.received is not None:
                 data, rpdo.received = rpdo.received, None
@@ -287,15 +288,16 @@ class Cia402DriveMock:
         # Also when nothing changed: a command holds for one time-out only.
         now_s = asyncio.get_running_loop().time()
         elapsed_s, self._controlled_s = now_s - self._controlled_s, now_s
-        for axis, counts in zip(self.axes, self._shafts.counts, strict=True):
-            axis.advance(elapsed_s, counts, 1 / self._shafts.counts_per_rad)
-        self._shafts.command([axis.demand_rad_s for axis in self.axes])
+        for axis, counts in zip(self.axes, self._encoders.counts, strict=True):
+            axis.advance(elapsed_s, counts, 1 / self._motors.counts_per_rad)
+        az_rad_s, el_rad_s = (axis.demand_rad_s for axis in self.axes)
+        self._motors.command_velocity_rad_s(az_rad_s, el_rad_s)
 
     def _go_on(self) -> None:
         """Ramps and limits also without SYNC; at 500 Hz there is nothing left to do here."""
         since_s = asyncio.get_running_loop().time() - self._controlled_s
         if since_s >= _CONTROL_S and any(axis.moves for axis in self.axes):
-            self._shafts.sample()
+            self._encoders.sample()
             self._command_motors()
             self._send_events()
 
@@ -311,7 +313,6 @@ class Cia402DriveMock:
         if kind == "reboot":
             self._power_off()
             if not without_power:
-                self._shafts.count_from_here()
                 self._reset_communication()
         if not without_power:
             self._look_for_causes()
@@ -319,7 +320,7 @@ class Cia402DriveMock:
 
     def _look_for_causes(self) -> None:
         """A cause puts its axis in fault, and no reset helps before it is gone."""
-        for number, (axis, part) in enumerate(zip(self.axes, PARTS, strict=True)):
+        for number, (axis, part) in enumerate(zip(self.axes, AXES, strict=True)):
             cause = self._cause(part)
             axis.fault_persists = cause is not None
             if cause is not None and axis.fault(cause):

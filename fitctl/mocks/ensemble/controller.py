@@ -187,9 +187,8 @@ class EnsembleControllerMock:
         now_s = asyncio.get_running_loop().time()
         period_s = min(now_s - self._stepped_s, _LONGEST_STEP_S)
         self._stepped_s = now_s
-        angles_rad = self._motors.position_rad()
-        for axis, angle_rad in zip(self.axes, angles_rad, strict=True):
-            axis.step(angle_rad * self._units_per_rad, period_s)
+        for axis, counts in zip(self.axes, self._motors.position_counts(), strict=True):
+            axis.step(counts / self._settings.counts_per_unit, period_s)
 
     def _drive(self) -> None:
         for number, axis in enumerate(self.axes):

@@ -187,10 +187,13 @@ async def test_a_jumped_counter_and_an_offset(mock, motors, client, exchange):
 @served(watchdog_s=60.0)
 async def test_a_reboot_takes_everything_away(mock, motors, client, exchange):
     await exchange(3277, 3277, 0b11)
+    motors.angles_rad = (math.tau, -math.tau)
     set_fault(mock, "reboot", value=0.01)
     assert motors.enabled == [False, False]
-    await asyncio.sleep(0.05)
+    while mock.faults.active:
+        await asyncio.sleep(0.001)
     assert motors.velocity_rad_s == (0.0, 0.0)
+    assert mock._inputs() == [65530, 3, 0], "counters start anew"
 
 
 @served

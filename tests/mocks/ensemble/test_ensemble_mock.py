@@ -2,6 +2,7 @@
 
 import asyncio
 import functools
+import math
 import os
 
 import hypothesis
@@ -27,9 +28,10 @@ class StillMotors:
 
     def __init__(self):
         self.enabled = [False, False]
+        self.angles_rad = (0.0, 0.0)
 
     def position_rad(self):
-        return (0.0, 0.0)
+        return self.angles_rad
 
     def command_velocity_rad_s(self, az, el):
         self.velocity_rad_s = (az, el)
@@ -256,9 +258,12 @@ async def test_after_a_reboot_it_is_as_at_power_up(mock, say, reader, writer):
     await say("ENABLE @0")
     await say("SETPARM @0, 32, 3.0")
     set_fault(mock, "reboot", value=0.01)
+    mock._motors._motors.angles_rad = (math.tau, 0.0)
     assert await asyncio.wait_for(reader.read(), 5) == b""
-    await asyncio.sleep(0.05)
+    while mock.faults.active:
+        await asyncio.sleep(0.001)
     assert mock._motors._motors.enabled == [False, False]
+    assert mock._answer("PFBK X") == b"%0.000000\n", "encoders start anew"
     assert mock._interpreter.answer("GETPARM(@0, 32)") == (Reply.DONE, "0.250000")
 
 
