@@ -9,7 +9,7 @@ PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices fuzz bench-sim lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-sim fuzz lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -72,6 +72,9 @@ bench-sim: $(READY)  ## How many times real time the simulation and the batch ru
 LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
     --custom-compile-command "make lock" --quiet
 
+bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
+	$(BIN)/python -m benchmarks.recorder $(ARGS)
+
 bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN servo cycle, the camera's stream
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
 	$(BIN)/python -m benchmarks.roundtrips
@@ -79,7 +82,7 @@ bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN serv
 	$(BIN)/python -m benchmarks.gvsp
 
 lock: $(READY)  ## Resolve the requirements anew (needs uv)
-	uv pip compile pyproject.toml --extra fast --extra cluster --group dev $(LOCK) -o requirements/dev.lock
+	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --group dev $(LOCK) -o requirements/dev.lock
 	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
 	uv pip compile --group bench $(LOCK) --constraint requirements/dev.lock -o requirements/bench.lock

@@ -6,9 +6,7 @@ start for as far as it makes sense, which is at least its last flush.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import struct
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -18,37 +16,31 @@ from typing import IO, Any, NamedTuple
 
 import google.protobuf.message
 import numpy as np
-import zstandard
 from google.protobuf.descriptor import FieldDescriptor
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
+from fitctl.logging.files import opened, up_to_the_tear
 from fitctl.logging.records import Tick
 from fitctl.logging.schemas import TOPICS
 
-# What a torn or damaged file makes the reader and its decompressors raise (lz4: RuntimeError).
-_DAMAGE = (
-    McapError,
-    struct.error,
-    ValueError,
-    RuntimeError,
-    KeyError,
-    google.protobuf.message.DecodeError,
-    zstandard.ZstdError,
-)
 # How a field is gathered (a type code of the array module; texts in a list) and what it becomes.
 _COLUMNS: dict[int, tuple[str, Any]] = {
     FieldDescriptor.CPPTYPE_DOUBLE: ("d", np.float64),
     FieldDescriptor.CPPTYPE_INT64: ("q", np.int64),
+    FieldDescriptor.CPPTYPE_UINT32: ("q", np.int64),
+    FieldDescriptor.CPPTYPE_ENUM: ("q", np.int64),
     FieldDescriptor.CPPTYPE_BOOL: ("b", np.bool_),
     FieldDescriptor.CPPTYPE_STRING: ("", np.str_),
 }
+Columns = dict[str, NDArray[Any]]
+HEADER = ("log_time_ns", "publish_time_ns", "sequence")
+"""The columns that every topic has."""
 
 
 class LogMessage(NamedTuple):
@@ -112,7 +104,7 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
     LogError
         If the file is missing, no MCAP log, or finished and yet damaged.
     """
-    with _opened(path) as (stream, finished), _up_to_the_tear(path, finished):
+    with opened(path) as (stream, finished), up_to_the_tear(path, finished):
         kind = SeekingReader if finished else NonSeekingReader
         reader = kind(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         # Not ordered by log time: it is already, and sorting a cut file gives nothing at all.
@@ -124,7 +116,38 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
             )
 
 
-def tick_arrays(path: Path, loop: str) -> dict[str, NDArray[Any]]:
+def column_blocks(
+    path: Path, topics: Collection[str] | None = None, rows: float = math.inf
+) -> Iterator[tuple[str, Columns]]:
+    """Messages as columns, a block of at most so many rows of one topic at a time.
+
+    Yields
+    ------
+    topic : str
+    columns : dict of str to array, shape (rows,)
+        ``log_time_ns`` and ``publish_time_ns`` (since 1970), ``sequence``, and the message's fields in their
+        order: float64, int64, bool, text or bytes. What a message cannot say in one column, such as a
+        time stamp in two parts, is left out.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read.
+    """
+    blocks: dict[str, _Block] = {}
+    for entry in read_records(path, topics):
+        block = blocks.get(entry.topic)
+        if block is None:
+            block = blocks[entry.topic] = _Block(entry.message)
+        block.add(entry)
+        if len(block) >= rows:
+            yield entry.topic, block.columns()
+            del blocks[entry.topic]
+    for topic, block in blocks.items():
+        yield topic, block.columns()
+
+
+def tick_arrays(path: Path, loop: str) -> Columns:
     """Every field of one loop's ticks as an array over ticks.
 
     Returns
@@ -137,20 +160,45 @@ def tick_arrays(path: Path, loop: str) -> dict[str, NDArray[Any]]:
     LogError
         If the log cannot be read, or has no ticks of this loop.
     """
-    columns: dict[str, array[Any] | list[str]] = {}
-    dtypes: dict[str, Any] = {}
-    for entry in read_records(path, [TOPICS[Tick].format(loop=loop)]):
-        if not columns:  # the file says which fields it has; it may be older than this program
-            for field in entry.message.DESCRIPTOR.fields:
-                code, dtypes[field.name] = _COLUMNS[field.cpp_type]
-                columns[field.name] = array(code) if code else []
-        for name, column in columns.items():
+    for _, columns in column_blocks(path, [TOPICS[Tick].format(loop=loop)]):
+        return {name: column for name, column in columns.items() if name not in HEADER}
+    topics = ", ".join(sorted(log_info(path).counts)) or "none"
+    msg = f"{path}: has no ticks of loop {loop!r}; topics in this log: {topics}"
+    raise LogError(msg)
+
+
+class _Block:
+    """Messages of one topic, field by field; the file says which fields, it may be older than we are."""
+
+    def __init__(self, message: google.protobuf.message.Message) -> None:
+        fields = [field for field in message.DESCRIPTOR.fields if field.cpp_type in _COLUMNS]
+        kinds = dict.fromkeys(HEADER, _COLUMNS[FieldDescriptor.CPPTYPE_INT64])
+        for field in fields:
+            # Text and bytes are told apart by their type alone.
+            is_bytes = field.type == FieldDescriptor.TYPE_BYTES
+            kinds[field.name] = ("", np.object_) if is_bytes else _COLUMNS[field.cpp_type]
+        self._dtypes = {name: dtype for name, (_, dtype) in kinds.items()}
+        self._values: dict[str, Any] = {
+            name: array(code) if code else [] for name, (code, _) in kinds.items()
+        }
+        self._header = [self._values[name] for name in HEADER]
+        self._fields = [(field.name, self._values[field.name]) for field in fields]
+
+    def __len__(self) -> int:
+        return len(self._header[0])
+
+    def add(self, entry: LogMessage) -> None:
+        times_ns = (entry.log_time_ns, entry.publish_time_ns, entry.sequence)
+        for column, value in zip(self._header, times_ns, strict=True):
+            column.append(value)
+        for name, column in self._fields:
             column.append(getattr(entry.message, name))
-    if not columns:
-        topics = ", ".join(sorted(log_info(path).counts)) or "none"
-        msg = f"{path}: has no ticks of loop {loop!r}; topics in this log: {topics}"
-        raise LogError(msg)
-    return {name: np.array(column, dtype=dtypes[name]) for name, column in columns.items()}
+
+    def columns(self) -> Columns:
+        return {
+            name: np.array(values, dtype=self._dtypes[name])
+            for name, values in self._values.items()
+        }
 
 
 def log_info(path: Path) -> LogInfo:
@@ -161,11 +209,11 @@ def log_info(path: Path) -> LogInfo:
     LogError
         If the file is missing, no MCAP log, or finished and yet damaged.
     """
-    with _opened(path) as (stream, finished):
+    with opened(path) as (stream, finished):
         counts: Counter[str] = Counter()
         metadata: dict[str, dict[str, str]] = {}
         span_ns: list[int] = []  # of the first message, of the last
-        with _up_to_the_tear(path, finished):
+        with up_to_the_tear(path, finished):
             if finished:
                 span_ns = _read_index(SeekingReader(stream), counts, metadata)
             else:
@@ -211,36 +259,3 @@ def _scan(
         elif isinstance(entry, Message):
             counts[topics[entry.channel_id]] += 1
             span_ns[1:] = [entry.log_time]  # the first one stays
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[IO[bytes], bool]]:
-    """The file, and whether it was finished."""
-    try:
-        stream = path.open("rb")
-    except OSError as error:
-        msg = f"{path}: cannot be opened: {error.strerror}; logs are *.mcap in the rig's logging.folder"
-        raise LogError(msg) from error
-    with stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            msg = f"{path}: is not an MCAP log; name a file that fitctl recorded"
-            raise LogError(msg)
-        start = stream.tell()
-        stream.seek(max(start, path.stat().st_size - len(MCAP0_MAGIC)))
-        finished = stream.read() == MCAP0_MAGIC
-        stream.seek(0)
-        yield stream, finished
-
-
-@contextlib.contextmanager
-def _up_to_the_tear(path: Path, finished: bool) -> Iterator[None]:
-    """Damage ends a cut file; in a finished file it is an error."""
-    try:
-        yield
-    except _DAMAGE as error:
-        if finished:
-            msg = (
-                f"{path}: is damaged: {error}; `pymcap-cli doctor` tells where and "
-                "`pymcap-cli recover` saves the rest"
-            )
-            raise LogError(msg) from error

@@ -10,14 +10,11 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
-from itertools import count
 from pathlib import Path
 
 import msgspec
 
 from fitctl.config import Logging
-from fitctl.logging.errors import LogError
 from fitctl.logging.queue import RecordReceiver
 from fitctl.logging.records import (
     RECORD_VERSION,
@@ -28,7 +25,7 @@ from fitctl.logging.records import (
     RunInfo,
     Severity,
 )
-from fitctl.logging.writer import LogWriter
+from fitctl.logging.rotation import RotatingLog
 
 STATUS_PERIOD_S = 1.0
 DRAIN_S = 2.0
@@ -48,18 +45,18 @@ def record(
     on_status: Callable[[RecorderStatus], None] | None = None,
     parent_pid: int | None = None,
 ) -> None:
-    """Record until `stop` is set or the parent process dies; then drain the queue and finish the file.
+    """Record until `stop` is set or the parent process dies; then drain the queue and finish the log.
 
     Parameters
     ----------
     endpoint : str
         The supervisor's :class:`~fitctl.logging.queue.RecordQueue`.
     rig_logging : Logging
-        Chunks, compression, how often to flush.
+        Chunks, compression, how often to flush, when to begin a new file, what to delete.
     rig_name : str
-        Begins the file's name.
+        Begins each file's name.
     folder : Path
-        Where the file goes; made if missing.
+        Where the files go; made if missing.
     stop : threading.Event
         Set by the caller, from a signal handler for example.
     on_status : callable, optional
@@ -73,11 +70,10 @@ def record(
         If the log cannot be written, or the endpoint is no address.
     """
     parent = os.getppid() if parent_pid is None else parent_pid
-    path = new_log_path(folder, rig_name, datetime.now(UTC))
-    with LogWriter(path, rig_logging) as writer:
+    with RotatingLog(rig_logging, rig_name, folder) as log:
         receiver = RecordReceiver(endpoint)
         try:
-            recording = _Recording(writer, receiver, rig_logging, on_status)
+            recording = _Recording(log, receiver, rig_logging, on_status)
             while not stop.is_set() and os.getppid() == parent:
                 recording.step(_POLL_S)
             deadline_s = time.monotonic() + DRAIN_S
@@ -87,31 +83,10 @@ def record(
             if still_coming:
                 recording.warn_of_cut_end()
             recording.report()
-            writer.close()
+            log.close()
             recording.confirm()
         finally:
             receiver.close()
-
-
-def new_log_path(folder: Path, rig_name: str, start: datetime) -> Path:
-    """``<rig>_<UTC yyyymmddThhmmssZ>.mcap`` in `folder`, with ``_2``, ``_3``... if it exists already.
-
-    Raises
-    ------
-    LogError
-        If the folder cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        msg = (
-            f"{folder}: cannot be made: {error.strerror}; name another folder for logs "
-            "(key logging.folder of the rig file)"
-        )
-        raise LogError(msg) from error
-    stem = f"{rig_name}_{start.astimezone(UTC):%Y%m%dT%H%M%SZ}"
-    names = (stem if number == 1 else f"{stem}_{number}" for number in count(1))
-    return next(path for name in names if not (path := folder / f"{name}.mcap").exists())
 
 
 class _Recording:
@@ -119,12 +94,12 @@ class _Recording:
 
     def __init__(
         self,
-        writer: LogWriter,
+        log: RotatingLog,
         receiver: RecordReceiver,
         settings: Logging,
         on_status: Callable[[RecorderStatus], None] | None,
     ) -> None:
-        self._writer = writer
+        self._log = log
         self._receiver = receiver
         self._flush_s = settings.flush_s
         # The queue keeps what is not confirmed, so confirm well before it is full.
@@ -133,6 +108,7 @@ class _Recording:
         # One offset for the whole log, the run's once it is known: log times never go back and
         # compare with the records' own times, even if somebody sets the wall clock meanwhile.
         self._wall_minus_monotonic_s = time.time() - time.monotonic()
+        self._log_time_s = 0.0
         self._last_sequence: int | None = None
         self._unconfirmed = 0
         self._lost = 0
@@ -154,8 +130,9 @@ class _Recording:
             self.report()
         if now_s >= self._next_flush_s or self._unconfirmed >= self._flush_records:
             self._next_flush_s = now_s + self._flush_s
-            self._writer.flush()
+            self._log.flush()
             self.confirm()
+            self._log.rotate_if_due()
         return data is not None
 
     def confirm(self) -> None:
@@ -165,8 +142,10 @@ class _Recording:
         self._unconfirmed = 0
 
     def report(self) -> None:
-        """Write a status record, and a warning if records were lost or not understood since the last."""
+        """Write a status record, and before it what was lost, not understood or deleted since the last."""
         now_s = time.monotonic()
+        for severity, message in self._log.take_notes():
+            self._say(severity, message)
         if self._lost > self._lost_reported:
             self._say(
                 "warning",
@@ -183,10 +162,10 @@ class _Recording:
             self._malformed_reported = self._malformed
         status = RecorderStatus(
             time_s=now_s,
-            path=str(self._writer.path),
-            records=self._writer.records,
+            path=str(self._log.path),
+            records=self._log.records,
             lost=self._lost,
-            bytes_written=self._writer.bytes_written,
+            bytes_written=self._log.bytes_written,
         )
         self._write(status)
         if self._on_status is not None:
@@ -218,7 +197,9 @@ class _Recording:
         self._last_sequence = sequence
 
     def _write(self, record: AnyRecord) -> None:
-        self._writer.write(record, time.monotonic() + self._wall_minus_monotonic_s)
+        now_s = time.monotonic() + self._wall_minus_monotonic_s
+        self._log_time_s = max(self._log_time_s, now_s)  # the run's offset comes a little late
+        self._log.write(record, self._log_time_s)
 
     def _say(self, severity: Severity, message: str) -> None:
         event = Event(

@@ -29,6 +29,7 @@ class RunInfo(Record, frozen=True, kw_only=True):
     versions: dict[str, str]
     scheduling: str
     random_seed: int | None = None
+    designs: dict[str, str] = {}  # by loop, as `fitctl design --out` saves them
 
 
 class Tick(Record, frozen=True, kw_only=True):
@@ -152,6 +153,7 @@ class LoopTiming(Record, frozen=True, kw_only=True):
     servo_missed: int
     stalls: int
     worst_stall_s: float
+    servo_skipped: int = 0
 
 
 class RecorderStatus(Record, frozen=True, kw_only=True):
@@ -161,6 +163,21 @@ class RecorderStatus(Record, frozen=True, kw_only=True):
     records: int
     lost: int
     bytes_written: int
+
+
+class SequenceAttempt(Record, frozen=True, kw_only=True):
+    """One attempt at one step of a sequence, when it ended; figures as JSON, units in their names."""
+
+    sequence_name: str
+    step_number: int
+    step: str
+    loop: str
+    attempt: int
+    began_s: float
+    ended_s: float
+    outcome: Literal["done", "failed", "timed out", "stopped"]
+    message: str
+    figures_json: str
 
 
 AnyRecord = (
@@ -175,6 +192,7 @@ AnyRecord = (
     | PiezoReading
     | LoopTiming
     | RecorderStatus
+    | SequenceAttempt
 )
 
 

@@ -31,6 +31,7 @@ from fitctl.logging.records import (
     PiezoReading,
     RecorderStatus,
     RunInfo,
+    SequenceAttempt,
     Tick,
 )
 
@@ -45,6 +46,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     PiezoReading: "/fit/{loop}/piezo",
     DeviceHealth: "/fit/devices/health",
     RecorderStatus: "/fit/recorder/status",
+    SequenceAttempt: "/fit/sequence/attempts",
 }
 """RunInfo is missing because it is kept as metadata: see :func:`run_metadata`."""
 
@@ -77,7 +79,7 @@ def to_message(record: AnyRecord, wall_ns: int) -> Message:
     convert = _FOXGLOVE.get(type(record))
     if convert is not None:
         return convert(record, wall_ns)
-    return _MESSAGES[type(record)](**msgspec.structs.asdict(record))
+    return MESSAGES[type(record)](**msgspec.structs.asdict(record))
 
 
 def run_metadata(info: RunInfo) -> dict[str, dict[str, str]]:
@@ -91,6 +93,8 @@ def run_metadata(info: RunInfo) -> dict[str, dict[str, str]]:
             "run_start_monotonic_s": repr(info.time_s),
         },
     }
+    if info.designs:
+        metadata["designs"] = dict(info.designs)
     if info.random_seed is not None:
         metadata["random_seed"] = {"value": str(info.random_seed)}
     return metadata
@@ -171,8 +175,9 @@ _FOXGLOVE: dict[type[AnyRecord], Callable[[Any, int], Message]] = {
     Event: _log,
 }
 _POOL = DescriptorPool()
-_MESSAGES: dict[type[AnyRecord], type[Message]] = {
-    record_type: message_class(record_type, _POOL)
-    for record_type in TOPICS
-    if record_type not in _FOXGLOVE
+MESSAGES: dict[type[AnyRecord], type[Message]] = {
+    FrameRecord: RawImage,
+    Event: Log,
+    **{kind: message_class(kind, _POOL) for kind in TOPICS if kind not in _FOXGLOVE},
 }
+"""The protobuf message that each kind of record becomes."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -30,7 +32,8 @@ _WALL_LIMIT_S = 2**63 / 1e9  # what fits in nanoseconds
 class LogWriter:
     """One log file, open for writing; a context manager that finishes it.
 
-    A message's publish time is its record's own time and its log time is the recorder's, both as wall
+    The file is locked (flock) for as long as it is open: `fitctl.logging.folder.in_use` asks for that. A
+    message's publish time is its record's own time and its log time is the recorder's, both as wall
     time. The sequence of a message is its record's ``number`` where it has one (ticks, frames), and
     otherwise counts the messages of its topic from 1.
 
@@ -67,9 +70,17 @@ class LogWriter:
             enable_data_crcs=True,
             use_summary_offsets=False,  # this writer would point to groups that are empty
         )
-        with self._explained():
-            self._mcap.start(library="fitctl")
-            self._mcap.flush()  # so that the file is a log from its first moment
+        try:
+            with self._explained():
+                with contextlib.suppress(OSError):  # a network folder may know no locks
+                    fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._mcap.start(library="fitctl")
+                self.flush()  # so that the file is a log from its first moment
+                _sync_folder(path.parent)
+        except LogError:
+            self.close()
+            path.unlink(missing_ok=True)  # a full disk still has room for any number of empty files
+            raise
 
     @property
     def bytes_written(self) -> int:
@@ -102,7 +113,7 @@ class LogWriter:
             self.records += 1
 
     def flush(self) -> None:
-        """Hand everything so far to the operating system; a killed recorder loses only what comes after.
+        """Put everything so far on the disk; a power cut or a killed recorder loses only what comes after.
 
         Raises
         ------
@@ -111,6 +122,7 @@ class LogWriter:
         """
         with self._explained():
             self._mcap.flush()
+            os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
         """Write the index and close; safe to call twice and after a failure.
@@ -128,6 +140,7 @@ class LogWriter:
                 with self._explained():
                     self._mcap.finish()
                     self._file.flush()
+                    os.fdatasync(self._file.fileno())
         finally:
             with contextlib.suppress(OSError):  # a full disk was reported already
                 self._file.close()
@@ -199,3 +212,12 @@ class LogWriter:
                 "write permission there, or name another folder (key logging.folder of the rig file)"
             )
             raise LogError(msg) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the folder's own list of files on the disk: a new file's data alone would not be found again."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -3,11 +3,14 @@
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from fitctl.config import Logging
+from fitctl.logging.reading import read_records
 from fitctl.logging.records import (
     DeviceHealth,
     Event,
@@ -19,9 +22,19 @@ from fitctl.logging.records import (
     RunInfo,
     Tick,
 )
+from fitctl.logging.writer import LogWriter
 
+WALL_S = 1_795_000_100.5
 SETTINGS = Logging(
-    folder="logs", chunk_bytes=16384, flush_s=0.2, queue_records=256, compression="zstd"
+    folder="logs",
+    chunk_bytes=16384,
+    flush_s=0.2,
+    queue_records=256,
+    compression="zstd",
+    rotate_bytes=1_000_000_000,
+    rotate_s=3600.0,
+    retain_bytes=2_000_000_000,
+    retain_days=365.0,
 )
 RUN_INFO = RunInfo(
     time_s=100.0,
@@ -31,6 +44,7 @@ RUN_INFO = RunInfo(
     versions={"fitctl": "0.1.0"},
     scheduling="SCHED_FIFO 50",
     random_seed=7,
+    designs={"right": '{"name": "eq20"}'},
 )
 _VALUES = {float: 0.125, int: 3, bool: True, str: "right", bytes: b"\x01\x02"}
 
@@ -58,6 +72,28 @@ def one_of_each():
     ]  # fmt: skip
 
 
+def frame(number):
+    noise = np.random.default_rng(number).integers(0, 65536, 1600, dtype="<u2")
+    return filled(
+        FrameRecord, number=number, camera="cam", width_px=40, height_px=40, data=noise.tobytes()
+    )
+
+
+def write_log(path, records, log_settings=SETTINGS, start_s=WALL_S):
+    """A finished log whose log times are a second apart."""
+    with LogWriter(path, log_settings) as writer:
+        for number, record in enumerate(records):
+            writer.write(record, start_s + number)
+    return path
+
+
+def contents(path):
+    return [
+        (entry.topic, entry.sequence, zlib.crc32(entry.message.SerializeToString()))
+        for entry in read_records(path)
+    ]
+
+
 RECORDER = """
 import signal, sys, threading
 from pathlib import Path
@@ -82,8 +118,9 @@ def recorder_command(endpoint, folder, settings=SETTINGS):
     return [sys.executable, "-c", RECORDER, endpoint, str(folder), settings.model_dump_json()]
 
 
-def start_recorder(endpoint, folder, settings=SETTINGS):
-    return subprocess.Popen(recorder_command(endpoint, folder, settings), stdout=subprocess.PIPE)
+def start_recorder(endpoint, folder, settings=SETTINGS, **options):
+    command = recorder_command(endpoint, folder, settings)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, **options)
 
 
 def wait_until(condition, timeout_s=10.0):

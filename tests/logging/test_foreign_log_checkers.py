@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from log_samples import RUN_INFO, SETTINGS, one_of_each, tick
 
+from fitctl.logging.copying import cut, merge, recover
+from fitctl.logging.reading import log_info
 from fitctl.logging.writer import LogWriter
 
 BIN = Path(sys.executable).parent
@@ -56,6 +58,31 @@ def test_pymcap_doctor_finds_nothing_wrong(tmp_path, run, content, compression):
     )
     summary = json.loads(printed.splitlines()[-1])
     assert (summary["errors"], summary["warnings"], summary["complete"]) == (0, 0, True), printed
+
+
+def recovered(path, target):
+    path.write_bytes(path.read_bytes()[:-3000])
+    recover(path, target)
+
+
+def halved_and_merged(path, target):
+    middle_ns = round((log_info(path).start_s + 2.0) * 1e9)
+    halves = [path.with_name(f"{half}.mcap") for half in ("head", "tail")]
+    cut(path, halves[0], from_ns=0, to_ns=middle_ns)
+    cut(path, halves[1], from_ns=middle_ns, to_ns=2**63)
+    merge(halves, target)
+
+
+@pytest.mark.parametrize("change", [recovered, halved_and_merged])
+def test_both_accept_what_is_made_from_a_log(tmp_path, run, change):
+    target = tmp_path / "changed.mcap"
+    change(written(tmp_path, "full"), target)
+    summary = json.loads(run("pymcap-cli", "doctor", "--format", "jsonl", target).splitlines()[-1])
+    assert (summary["errors"], summary["warnings"], summary["complete"]) == (0, 0, True)
+    printed = run("rerun", "mcap", "check", "--full", target)
+    rows = [line.split() for line in printed.splitlines() if " /fit/" in line]
+    assert len(rows) == len(one_of_each())
+    assert {row[0] for row in rows} == {"ok"}
 
 
 def test_rerun_check_finds_every_topic_in_order(tmp_path, run):

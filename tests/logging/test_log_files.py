@@ -2,37 +2,20 @@ import os
 import resource
 import tempfile
 import time
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import RUN_INFO, SETTINGS, filled, one_of_each, tick
+from log_samples import RUN_INFO, SETTINGS, WALL_S, contents, frame, one_of_each, tick, write_log
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records, tick_arrays
-from fitctl.logging.records import FrameRecord
 from fitctl.logging.schemas import to_message, topic_of
 from fitctl.logging.writer import LogWriter
 
-WALL_S = 1_795_000_100.5
 NOBODY = 65534
-
-
-def write_log(path, records, log_settings=SETTINGS):
-    with LogWriter(path, log_settings) as writer:
-        for number, record in enumerate(records):
-            writer.write(record, WALL_S + number)
-    return path
-
-
-def frame(number):
-    noise = np.random.default_rng(number).integers(0, 65536, 1600, dtype="<u2")
-    return filled(
-        FrameRecord, number=number, camera="cam", width_px=40, height_px=40, data=noise.tobytes()
-    )
 
 
 def write_frames(writer, number):
@@ -121,13 +104,6 @@ def test_an_empty_log_is_a_log(tmp_path):
     path = write_log(tmp_path / "a.mcap", [])
     assert list(read_records(path)) == []
     assert np.isnan(log_info(path).duration_s)
-
-
-def contents(path):
-    return [
-        (entry.topic, entry.sequence, zlib.crc32(entry.message.SerializeToString()))
-        for entry in read_records(path)
-    ]
 
 
 @pytest.fixture(scope="module", params=["zstd", "lz4", "none"])

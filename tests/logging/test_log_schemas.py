@@ -7,8 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from log_samples import RUN_INFO, filled, one_of_each
 
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
 from fitctl.logging.records import AnyRecord, Event, FrameRecord, RunInfo, Tick
 from fitctl.logging.schemas import TOPICS, message_class, run_metadata, to_message, topic_of
+from fitctl.supervisor.run import run_info
 
 WALL_NS = 1_795_000_000_250_000_001
 
@@ -98,4 +101,15 @@ def test_the_run_is_described_in_metadata_without_rounding():
     metadata = run_metadata(RUN_INFO)
     assert metadata["rig"] == {"name": "bench", "json": '{"name": "bench"}'}
     assert metadata["random_seed"] == {"value": "7"}
+    assert metadata["designs"] == {"right": '{"name": "eq20"}'}
     assert float(metadata["clock"]["wall_minus_monotonic_s"]) == RUN_INFO.wall_minus_monotonic_s
+
+
+def test_the_design_that_a_log_carries_can_be_used_again(tmp_path):
+    rig = load_rig(default_rig_path())
+    metadata = run_metadata(run_info(rig, "", now_s=0.0))
+    path = tmp_path / "of-the-log.json"
+    path.write_text(metadata["designs"]["right"])
+    again, first = design_for(rig, "right", str(path)), design_for(rig, "right")
+    assert again.name == first.name
+    np.testing.assert_array_equal(again.a, first.a)

@@ -3,7 +3,6 @@ import subprocess
 import sys
 import threading
 import time
-from datetime import UTC, datetime
 
 import msgspec
 import pytest
@@ -21,7 +20,7 @@ from log_samples import (
 from fitctl.logging.errors import LogError
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.reading import log_info, read_records, tick_arrays
-from fitctl.logging.recorder import new_log_path, record
+from fitctl.logging.recorder import record
 from fitctl.logging.records import RECORD_VERSION, Envelope
 
 
@@ -251,17 +250,3 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path, endpoint):
             folder=tmp_path / "file" / "logs",
             stop=threading.Event(),
         )
-
-
-def test_names_tell_rig_and_start_and_never_clash(tmp_path):
-    start = datetime(2026, 11, 21, 8, 9, 10, tzinfo=UTC)
-    names = []
-    for _ in range(3):
-        path = new_log_path(tmp_path / "new", "fit-mock", start)
-        path.touch()
-        names.append(path.name)
-    assert names == [
-        "fit-mock_20261121T080910Z.mcap",
-        "fit-mock_20261121T080910Z_2.mcap",
-        "fit-mock_20261121T080910Z_3.mcap",
-    ]

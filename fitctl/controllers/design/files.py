@@ -25,14 +25,8 @@ _MOST_BYTES = 1_000_000  # a hundred times a design's
 _ROUNDING = 1e-6
 
 
-def save_design(design: Design, path: Path) -> None:
-    """Write a design.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be written.
-    """
+def design_json(design: Design) -> str:
+    """A design with everything needed to make it again, as its file has it."""
     document = {
         "format": FORMAT,
         "fitctl": importlib.metadata.version("fitctl"),
@@ -45,8 +39,19 @@ def save_design(design: Design, path: Path) -> None:
         "parameters": design.parameters,
         **{name: getattr(design, name).tolist() for name in _MATRICES},
     }
+    return json.dumps(document, indent=1) + "\n"
+
+
+def save_design(design: Design, path: Path) -> None:
+    """Write a design.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written.
+    """
     try:
-        path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        path.write_text(design_json(design), encoding="utf-8")
     except OSError as error:
         msg = f"{path}: cannot be written: {error.strerror}"
         raise ConfigError(msg) from None

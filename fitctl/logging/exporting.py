@@ -1,0 +1,156 @@
+"""Logs as CSV, Parquet and NumPy files, one for each topic; units stay in the names of the columns."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import Columns, column_blocks
+from fitctl.logging.records import Event, FrameRecord
+from fitctl.logging.schemas import TOPICS
+
+_ROWS = 5000  # of one topic in memory at a time
+_RENAMED = {"name": "source", "width": "width_px", "height": "height_px", "frame_id": "camera"}
+
+Write = Callable[[Columns], None]
+
+
+def export(path: Path, folder: Path, kind: str, topics: list[str]) -> dict[Path, int]:
+    """Write each topic of a log into a file of its own.
+
+    Column names are the record's fields, and before them ``log_time_ns`` and ``publish_time_ns``
+    (nanoseconds since 1970) and ``sequence``. Frames are ``pixels_dn``: in NumPy shape (frames, height,
+    width), in Parquet little-endian 16 bit, row by row; CSV has no frames.
+
+    Parameters
+    ----------
+    path : Path
+        A log, finished or not.
+    folder : Path
+        Made if missing; no file in it is overwritten.
+    kind : str
+        One of :data:`KINDS`.
+    topics : list of str
+        Which.
+
+    Returns
+    -------
+    dict of Path to int
+        The files and their rows.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, a file exists or cannot be written, or pyarrow is missing for Parquet.
+    """
+    begin = KINDS[kind]
+    rows: dict[Path, int] = {}
+    writers: dict[str, Write] = {}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            for topic, columns in _blocks(path, topics, frames=kind != "csv"):
+                file = folder / f"{topic.strip('/').replace('/', '.')}.{kind}"
+                if topic not in writers:
+                    if file.exists():
+                        msg = f"{file}: exists already; give another folder with --out"
+                        raise LogError(msg)
+                    writers[topic] = begin(file, stack)
+                    rows[file] = 0
+                writers[topic](columns)
+                rows[file] += len(columns["sequence"])
+    except OSError as error:
+        msg = f"{folder}: cannot be written: {error.strerror or error}; make room, or give another --out"
+        raise LogError(msg) from error
+    return rows
+
+
+def _blocks(path: Path, topics: list[str], *, frames: bool) -> Iterator[tuple[str, Columns]]:
+    wanted = [topic for topic in topics if frames or topic != TOPICS[FrameRecord]]
+    for topic, columns in column_blocks(path, wanted, _ROWS):
+        if topic == TOPICS[FrameRecord]:
+            columns["pixels_dn"] = columns.pop("data")
+            del columns["encoding"], columns["step"]  # mono16, and twice the width
+        elif topic == TOPICS[Event]:
+            columns["level"] = np.array([Log.Level.Name(level) for level in columns["level"]])
+            del columns["file"], columns["line"]
+        yield topic, {_RENAMED.get(name, name): column for name, column in columns.items()}
+
+
+def _csv(file: Path, stack: ExitStack) -> Write:
+    stream = stack.enter_context(file.open("x", newline="", encoding="utf-8"))
+    rows = csv.writer(stream)
+
+    def write(columns: Columns) -> None:
+        if not stream.tell():
+            rows.writerow(columns)
+        rows.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+    return write
+
+
+def _parquet(file: Path, stack: ExitStack) -> Write:
+    try:
+        arrow: Any = importlib.import_module("pyarrow")
+        parquet: Any = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        msg = "Parquet needs pyarrow: pip install 'fitctl[parquet]', or export csv or npz"
+        raise LogError(msg) from None
+    writers: list[Any] = []
+
+    def write(columns: Columns) -> None:
+        table = arrow.table(
+            {
+                name: arrow.array(column.tolist()) if column.dtype.kind in "OU" else column
+                for name, column in columns.items()
+            }
+        )
+        if not writers:
+            writers.append(stack.enter_context(parquet.ParquetWriter(file, table.schema)))
+        writers[0].write_table(table)
+
+    return write
+
+
+def _npz(file: Path, stack: ExitStack) -> Write:
+    blocks: list[Columns] = []
+
+    def finish() -> None:
+        columns: dict[str, Any] = {
+            name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]
+        }
+        if "pixels_dn" in columns:
+            columns["pixels_dn"] = _images(file, columns)
+        np.savez_compressed(file, **columns)
+
+    def write(columns: Columns) -> None:
+        if not blocks:
+            stack.callback(finish)
+        blocks.append(columns)
+
+    return write
+
+
+def _images(file: Path, columns: Columns) -> Any:
+    """Frames as one array, shape (frames, height, width)."""
+    sizes = set(zip(columns["height_px"].tolist(), columns["width_px"].tolist(), strict=True))
+    if len(sizes) > 1:
+        msg = f"{file}: frames of several sizes do not go into one array; cut the log by time, or take parquet"
+        raise LogError(msg)
+    return np.frombuffer(b"".join(columns["pixels_dn"]), "<u2").reshape(-1, *sizes.pop())
+
+
+KINDS: dict[str, Callable[[Path, ExitStack], Write]] = {
+    "csv": _csv,
+    "parquet": _parquet,
+    "npz": _npz,
+}
+"""What can be exported, by the file's ending."""

@@ -1,0 +1,120 @@
+"""Whether a log is what its recorder meant to write."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from mcap.records import Channel, DataEnd, Footer, Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.files import DAMAGE, opened
+from fitctl.logging.folder import in_use
+from fitctl.logging.reading import log_info, read_records
+from fitctl.logging.records import FrameRecord, RecorderStatus
+from fitctl.logging.schemas import TOPICS
+
+_AFTER_SUMMARY_BYTES = 4 + len(
+    MCAP0_MAGIC
+)  # what the summary's checksum does not cover: itself, the end
+_MEND = "`fitctl log recover` saves what is sound into a new file"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is in a log and what is wrong with it.
+
+    Attributes
+    ----------
+    records : int
+        That were read.
+    lost : int
+        By the recorder's own count since it was started.
+    frames_missing : int
+        Gaps in the camera's numbers of the frames.
+    problems : tuple of str
+        Empty for a whole log.
+    """
+
+    records: int
+    lost: int
+    frames_missing: int
+    problems: tuple[str, ...]
+
+
+def verify(path: Path) -> Verdict:
+    """Read a log from end to end: checksums, index against contents, order, every message, every frame's size.
+
+    Raises
+    ------
+    LogError
+        If it is missing, or no MCAP log at all.
+    """
+    with opened(path) as (stream, finished):
+        in_order, problems = _checked(stream) if finished else (Counter(), [_unfinished(path)])
+    if finished and problems:  # what its messages say is not worth reading
+        return Verdict(in_order.total(), 0, 0, tuple(problems))
+    counts: Counter[str] = Counter()
+    lost = last_lost = frames_missing = newest_ns = 0
+    last_frame: int | None = None
+    try:
+        for entry in read_records(path):  # by the index, if there is one
+            message: Any = entry.message
+            counts[entry.topic] += 1
+            if entry.log_time_ns < newest_ns:
+                problems.append(f"record {counts.total()} ({entry.topic}): its log time goes back")
+            newest_ns = entry.log_time_ns
+            if entry.topic == TOPICS[RecorderStatus]:
+                now_lost = message.lost  # counts on while one recorder lives
+                lost += now_lost - last_lost if now_lost >= last_lost else now_lost
+                last_lost = now_lost
+            elif entry.topic == TOPICS[FrameRecord]:
+                if last_frame is not None:  # the camera's numbers begin anew at times
+                    frames_missing += max(0, entry.sequence - last_frame - 1)
+                last_frame = entry.sequence
+                if len(message.data) != message.step * message.height:
+                    problems.append(f"frame {entry.sequence}: its data is not as large as it says")
+        if finished and not in_order == counts == Counter(log_info(path).counts):
+            problems.append(f"its index is not of its contents; {_MEND}")
+    except LogError as error:
+        problems.append(str(error).removeprefix(f"{path}: "))
+    return Verdict(counts.total(), lost, frames_missing, tuple(problems))
+
+
+def _unfinished(path: Path) -> str:
+    if in_use(path):
+        return "is being recorded just now; stop the recorder, or look again when it has begun another file"
+    return f"is cut off; {_MEND}"
+
+
+def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:
+    """Messages by topic of a finished log, as they come in the file, and what its checksums complain of."""
+    counts: Counter[str] = Counter()
+    topics: dict[int, str] = {}
+    ends: list[DataEnd | Footer] = []
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(0)
+    try:
+        for record in StreamReader(stream, validate_crcs=True, record_size_limit=size).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                counts[topics[record.channel_id]] += 1
+            elif isinstance(record, DataEnd | Footer):
+                ends.append(record)
+        footer = ends[-1]
+        if len(ends) != 2 or not isinstance(footer, Footer):
+            return counts, [f"is damaged: its index is not where it should be; {_MEND}"]
+        stream.seek(footer.summary_start)
+        summary_crc = zlib.crc32(stream.read(size - _AFTER_SUMMARY_BYTES - footer.summary_start))
+    except DAMAGE as error:
+        return counts, [f"is damaged: {error}; {_MEND}"]
+    if footer.summary_crc not in {0, summary_crc}:
+        return counts, [f"its index is damaged: wrong checksum; {_MEND}"]
+    return counts, []

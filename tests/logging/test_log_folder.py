@@ -1,0 +1,239 @@
+"""Files that follow each other, and what stays of them."""
+
+import os
+import resource
+import time
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_samples import RUN_INFO, SETTINGS, WALL_S, contents, frame, tick
+from pydantic import ValidationError
+
+from fitctl.config import Logging
+from fitctl.logging.copying import merge
+from fitctl.logging.errors import LogError
+from fitctl.logging.folder import in_use, is_kept, keep, new_log_path, prune
+from fitctl.logging.reading import log_info, tick_arrays
+from fitctl.logging.rotation import RotatingLog
+from fitctl.logging.verifying import verify
+from fitctl.logging.writer import LogWriter
+
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+DAY_S = 86400
+SMALL = SETTINGS.model_copy(update={"rotate_bytes": 65_536, "chunk_bytes": 4096})
+
+
+def recorded(settings, folder, number, flush_every=5):
+    """Ticks and frames through a rotating log that is flushed now and then; the log."""
+    with RotatingLog(settings, "bench", folder) as log:
+        log.write(RUN_INFO, WALL_S)
+        for index in range(number):
+            log.write(tick(index), WALL_S + index)
+            log.write(frame(index), WALL_S + index)
+            if index % flush_every == 0:
+                log.flush()
+                log.rotate_if_due()
+    return log
+
+
+def test_a_file_that_is_large_enough_is_followed_by_another_and_nothing_is_lost(tmp_path):
+    log = recorded(SMALL, tmp_path, 100)
+    files = sorted(tmp_path.glob("*.mcap"), key=lambda path: log_info(path).start_s)
+    assert len(files) >= 4
+    for path in files:
+        assert verify(path).problems == ()
+        assert log_info(path).metadata["rig"] == {"name": "bench", "json": '{"name": "bench"}'}
+        assert path.stat().st_size < 65_536 + 40_000  # and one flush more
+    assert [n for path in files for n in tick_arrays(path, "right")["number"]] == list(range(100))
+    assert log.records == sum(sum(log_info(path).counts.values()) for path in files) + len(files)
+    assert log.bytes_written == sum(path.stat().st_size for path in files)
+    merge(files, tmp_path / "merged")
+    assert list(tick_arrays(tmp_path / "merged", "right")["number"]) == list(range(100))
+
+
+def test_a_file_that_is_old_enough_is_followed_by_another(tmp_path, monkeypatch):
+    now_s = 1000.0
+    monkeypatch.setattr("fitctl.logging.rotation.time.monotonic", lambda: now_s)
+    with RotatingLog(SETTINGS, "bench", tmp_path) as log:
+        first = log.path
+        now_s += SETTINGS.rotate_s - 0.001
+        log.rotate_if_due()
+        assert log.path == first
+        now_s += 0.001
+        log.rotate_if_due()
+        assert log.path != first
+        assert log_info(first).finished
+
+
+def test_a_log_is_in_use_while_it_is_recorded(tmp_path):
+    with LogWriter(tmp_path / "a.mcap", SETTINGS) as writer:
+        assert in_use(writer.path)
+    assert not in_use(writer.path)
+    assert not in_use(tmp_path / "none.mcap")
+
+
+def aged(folder, name, age_days, size):
+    path = folder / name
+    path.write_bytes(b"x" * size)
+    written_s = (NOW - timedelta(days=age_days)).timestamp()
+    os.utime(path, (written_s, written_s))
+    return path
+
+
+def name_of(number, rig="bench"):
+    return f"{rig}_20261101T0000{number:02d}Z.mcap"
+
+
+def limits(retain_bytes, retain_days):
+    return SETTINGS.model_copy(update={"retain_bytes": retain_bytes, "retain_days": retain_days})
+
+
+@given(
+    logs=st.lists(
+        st.tuples(st.integers(0, 20), st.integers(1, 100), st.booleans(), st.booleans()),
+        max_size=8,
+    ),
+    retain_bytes=st.integers(1, 400),
+    retain_days=st.integers(1, 20),
+)
+@settings(max_examples=80, deadline=None)
+def test_the_oldest_go_until_the_rest_fits_but_never_one_in_use_or_kept(
+    tmp_path_factory, logs, retain_bytes, retain_days
+):
+    folder = tmp_path_factory.mktemp("retention")
+    paths, safe, streams = [], set(), []
+    for number, (age, size, kept, used) in enumerate(logs):
+        path = folder / name_of(number)
+        if used:
+            streams.append(LogWriter(path, SETTINGS))
+            os.utime(path, ((NOW.timestamp() - age * DAY_S),) * 2)
+        else:
+            aged(folder, path.name, age, size)
+        if kept:
+            keep(path, kept=True)
+        if kept or used:
+            safe.add(path)
+        paths.append((age, path, path.stat().st_size))
+    try:
+        deleted = prune(folder, "bench", limits(retain_bytes, retain_days), NOW)
+        left = [(age, path, size) for age, path, size in paths if path.exists()]
+    finally:
+        for stream in streams:
+            stream.close()
+    assert {path for _, path, _ in paths} - set(deleted) == {path for _, path, _ in left}
+    assert safe.isdisjoint(deleted)
+    free = [entry for entry in left if entry[1] not in safe]
+    assert all(age <= retain_days for age, *_ in free)
+    total = sum(size for *_, size in left)
+    assert total <= retain_bytes or not free
+    if deleted and free:  # the oldest went first
+        ages = {path: age for age, path, _ in paths}
+        assert min(ages[path] for path in deleted) >= max(age for age, *_ in free)
+    newest = max(
+        (entry for entry in paths if entry[1] in deleted), key=lambda e: -e[0], default=None
+    )
+    if newest is not None:  # and none went without need
+        assert newest[0] > retain_days or total + newest[2] > retain_bytes
+
+
+def test_only_what_a_recorder_of_this_rig_named_is_deleted(tmp_path):
+    others = [
+        aged(tmp_path, name, 400, 10)
+        for name in (
+            name_of(1, "other"),
+            "bench_20261101T000001Z_recovered.mcap",
+            "bench_best_night.mcap",
+            "bench_20261101T000001Z.csv",
+        )
+    ]
+    mine = [
+        aged(tmp_path, name_of(1), 400, 10),
+        aged(tmp_path, "bench_20261101T000001Z_2.mcap", 399, 10),
+    ]
+    assert prune(tmp_path, "bench", SETTINGS, NOW) == mine
+    assert all(path.exists() for path in others)
+
+
+def test_a_kept_log_stays_until_it_is_no_longer_kept(tmp_path):
+    path = aged(tmp_path, name_of(1), 400, 10)
+    keep(path, kept=True)
+    assert is_kept(path)
+    assert prune(tmp_path, "bench", SETTINGS, NOW) == []
+    keep(path, kept=False)
+    assert prune(tmp_path, "bench", SETTINGS, NOW) == [path]
+
+
+def test_a_log_that_is_not_there_cannot_be_kept(tmp_path):
+    with pytest.raises(LogError, match=r"a\.mcap: no such log"):
+        keep(tmp_path / "a.mcap", kept=True)
+
+
+def test_a_new_recording_clears_away_and_says_so_in_the_log(tmp_path):
+    old = aged(tmp_path, name_of(1), 400, 10)
+    with RotatingLog(SETTINGS, "bench", tmp_path) as log:
+        assert not old.exists()
+        assert log.take_notes() == [("info", f"{old}: deleted, its time was over")]
+        assert log.take_notes() == []
+
+
+def test_recording_goes_on_where_nothing_can_be_deleted(tmp_path, monkeypatch):
+    old = aged(tmp_path, name_of(1), 400, 10)
+
+    def refuse(path, **_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("fitctl.logging.folder.Path.unlink", refuse)
+    with RotatingLog(SETTINGS, "bench", tmp_path) as log:
+        ((severity, text),) = log.take_notes()
+        log.write(tick(1), WALL_S)
+    assert severity == "warning"
+    assert f"{old}: is due for deletion, but cannot be deleted" in text
+    assert len(contents(log.path)) == 1
+
+
+def test_a_limit_that_would_leave_no_finished_file_is_refused():
+    document = SETTINGS.model_dump() | {"rotate_bytes": 1_000_000, "retain_bytes": 1_999_999}
+    with pytest.raises(ValidationError, match="retain_bytes must be at least twice rotate_bytes"):
+        Logging(**document)
+
+
+def test_names_tell_rig_and_start_and_never_clash(tmp_path):
+    start = datetime(2026, 11, 21, 8, 9, 10, tzinfo=UTC)
+    names = []
+    for _ in range(3):
+        path = new_log_path(tmp_path / "new", "fit-mock", start)
+        path.touch()
+        names.append(path.name)
+    assert names == [
+        "fit-mock_20261121T080910Z.mcap",
+        "fit-mock_20261121T080910Z_2.mcap",
+        "fit-mock_20261121T080910Z_3.mcap",
+    ]
+
+
+def test_a_file_that_cannot_be_begun_leaves_none_behind(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, hard))
+    try:
+        with pytest.raises(LogError, match=r"a\.mcap: cannot be written: File too large"):
+            LogWriter(tmp_path / "a.mcap", SETTINGS)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_flushed_is_on_the_disk_before_it_is_confirmed(tmp_path, monkeypatch):
+    """A power cut takes what the operating system still holds; only the disk counts."""
+    synced = []
+    real = os.fdatasync
+    monkeypatch.setattr(
+        "fitctl.logging.writer.os.fdatasync",
+        lambda descriptor: (synced.append(os.fstat(descriptor).st_size), real(descriptor)),
+    )
+    with LogWriter(tmp_path / "a.mcap", SETTINGS) as writer:
+        writer.write(tick(1), time.time())
+        writer.flush()
+        assert synced[-1] == writer.bytes_written == writer.path.stat().st_size
+    assert synced[-1] == writer.path.stat().st_size

@@ -1,0 +1,84 @@
+"""What is said of a log that is whole, and of one that is not."""
+
+import contextlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_samples import RUN_INFO, SETTINGS, WALL_S, filled, frame, one_of_each, tick, write_log
+from mcap.writer import MCAP0_MAGIC
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import log_info, read_records
+from fitctl.logging.records import RecorderStatus
+from fitctl.logging.verifying import verify
+from fitctl.logging.writer import LogWriter
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_a_finished_log_is_whole(tmp_path, compression):
+    chosen = SETTINGS.model_copy(update={"compression": compression, "chunk_bytes": 4096})
+    records = [RUN_INFO, *one_of_each()[2:], *(frame(n) for n in range(20))]
+    verdict = verify(write_log(tmp_path / "a.mcap", records, chosen))
+    assert (verdict.records, verdict.problems) == (26, ())
+
+
+@given(data=st.data())
+@settings(max_examples=150, deadline=None)
+def test_any_changed_byte_is_noticed(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "changed.mcap"
+    path.unlink(missing_ok=True)
+    write_log(path, [RUN_INFO, *(frame(n) for n in range(4)), tick(1)])
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(len(MCAP0_MAGIC), len(content) - 1), label="at")
+    content[at] ^= data.draw(st.integers(1, 255), label="flip")
+    path.write_bytes(content)
+    assert verify(path).problems != ()
+    for read in (log_info, lambda path: list(read_records(path))):
+        with contextlib.suppress(LogError):  # and nothing else
+            read(path)
+
+
+@given(data=st.data())
+@settings(max_examples=40, deadline=None)
+def test_any_cut_is_noticed(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "short.mcap"
+    path.unlink(missing_ok=True)
+    write_log(path, [RUN_INFO, *(frame(n) for n in range(4)), tick(1)])
+    content = path.read_bytes()
+    path.write_bytes(content[: data.draw(st.integers(8, len(content) - 1), label="cut after")])
+    (problem,) = verify(path).problems
+    assert "is cut off; `fitctl log recover`" in problem
+
+
+def test_a_log_that_is_being_recorded_is_not_called_cut(tmp_path):
+    with LogWriter(tmp_path / "a.mcap", SETTINGS) as writer:
+        (problem,) = verify(writer.path).problems
+    assert "being recorded just now" in problem
+
+
+def test_losses_are_told_from_damage(tmp_path):
+    status = [filled(RecorderStatus, path=p, lost=n) for p, n in (("a", 2), ("a", 5), ("b", 1))]
+    records = [frame(7), frame(8), frame(11), frame(65535), frame(1), *status]
+    verdict = verify(write_log(tmp_path / "a.mcap", records))
+    assert verdict.lost == 6
+    assert verdict.frames_missing == 2 + 65523
+    assert verdict.problems == ()
+
+
+def test_a_frame_that_is_not_as_large_as_it_says_and_a_time_that_goes_back_are_named(tmp_path):
+    with LogWriter(tmp_path / "a.mcap", SETTINGS) as writer:
+        writer.write(one_of_each()[1], WALL_S)
+        writer.write(filled(type(frame(1)), number=9, width_px=40, height_px=40), WALL_S - 1)
+    problems = verify(writer.path).problems
+    assert problems == (
+        "record 2 (/fit/camera/frame): its log time goes back",
+        "frame 9: its data is not as large as it says",
+    )
+
+
+def test_what_is_no_log_is_refused(tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"hello")
+    with pytest.raises(LogError, match="is not an MCAP log"):
+        verify(path)
