@@ -13,6 +13,8 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from fitctl.commands import log, sequence
+from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
@@ -32,21 +34,9 @@ app = typer.Typer(
 
 fault = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
 app.add_typer(fault, name="fault")
+app.add_typer(log.app, name="log")
+app.add_typer(sequence.app, name="sequence")
 
-RigOption = Annotated[
-    Path | None,
-    typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE", help="Replace a value of the rig file; may be repeated."
-    ),
-]
-SeedOption = Annotated[
-    int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
 ControllerOption = Annotated[
     str | None,
     typer.Option(
@@ -415,14 +405,6 @@ def check(rig: RigOption = None, overrides: SetOption = None) -> None:
     check_plant(settings)
     loops = ", ".join(settings.loops)
     typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
-
-
-@app.command()
-def log(path: Annotated[Path, typer.Argument(help="An MCAP file, finished or not.")]) -> None:
-    """Say what a log holds."""
-    from fitctl.commands.instrument import show_log
-
-    show_log(path)
 
 
 @app.command(hidden=True)

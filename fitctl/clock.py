@@ -65,4 +65,5 @@ class VirtualClock:
 
     def sleep_until(self, deadline_s: float) -> None:
         """Move the time on, at once."""
-        self._now_s = max(self._now_s, deadline_s)
+        if deadline_s > self._now_s:  # noqa: PLR1730 - max takes thrice as long, 700 times a second
+            self._now_s = deadline_s

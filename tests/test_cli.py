@@ -51,7 +51,7 @@ BAD_INPUT = {
     "a value of a wrong type": (["check", "--set", "camera.width_px=wide"], "camera.width_px"),
     "a missing rig file": (["check", "--rig", "no-such.toml"], "no-such.toml: no such rig file"),
     "a --set without a value": (["check", "--set", "camera.width_px"], "expected key.path=value"),
-    "a log that is not there": (["log", "no-such.mcap"], "no-such.mcap"),
+    "a log that is not there": (["log", "info", "no-such.mcap"], "no-such.mcap"),
     "a command that is none": (["send", "explode"], "explode is no command"),
     "a negative duration": (["simulate", "--duration", "-3"], "duration"),
     "a negative seed": (["simulate", "--seed", "-1"], "seed"),
@@ -63,7 +63,7 @@ BAD_INPUT = {
     ),
     "a frame limit below the delay": (
         ["check", "--set", "camera.frame_delay_s=0.3"],
-        "frame_timeout_s must be above",
+        "stale_s must be above",
     ),
     "a stack that cannot be": (
         ["simulate", "--set", "plant.loops.right.hysteresis.breakpoints_v=[0.0, 0.1]"],

@@ -32,6 +32,7 @@ from fitctl.commands.fault import kinds as fault_kinds
 from fitctl.commands.instrument import command_of
 from fitctl.config import default_rig_path, load_rig, rig_from_document
 from fitctl.logging.records import RecorderStatus
+from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.logging.writer import LogWriter
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.supervisor.messages import Acquire, Shutdown, Status
@@ -81,19 +82,23 @@ def sample_log(tmp_path_factory):
     rig = load_rig(default_rig_path())
     path = tmp_path_factory.mktemp("sample") / "sample.mcap"
     info = run_info(rig, "simulated", now_s=0.0)
+
+    def log_time_s():
+        return simulation.clock.now_s() + info.wall_minus_monotonic_s
+
     with LogWriter(path, rig.logging) as log:
         log.write(info, info.wall_minus_monotonic_s)
         simulation = Simulation(
             rig,
             seed=1,
             star_offset_px=NEARBY_PX,
-            record=lambda record: log.write(record, record.time_s + info.wall_minus_monotonic_s),
+            record=lambda record: log.write(record, log_time_s()),
         )
         simulation.acquire()
         simulation.run(20.0)
         now_s = simulation.clock.now_s()
         status = RecorderStatus(time_s=now_s, path=str(path), records=1, lost=0, bytes_written=1)
-        log.write(status, now_s + info.wall_minus_monotonic_s)
+        log.write(status, log_time_s())
     return path
 
 
@@ -145,8 +150,8 @@ def masked(lines):
 
 @pytest.mark.parametrize("found", filter(runnable, ours()), ids=str)
 def test_quick_commands_run_and_print_what_the_document_shows(found, checkout):
-    for word in found.words:
-        if word.endswith(".mcap"):
+    for before, word in pairwise(found.words):
+        if word.endswith(".mcap") and before != "--out":
             shutil.copy(checkout / "logs" / "sample.mcap", checkout / word)
 
     done = subprocess.run(
@@ -287,6 +292,18 @@ def test_the_faults_are_those_of_the_mocks():
     assert between("devices.md", "faults") == table(
         ["device", "fault", "what happens", "value, if none is given", "parts"], rows
     )
+
+
+def test_the_topics_of_a_log_are_those_of_the_schemas():
+    loop = next(iter(default_rig()["loops"]))
+    rows = []
+    for kind, topic in TOPICS.items():
+        message = MESSAGES[kind].DESCRIPTOR
+        fields = ", ".join(f"`{field.name}`" for field in message.fields)
+        what = kind.__doc__.split("\n")[0].replace("``", "`").replace(":class:", "")
+        rows.append([f"`{topic.format(loop=loop)}`", message.full_name, what, fields])
+
+    assert between("logs.md", "topics") == table(["topic", "message", "what it is", "fields"], rows)
 
 
 def test_the_layers_are_those_of_the_import_contract():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,6 @@ from fitctl import demo as demos
 from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, LoopMocks, Rig
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import log_info
 from fitctl.logging.records import RecorderStatus
 from fitctl.model.plant_constants import plant_constants
 from fitctl.processes import (
@@ -53,13 +51,14 @@ COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
 class WithValues(NamedTuple):
     """A command that needs values, and their names in the order in which they are given."""
 
-    make: type[messages.SetTarget | messages.SetController]
+    make: type[messages.SetTarget | messages.SetController | messages.Reset]
     fields: tuple[str, ...]
 
 
 WITH_VALUES = {
     "target": WithValues(messages.SetTarget, ("az_px", "el_px")),
     "controller": WithValues(messages.SetController, ("name",)),
+    "reset": WithValues(messages.Reset, ("name",)),
 }
 
 
@@ -348,17 +347,3 @@ def check_plant(rig: Rig) -> None:
     if rig.plant is not None:
         for name in rig.loops:
             plant_constants(rig, name, np.zeros((1, 2)))
-
-
-def show_log(path: Path) -> None:
-    """Print what a log holds."""
-    try:
-        info = log_info(path)
-    except LogError as error:
-        raise ConfigError(str(error)) from None
-    state = "finished" if info.finished else "not finished (cut off, or still being written)"
-    start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(info.start_s))
-    typer.echo(f"{info.path}: {state}\nfrom {start}, {info.duration_s:.1f} s")
-    width = max(map(len, info.counts), default=0)
-    for topic, count in sorted(info.counts.items()):
-        typer.echo(f"  {topic:<{width}}  {count}")

@@ -18,6 +18,7 @@ from fitctl.config.devices import (
     StackHysteresis,
     Structure,
 )
+from fitctl.config.interlocks import QUANTITIES, Action, Interlock, ResetBy
 from fitctl.config.loops import (
     CONTROLLERS,
     AirPathModel,
@@ -44,6 +45,8 @@ __all__ = [
     "ARCSEC_PER_RAD",
     "CONTROLLERS",
     "HALF_WINDOW_PX",
+    "QUANTITIES",
+    "Action",
     "AirPath",
     "AirPathModel",
     "AxisPair",
@@ -60,6 +63,7 @@ __all__ = [
     "Fsm",
     "GigeMock",
     "Hysteresis",
+    "Interlock",
     "Logging",
     "Loop",
     "LoopMocks",
@@ -68,6 +72,7 @@ __all__ = [
     "Mdt693Mock",
     "ModbusDacDevice",
     "Range",
+    "ResetBy",
     "Rig",
     "Siderostat",
     "Spot",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from fitctl.config.base import (
     AxisPair,
@@ -14,7 +14,6 @@ from fitctl.config.base import (
     Positive,
     Range,
     Settings,
-    TimeoutS,
 )
 from fitctl.config.devices import AnySiderostat, Fsm
 
@@ -120,7 +119,6 @@ class Loop(Settings):
 class Supervisor(Settings):
     """Time limits and rates of the supervisor."""
 
-    frame_timeout_s: TimeoutS
     late_tick_s: Positive
     stall_s: Positive
     safe_disable_after_s: NonNegative
@@ -134,10 +132,21 @@ class Service(Settings):
 
 
 class Logging(Settings):
-    """The log: where, and how much may be lost."""
+    """The log: where, how much may be lost, when a new file begins, and how long files stay."""
 
     folder: str
     chunk_bytes: Annotated[int, Field(ge=4096, le=16_777_216)]
     flush_s: Annotated[float, Field(gt=0, le=60)]
     queue_records: Annotated[int, Field(ge=16, le=1_000_000)]
     compression: Literal["zstd", "lz4", "none"]
+    rotate_bytes: Annotated[int, Field(ge=65_536)]
+    rotate_s: Annotated[float, Field(ge=1, le=31_536_000)]
+    retain_bytes: Count
+    retain_days: Annotated[float, Field(gt=0, le=36_500)]
+
+    @model_validator(mode="after")
+    def _room_to_write(self) -> Logging:
+        if self.retain_bytes < 2 * self.rotate_bytes:
+            msg = "retain_bytes must be at least twice rotate_bytes, or no finished file would stay"
+            raise ValueError(msg)
+        return self

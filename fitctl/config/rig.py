@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from fitctl.config.base import ConfigError, Settings
 from fitctl.config.devices import Camera, Optics
+from fitctl.config.interlocks import QUANTITIES, Interlock
 from fitctl.config.loops import Logging, Loop, Service, Supervisor
 from fitctl.config.mocks import Mocks
 from fitctl.config.plant import PlantTruth
@@ -26,6 +27,7 @@ class Rig(Settings):
     camera: Camera
     loops: Annotated[dict[str, Loop], Field(min_length=1)]
     supervisor: Supervisor
+    interlocks: dict[str, Interlock]
     service: Service
     logging: Logging
     plant: PlantTruth | None = None
@@ -46,12 +48,14 @@ class Rig(Settings):
                 )
                 raise ValueError(msg)
         oldest_s = self.camera.frame_delay_s + 2 * self.camera.period_s
-        if self.supervisor.frame_timeout_s <= oldest_s:
-            msg = (
-                f"supervisor.frame_timeout_s must be above {oldest_s:g} s, "
-                "the camera's delay and two frames"
-            )
-            raise ValueError(msg)
+        for name, row in self.interlocks.items():
+            of_frames = QUANTITIES[row.quantity].every_frame
+            if of_frames and row.stale_s is not None and row.stale_s <= oldest_s:
+                msg = (
+                    f"interlocks.{name}.stale_s must be above {oldest_s:g} s, "
+                    "the camera's delay and two frames"
+                )
+                raise ValueError(msg)
         for section, part in (("plant", self.plant), ("mocks", self.mocks)):
             if part is not None and set(part.loops) != set(self.loops):
                 msg = f"{section}.loops must name the same loops as loops: {', '.join(self.loops)}"

@@ -99,9 +99,8 @@ class StarSensor:
         ].astype(np.float64)
         light_dn, az_moment, el_moment = _SUMS.dot(window.ravel()).tolist()
         flux_dn = light_dn - self._window_bias_dn  # the bias has no moment about the middle
-        if (
-            float(window.max()) - self._bias_dn > LARGEST_PEAK * flux_dn
-        ):  # also where there is no light
+        peak_dn = float(window.max()) - self._bias_dn
+        if flux_dn <= 0 or peak_dn > LARGEST_PEAK * flux_dn:
             return None
         return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
 

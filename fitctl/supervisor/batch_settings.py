@@ -22,6 +22,7 @@ from fitctl.model.optics import mirror_angles, scales, stack_matrix
 from fitctl.model.pixel_noise import quantiles
 from fitctl.model.plant_constants import PlantConstants
 from fitctl.model.scene import FULL_WELL_DN
+from fitctl.supervisor.batch_interlocks import acting_interlocks
 from fitctl.supervisor.injector import PERIOD_S
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.servo import FOLLOWING_S, HISTORY_S
@@ -127,7 +128,7 @@ WORK = np.dtype(
 
 
 class TooLargeForBatchError(Exception):
-    """The rig has more of something than the records hold."""
+    """The rig has more of something than the records hold, or an interlock that may act."""
 
 
 def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArray[np.void]:
@@ -137,6 +138,10 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     ------
     TooLargeForBatchError
     """
+    acting = acting_interlocks(rig, loop_name)
+    if acting:
+        msg = f"interlock {acting[0]} may act, and a batch knows of no interlocks"
+        raise TooLargeForBatchError(msg)
     loop, camera = rig.loops[loop_name], rig.true_camera
     truth, _ = rig.mock_parts()
     plant = truth.loops[loop_name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -43,6 +44,11 @@ class Client:
         self._subscriber.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
         self._subscriber.subscribe(b"")
         self._subscriber.connect(f"ipc://{folder / TELEMETRY_SOCKET}")
+
+    @staticmethod
+    def now_s() -> float:
+        """The supervisor's time: processes of one machine share their monotonic clock."""
+        return time.monotonic()
 
     def receive(self, timeout_s: float) -> Telemetry | None:
         """The next telemetry message, or None when none came in time.

@@ -54,6 +54,7 @@ class Injector:
         self.threaded = False
         self.fault: Exception | None = None
         self.late_s: deque[float] = deque(maxlen=64)
+        self.skipped = 0
         self._dac = dac
         self._clock = clock
         self._stack_v_per_px = stack_v_per_px

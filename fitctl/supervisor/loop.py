@@ -35,7 +35,9 @@ from fitctl.logging.records import (
 )
 from fitctl.model.drives import SIDEROSTAT, Drive, channel_values, experiment_s
 from fitctl.model.optics import scales
+from fitctl.supervisor.interlocks import Interlocks
 from fitctl.supervisor.modes import FOLLOWING, TRACKING, Mode, Trigger, transition
+from fitctl.supervisor.quantities import Quantities, places
 from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.stages import Stages
 
@@ -135,8 +137,10 @@ class StellarLoop:
         self.stages = Stages(rig, name, servo, dac, clock)
         self._experiment: Experiment | None = None
         self._range_px = self._scale.mirror_px_per_rad * loop.fsm.range_rad
-        self._at_travel_limit = False
         self._findings = Findings()
+        self._flattened = False
+        self.measured = Quantities(rig, name)
+        self.interlocks = Interlocks(rig.interlocks, places(rig, name))
         self._laws: dict[Mode, Callable[[Seen], None]] = {
             Mode.OFF: self._rest,
             Mode.STANDBY: self._rest,
@@ -155,11 +159,25 @@ class StellarLoop:
         self._note_injections()
         seen = self._sense(frame)
         self._judge(frame, seen.star)
-        # Without a frame to track by, the stages wait where they are.
-        if frame is not None or self.mode not in TRACKING:
-            self._laws[self.mode](seen)
+        self._judge_interlocks(frame, seen.star)
+        self._move(frame, seen)
         self._write()
-        return self._record(frame, seen, started_s, frames_lost)
+        tick = self._record(frame, seen, started_s, frames_lost)
+        self.measured.of_tick(tick.compute_s, tick.time_s)
+        return tick
+
+    def _move(self, frame: Frame | None, seen: Seen) -> None:
+        """By the mode's law, unless an interlock holds or flattens."""
+        action = self.interlocks.action if self.mode in TRACKING else None
+        if action == "flatten":
+            self.stages.mirror_to_bias()
+        elif self._flattened and self.mode is Mode.VERNIER:
+            self._start_pair()
+        self._flattened = action == "flatten"
+        # Without a frame to track by, the stages wait where they are.
+        waits = frame is None and self.mode in TRACKING
+        if action not in {"hold", "flatten"} and not waits:
+            self._laws[self.mode](seen)
 
     def _sense(self, frame: Frame | None) -> Seen:
         """What a frame shows belongs to where the stages were when it was exposed."""
@@ -183,7 +201,7 @@ class StellarLoop:
         return star
 
     def _judge(self, frame: Frame | None, star: Star | None) -> None:
-        """Interlocks and findings: what leads to another mode."""
+        """Errors of devices and findings: what leads to another mode."""
         if self.servo.fault is not None:
             self.fail(str(self.servo.fault))
         elif frame is not None and self.mode is Mode.ACQUISITION:
@@ -193,6 +211,39 @@ class StellarLoop:
             self.fail(str(self.stages.injector.fault))
         elif frame is not None and self.mode in FOLLOWING:
             self._judge_tracking(star)
+
+    def _judge_interlocks(self, frame: Frame | None, star: Star | None) -> None:
+        """Measure, judge by the rig file's table, and tell; what holds or flattens, :meth:`_move` asks for."""
+        now_s, measured, interlocks = self._clock.now_s(), self.measured, self.interlocks
+        if frame is not None:
+            measured.of_frame(frame, star, now_s)
+        measured.of_stages(self.servo, self.stages, now_s)
+        for trip, over in interlocks.judge(self.mode.name, now_s, measured.readings):
+            if over:
+                self._event("info", f"interlock {trip.name} is over")
+            elif trip.action == "safe":
+                self.fail(trip.reason)
+            else:
+                self._event("warning", f"{trip.reason} ({trip.action})")
+        if interlocks.tripped:
+            self._obey_interlocks()
+
+    def _obey_interlocks(self) -> None:
+        """What is tripped stays in force, whatever mode the loop is put in."""
+        action = self.interlocks.action
+        reason = next(trip.reason for trip in self.interlocks.tripped if trip.action == action)
+        if action == "safe" and self.mode is not Mode.SAFE:
+            self.fire(Trigger.FAULT, reason)
+        elif action in {"hold", "flatten"} and self.mode is Mode.EXPERIMENT:
+            self.fire(Trigger.EXPERIMENT_DONE, reason)
+
+    def reset_interlock(self, name: str) -> str:
+        """Let one go by hand; why not, if it cannot be."""
+        now_s = self._clock.now_s()
+        why_not = self.interlocks.reset(name, now_s, self.measured.readings)
+        if not why_not:
+            self._event("info", f"interlock {name} is reset by hand")
+        return why_not
 
     def _judge_search(self, frame: Frame, star: Star | None) -> None:
         acquisition = self.settings.acquisition
@@ -289,9 +340,7 @@ class StellarLoop:
 
     def _start_search(self) -> None:
         """A new spiral, about where the star is expected: on the target, or where it was last seen."""
-        motor_rad = self.servo.position_rad
-        if not self._estimator.known:
-            self._estimator.assume(self.target_px, motor_rad, np.zeros(2))
+        self._estimator.expect(self.target_px, self.servo.position_rad, np.zeros(2))
         # The expected star belongs in the middle of the field, where the search sees farthest.
         self._spiral_centre_rad = self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
         self._spiral = Spiral(self._plan)
@@ -306,10 +355,12 @@ class StellarLoop:
     def _search(self, _seen: Seen) -> None:
         self.stages.mirror_to_bias()
         if self._sighting is not None:
-            self._siderostat_to(self._sighting.motor_rad)
+            self.stages.siderostat_to(self._sighting.motor_rad)
             return
         offset_px = self._spiral.advance(self._period_s)
-        self._siderostat_to(self._spiral_centre_rad + offset_px / self._scale.motor_px_per_rad)
+        self.stages.siderostat_to(
+            self._spiral_centre_rad + offset_px / self._scale.motor_px_per_rad
+        )
 
     def _pull_in(self, seen: Seen) -> None:
         self.stages.mirror_to_bias()
@@ -340,7 +391,7 @@ class StellarLoop:
             self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
             return
         offset_px = channel_values(experiment.drives, SIDEROSTAT, now_s - experiment.start_s)
-        self._siderostat_to(experiment.held_rad + offset_px / self._scale.motor_px_per_rad)
+        self.stages.siderostat_to(experiment.held_rad + offset_px / self._scale.motor_px_per_rad)
 
     # ------------------------------------------------------------ designs and experiments
 
@@ -376,7 +427,7 @@ class StellarLoop:
         self._note_injections()
         experiment, self._experiment = self._experiment, None
         if experiment is not None and self.mode is not Mode.SAFE:
-            self._siderostat_to(experiment.held_rad)
+            self.stages.siderostat_to(experiment.held_rad)
 
     def _note_injections(self) -> None:
         for time_s, stack_v in self.stages.take_injections():
@@ -400,9 +451,15 @@ class StellarLoop:
     # ------------------------------------------------------------ stages
 
     def start_from(self, stack_v: Floats) -> None:
-        """Take the D/A's outputs, shape (3,), as found; the mirror goes to its bias from there."""
+        """Begin anew with devices just opened and checked.
+
+        The D/A's outputs, shape (3,), are taken as found: the mirror goes to its bias from there. Every
+        interlock is judged anew.
+        """
         self.stages.start_from(stack_v)
         self._last_failure = ""
+        self.measured.begin()
+        self.interlocks.reset_all(self._clock.now_s())
         if self.servo.encoders_jumped:
             self._estimator.forget()
             self._event(
@@ -410,17 +467,7 @@ class StellarLoop:
             )
 
     def _siderostat_by(self, step_rad: Floats) -> None:
-        self._siderostat_to(self.stages.setpoint_rad + step_rad)
-
-    def _siderostat_to(self, setpoint_rad: Floats) -> None:
-        limited = not self.stages.siderostat_to(setpoint_rad)
-        if limited and not self._at_travel_limit:
-            self._event(
-                "warning",
-                f"siderostat at its software limit of {self.settings.siderostat.travel_sky_arcsec:g} "
-                "arcsec; it waits there",
-            )
-        self._at_travel_limit = limited
+        self.stages.siderostat_to(self.stages.setpoint_rad + step_rad)
 
     def _write(self) -> None:
         """Every tick, so that the D/A's watchdog sees that we live."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 
-from fitctl.config import ControllerName
+from fitctl.config import Action, ControllerName, ResetBy
 from fitctl.logging.records import (
     DeviceHealth,
     Event,
@@ -13,6 +15,7 @@ from fitctl.logging.records import (
     ModeChange,
     PiezoReading,
     RecorderStatus,
+    SequenceAttempt,
     Tick,
 )
 from fitctl.model.drives import Drive
@@ -64,6 +67,12 @@ class SetController(Command, frozen=True, kw_only=True):
     name: ControllerName
 
 
+class Reset(Command, frozen=True, kw_only=True):
+    """Let a tripped interlock go, by its name in the rig file."""
+
+    name: str
+
+
 class Experiment(Command, frozen=True, kw_only=True):
     """From COARSE or VERNIER: move the stages of one loop as told, open loop, and go back to COARSE."""
 
@@ -85,6 +94,34 @@ class RecorderReport(Command, frozen=True, kw_only=True):
     status: RecorderStatus
 
 
+class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a sequence is; ``run`` tells two runs apart, ``wanted`` is what people ask of it."""
+
+    run: str
+    name: str
+    state: Literal["running", "paused", "done", "failed", "stopped"]
+    steps: int
+    step_number: int = 0
+    step: str = ""
+    loop: str = ""
+    attempt: int = 0
+    message: str = ""
+    last_attempt: SequenceAttempt | None = None
+    wanted: Literal["run", "pause", "stop"] = "run"
+
+
+class SequenceReport(Command, frozen=True, kw_only=True):
+    """A sequence tells where it is, at least once a second."""
+
+    status: SequenceStatus
+
+
+class SequenceControl(Command, frozen=True, kw_only=True):
+    """Pause, resume or stop the sequence that is running, wherever it runs."""
+
+    action: Literal["pause", "resume", "stop"]
+
+
 AnyCommand = (
     Standby
     | Acquire
@@ -94,10 +131,13 @@ AnyCommand = (
     | Off
     | SetTarget
     | SetController
+    | Reset
     | Experiment
     | Status
     | Shutdown
     | RecorderReport
+    | SequenceReport
+    | SequenceControl
 )
 
 
@@ -106,6 +146,16 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
     accepted: bool
     text: str = ""
+
+
+class TrippedInterlock(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of the table of interlocks that is in force; ``reason`` ends with what to do."""
+
+    name: str
+    since_s: float
+    action: Action
+    reset: ResetBy
+    reason: str
 
 
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
@@ -119,6 +169,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     usable_commands: list[str]
     controller: str = ""
     last_change: ModeChange | None = None
+    interlocks: list[TrippedInterlock] = []
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
@@ -144,3 +195,4 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     recorder: RecorderStatus | None
     records_lost: int
     scheduling: str
+    running_sequence: SequenceStatus | None = None

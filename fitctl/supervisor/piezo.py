@@ -61,6 +61,6 @@ def disagreement(
                 "that the D/A was told",
                 f"{volts:.1f} V",
                 "check the cable from D/A to amplifier, the amplifier's own set-point (it must be 0 V), "
-                "and the stack",
+                "the stack, and piezo.gain in the rig file",
             )
     return None

@@ -18,6 +18,8 @@ from pathlib import Path
 
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import design_json
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.processes import end_process, ended_by_signals, last_line, start_process
@@ -28,6 +30,7 @@ from fitctl.supervisor.endpoints import (
     TELEMETRY_SOCKET,
     make_service_folder,
 )
+from fitctl.supervisor.machine import Machine
 from fitctl.supervisor.realtime import (
     become_realtime,
     collect_young,
@@ -177,7 +180,8 @@ def run_supervisor(
     ConfigError
         If the socket folder cannot be used, or another supervisor has this rig.
     """
-    check_log_folder(Path(rig.logging.folder).expanduser())
+    log_folder = Path(rig.logging.folder).expanduser()
+    check_log_folder(log_folder)
     folder = make_service_folder(rig)
     with ExitStack() as stack:
         ending = threading.Event()
@@ -198,6 +202,9 @@ def run_supervisor(
         supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
         recorder = Recorder(recorder_arguments, folder / _RECORDER_ERRORS, supervisor.note)
         stack.callback(recorder.end)
+        machine = Machine(
+            log_folder, lambda: queue.waiting / rig.logging.queue_records, supervisor.measured
+        )
         scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
         info = run_info(rig, scheduling, clock.now_s())
         record(info)
@@ -215,7 +222,7 @@ def run_supervisor(
             thread.start()
         on_ready(folder)
         try:
-            _loop(supervisor, service, queue, recorder, executor, clock, ending)
+            _loop(supervisor, service, queue, recorder, machine, executor, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -229,6 +236,7 @@ def _loop(
     service: Service,
     queue: RecordQueue,
     recorder: Recorder,
+    machine: Machine,
     executor: ThreadPoolExecutor,
     clock: MonotonicClock,
     ending: threading.Event,
@@ -242,6 +250,7 @@ def _loop(
                 queue.pump()
                 collect_young()
                 executor.submit(recorder.check)
+                executor.submit(machine.look)
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
         supervisor.shutdown_wanted = True
@@ -262,5 +271,6 @@ def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
         rig_name=rig.name,
         rig_json=rig.model_dump_json(indent=1),
         versions=versions | {"python": platform.python_version()},
+        designs={name: design_json(design_for(rig, name)) for name in rig.loops},
         scheduling=scheduling,
     )

@@ -101,6 +101,7 @@ class TelemetryBuffer:
                     usable_commands=[t.name.capitalize() for t in usable_commands(loop.mode)],
                     controller=loop.controller,
                     last_change=loop.last_change,
+                    interlocks=list(loop.interlocks.tripped),
                 )
                 for name, loop in supervisor.loops.items()
             ],
@@ -114,6 +115,7 @@ class TelemetryBuffer:
             recorder=self.recorder,
             records_lost=state.records_lost(),
             scheduling=state.scheduling,
+            running_sequence=supervisor.sequences.status(),
         )
 
 

@@ -38,7 +38,6 @@ HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
 _READ_AT = operator.itemgetter(0)  # of a reading: when
 _STILL = (0.0, 0.0)
-_BLIND_MISSES = 2
 FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
 
@@ -48,6 +47,7 @@ class ServoTiming(NamedTuple):
 
     late_s: list[float]
     missed_readings: int
+    skipped: int
 
 
 class SiderostatServo:
@@ -97,13 +97,17 @@ class SiderostatServo:
         self._wish_rad: AzEl | None = None
         self._requests: deque[tuple[Callable[[], DeviceIdentity | None], Future]] = deque()
         self._history: deque[ServoReading] = deque(maxlen=round(HISTORY_S / self.period_s))
-        self._last_reading_s = 0.0
+        self._blind_s = 1.0 / siderostat.servo.gain_per_s  # an older reading would make it swing
+        self._read_s = -math.inf
+        self._timely_s = 0.0
         self._missed_readings = 0
-        self._misses_in_a_row = 0
         self._followed_s = 0.0
         self.encoders_jumped = False
         self._disabling = False
         self.late_s: deque[float] = deque(maxlen=4096)
+        self.skipped = 0
+        self.round_trip_s = 0.0
+        self._least_following_rad: float | None = None
 
     # ------------------------------------------------------------ from any thread
 
@@ -127,6 +131,19 @@ class SiderostatServo:
         """Servo about where the motors are now."""
         self.move_to(self.position_rad)
         self._stopped = False
+
+    @property
+    def newest_reading(self) -> ServoReading | None:
+        """What the amplifiers said last."""
+        try:
+            return self._history[-1]
+        except IndexError:  # none since it was opened
+            return None
+
+    def take_following_rad(self) -> float | None:
+        """The least following error since last asked; None where the motors followed nothing."""
+        least, self._least_following_rad = self._least_following_rad, None
+        return least
 
     def position_at(self, time_s: float) -> Floats:
         """Motor angles at a recent time, shape (2,), interpolated between readings."""
@@ -157,10 +174,11 @@ class SiderostatServo:
         self._ask(self._close)
 
     def take_timing(self) -> ServoTiming:
-        """Lateness and missed readings since the last call."""
+        """Lateness, missed readings and skipped periods since the last call."""
         late = [self.late_s.popleft() for _ in range(len(self.late_s))]
         missed, self._missed_readings = self._missed_readings, 0
-        return ServoTiming(late, missed)
+        skipped, self.skipped = self.skipped, 0
+        return ServoTiming(late, missed, skipped)
 
     # ------------------------------------------------------------ on the servo's thread
 
@@ -188,15 +206,18 @@ class SiderostatServo:
         """There is always work."""
 
     def _exchange(self) -> None:
-        reading = self._amplifiers.exchange(self._velocity_rad_s())
+        asked_s = self._clock.now_s()
+        reading = self._amplifiers.exchange(self._velocity_rad_s(asked_s))
         now_s = self._clock.now_s()
+        self.round_trip_s = now_s - asked_s
         if reading is None:
             self._missed_readings += 1
-            self._misses_in_a_row += 1
-            if now_s - self._last_reading_s > self._settings.reading_timeout_s:
-                raise self._no_reading()
+        else:
+            self._take(reading, now_s)
+        if now_s - self._timely_s > self._settings.reading_timeout_s:
+            raise self._no_reading()
+        if reading is None:
             return
-        self._take(reading, now_s)
         if reading.fault:
             hint = "remove its cause, then recover"
             raise DeviceFault(self._device, self.endpoint, "no fault", reading.fault, hint)
@@ -207,25 +228,29 @@ class SiderostatServo:
             self._servo.reset(reading.position_rad)
             return
         following_rad = self._servo.following_error_rad(reading.position_rad)
+        least_rad = self._least_following_rad
+        if least_rad is None or following_rad < least_rad:
+            self._least_following_rad = following_rad
         if following_rad <= self._settings.following_error_limit_rad:
             self._followed_s = reading.time_s
         # A reversal at full speed is behind for a moment; a stuck axis stays behind.
         elif reading.time_s - self._followed_s > FOLLOWING_S:
             raise self._not_following(following_rad)
 
-    def _velocity_rad_s(self) -> AzEl:
+    def _velocity_rad_s(self, now_s: float) -> AzEl:
         wish, self._wish_rad = self._wish_rad, None
         if self._stopped or not self.enabled:
             return _STILL
         if wish is not None:
             self._servo.move_to(wish)
-        if self._misses_in_a_row >= _BLIND_MISSES:
+        if now_s - self._read_s > self._blind_s:
             return _STILL  # blind motors stand still, and the reference waits for them
         return self._servo.step(self._position_rad)
 
     def _take(self, reading: ServoReading, now_s: float) -> None:
-        self._last_reading_s = now_s
-        self._misses_in_a_row = 0
+        self._read_s = reading.time_s
+        if now_s - reading.time_s <= self._blind_s:
+            self._timely_s = now_s
         self._position_rad = reading.position_rad
         self._history.append(reading)
 
@@ -241,7 +266,8 @@ class SiderostatServo:
         return DeviceTimeout(
             self._device,
             self.endpoint,
-            f"an encoder reading within {self._settings.reading_timeout_s:g} s",
+            f"an encoder reading within {self._settings.reading_timeout_s:g} s, "
+            f"at most {self._blind_s * 1e3:.0f} ms old",
             "none",
             "check the drive's power and link, then recover",
         )
@@ -268,7 +294,7 @@ class SiderostatServo:
         self._find_position()
         self._amplifiers.enable()
         self.opened = self.enabled = True
-        self._last_reading_s = self._clock.now_s()
+        self._timely_s = self._clock.now_s()
         return identity
 
     def _find_position(self) -> None:
@@ -328,6 +354,7 @@ class Periodic(Protocol):
     period_s: float
     threaded: bool
     late_s: deque[float]
+    skipped: int
 
     def period(self) -> None:
         """Do one period's work."""
@@ -368,3 +395,4 @@ class PeriodicThread:
             self._work.wait()
             passed = max(1, int((self._clock.now_s() - deadline_s) / period_s) + 1)
             deadline_s += passed * period_s
+            self._work.skipped += passed - 1

@@ -39,6 +39,12 @@ class Stages:
         Wanted at the D/A, from the next write on.
     mirror_rad, setpoint_rad : arrays, shape (2,)
         Commanded mirror angles and motor set-points.
+    written_s, round_trip_s : float
+        When the D/A last took voltages, and how long that took.
+    asked_fraction : float
+        Of the siderostat's travel: the wanted set-point before it was limited.
+    travel_rad : float
+        Of the motors, each way from the encoders' zero.
     injector : Injector
         Writes the D/A in this one's stead while an experiment runs.
     """
@@ -52,6 +58,9 @@ class Stages:
         self.stack_v = np.full(3, loop.fsm.bias_v)
         self.mirror_rad = np.zeros(2)
         self.setpoint_rad = np.zeros(2)
+        self.written_s = clock.now_s()
+        self.round_trip_s = 0.0
+        self.asked_fraction = 0.0
         self.injector = Injector(
             dac,
             clock,
@@ -67,7 +76,7 @@ class Stages:
         self._clock = clock
         self._mirror = Mirror(loop.fsm)
         self._most_slew_v = loop.fsm.slew_v_per_s * rig.camera.period_s
-        self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        self.travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
         shortest_s = min(rig.camera.period_s, self.injector.period_s)
         self._lowest_v, self._highest_v = self.stack_v.copy(), self.stack_v.copy()
         self._mirror_history: deque[tuple[float, Floats]] = deque(
@@ -98,6 +107,7 @@ class Stages:
         self.stack_v = self._mirror.stack_v
         self.mirror_rad = self._mirror.angles_rad
         self.take_told_range()
+        self.written_s = self._clock.now_s()
         self.ready = True
 
     def at_bias(self) -> bool:
@@ -126,11 +136,14 @@ class Stages:
             If it does not take it; then nothing more is written until :meth:`start_from`.
         """
         self.ready = False
+        begun_s = self._clock.now_s()
         self._dac.write_v(self.stack_v)
         self.ready = True
+        self.written_s = self._clock.now_s()
+        self.round_trip_s = self.written_s - begun_s
         self._mirror.written(self.stack_v)
         self._extend_told_range(self.stack_v)
-        self._mirror_history.append((self._clock.now_s(), self._mirror.angles_rad))
+        self._mirror_history.append((self.written_s, self._mirror.angles_rad))
 
     def take_told_range(self) -> tuple[Floats, Floats]:
         """Lowest and highest voltages, shape (3,) each, that the D/A was told since last asked."""
@@ -150,6 +163,7 @@ class Stages:
             self._extend_told_range(stack_v)
             self.stack_v, self.mirror_rad = stack_v, self._mirror.angles_rad
             self._mirror_history.append((time_s, self.mirror_rad))
+            self.written_s = time_s
         return injections
 
     # ------------------------------------------------------------ siderostat
@@ -157,12 +171,13 @@ class Stages:
     def siderostat_held(self) -> None:
         """The servo holds the siderostat where it is."""
         self.setpoint_rad = self._servo.setpoint_rad
+        self.asked_fraction = 0.0
 
-    def siderostat_to(self, setpoint_rad: Floats) -> bool:
-        """Move the set-point, shape (2,), no farther than its travel; False where that ends."""
+    def siderostat_to(self, setpoint_rad: Floats) -> None:
+        """Move the set-point, shape (2,), no farther than its travel."""
         az_rad, el_rad = setpoint_rad.tolist()
-        most_rad = self._travel_rad
-        within = -most_rad <= az_rad <= most_rad and -most_rad <= el_rad <= most_rad
+        most_rad = self.travel_rad
+        self.asked_fraction = max(abs(az_rad), abs(el_rad)) / most_rad
+        within = self.asked_fraction <= 1.0
         self.setpoint_rad = setpoint_rad if within else np.clip(setpoint_rad, -most_rad, most_rad)
         self._servo.move_to(self.setpoint_rad)
-        return within

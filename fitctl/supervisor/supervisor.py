@@ -23,13 +23,14 @@ from fitctl.drivers.interface import (
     DeviceIdentity,
     DeviceMismatch,
     Devices,
-    DeviceTimeout,
     Frame,
 )
 from fitctl.logging.records import (
     AnyRecord,
     Event,
     FrameRecord,
+    LoopTiming,
+    PiezoReading,
     Severity,
 )
 from fitctl.supervisor.drives import refused_drives
@@ -43,6 +44,9 @@ from fitctl.supervisor.messages import (
     Off,
     Recover,
     Reply,
+    Reset,
+    SequenceControl,
+    SequenceReport,
     SetController,
     SetTarget,
     Shutdown,
@@ -52,10 +56,12 @@ from fitctl.supervisor.messages import (
 from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
 from fitctl.supervisor.piezo import disagreement, read_piezo
 from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices
+from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.servo import Periodic, SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
 _CLOSE_TIMEOUT_S = 30.0
+_SILENT_FRAMES = 10  # fewer may be missing when the machine stands still
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Standby: Trigger.STANDBY,
     Acquire: Trigger.ACQUIRE,
@@ -107,11 +113,12 @@ class Supervisor:
             name: StellarLoop(name, rig, servo, devices.loops[name].dac, clock, record)
             for name, servo in self.servos.items()
         }
+        self.sequences = SequenceBoard(clock, record)
         self.shutdown_wanted = False
         self._devices = devices
         self._clock = clock
         self._executor = executor
-        self._record = record
+        self._log = record
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
         self._notes: deque[tuple[Severity, str, str]] = deque()
         self._job: Job | None = None
@@ -125,7 +132,7 @@ class Supervisor:
         self._camera_ready = False
         self._last_frame_s = clock.now_s()
         self._identities: dict[str, DeviceIdentity] = {}
-        self._timing = TimingBook(clock, rig, record)
+        self._timing = TimingBook(clock, rig, self._record)
 
     # ------------------------------------------------------------ from any thread
 
@@ -142,6 +149,12 @@ class Supervisor:
     def note(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
         self._notes.append((severity, source, message))
+
+    def measured(self, name: str, value: float) -> None:
+        """A quantity of all loops, for their interlocks; from any thread."""
+        now_s = self._clock.now_s()
+        for loop in self.loops.values():
+            loop.measured.put(name, value, now_s)
 
     @property
     def periodic(self) -> list[Periodic]:
@@ -215,21 +228,19 @@ class Supervisor:
         except DeviceError as error:
             self._camera_lost(error)
             return None
-        now_s = self._clock.now_s()
         if frame is not None:
-            self._last_frame_s = now_s
-        elif now_s - self._last_frame_s > self.rig.supervisor.frame_timeout_s:
-            device = self.rig.camera.device
-            self._camera_lost(
-                DeviceTimeout(
-                    CAMERA,
-                    f"{device.address}:{device.gvcp_port}",
-                    f"a frame within {self.rig.supervisor.frame_timeout_s:g} s",
-                    "none",
-                    "check the camera's power and link, then recover",
-                )
-            )
+            self._last_frame_s = self._clock.now_s()
         return frame
+
+    @property
+    def _camera_well(self) -> bool:
+        """It is open, and frames come."""
+        camera = self.rig.camera
+        silent_s = self._clock.now_s() - self._last_frame_s
+        return (
+            self._camera_ready
+            and silent_s <= camera.frame_delay_s + _SILENT_FRAMES * camera.period_s
+        )
 
     def _camera_lost(self, error: DeviceError) -> None:
         self._camera_ready = False
@@ -255,8 +266,14 @@ class Supervisor:
                 reply = self._set_target(command, names)
             case SetController():
                 reply = self._set_controller(command, names)
+            case Reset():
+                reply = self._reset(command, names)
             case Experiment():
                 reply = self._start_experiment(command, names)
+            case SequenceReport():
+                reply = self.sequences.report(command.status)
+            case SequenceControl():
+                reply = self.sequences.control(command.action)
             case _ if type(command) in _COMMANDS:
                 reply = self._fire(_COMMANDS[type(command)], names)
             case _:
@@ -304,6 +321,10 @@ class Supervisor:
         self._finish_jobs()
         return Reply(accepted=True, text="designing; an event tells when it is at work")
 
+    def _reset(self, command: Reset, names: list[str]) -> Reply:
+        why_not = [self.loops[name].reset_interlock(command.name) for name in names]
+        return Reply(accepted=True) if "" in why_not else _refusal(why_not[0])
+
     def _designed(self, name: str, controller: str, future: Future) -> None:
         error = future.exception()
         if error is None:
@@ -333,7 +354,8 @@ class Supervisor:
             self._polls.pop(name, None)
         self._opening, self._abandoned = set(names), set()
         self._event("info", "supervisor", "opening and checking all devices")
-        with_camera = not self._camera_ready
+        with_camera = not self._camera_well
+        self._camera_ready = not with_camera  # nobody asks it for frames while it is opened
         future = self._submit(open_devices, names, with_camera)
         self._job = Job(future, partial(self._opened, names, with_camera, trigger))
         self._finish_jobs()
@@ -418,9 +440,10 @@ class Supervisor:
                 }
             )
         counts = self._devices.camera.counts()
-        self._record(camera_health(self.rig, counts, self._camera_ready, self._identities, now_s))
+        self._record(camera_health(self.rig, counts, self._camera_well, self._identities, now_s))
         for name, loop in self.loops.items():
             trouble = self._piezo_error[name]
+            loop.measured.of_piezo_error(trouble, now_s)
             for row in loop_health(loop, trouble, self._identities, now_s):
                 self._record(row)
 
@@ -455,6 +478,14 @@ class Supervisor:
         else:  # on a line without checksum one bad answer says little
             self._event("warning", name, f"{_told(error)}; asking again")
             self._piezo_read_s[name] -= settings.poll_s
+
+    def _record(self, record: AnyRecord) -> None:
+        """To the log and the consoles; some records carry what interlocks judge."""
+        if isinstance(record, PiezoReading):
+            self.loops[record.loop].measured.of_piezo(record)
+        elif isinstance(record, LoopTiming):
+            self.loops[record.loop].measured.of_timing(record)
+        self._log(record)
 
     def _event(self, severity: Severity, source: str, message: str) -> None:
         self._record(

@@ -55,6 +55,7 @@ class TimingBook:
                     servo_missed=servo.missed_readings,
                     stalls=len(stalls),
                     worst_stall_s=max(stalls, default=0.0),
+                    servo_skipped=servo.skipped,
                 )
             )
             ticks.clear()

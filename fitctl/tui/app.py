@@ -21,7 +21,7 @@ from textual.screen import Screen
 from fitctl.supervisor.messages import AnyCommand, Reply, Shutdown, Stop, Telemetry
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS
 from fitctl.tui.link import Link
-from fitctl.tui.palette import ControllerProvider, TargetProvider
+from fitctl.tui.palette import ControllerProvider, ResetProvider, TargetProvider
 from fitctl.tui.screens import Reader, events_text, help_text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.events import Events
@@ -91,7 +91,7 @@ class ConsoleApp(App[None]):
     CSS_PATH = Path(__file__).with_name("console.tcss")
     TITLE = "fitctl"
     ENABLE_COMMAND_PALETTE = True
-    COMMANDS = App.COMMANDS | {TargetProvider, ControllerProvider}
+    COMMANDS = App.COMMANDS | {TargetProvider, ControllerProvider, ResetProvider}
     BINDINGS: ClassVar[list[BindingType]] = [
         # A priority binding works over every dialog. A text field keeps "s" and space for itself.
         Binding("s,space,ctrl+s", "command('Stop')", "STOP", priority=True, show=False),

@@ -1,17 +1,17 @@
-"""The command palette's commands beyond the keys: ``target AZ EL``, and the controllers by name."""
+"""The command palette's commands beyond the keys: ``target AZ EL``, controllers, and tripped interlocks."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 
 from fitctl.config import CONTROLLERS
-from fitctl.supervisor.messages import SetController, SetTarget
+from fitctl.supervisor.messages import Reset, SetController, SetTarget
 
 if TYPE_CHECKING:
     from fitctl.tui.app import ConsoleApp
@@ -69,6 +69,28 @@ class ControllerProvider(Provider):
 
     def _give(self, command: SetController) -> Callable[[], object]:
         return partial(cast("ConsoleApp", self.app).give, command)
+
+
+class ResetProvider(Provider):
+    """Offers to let go of each tripped interlock of the shown loop."""
+
+    async def discover(self) -> Hits:
+        """All of them."""
+        for text, reason, give in self._resets():
+            yield DiscoveryHit(text, give, help=reason)
+
+    async def search(self, query: str) -> Hits:
+        """Those that match."""
+        matcher = self.matcher(query)
+        for text, reason, give in self._resets():
+            score = matcher.match(text)
+            if score > 0:
+                yield Hit(score, matcher.highlight(text), give, help=reason)
+
+    def _resets(self) -> Iterator[tuple[str, str, Callable[[], object]]]:
+        app = cast("ConsoleApp", self.app)
+        for trip in app.state.loop.state.interlocks if app.state.loop else []:
+            yield f"reset {trip.name}", trip.reason, partial(app.give, Reset(name=trip.name))
 
 
 _CONTROLLERS = {f"controller {name}": SetController(name=name) for name in CONTROLLERS}

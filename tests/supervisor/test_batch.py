@@ -133,3 +133,18 @@ def test_what_a_batch_does_not_know_is_simulated():
 def test_a_rig_with_more_than_fits_is_refused():
     with pytest.raises(TooLargeForBatchError, match="steps to remember"):
         Batch(rig_with("plant.step_s=0.00005"))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["interlocks.fsm_edge.action=flatten"],
+        ["interlocks.star_lost.action=hold"],
+        ["interlocks.siderostat_rate.high=0.5"],
+        ["interlocks.piezo_limit.stale_s=0.5"],
+        ["plant.frame_delay_s=0.07"],  # later than the frame-age row allows
+    ],
+)
+def test_a_rig_whose_interlocks_may_act_is_refused(overrides):
+    with pytest.raises(TooLargeForBatchError, match="may act"):
+        Batch(rig_with(*overrides))

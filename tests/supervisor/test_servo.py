@@ -10,7 +10,7 @@ from fitctl.supervisor.servo import PeriodicThread, SiderostatServo
 
 
 class Amplifiers:
-    """Ideal motors, 2 ms a period; attributes make them misbehave."""
+    """Ideal motors, 2 ms a period, read at its end; attributes make them misbehave."""
 
     def __init__(self, clock):
         self.clock = clock
@@ -20,6 +20,7 @@ class Amplifiers:
         self.fault = ""
         self.surprise = None
         self.readings_until_heard = 0
+        self.period_s, self.late_s = 0.002, 0.0
 
     def open(self):
         return DeviceIdentity("test", "motors", "", "")
@@ -35,16 +36,19 @@ class Amplifiers:
 
     def exchange(self, velocity_rad_s):
         self.commands.append(velocity_rad_s)
-        self.clock.sleep_until(self.clock.now_s() + 0.002)
+        self.clock.sleep_until(self.clock.now_s() + self.period_s)
         if not self.stuck:
-            (az_rad, el_rad), (az_rad_s, el_rad_s) = self.position_rad, velocity_rad_s
-            self.position_rad = (az_rad + az_rad_s * 0.002, el_rad + el_rad_s * 0.002)
+            self.position_rad = tuple(
+                rad + rad_s * self.period_s
+                for rad, rad_s in zip(self.position_rad, velocity_rad_s, strict=True)
+            )
         if self.surprise is not None:
             raise self.surprise
         self.readings_until_heard -= 1
         if self.silent or self.readings_until_heard > 0:
             return None
-        return ServoReading(self.clock.now_s(), self.position_rad, self.enabled, self.fault)
+        read_s = self.clock.now_s() - self.late_s
+        return ServoReading(read_s, self.position_rad, self.enabled, self.fault)
 
     def close(self):
         self.enabled = False
@@ -134,7 +138,7 @@ def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
     servo.move_to(np.array([0.9, 0.0]))
     run(servo, 5)
     amplifiers.silent = True
-    run(servo, 4)
+    run(servo, 5)  # 1 / gain_per_s is 7.4 ms
     assert amplifiers.commands[-1] == (0.0, 0.0)
 
     amplifiers.silent = False
@@ -142,6 +146,21 @@ def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
 
     assert servo.fault is None
     assert amplifiers.position_rad[0] == pytest.approx(0.9, abs=2e-3)
+
+
+@pytest.mark.parametrize(("late_s", "period_s"), [(0.1, 0.002), (0.2, 0.5)])
+def test_readings_too_old_to_servo_by_are_no_readings(servo, amplifiers, late_s, period_s):
+    """Late on a wire that is asked again meanwhile, or on one whose every answer is waited for."""
+    servo.hold()
+    amplifiers.late_s, amplifiers.period_s = late_s, period_s
+    servo.period()
+    servo.move_to(np.array([3.0, 0.0]))
+    commanded = len(amplifiers.commands)
+    run(servo, int(0.3 / period_s) + 1)
+
+    assert isinstance(servo.fault, DeviceTimeout)
+    assert "within 0.25 s, at most 7 ms old" in str(servo.fault)
+    assert set(amplifiers.commands[commanded:]) == {(0.0, 0.0)}
 
 
 def test_an_amplifier_fault_is_named(servo, amplifiers):

@@ -118,6 +118,20 @@ def test_without_a_star_the_search_ends_in_standby_and_says_so(simulate_with):
     assert any("no star within" in event.message for event in events_of(simulation))
 
 
+def test_the_next_search_is_about_the_same_place_as_the_one_that_found_nothing(simulate_with):
+    simulation = simulate_with()
+    darken(simulation)
+    simulation.acquire()
+    centres_rad = []
+    for _ in range(3):
+        until(simulation, Mode.ACQUISITION, limit_s=5.0)
+        centres_rad.append(simulation.supervisor.loops["right"]._spiral_centre_rad)
+        until(simulation, Mode.STANDBY, limit_s=15.0)
+        simulation.command(Acquire())
+
+    assert np.ptp(centres_rad, axis=0) == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
 def test_the_fringe_spot_alone_is_not_taken_for_the_star(simulate_with):
     simulation = simulate_with(**NEAR)
     flux_dn = simulation.camera._scene._flux_dn
@@ -389,7 +403,7 @@ def test_a_frame_that_does_not_come_is_a_fault_in_time(vernier, monkeypatch):
     monkeypatch.setattr(camera, "next_frame", nothing)
     until(vernier, Mode.SAFE, limit_s=1.0)
 
-    limit_s = vernier.rig.supervisor.frame_timeout_s
+    limit_s = vernier.rig.interlocks["frame_missing"].stale_s
     assert vernier.mode_changes[-1].time_s - since_s <= limit_s + 2 * vernier.rig.camera.period_s
 
 

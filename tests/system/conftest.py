@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from fitctl.config import default_rig_path
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
@@ -42,10 +43,12 @@ def end(process, number=signal.SIGTERM, timeout_s=20.0):
 class Rig:
     """Mock testbed and supervisor of a test, each of which the test may kill and start again."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, file: Path | None = None):
         self.folder = folder
         self.sockets = Path(f"/tmp/fitctl-test-{os.getpid()}-{time.monotonic_ns()}")
         self.common = [
+            "--rig",
+            str(file or default_rig_path()),
             "--set",
             f"logging.folder={folder}",
             "--set",
@@ -122,6 +125,10 @@ class Rig:
             if process is not None:
                 end(process)
                 process.stdout.close()
+        for path in sorted(self.sockets.glob("*")):
+            path.unlink()
+        if self.sockets.exists():
+            self.sockets.rmdir()
 
 
 @pytest.fixture
@@ -133,7 +140,3 @@ def rig(tmp_path):
         yield rig
     finally:
         rig.close()
-        for path in sorted(rig.sockets.glob("*")) if rig.sockets.exists() else []:
-            path.unlink()
-        if rig.sockets.exists():
-            rig.sockets.rmdir()

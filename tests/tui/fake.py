@@ -23,7 +23,13 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.supervisor.messages import AnyCommand, LoopState, Reply, Telemetry
+from fitctl.supervisor.messages import (
+    AnyCommand,
+    LoopState,
+    Reply,
+    Telemetry,
+    TrippedInterlock,
+)
 
 START_S = 1000.0
 WALL_MINUS_MONOTONIC_S = 1796021000.0
@@ -82,6 +88,7 @@ class FakeSupervisor:
         self.sequence = 0
         self.faulty: dict[str, str] = {}
         self.records_lost = 0
+        self.interlocks: list[TrippedInterlock] = []
 
     @property
     def time_s(self) -> float:
@@ -134,6 +141,7 @@ class FakeSupervisor:
             sky_arcsec_per_px=2.708,
             controller="minimum-variance",
             last_change=self._change(loop),
+            interlocks=self.interlocks,
         )
 
     def _change(self, loop: str) -> ModeChange:

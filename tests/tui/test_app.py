@@ -14,7 +14,18 @@ from textual.pilot import Pilot
 
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
-from fitctl.supervisor.messages import Acquire, Hold, Off, Recover, Reply, SetTarget, Standby, Stop
+from fitctl.supervisor.messages import (
+    Acquire,
+    Hold,
+    Off,
+    Recover,
+    Reply,
+    Reset,
+    SetTarget,
+    Standby,
+    Stop,
+    TrippedInterlock,
+)
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.screens import Reader
 from fitctl.tui.widgets.header import Header
@@ -326,6 +337,26 @@ def test_a_target_is_given_through_the_palette():
             await until(pilot, lambda: link.sent)
 
     assert run(scenario).sent == [SetTarget(loop="right", az_px=20.0, el_px=19.5)]
+
+
+def test_a_tripped_interlock_is_reset_through_the_palette():
+    supervisor = FakeSupervisor()
+    supervisor.interlocks = [
+        TrippedInterlock(
+            name="clock_step", since_s=START_S, action="warn", reset="hand", reason="it stepped"
+        )
+    ]
+
+    async def scenario(app, pilot, link):
+        await pilot.press("ctrl+p")
+        await until(pilot, lambda: isinstance(app.screen, CommandPalette))
+        await pilot.press(*"reset", "space", *"clock")
+        await until(pilot, lambda: app.screen.query("OptionList").first().option_count == 1)
+        await pilot.press("enter")
+        await until(pilot, lambda: link.sent)
+
+    sent = run(scenario, supervisor=supervisor).sent
+    assert sent == [Reset(loop="right", name="clock_step")]
 
 
 def test_quitting_leaves_no_thread_and_closes_the_link():

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from fitctl.logging.records import Event
+from fitctl.supervisor.messages import TrippedInterlock
 from fitctl.tui.draw.frame import place
 from fitctl.tui.palette import parse_target
 from fitctl.tui.state import ConsoleState
@@ -184,6 +185,29 @@ def test_the_header_says_when_nothing_comes():
     state = shown(FakeSupervisor())
     state.now_s += 7.0
     assert "NO DATA for 7 s" in plain(Header(state).draw(80, 3))[2]
+
+
+def tripped(name, since_s, **fields):
+    told = {"action": "warn", "reset": "hand", "reason": f"interlock {name}: look at it"}
+    return TrippedInterlock(name=name, since_s=since_s, **(told | fields))
+
+
+def test_the_header_shows_what_is_tripped_how_many_there_are_and_how_to_reset_it():
+    supervisor = FakeSupervisor()
+    supervisor.interlocks = [tripped("disk_space", START_S), tripped("clock_step", START_S + 1)]
+    line = plain(Header(shown(supervisor)).draw(120, 3))[2]
+
+    assert "▲ clock_step warn +1  interlock clock_step: look at it; reset clock_step" in line
+
+
+def test_what_resets_itself_asks_for_no_hand_and_a_short_line_is_cut():
+    supervisor = FakeSupervisor()
+    supervisor.interlocks = [tripped("flux_low", START_S, reset="itself", reason="far " * 60)]
+    line = plain(Header(shown(supervisor)).draw(80, 3))[2]
+
+    assert "flux_low warn  far far" in line
+    assert "reset" not in line
+    assert len(line.rstrip()) <= 80
 
 
 def test_a_command_of_no_use_loses_its_cap():

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 
 from rich.segment import Segment
 
+from fitctl.supervisor.messages import TrippedInterlock
 from fitctl.tui.look import (
     DIM,
     FAINT,
@@ -35,7 +36,7 @@ ASIDE = {"SAFE", "EXPERIMENT"}
 
 
 class Header(Panel):
-    """Rig, loop, mode, time in mode, link, clock; the modes as a diagram; the last transition."""
+    """Rig, loop, mode, time in mode, link, clock; the modes as a diagram; interlocks or last transition."""
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """Three lines, with a large badge of the mode beside them where there is room."""
@@ -118,15 +119,32 @@ class Header(Panel):
             old = "; what you see is old" if state.newest else "; is the supervisor running?"
             message = f" ✗ NO DATA for {state.silent_s:.0f} s{old}; reconnecting"
             return [text(message.ljust(columns), PAPER, on=RED, bold=True)]
+        tripped = state.loop.state.interlocks if state.loop else []
+        if tripped:
+            return self._tripped(tripped, columns)
         change = state.loop.change if state.loop else None
         if change is None:
             return [text("no change of mode since this console began to listen", DIM)]
-        at = datetime.fromtimestamp(state.wall_s(change.time_s), UTC).strftime("%H:%M:%S")
         line = [
-            text(f"{at} ", DIM),
+            text(f"{self._at(change.time_s)} ", DIM),
             text(f"{change.source} → {change.target}", INK),
             text(f"  {change.trigger.lower().replace('_', ' ')}", SKY),
         ]
         if change.reason:
             line.append(text(shorten(f"  {change.reason}", columns - width(line)), DIM))
         return line
+
+    def _tripped(self, tripped: list[TrippedInterlock], columns: int) -> Line:
+        """The one that tripped last in full, and how many there are besides."""
+        last = max(tripped, key=lambda trip: trip.since_s)
+        others = f" +{len(tripped) - 1}" if len(tripped) > 1 else ""
+        colour = ORANGE if last.action == "warn" else RED
+        line = [
+            text(f"{self._at(last.since_s)} ", DIM),
+            text(f"▲ {last.name} {last.action}{others}", colour, bold=True),
+        ]
+        how = "" if last.reset == "itself" else f"; reset {last.name}"
+        return [*line, text(shorten(f"  {last.reason}{how}", columns - width(line)), DIM)]
+
+    def _at(self, time_s: float) -> str:
+        return datetime.fromtimestamp(self.state.wall_s(time_s), UTC).strftime("%H:%M:%S")

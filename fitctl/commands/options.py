@@ -1,0 +1,23 @@
+"""Options that many commands have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RigOption = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Replace a value of the rig file; may be repeated."
+    ),
+]
+SeedOption = Annotated[
+    int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]

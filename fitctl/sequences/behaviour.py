@@ -1,0 +1,76 @@
+"""What every kind of step gives the runner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from fitctl.config import Rig
+from fitctl.model.optics import scales
+from fitctl.sequences.steps import Moving
+from fitctl.sequences.view import Figures, View
+from fitctl.supervisor.messages import Hold
+from fitctl.supervisor.modes import Mode
+
+
+class Result(NamedTuple):
+    """What a step that is done has measured, and that in words."""
+
+    figures: Figures
+    message: str
+
+
+class Behaviour(NamedTuple):
+    """How one kind of step works; each function takes the step's data first.
+
+    Attributes
+    ----------
+    needs : frozenset of Mode
+        Modes in which it can begin; those that lead there by themselves are waited for.
+    check : callable
+        What is wrong with the step for a rig and a loop, without the instrument: one text each.
+    own_s : callable
+        How long it takes when all goes well, for the rig's loop of that name; time-outs count from there.
+    run : callable
+        Gives the first command.
+    done : callable
+        Asked at every telemetry message: the result, or None while it is under way. Raises StepFailed.
+    stop : callable
+        After an attempt that failed or was stopped: ends what the step began.
+    pausable : bool
+        Whether a pause can begin inside the step.
+    """
+
+    needs: frozenset[Mode]
+    done: Callable[[Any, View], Result | None]
+    run: Callable[[Any, View], None] = lambda _step, _view: None
+    stop: Callable[[Any, View], None] = lambda _step, _view: None
+    check: Callable[[Any, Rig, str], list[str]] = lambda _step, _rig, _loop: []
+    own_s: Callable[[Any, Rig, str], float] = lambda _step, _rig, _loop: 0.0
+    pausable: bool = False
+
+
+POWERED = frozenset({Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
+
+
+def too_far(step: Moving, rig: Rig, loop_name: str, offset_px: float) -> list[str]:
+    """What is wrong with moving the star by so much."""
+    sky_arcsec = offset_px * scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
+    problems = []
+    if offset_px > step.max_offset_px:
+        problems.append(
+            f"the star would go {offset_px:.2f} px from its target; max_offset_px is {step.max_offset_px:g}"
+        )
+    if sky_arcsec > (step.max_offset_sky_arcsec or math.inf):
+        problems.append(
+            f"the star would go {sky_arcsec:.2f} arcsec on the sky from its target; "
+            f"max_offset_sky_arcsec is {step.max_offset_sky_arcsec:g}"
+        )
+    return problems
+
+
+def let_go(_step: object, view: View) -> None:
+    """Stop tracking where the stages are."""
+    if view.tracking:
+        view.ask(Hold(loop=view.loop_name))

@@ -1,0 +1,171 @@
+"""A sequence's contact with the supervisor: what it hears, what it tells, and who wants it to end."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Literal
+
+import msgspec
+
+from fitctl.config import Rig
+from fitctl.sequences.links import Link
+from fitctl.sequences.view import SequenceError, View
+from fitctl.supervisor.messages import Reply, SequenceReport, SequenceStatus, Telemetry
+from fitctl.supervisor.modes import Mode
+
+MESSAGE_CHARS = 300
+_RECEIVE_S = 0.5
+_SILENCE_S = 5.0
+_REPORT_S = 1.0
+
+
+class Stopped(Exception):
+    """Somebody wants the whole sequence to end; `hold` tells whether its loops are to be held then."""
+
+    def __init__(self, message: str, *, hold: bool) -> None:
+        super().__init__(message)
+        self.hold = hold
+
+
+class Contact:
+    """Telemetry in, reports out.
+
+    Parameters
+    ----------
+    link : Link
+    rig : Rig
+    name : str
+    steps : int
+        How many there will be.
+    on_status : callable
+        Hears of every change: a new attempt, a pause, an end.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        rig: Rig,
+        name: str,
+        steps: int,
+        on_status: Callable[[SequenceStatus], None],
+    ) -> None:
+        self.stop_wanted = threading.Event()  # from another thread, such as a cancelled task's
+        self.status = SequenceStatus(run=uuid.uuid4().hex, name=name, state="running", steps=steps)
+        self._link = link
+        self._rig = rig
+        self._on_status = on_status
+        self._wanted = "run"
+        self._reported_s = 0.0
+
+    def begin(self) -> None:
+        """Tell the supervisor that a sequence begins.
+
+        Raises
+        ------
+        SequenceError
+            If it refuses, because another is under way.
+        ConnectionError
+            If there is no supervisor.
+        """
+        reply = self._send_report()
+        if not reply.accepted:
+            raise SequenceError(reply.text)
+        self._on_status(self.status)
+
+    def end(self, state: Literal["done", "failed", "stopped"], message: str = "") -> None:
+        """Tell the supervisor how it ended; one that is gone is not told."""
+        with suppress(ConnectionError):
+            self.report(state=state, message=message[:MESSAGE_CHARS])
+
+    @property
+    def pause_wanted(self) -> bool:
+        """The operator wants a pause."""
+        return self._wanted == "pause"
+
+    # ------------------------------------------------------------ telemetry
+
+    def look(self, loop_name: str) -> View:
+        """A view that begins with telemetry from now on: older may have queued up between two steps."""
+        since_s = self._link.now_s()
+        telemetry = self._receive()
+        while telemetry.time_s < since_s:
+            telemetry = self._receive()
+        view = View(self._link, self._rig, loop_name, telemetry, began_s=telemetry.time_s)
+        self._obey(view)
+        return view
+
+    def next(self, view: View, *, paused: bool = False) -> None:
+        """Take the next message.
+
+        Raises
+        ------
+        Stopped
+            If the loop is made SAFE, or somebody stops the sequence.
+        """
+        view.take(self._receive(), paused=paused)
+        self._obey(view)
+        if paused:
+            self.show_pause(paused=True)
+        if self._link.now_s() - self._reported_s >= _REPORT_S:
+            self.report()
+
+    def _receive(self) -> Telemetry:
+        begun_s = self._link.now_s()
+        while True:
+            telemetry = self._link.receive(_RECEIVE_S)
+            if telemetry is not None:
+                return telemetry
+            if self.stop_wanted.is_set():
+                msg = "stopped by its program"
+                raise Stopped(msg, hold=True)
+            if self._link.now_s() - begun_s > _SILENCE_S:
+                msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then begin again"
+                raise ConnectionError(msg)
+
+    def _obey(self, view: View) -> None:
+        if view.mode is Mode.SAFE:
+            # Nothing is commanded any more: SAFE has the last word.
+            msg = f"loop {view.loop_name} is SAFE: {view.why}; see to it, then: fitctl send recover"
+            raise Stopped(msg, hold=False)
+        if self.stop_wanted.is_set():
+            msg = "stopped by its program"
+            raise Stopped(msg, hold=True)
+        told = view.telemetry.running_sequence
+        if told is not None and told.run == self.status.run:
+            self._wanted = told.wanted
+        if self._wanted == "stop":
+            msg = "stopped by the operator"
+            raise Stopped(msg, hold=True)
+
+    # ------------------------------------------------------------ what is told
+
+    def show_pause(self, *, paused: bool) -> bool:
+        """Tell when a pause begins or ends; True if one has just ended."""
+        state: Literal["paused", "running"] = "paused" if paused else "running"
+        if self.status.state == state:
+            return False
+        self.report(state=state)
+        return not paused
+
+    def report(self, **changes: object) -> None:
+        """Tell the supervisor where the sequence is, with what has changed of it.
+
+        Raises
+        ------
+        ConnectionError
+            If there is no supervisor, or it knows another sequence by now.
+        """
+        self.status = msgspec.structs.replace(self.status, **changes)
+        reply = self._send_report()
+        if not reply.accepted:
+            msg = f"the supervisor no longer knows this sequence: {reply.text}"
+            raise ConnectionError(msg)
+        if changes:
+            self._on_status(self.status)
+
+    def _send_report(self) -> Reply:
+        self._reported_s = self._link.now_s()
+        return self._link.send(SequenceReport(status=self.status))

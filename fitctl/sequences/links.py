@@ -1,0 +1,59 @@
+"""What a sequence needs of an instrument, and how the simulated one gives it."""
+
+from __future__ import annotations
+
+import os
+from typing import Protocol
+
+from fitctl.config import Rig
+from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
+from fitctl.supervisor.service import ServiceState, TelemetryBuffer
+from fitctl.supervisor.simulate import Simulation
+
+
+class Link(Protocol):
+    """Commands in, telemetry out; :class:`fitctl.supervisor.client.Client` is the one to a running rig."""
+
+    def now_s(self) -> float:
+        """The supervisor's time."""
+        ...
+
+    def send(self, command: AnyCommand) -> Reply:
+        """Give a command and wait for its reply; ConnectionError if none comes."""
+        ...
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        """The next telemetry message, or None when none came in time."""
+        ...
+
+
+class SimulatedLink:
+    """The instrument on the virtual clock: waiting for telemetry is what moves the time on."""
+
+    def __init__(self, rig: Rig, seed: int) -> None:
+        self._buffer = TelemetryBuffer()
+        self._period_s = 1.0 / rig.supervisor.telemetry_hz
+        self._simulation = Simulation(rig, seed, record=self._buffer.add, history_s=1.0)
+        self._state = ServiceState(
+            pid=os.getpid(),
+            wall_minus_monotonic_s=0.0,
+            scheduling="virtual clock",
+            records_lost=lambda: 0,
+        )
+
+    def now_s(self) -> float:
+        """The virtual time."""
+        return self._simulation.clock.now_s()
+
+    def send(self, command: AnyCommand) -> Reply:
+        """Give a command and step once, so that it is obeyed."""
+        return self._simulation.command(command)
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        """Go on until telemetry is due, or by `timeout_s`."""
+        self._simulation.run(min(timeout_s, self._period_s))
+        self._simulation.ticks.clear()  # for judging a run; nobody does here
+        if timeout_s < self._period_s:
+            return None
+        self._state.sequence += 1
+        return self._buffer.telemetry(self._simulation.supervisor, self._state, self.now_s())

@@ -1,0 +1,91 @@
+"""Steps that are a command and the mode that it leads to: standby, acquire, controller, wait, off."""
+
+from __future__ import annotations
+
+from fitctl.config import Rig
+from fitctl.sequences import steps
+from fitctl.sequences.behaviour import POWERED, Behaviour, Result, let_go
+from fitctl.sequences.view import StepFailed, View
+from fitctl.supervisor.messages import Acquire, Hold, Off, SetController, Standby
+from fitctl.supervisor.modes import Mode
+
+
+def _run_standby(_step: steps.Standby, view: View) -> None:
+    if view.mode is Mode.OFF:
+        view.command(Standby(loop=view.loop_name))
+    elif view.mode is not Mode.STANDBY:
+        view.command(Hold(loop=view.loop_name))
+
+
+def _standby_done(_step: steps.Standby, view: View) -> Result | None:
+    if view.errors:
+        raise StepFailed(view.errors[0])
+    return Result({}, "") if view.mode is Mode.STANDBY else None
+
+
+def _run_acquire(_step: steps.Acquire, view: View) -> None:
+    if view.mode is Mode.OFF:
+        view.command(Standby(loop=view.loop_name))
+    elif view.mode is Mode.STANDBY:
+        _search(view)
+
+
+def _search(view: View) -> None:
+    view.command(Acquire(loop=view.loop_name))
+    view.marks.append(view.fresh_s)
+
+
+def _acquire_done(_step: steps.Acquire, view: View) -> Result | None:
+    if view.errors:
+        raise StepFailed(view.errors[0])
+    if view.mode is Mode.STANDBY and not view.marks:
+        _search(view)  # the devices are on now
+        return None
+    if view.mode is Mode.OFF:
+        return None
+    view.insist_on(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
+    if view.mode is not Mode.VERNIER:
+        return None
+    return Result({"acquired_s": view.gone_s}, f"held after {view.gone_s:.1f} s")
+
+
+def _run_controller(step: steps.Controller, view: View) -> None:
+    view.command(SetController(loop=view.loop_name, name=step.name))
+
+
+def _controller_done(step: steps.Controller, view: View) -> Result | None:
+    if view.errors:
+        raise StepFailed(view.errors[0])
+    return Result({}, step.name) if view.loop.controller == step.name else None
+
+
+def _wait_done(step: steps.Wait, view: View) -> Result | None:
+    return Result({}, "") if view.gone_s >= step.duration_s else None
+
+
+def _run_off(_step: steps.Off, view: View) -> None:
+    let_go(_step, view)
+
+
+def _off_done(_step: steps.Off, view: View) -> Result | None:
+    if view.mode is Mode.STANDBY:
+        view.ask(Off(loop=view.loop_name))  # refused while the mirror is on its way to its bias
+    return Result({}, "") if view.mode is Mode.OFF else None
+
+
+def _wait_s(step: steps.Wait, _rig: Rig, _loop_name: str) -> float:
+    return step.duration_s
+
+
+PLAIN = {
+    "standby": Behaviour(POWERED | {Mode.OFF}, _standby_done, _run_standby),
+    "acquire": Behaviour(
+        frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER}),
+        _acquire_done,
+        _run_acquire,
+        let_go,
+    ),
+    "controller": Behaviour(POWERED | {Mode.OFF}, _controller_done, _run_controller),
+    "wait": Behaviour(POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True),
+    "off": Behaviour(POWERED | {Mode.OFF}, _off_done, _run_off),
+}

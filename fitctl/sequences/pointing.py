@@ -1,0 +1,181 @@
+"""Steps that hold the star and judge how well: hold, and target, jog and raster, which lead it about."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.figures.settling import settling
+from fitctl.model.optics import scales
+from fitctl.sequences import steps
+from fitctl.sequences.behaviour import Behaviour, Result, too_far
+from fitctl.sequences.view import Figures, StepFailed, View, columns
+from fitctl.supervisor.messages import SetTarget
+from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import rms
+
+Floats = NDArray[np.float64]
+AXES = ("az", "el")
+_LEAST_SEEN = 0.9  # of the frames that were due
+_NEEDS = frozenset({Mode.VERNIER})
+
+
+class Offset(NamedTuple):
+    """A place of the star, from the rig file's target."""
+
+    az_px: float
+    el_px: float
+
+
+# ---------------------------------------------------------------- hold
+
+
+def _hold_done(step: steps.Hold, view: View) -> Result | None:
+    if view.mode is not Mode.VERNIER or view.loop.since_s > view.began_s:
+        msg = f"the star was not held all the time: {view.why}"
+        raise StepFailed(msg)
+    if view.gone_s < step.settle_s + step.duration_s:
+        return None
+    table = columns(view.looks)
+    # A pause took frames out; what is judged are the last of those that are left.
+    due = round(step.duration_s * view.rig.camera.frame_rate_hz)
+    return _judged(step, view, table[-due:, 3:5], due)
+
+
+def _judged(step: steps.Hold | steps.Visiting, view: View, errors_px: Floats, due: int) -> Result:
+    """RMS of each axis of the errors, shape (n, 2), against what is required; of `due` frames."""
+    seen = np.isfinite(errors_px).all(axis=1)
+    if np.count_nonzero(seen) < _LEAST_SEEN * due:
+        msg = (
+            f"the star was seen on {np.count_nonzero(seen)} of {due} frames; expected at least "
+            f"{100 * _LEAST_SEEN:g} %"
+        )
+        raise StepFailed(msg)
+    per_px = scales(view.rig, view.settings).sky_arcsec_per_px
+    rms_px = rms(errors_px[seen])
+    limit_px = step.rms_limit_px or view.settings.requirement_px
+    figures: Figures = {}
+    for axis, value_px in zip(AXES, rms_px.tolist(), strict=True):
+        figures[f"rms_{axis}_px"] = value_px
+        figures[f"rms_{axis}_sky_arcsec"] = value_px * per_px
+    figures["limit_px"] = limit_px
+    figures["frames_seen"] = float(np.count_nonzero(seen))
+    said = f"az {rms_px[0]:.4f}, el {rms_px[1]:.4f} px RMS; required {limit_px:g} px"
+    if rms_px.max() > limit_px:
+        raise StepFailed(said)
+    return Result(figures, said)
+
+
+def _hold_s(step: steps.Hold, _rig: Rig, _loop_name: str) -> float:
+    return step.settle_s + step.duration_s
+
+
+# ---------------------------------------------------------------- from place to place
+
+
+def places(step: steps.Visiting) -> list[Offset]:
+    """Where the star is led, in order."""
+    match step:
+        case steps.Target():
+            return [Offset(step.offset_az_px, step.offset_el_px)]
+        case steps.Jog():
+            there = step.jog_px
+            return [Offset(there, there), Offset(-there, -there), Offset(0.0, 0.0)]
+        case steps.Raster():
+            return [*_grid(step), Offset(0.0, 0.0)]
+    msg = f"{step.step} leads the star nowhere"
+    raise TypeError(msg)
+
+
+def _grid(step: steps.Raster) -> list[Offset]:
+    az_px = [(column - (step.columns - 1) / 2) * step.spacing_px for column in range(step.columns)]
+    el_px = [(row - (step.rows - 1) / 2) * step.spacing_px for row in range(step.rows)]
+    return [
+        Offset(az, el)
+        for row, el in enumerate(el_px)
+        for az in (az_px if row % 2 == 0 else reversed(az_px))
+    ]
+
+
+def _check_visit(step: steps.Visiting, rig: Rig, loop_name: str) -> list[str]:
+    target, offsets = rig.loops[loop_name].target_px, places(step)
+    problems = too_far(step, rig, loop_name, max(math.hypot(*offset) for offset in offsets))
+    if not all(
+        rig.camera.window_fits(target.az + offset.az_px, target.el + offset.el_px)
+        for offset in offsets
+    ):
+        problems.append(f"a place is off the frame: the star {rig.camera.window_range_text}")
+    if step.steady_after_s >= step.dwell_s:
+        problems.append(f"steady_after_s must be below dwell_s, {step.dwell_s:g} s")
+    return problems
+
+
+def _visit_s(step: steps.Visiting, _rig: Rig, _loop_name: str) -> float:
+    return step.dwell_s * len(places(step))
+
+
+def _go(view: View, offset: Offset) -> None:
+    target = view.settings.target_px
+    view.command(
+        SetTarget(
+            loop=view.loop_name, az_px=target.az + offset.az_px, el_px=target.el + offset.el_px
+        )
+    )
+    view.marks.append(view.fresh_s)
+
+
+def _run_visit(step: steps.Visiting, view: View) -> None:
+    _go(view, places(step)[0])
+
+
+def _visit_done(step: steps.Visiting, view: View) -> Result | None:
+    view.insist_on(Mode.VERNIER, Mode.COARSE)  # a long way leads through COARSE
+    if view.now_s - view.marks[-1] < step.dwell_s:
+        return None
+    offsets = places(step)
+    if len(view.marks) < len(offsets):
+        _go(view, offsets[len(view.marks)])
+        return None
+    return _judge_visits(step, view, offsets)
+
+
+def _judge_visits(step: steps.Visiting, view: View, offsets: list[Offset]) -> Result:
+    """Settling after each move; RMS about the places where each has died away."""
+    table, target = columns(view.looks), view.settings.target_px
+    time_s, star_px = table[:, 0], table[:, 1:3]
+    limit_px = step.rms_limit_px or view.settings.requirement_px
+    settled_s, overshoot_px, steady = [0.0], [0.0], []
+    due_each = round((step.dwell_s - step.steady_after_s) * view.rig.camera.frame_rate_hz)
+    for came_s, offset in zip(view.marks, offsets, strict=True):
+        there = (time_s >= came_s) & (time_s < came_s + step.dwell_s)
+        away_px = star_px[there] - (target.az + offset.az_px, target.el + offset.el_px)
+        for axis in range(2):
+            # Three times the RMS that is required: a single frame may be farther off than that.
+            found = settling(time_s[there], away_px[:, axis], came_s, 3 * limit_px)
+            settled_s.append(found.settled_s)
+            overshoot_px.append(found.overshoot_px)
+        steady.append(away_px[time_s[there] >= came_s + step.steady_after_s])
+    judged = _judged(step, view, np.concatenate(steady), due_each * len(offsets))
+    figures = judged.figures | {
+        "settled_s": float(np.max(settled_s)),
+        "overshoot_px": float(np.max(overshoot_px)),
+    }
+    return Result(figures, f"settled in {figures['settled_s']:.1f} s; {judged.message}")
+
+
+def _stop_visit(_step: steps.Visiting, view: View) -> None:
+    target = view.settings.target_px
+    view.ask(SetTarget(loop=view.loop_name, az_px=target.az, el_px=target.el))
+
+
+_VISIT = Behaviour(_NEEDS, _visit_done, _run_visit, _stop_visit, _check_visit, _visit_s)
+POINTING = {
+    "hold": Behaviour(_NEEDS, _hold_done, own_s=_hold_s, pausable=True),
+    "target": _VISIT,
+    "jog": _VISIT,
+    "raster": _VISIT,
+}

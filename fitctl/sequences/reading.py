@@ -1,0 +1,144 @@
+"""Sequence files: TOML in, a sequence or one line for each mistake out."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import ValidationError
+
+from fitctl.config import ConfigError, Rig
+from fitctl.config.base import Settings
+from fitctl.sequences.behaviours import problems
+from fitctl.sequences.steps import AnyStep, Sequence, Step
+
+STEPS: dict[str, type[Step]] = {
+    kind.model_fields["step"].default: kind for kind in get_args(AnyStep)
+}
+
+
+def shipped_folder() -> Path:
+    """Where the shipped sequences are: beside the package in a checkout, inside it once installed."""
+    package = Path(__file__).parent.parent
+    installed = package / "shipped_sequences"
+    return installed if installed.exists() else package.parent / "sequences"
+
+
+def find_sequence(name: Path) -> Path:
+    """The file of a sequence: as given, or a shipped one by its bare name."""
+    if name.exists() or name.parent != Path() or name.suffix:
+        return name
+    shipped = shipped_folder() / f"{name}.toml"
+    return shipped if shipped.exists() else name
+
+
+def load_sequence(path: Path, rig: Rig) -> Sequence:
+    """Read a sequence file and check it for a rig, without the instrument.
+
+    Raises
+    ------
+    ConfigError
+        One line for each mistake: file, step, key, what is allowed.
+    """
+    sequence = read_sequence(path)
+    wrong = [
+        f"{path}: step {number} ({step.step}): {problem}"
+        for number, step in enumerate(sequence.steps, start=1)
+        for problem in problems(step, rig)
+    ]
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+    return sequence
+
+
+def read_sequence(path: Path) -> Sequence:
+    """Read a sequence file, for whatever rig.
+
+    Raises
+    ------
+    ConfigError
+        One line for each mistake.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.toml")))
+        msg = f"{path}: no such sequence file; shipped are {names}"
+        raise ConfigError(msg) from None
+    except (OSError, UnicodeDecodeError) as error:
+        msg = f"{path}: cannot be read: {error}"
+        raise ConfigError(msg) from None
+    except tomllib.TOMLDecodeError as error:
+        msg = f"{path}: not TOML: {error}"
+        raise ConfigError(msg) from None
+    return sequence_from_document(document, str(path))
+
+
+def sequence_from_document(document: Mapping[str, Any], origin: str) -> Sequence:
+    """Validate a sequence that is already a dictionary; `origin` is what errors call it.
+
+    Raises
+    ------
+    ConfigError
+        One line for each mistake.
+    """
+    try:
+        return Sequence.model_validate(document)
+    except ValidationError as error:
+        lines = [_told(*_place(origin, each["loc"]), each) for each in error.errors()]
+        raise ConfigError("\n".join(lines)) from None
+
+
+def make_step(kind: type[Step], keys: Mapping[str, Any]) -> Step:
+    """A step from its keys.
+
+    Raises
+    ------
+    ConfigError
+        One line for each mistake.
+    """
+    try:
+        return kind.model_validate(keys)
+    except ValidationError as error:
+        name = kind.model_fields["step"].default
+        lines = [_told(name, kind, _key(each["loc"]), each) for each in error.errors()]
+        raise ConfigError("\n".join(lines)) from None
+
+
+def _place(origin: str, place: tuple[Any, ...]) -> tuple[str, type[Settings], str]:
+    """Where a mistake is, of what kind that is, and its key: from ("steps", number, step's name, key)."""
+    if len(place) < 2 or place[0] != "steps":
+        return origin, Sequence, _key(place)
+    where = f"{origin}: step {place[1] + 1}"
+    if len(place) == 2:
+        return where, Sequence, ""
+    return f"{where} ({place[2]})", STEPS[place[2]], _key(place[3:])
+
+
+def _key(place: tuple[Any, ...]) -> str:
+    return ".".join(str(part) for part in place)
+
+
+def _told(where: str, kind: type[Settings], key: str, problem: Mapping[str, Any]) -> str:
+    """One mistake as one line."""
+    match problem["type"]:
+        case "union_tag_not_found":
+            said = f"step is missing; there are {', '.join(STEPS)}"
+        case "union_tag_invalid":
+            said = f"{problem['ctx']['tag']!r} is no step; there are {', '.join(STEPS)}"
+        case "extra_forbidden":
+            allowed = [name for name in kind.model_fields if name != "step"]
+            near = difflib.get_close_matches(key, allowed, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            said = f"{key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
+        case "missing":
+            said = f"{key}: is missing"
+        case _:
+            given = problem.get("input")
+            shown = f" (is {given!r})" if isinstance(given, str | int | float) else ""
+            message = problem["msg"].replace("Input should be", "must be") + shown
+            said = f"{key}: {message}" if key else message
+    return f"{where}: {said}".replace("\n", " ")

@@ -1,0 +1,231 @@
+"""Runs steps: check, run, wait until done, stop what failed, try again; every attempt is told and recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Literal
+
+import msgspec
+
+from fitctl.config import Rig
+from fitctl.logging.records import SequenceAttempt
+from fitctl.sequences.behaviour import Behaviour, Result
+from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
+from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
+from fitctl.sequences.links import Link
+from fitctl.sequences.steps import Sequence, Step
+from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
+from fitctl.supervisor.messages import Hold, SequenceStatus
+from fitctl.supervisor.modes import Mode
+
+_RETRY_S = 1.0  # between attempts
+# Modes that lead on by themselves, so that a step may wait in them for the one that it needs.
+_ON_THE_WAY = frozenset({Mode.ACQUISITION, Mode.COARSE, Mode.EXPERIMENT})
+
+Outcome = Literal["done", "failed", "timed out", "stopped"]
+
+
+class TimedOut(StepFailed):
+    """The step was not done in time."""
+
+
+class Runner:
+    """Runs the steps of one sequence, one at a time, on one link.
+
+    Parameters
+    ----------
+    link : Link
+    rig : Rig
+    name : str
+    steps : int
+        How many there will be.
+    on_status : callable
+        Hears of every change: a new attempt, a pause, an end.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        rig: Rig,
+        name: str,
+        steps: int,
+        on_status: Callable[[SequenceStatus], None] = lambda _status: None,
+    ) -> None:
+        self.attempts: list[SequenceAttempt] = []
+        self.contact = Contact(link, rig, name, steps, on_status)
+        self._link = link
+        self._rig = rig
+        self._loops: set[str] = set()
+
+    def hold_stages(self) -> None:
+        """Stop tracking with every loop that had a step; one that does not track refuses, and may."""
+        with suppress(ConnectionError):
+            for name in self._loops:
+                self._link.send(Hold(loop=name))
+
+    def run(self, step: Step) -> SequenceAttempt:
+        """Run one step, as often as it may be tried.
+
+        Raises
+        ------
+        SequenceError
+            If no attempt succeeds.
+        Stopped
+            If the loop is made SAFE, or somebody stops the sequence.
+        """
+        number = self.contact.status.step_number + 1
+        wrong = problems(step, self._rig)
+        if wrong:
+            msg = f"step {number} ({step.step}): {'; '.join(wrong)}"
+            raise SequenceError(msg)
+        loop_name = loop_of(step, self._rig)
+        self._loops.add(loop_name)
+        for attempt in range(1, step.attempts + 1):
+            self.contact.report(
+                state="running", step_number=number, step=step.step, loop=loop_name, attempt=attempt,
+                message="",
+            )  # fmt: skip
+            record = self._attempt(step, loop_name)
+            if record.outcome == "done":
+                return record
+            if attempt < step.attempts:
+                self._rest(loop_name)
+        msg = f"step {number} ({step.step}) {record.outcome}: {record.message}"
+        raise SequenceError(msg, record)
+
+    # ------------------------------------------------------------ one attempt
+
+    def _attempt(self, step: Step, loop_name: str) -> SequenceAttempt:
+        behaviour = BEHAVIOURS[step.step]
+        began_s = self._link.now_s()
+        view: View | None = None
+        try:
+            view = self.contact.look(loop_name)
+            self._wait_while_paused(view)
+            self._wait_for_mode(step, behaviour, view)
+            result = self._work(step, behaviour, view)
+        except StepFailed as failure:
+            if view is not None:
+                behaviour.stop(step, view)
+            outcome: Outcome = "timed out" if isinstance(failure, TimedOut) else "failed"
+            return self._note(outcome, str(failure), {}, began_s)
+        except (Stopped, KeyboardInterrupt) as stopped:
+            hold = not isinstance(stopped, Stopped) or stopped.hold
+            with suppress(ConnectionError):
+                if view is not None and hold:
+                    behaviour.stop(step, view)
+                self._note("stopped", str(stopped) or "interrupted", {}, began_s)
+            raise
+        return self._note("done", result.message, result.figures, began_s)
+
+    def _work(self, step: Step, behaviour: Behaviour, view: View) -> Result:
+        limit_s = behaviour.own_s(step, self._rig, view.loop_name) + step.timeout_s
+        view.began_s, view.paused_s = self._link.now_s(), 0.0
+        view.looks.clear()
+        view.errors.clear()
+        behaviour.run(step, view)
+        while True:
+            paused = behaviour.pausable and self.contact.pause_wanted
+            self.contact.next(view, paused=paused)
+            if paused or self.contact.show_pause(paused=False):
+                continue
+            if view.now_s >= view.fresh_s:
+                result = behaviour.done(step, view)
+                if result is not None:
+                    return result
+            if view.gone_s > limit_s:
+                msg = f"not done within {limit_s:g} s; loop {view.loop_name} is in {view.mode.name}"
+                raise TimedOut(msg)
+
+    def _wait_for_mode(self, step: Step, behaviour: Behaviour, view: View) -> None:
+        begun_s = view.now_s
+        while view.mode not in behaviour.needs:
+            needs = " or ".join(mode.name for mode in sorted(behaviour.needs))
+            msg = f"{step.step} needs {needs}; loop {view.loop_name} is in {view.mode.name}"
+            if view.mode not in _ON_THE_WAY:
+                raise StepFailed(msg)
+            if view.now_s - begun_s > step.timeout_s:
+                told = f"{msg}, still after {step.timeout_s:g} s"
+                raise TimedOut(told)
+            self.contact.next(view)
+
+    def _wait_while_paused(self, view: View) -> None:
+        while self.contact.pause_wanted:
+            self.contact.next(view, paused=True)
+        self.contact.show_pause(paused=False)
+
+    def _rest(self, loop_name: str) -> None:
+        view = self.contact.look(loop_name)
+        end_s = view.now_s + _RETRY_S
+        while view.now_s < end_s:
+            self.contact.next(view)
+
+    def _note(
+        self, outcome: Outcome, message: str, figures: Figures, began_s: float
+    ) -> SequenceAttempt:
+        now_s = self._link.now_s()
+        record = SequenceAttempt(
+            time_s=now_s,
+            sequence_name=self.contact.status.name,
+            step_number=self.contact.status.step_number,
+            step=self.contact.status.step,
+            loop=self.contact.status.loop,
+            attempt=self.contact.status.attempt,
+            began_s=began_s,
+            ended_s=now_s,
+            outcome=outcome,
+            message=message[:MESSAGE_CHARS],
+            figures_json=msgspec.json.encode(figures).decode(),
+        )
+        self.attempts.append(record)
+        self.contact.report(last_attempt=record)
+        return record
+
+
+@contextmanager
+def ending(runner: Runner) -> Iterator[None]:
+    """Tell how it ended, whatever happens inside; a stop becomes a SequenceError."""
+    try:
+        yield
+    except Stopped as stopped:
+        if stopped.hold:
+            runner.hold_stages()
+        runner.contact.end("stopped", str(stopped))
+        raise SequenceError(
+            str(stopped), runner.attempts[-1] if runner.attempts else None
+        ) from None
+    except (SequenceError, ConnectionError) as error:
+        runner.contact.end("failed", str(error))
+        raise
+    except KeyboardInterrupt:
+        runner.hold_stages()
+        runner.contact.end("stopped", "interrupted")
+        raise
+    except Exception as error:
+        runner.contact.end("failed", repr(error))
+        raise
+    runner.contact.end("done")
+
+
+def run_sequence(
+    link: Link,
+    rig: Rig,
+    sequence: Sequence,
+    on_status: Callable[[SequenceStatus], None] = lambda _status: None,
+) -> list[SequenceAttempt]:
+    """Run a whole sequence; the records of all attempts.
+
+    Raises
+    ------
+    SequenceError
+        If another sequence is under way, a step fails or the sequence is stopped; the text says which.
+    ConnectionError
+        If the supervisor does not answer or falls silent.
+    """
+    runner = Runner(link, rig, sequence.name, len(sequence.steps), on_status)
+    runner.contact.begin()
+    with ending(runner):
+        for step in sequence.steps:
+            runner.run(step)
+    return runner.attempts

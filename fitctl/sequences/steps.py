@@ -1,0 +1,210 @@
+"""What a step is made of: frozen data, the same in a sequence file and in Python."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from fitctl.config.base import Count, Finite, NonNegative, Positive, Settings
+from fitctl.config.loops import ControllerName
+
+LONGEST_S = 86_400.0
+
+LoopName = Annotated[
+    str, Field(description="the loop that works; may be left out where the rig has only one")
+]
+TimeoutS = Annotated[
+    float,
+    Field(gt=0, le=LONGEST_S, description="the most that is waited beyond the step's own time"),
+]
+Attempts = Annotated[int, Field(ge=1, le=20, description="how often it is tried in all")]
+DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
+OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
+RmsLimitPx = Annotated[
+    Positive | None,
+    Field(description="largest RMS of an axis; without it, the rig file's requirement_px"),
+]
+
+
+class Step(Settings):
+    """The common part of all steps."""
+
+    step: str
+    loop: LoopName = ""
+    timeout_s: TimeoutS = 30.0
+    attempts: Attempts = 1
+
+
+class Standby(Step):
+    """Devices on and ready, a star let go, the stages held where they are: STANDBY."""
+
+    step: Literal["standby"] = "standby"
+    timeout_s: TimeoutS = 60.0
+    attempts: Attempts = 2
+
+
+class Acquire(Step):
+    """Devices on, search for the star, pull it in, until it is held; one that is held stays so."""
+
+    step: Literal["acquire"] = "acquire"
+    timeout_s: TimeoutS = 120.0
+    attempts: Attempts = 2
+
+
+class Hold(Step):
+    """Hold the star for a time and judge each axis against the requirement."""
+
+    step: Literal["hold"] = "hold"
+    duration_s: Annotated[DurationS, Field(description="how long is judged")]
+    settle_s: Annotated[NonNegative, Field(le=600, description="before, not judged")] = 10.0
+    rms_limit_px: RmsLimitPx = None
+    timeout_s: TimeoutS = 60.0
+
+
+class Moving(Step):
+    """The common part of steps that move the star on the focal plane."""
+
+    timeout_s: TimeoutS = 60.0
+    max_offset_px: Annotated[
+        Positive, Field(description="a step that goes farther than this is refused")
+    ] = 5.0
+    max_offset_sky_arcsec: Annotated[
+        Positive | None, Field(description="the same on the sky, where it is given")
+    ] = None
+
+
+class Visiting(Moving):
+    """The common part of steps that lead the star to one place after another."""
+
+    dwell_s: Annotated[DurationS, Field(description="at each place")] = 20.0
+    steady_after_s: Annotated[
+        NonNegative, Field(description="of a dwell: from then on its RMS counts")
+    ] = 10.0
+    rms_limit_px: RmsLimitPx = None
+
+
+class Target(Visiting):
+    """A step of the commanded position (Fig. 11); the star stays there."""
+
+    step: Literal["target"] = "target"
+    offset_az_px: OffsetPx
+    offset_el_px: OffsetPx
+
+
+class Jog(Visiting):
+    """Both axes to one side, to the other and back (Fig. 12)."""
+
+    step: Literal["jog"] = "jog"
+    jog_px: Annotated[Positive, Field(description="each axis, to either side")] = 1.0
+
+
+class Raster(Visiting):
+    """Places on a grid about the target, row by row, to and fro; then back to the target."""
+
+    step: Literal["raster"] = "raster"
+    columns: Annotated[Count, Field(le=21, description="in azimuth")] = 3
+    rows: Annotated[Count, Field(le=21, description="in elevation")] = 3
+    spacing_px: Annotated[Positive, Field(description="between neighbours")] = 1.0
+    dwell_s: Annotated[DurationS, Field(description="at each place")] = 12.0
+    steady_after_s: Annotated[
+        NonNegative, Field(description="of a dwell: from then on its RMS counts")
+    ] = 8.0
+
+
+class Controller(Step):
+    """Work with another design from now on."""
+
+    step: Literal["controller"] = "controller"
+    name: Annotated[ControllerName, Field(description="as `fitctl send controller` takes it")]
+    timeout_s: TimeoutS = 60.0
+
+
+class Experiment(Moving):
+    """The motions of an identification, open loop; its log is for `fitctl identify WHAT --log`."""
+
+    step: Literal["experiment"] = "experiment"
+    what: Annotated[
+        Literal["backlash", "delay", "hysteresis", "airpath"],
+        Field(description="as in `fitctl identify`"),
+    ]
+
+
+class Chirp(Moving):
+    """A sine of rising or falling frequency on one axis of one stage, open loop."""
+
+    step: Literal["chirp"] = "chirp"
+    channel: Annotated[
+        Literal["fsm_az", "fsm_el", "siderostat_az", "siderostat_el"],
+        Field(description="stage and axis"),
+    ]
+    amplitude_px: Annotated[Positive, Field(description="of the star on the focal plane")] = 1.0
+    from_hz: Annotated[Positive, Field(description="at the beginning")] = 0.2
+    to_hz: Annotated[Positive, Field(description="at the end")] = 5.0
+    duration_s: Annotated[DurationS, Field(le=600, description="of the sweep")] = 30.0
+
+
+class PlateScale(Moving):
+    """Drive both stages along both axes, open loop, and solve how each moves the star."""
+
+    step: Literal["plate_scale"] = "plate_scale"
+    amplitude_px: Annotated[Positive, Field(description="of each stage's swing")] = 3.0
+    duration_s: Annotated[DurationS, Field(le=120, description="of each of the four swings")] = 20.0
+    max_error: Annotated[
+        Positive,
+        Field(le=0.5, description="largest standard deviation of a scale that is accepted"),
+    ] = 0.02
+    max_residual_px: Annotated[
+        Positive, Field(description="largest RMS that the fit may leave unexplained")
+    ] = 0.5
+
+
+class Dark(Step):
+    """The camera's bias and noise, from frames without a star: close the shutter before."""
+
+    step: Literal["dark"] = "dark"
+    frames: Annotated[int, Field(ge=10, le=2000, description="how many are taken")] = 100
+    max_bright_pixels: Annotated[
+        int, Field(ge=0, description="with more pixels 5 times the noise above the bias, it fails")
+    ] = 5
+
+
+class Wait(Step):
+    """Nothing, for a time."""
+
+    step: Literal["wait"] = "wait"
+    duration_s: Annotated[DurationS, Field(description="how long")]
+
+
+class Off(Step):
+    """Hold, mirror to its bias, amplifiers disabled, devices let go: OFF."""
+
+    step: Literal["off"] = "off"
+
+
+AnyStep = (
+    Standby
+    | Acquire
+    | Hold
+    | Target
+    | Jog
+    | Raster
+    | Controller
+    | Experiment
+    | Chirp
+    | PlateScale
+    | Dark
+    | Wait
+    | Off
+)
+
+
+class Sequence(Settings):
+    """A sequence file."""
+
+    schema_version: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,40}$")]
+    description: Annotated[str, Field(min_length=1, max_length=300)]
+    steps: Annotated[
+        list[Annotated[AnyStep, Field(discriminator="step")]], Field(min_length=1, max_length=500)
+    ]

@@ -1,0 +1,180 @@
+"""What one attempt at a step sees of the instrument, and how it speaks to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Loop, Rig
+from fitctl.logging.records import FrameRecord, SequenceAttempt, Tick
+from fitctl.sequences.links import Link
+from fitctl.supervisor.messages import AnyCommand, LoopState, Reply, Telemetry
+from fitctl.supervisor.modes import TRACKING, Mode
+
+Floats = NDArray[np.float64]
+Figures = dict[str, float]
+
+
+class SequenceError(Exception):
+    """A sequence, or a step given from Python, did not end well; ``attempt`` is its last one, if any."""
+
+    def __init__(self, message: str, attempt: SequenceAttempt | None = None) -> None:
+        super().__init__(message)
+        self.attempt = attempt
+
+
+class StepFailed(Exception):
+    """The attempt has failed; another may succeed."""
+
+
+class Look(NamedTuple):
+    """What a frame's tick showed of the star; NaN where it was not seen."""
+
+    time_s: float
+    star_az_px: float
+    star_el_px: float
+    error_az_px: float
+    error_el_px: float
+    motor_az_rad: float
+    motor_el_rad: float
+
+
+@dataclass
+class View:
+    """One attempt, as its step sees it.
+
+    Attributes
+    ----------
+    began_s : float
+        When the loop was ready for it, by the supervisor's time.
+    paused_s : float
+        Spent in pauses since.
+    looks : list of Look
+        Of every frame since, but not of those in a pause.
+    marks : list of float
+        For the step's own use: times of what it did.
+    frames : list of FrameRecord
+        For the step's own use too: those that it keeps.
+    errors : list of str
+        Error events of the supervisor since the attempt's first command.
+    fresh_s : float
+        Telemetry from before tells nothing about the last command.
+    """
+
+    link: Link
+    rig: Rig
+    loop_name: str
+    telemetry: Telemetry
+    began_s: float
+    paused_s: float = 0.0
+    fresh_s: float = 0.0
+    looks: list[Look] = field(default_factory=list)
+    marks: list[float] = field(default_factory=list)
+    frames: list[FrameRecord] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+    @property
+    def settings(self) -> Loop:
+        """The loop's part of the rig file."""
+        return self.rig.loops[self.loop_name]
+
+    @property
+    def loop(self) -> LoopState:
+        """The loop's newest state."""
+        return next(loop for loop in self.telemetry.loops if loop.name == self.loop_name)
+
+    @property
+    def mode(self) -> Mode:
+        """The loop's mode."""
+        return Mode[self.loop.mode]
+
+    @property
+    def now_s(self) -> float:
+        """The time of the newest telemetry."""
+        return self.telemetry.time_s
+
+    @property
+    def gone_s(self) -> float:
+        """Since the attempt began, without pauses."""
+        return self.now_s - self.began_s - self.paused_s
+
+    @property
+    def why(self) -> str:
+        """The reason of the loop's last change of mode."""
+        change = self.loop.last_change
+        return "" if change is None else change.reason
+
+    def ask(self, command: AnyCommand) -> Reply:
+        """Give a command that may be refused."""
+        reply = self.link.send(command)
+        self.fresh_s = self.link.now_s()
+        return reply
+
+    def command(self, command: AnyCommand) -> None:
+        """Give a command.
+
+        Raises
+        ------
+        StepFailed
+            If it is refused.
+        """
+        reply = self.ask(command)
+        if not reply.accepted:
+            msg = f"{type(command).__name__.lower()} was refused: {reply.text}"
+            raise StepFailed(msg)
+
+    def insist_on(self, *modes: Mode) -> None:
+        """Refuse to go on in another mode.
+
+        Raises
+        ------
+        StepFailed
+            If the loop is in none of these.
+        """
+        if self.mode not in modes:
+            msg = f"loop {self.loop_name} went to {self.mode.name}: {self.why}"
+            raise StepFailed(msg)
+
+    def take(self, telemetry: Telemetry, *, paused: bool) -> None:
+        """Take the next message."""
+        if paused:
+            self.paused_s += telemetry.time_s - self.telemetry.time_s
+        else:
+            ticks = [tick for tick in telemetry.ticks if self._is_mine(tick)]
+            self.looks += [_look(tick) for tick in ticks]
+        self.errors += [
+            event.message
+            for event in telemetry.events
+            if event.severity == "error"
+            and event.time_s >= self.began_s
+            and event.source in {"supervisor", self.loop_name}
+        ]
+        self.telemetry = telemetry
+
+    def _is_mine(self, tick: Tick) -> bool:
+        return tick.loop == self.loop_name and tick.mid_exposure_s >= self.began_s
+
+    @property
+    def tracking(self) -> bool:
+        """The stages follow a star, or search for one."""
+        return self.mode in TRACKING
+
+
+def _look(tick: Tick) -> Look:
+    return Look(
+        tick.mid_exposure_s,
+        tick.star_az_px,
+        tick.star_el_px,
+        tick.error_az_px,
+        tick.error_el_px,
+        tick.siderostat_az_rad,
+        tick.siderostat_el_rad,
+    )
+
+
+def columns(looks: list[Look]) -> Floats:
+    """Looks as an array, shape (n, 7)."""
+    return np.array(looks, dtype=np.float64).reshape(-1, len(Look._fields))

@@ -1,0 +1,89 @@
+"""The sequence that reports to this supervisor: shown to every console, and what people want of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+
+from fitctl.clock import Clock
+from fitctl.logging.records import AnyRecord, Event, Severity
+from fitctl.supervisor.messages import Reply, SequenceStatus
+
+SILENCE_S = 3.0
+_UNDER_WAY = ("running", "paused")
+_WANTED: dict[str, Literal["run", "pause", "stop"]] = {
+    "pause": "pause",
+    "resume": "run",
+    "stop": "stop",
+}
+
+
+class SequenceBoard:
+    """What the newest sequence told; at most one is under way.
+
+    Reports and orders come from the loop's thread; :meth:`status` may be asked from any.
+
+    Parameters
+    ----------
+    clock : Clock
+    record : callable
+        Takes the records of attempts, and events.
+    """
+
+    def __init__(self, clock: Clock, record: Callable[[AnyRecord], None]) -> None:
+        self._clock = clock
+        self._record = record
+        self._heard_s = clock.now_s()
+        self._status: SequenceStatus | None = None
+
+    def status(self) -> SequenceStatus | None:
+        """Of the sequence that is under way or has just ended; None after `SILENCE_S` without a word."""
+        silent = self._clock.now_s() - self._heard_s > SILENCE_S
+        return None if silent else self._status
+
+    def report(self, status: SequenceStatus) -> Reply:
+        """Take a sequence's word, unless another is under way."""
+        known = self.status()
+        if known is not None and known.run != status.run and known.state in _UNDER_WAY:
+            text = (
+                f"sequence {known.name} is under way (step {known.step_number} of {known.steps}); wait for "
+                "its end, or: fitctl sequence stop"
+            )
+            return Reply(accepted=False, text=text)
+        before = self._status
+        same = before is not None and before.run == status.run
+        wanted = before.wanted if same and before is not None else "run"
+        self._heard_s = self._clock.now_s()
+        self._status = msgspec.structs.replace(status, wanted=wanted)
+        self._tell_change(before if same else None, status)
+        return Reply(accepted=True)
+
+    def control(self, action: Literal["pause", "resume", "stop"]) -> Reply:
+        """Leave an order, which the sequence reads in the telemetry."""
+        known = self.status()
+        if known is None or known.state not in _UNDER_WAY:
+            return Reply(accepted=False, text=f"{action}: no sequence is under way")
+        if known.wanted == "stop":
+            return Reply(accepted=False, text=f"{action}: sequence {known.name} is being stopped")
+        self._status = msgspec.structs.replace(known, wanted=_WANTED[action])
+        self._event("info", f"{known.name}: {action}, asked for by the operator")
+        return Reply(accepted=True)
+
+    def _tell_change(self, before: SequenceStatus | None, now: SequenceStatus) -> None:
+        if now.last_attempt is not None and (
+            before is None or before.last_attempt != now.last_attempt
+        ):
+            self._record(now.last_attempt)
+        if before is None:
+            self._event("info", f"{now.name} begins, {now.steps} steps")
+        elif before.state != now.state:
+            severity: Severity = "warning" if now.state in {"failed", "stopped"} else "info"
+            told = f": {now.message}" if now.message else ""
+            self._event(severity, f"{now.name} {now.state}{told}")
+
+    def _event(self, severity: Severity, message: str) -> None:
+        self._record(
+            Event(time_s=self._clock.now_s(), severity=severity, source="sequence", message=message)
+        )

@@ -1,0 +1,152 @@
+"""The instrument from Python: blocking, awaited, and in a program that has an event loop already."""
+
+import asyncio
+import inspect
+import math
+from typing import get_args, get_type_hints
+
+import pytest
+
+import fitctl
+from fitctl import AsyncInstrument, Instrument
+from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.sequences.methods import StepMethods
+from fitctl.sequences.reading import STEPS
+from fitctl.sequences.view import SequenceError
+from fitctl.supervisor.messages import Status
+
+NEAR = load_rig(default_rig_path(), ["plant.loops.right.star_offset_sky_arcsec_max=5.0"])
+
+
+def mode(instrument):
+    return instrument.telemetry().loops[0].mode
+
+
+def test_a_script_acquires_holds_and_gets_figures():
+    with Instrument(NEAR, simulate=True) as instrument:
+        acquired = instrument.acquire()
+        held = instrument.hold(5.0, settle_s=5.0)
+
+        assert 0 < acquired["acquired_s"] < 30
+        assert 0 < held["rms_az_px"] < held["limit_px"]
+        assert mode(instrument) == "VERNIER"
+
+
+def test_what_is_refused_or_fails_raises_and_says_why():
+    with Instrument(NEAR, simulate=True) as instrument:
+        with pytest.raises(ConfigError, match=r"^hold: duration_s: must be greater than 0"):
+            instrument.hold(-1.0)
+        with pytest.raises(
+            SequenceError, match="hold needs VERNIER; loop right is in OFF"
+        ) as failed:
+            instrument.hold(1.0)
+        assert failed.value.attempt.outcome == "failed"
+        with pytest.raises(SequenceError, match="max_offset_px is 2"):
+            instrument.target(3.0, 0.0, max_offset_px=2.0)
+        assert mode(instrument) == "OFF"
+
+
+def test_stop_is_safe_and_no_step_runs_after_it():
+    with Instrument(NEAR, simulate=True) as instrument:
+        instrument.acquire()
+        instrument.stop()
+
+        with pytest.raises(SequenceError, match="SAFE"):
+            instrument.hold(1.0)
+        assert mode(instrument) == "SAFE"
+
+
+def test_a_file_runs_from_python(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text(
+        'schema_version = 1\nname = "a"\ndescription = "b"\n'
+        'steps = [{ step = "acquire" }, { step = "off" }]\n'
+    )
+    with Instrument(NEAR, simulate=True) as instrument:
+        acquired, off = instrument.run_sequence(file)
+
+        assert acquired["acquired_s"] > 0
+        assert off == {}
+        assert mode(instrument) == "OFF"
+
+
+def test_without_a_supervisor_there_is_no_instrument(tmp_path):
+    with pytest.raises(ConnectionError, match="no supervisor answers"):
+        Instrument(folder=tmp_path)
+
+
+def test_the_blocking_form_works_where_an_event_loop_runs():
+    async def cell():
+        with Instrument(NEAR, simulate=True) as instrument:
+            return instrument.acquire()
+
+    assert asyncio.run(cell())["acquired_s"] > 0
+
+
+def test_an_awaited_step_leaves_the_event_loop_free():
+    async def night():
+        beats = 0
+
+        async def beat():
+            nonlocal beats
+            while True:
+                await asyncio.sleep(0.001)
+                beats += 1
+
+        async with AsyncInstrument(NEAR, simulate=True) as instrument:
+            await instrument.acquire()
+            beating = asyncio.create_task(beat())
+            held = await instrument.hold(10.0)
+            beating.cancel()
+            assert (await instrument.send(Status())).accepted is False  # the service's, not here
+        return held, beats
+
+    held, beats = asyncio.run(night())
+
+    assert held["frames_seen"] == 500
+    assert beats > 0
+
+
+def test_a_cancelled_step_is_ended_and_the_stages_are_held():
+    async def night():
+        async with AsyncInstrument(NEAR, simulate=True) as instrument:
+            await instrument.acquire()
+            holding = asyncio.create_task(instrument.hold(80_000.0))
+            await asyncio.sleep(0.2)
+            holding.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await holding
+            return (await instrument.telemetry()).loops[0].mode
+
+    assert asyncio.run(night()) == "STANDBY"
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_every_step_is_a_method_with_its_keys_and_defaults(name):
+    fields = {key: field for key, field in STEPS[name].model_fields.items() if key != "step"}
+    method = getattr(StepMethods, name)
+    parameters = dict(inspect.signature(method).parameters)
+    del parameters["self"]
+    limits = get_type_hints(get_args(get_type_hints(method)["limits"])[0])
+    del parameters["limits"]
+
+    assert set(parameters) | set(limits) == set(fields)
+    for key, parameter in parameters.items():
+        required = parameter.default is inspect.Parameter.empty
+        assert required == fields[key].is_required()
+        assert required or parameter.default == fields[key].default
+
+
+def test_a_figure_that_could_not_be_had_is_not_a_number(monkeypatch):
+    from fitctl.sequences import plain
+    from fitctl.sequences.behaviour import Result
+
+    never = plain.PLAIN["wait"]._replace(done=lambda _step, _view: Result({"a_s": math.nan}, ""))
+    monkeypatch.setitem(fitctl.sequences.runner.BEHAVIOURS, "wait", never)
+    with Instrument(NEAR, simulate=True) as instrument:
+        assert math.isnan(instrument.wait(1.0)["a_s"])
+
+
+def test_fitctl_has_only_what_it_has():
+    with pytest.raises(AttributeError, match="Instruments"):
+        _ = fitctl.Instruments

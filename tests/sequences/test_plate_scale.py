@@ -1,0 +1,128 @@
+"""Plate scale: matrices that are known come back, and what cannot be believed is refused."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.sequences.plate_scale import (
+    fit_plate_scale,
+    plan,
+    refusal,
+    swing_of,
+)
+from fitctl.sequences.steps import PlateScale
+from fitctl.sequences.view import StepFailed
+
+RIG = load_rig(default_rig_path())
+STEP = PlateScale()
+DRIVES = plan(STEP, RIG, "right")
+TIME_S = np.arange(0.0, DRIVES[-1].start_s + DRIVES[-1].duration_s, 0.02)
+
+
+def behind_play(moved, width):
+    out = np.empty_like(moved)
+    last = 0.0
+    for row, now in enumerate(moved):
+        last = max(now - width / 2, min(now + width / 2, last))
+        out[row] = last
+    return out
+
+
+def star_of(mirror, siderostat, *, play_px=0.37, noise_px=0.02, drift_px=0.5, seed=0):
+    """A star that both stages move, each behind a play, on drifting air."""
+    rng = np.random.default_rng(seed)
+    swings = [swing_of(drive, TIME_S) for drive in DRIVES]
+    played = np.column_stack([behind_play(swing.moved_px, play_px) for swing in swings])
+    slow = drift_px * np.column_stack([np.sin(0.31 * TIME_S), np.cos(0.17 * TIME_S)])
+    matrix = np.hstack([mirror, siderostat])
+    return swings, played @ matrix.T + slow + noise_px * rng.standard_normal((len(TIME_S), 2))
+
+
+def turned(scale, angle_rad):
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return scale * np.array([[cos, -sin], [sin, cos]])
+
+
+scales = st.floats(0.5, 1.5)
+angles = st.floats(-np.pi, np.pi)
+
+
+@settings(max_examples=25)
+@given(scales, angles, scales, angles, st.floats(0.0, 0.5))
+def test_matrices_that_are_known_come_back(
+    mirror_scale, mirror_rad, siderostat_scale, siderostat_rad, play_px
+):
+    mirror = turned(mirror_scale, mirror_rad)
+    siderostat = turned(siderostat_scale, siderostat_rad)
+    swings, star_px = star_of(mirror, siderostat, play_px=play_px)
+
+    fit = fit_plate_scale(TIME_S, star_px, swings)
+
+    assert refusal(fit, STEP) == ""
+    np.testing.assert_allclose(fit.mirror, mirror, atol=0.01)
+    np.testing.assert_allclose(fit.siderostat, siderostat, atol=0.01)
+
+
+def test_the_uncertainty_is_that_of_repeated_fits():
+    fits = []
+    for seed in range(30):
+        swings, star_px = star_of(np.eye(2), np.eye(2), noise_px=0.3, seed=seed)
+        fits.append(fit_plate_scale(TIME_S, star_px, swings))
+
+    scatter = np.std([fit.mirror for fit in fits], axis=0)
+    claimed = np.mean([fit.mirror_sd for fit in fits], axis=0)
+
+    assert np.all(claimed > 0.6 * scatter)
+    assert np.all(claimed < 1.6 * scatter)
+
+
+def test_frames_without_a_star_are_left_out():
+    swings, star_px = star_of(np.eye(2), np.eye(2))
+    star_px[::3] = np.nan
+
+    fit = fit_plate_scale(TIME_S, star_px, swings)
+
+    np.testing.assert_allclose(fit.mirror, np.eye(2), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("mirror", "siderostat", "options", "said"),
+    [
+        (np.eye(2), np.diag([1.0, 0.05]), {}, "siderostat: does not move the star along both axes"),
+        (np.zeros((2, 2)), np.eye(2), {}, "mirror: does not move the star"),
+        (np.eye(2), np.eye(2), {"noise_px": 1.0}, "px RMS are unexplained"),
+        (np.eye(2), np.eye(2), {"noise_px": 0.45, "play_px": 0.0}, "a scale is uncertain by"),
+    ],
+)
+def test_a_fit_that_cannot_be_believed_is_refused(mirror, siderostat, options, said):
+    swings, star_px = star_of(mirror, siderostat, **options)
+    strict = STEP.model_copy(update={"max_error": 0.003})
+
+    assert said in refusal(fit_plate_scale(TIME_S, star_px, swings), strict)
+
+
+def test_too_few_frames_are_refused():
+    swings, star_px = star_of(np.eye(2), np.eye(2))
+    star_px[100:] = np.nan
+
+    with pytest.raises(StepFailed, match="expected at least"):
+        fit_plate_scale(TIME_S, star_px, swings)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.25])
+def test_a_rig_file_that_is_wrong_is_found_out(tried, scale):
+    """The siderostat truly moves the star `scale` times as far as the rig file says."""
+    run = tried()
+    lever_arm_m = RIG.loops["right"].siderostat.lever_arm_m * scale
+    run.rig = load_rig(default_rig_path(), [f"loops.right.siderostat.lever_arm_m={lever_arm_m}"])
+
+    run({"step": "acquire"}, {"step": "wait", "duration_s": 10.0}, {"step": "plate_scale"})
+
+    assert run.outcomes() == ["done"] * 3
+    found = msgspec.json.decode(run.attempts[-1].figures_json)
+    assert found["siderostat_scale"] == pytest.approx(scale, rel=0.02)
+    assert found["fsm_scale"] == pytest.approx(1.0, rel=0.02)
+    assert abs(found["siderostat_rotation_deg"]) < 1.0

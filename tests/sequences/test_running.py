@@ -1,0 +1,211 @@
+"""How a sequence runs: attempts, time limits, pauses, and every way to end one."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.sequences.links import SimulatedLink
+from fitctl.sequences.reading import load_sequence, shipped_folder
+from fitctl.sequences.runner import run_sequence
+from fitctl.supervisor.messages import Hold, SequenceControl, Stop
+
+ACQUIRE = {"step": "acquire"}
+HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
+RIG = load_rig(default_rig_path())
+
+
+def figures(attempt):
+    return msgspec.json.decode(attempt.figures_json)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(shipped_folder().glob("*.toml")), ids=lambda path: path.stem
+)
+def test_every_shipped_sequence_runs_to_its_end(path):
+    sequence = load_sequence(path, RIG)
+    assert sequence.name == path.stem
+
+    attempts = run_sequence(SimulatedLink(RIG, 0), RIG, sequence)
+
+    assert [attempt.outcome for attempt in attempts] == ["done"] * len(sequence.steps)
+
+
+def test_a_held_star_is_judged_against_the_requirement(tried):
+    run = tried()
+
+    run(ACQUIRE, HOLD, {**HOLD, "rms_limit_px": 1e-4, "attempts": 2})
+
+    assert run.outcomes() == ["done", "done", "failed", "failed"]
+    held = figures(run.attempts[1])
+    assert 0 < held["rms_az_px"] < held["limit_px"] == RIG.loops["right"].requirement_px
+    assert held["frames_seen"] == 250
+    assert "required 0.0001 px" in run.error
+    assert run.link.mode() == "VERNIER"  # a poor RMS is no reason to let go
+
+
+def test_a_search_that_finds_nothing_is_tried_again(tried):
+    run = tried(
+        "plant.loops.right.star_offset_sky_arcsec_max=5000.0",
+        "loops.right.acquisition.search_radius_sky_arcsec=40.0",
+    )
+
+    run({**ACQUIRE, "attempts": 2}, HOLD)
+
+    assert run.outcomes() == ["failed", "failed"]
+    assert "no star within" in run.attempts[0].message
+    assert [attempt.attempt for attempt in run.attempts] == [1, 2]
+    assert run.states[-1] == "failed"
+
+
+def test_a_step_that_takes_too_long_is_stopped_and_the_stages_are_held(tried):
+    run = tried("plant.loops.right.star_offset_sky_arcsec_max=200.0")
+
+    run({**ACQUIRE, "timeout_s": 1.0, "attempts": 1})
+
+    assert run.outcomes() == ["timed out"]
+    assert run.attempts[0].ended_s - run.attempts[0].began_s < 2.0
+    assert run.link.mode() == "STANDBY"
+
+
+def test_a_step_waits_for_the_mode_that_it_needs_but_not_for_one_that_never_comes(tried):
+    run = tried()
+
+    run(HOLD)
+
+    assert run.outcomes() == ["failed"]
+    assert "hold needs VERNIER; loop right is in OFF" in run.error
+    assert run.link.commands == []
+
+
+def test_a_star_that_is_let_go_fails_the_hold_and_the_next_attempt_says_why(tried):
+    run = tried()
+    run.link.meddling = [(15.0, Hold())]
+
+    run(ACQUIRE, {**HOLD, "duration_s": 60.0, "attempts": 2})
+
+    assert run.outcomes() == ["done", "failed", "failed"]
+    assert "not held all the time" in run.attempts[1].message
+    assert "needs VERNIER" in run.attempts[2].message
+
+
+def test_stop_ends_the_sequence_at_once_and_has_the_last_word(tried):
+    run = tried()
+    run.link.meddling = [(15.0, Stop())]
+
+    run(ACQUIRE, {"step": "jog", "dwell_s": 20.0, "attempts": 3}, HOLD)
+
+    assert run.outcomes() == ["done", "stopped"]
+    assert run.attempts[-1].ended_s < 15.5
+    assert "SAFE" in run.error
+    given = len(run.link.commands)
+    assert run.link.mode() == "SAFE"
+    run(ACQUIRE)
+    assert "SAFE" in run.error
+    assert len(run.link.commands) == given  # nothing was commanded
+
+
+def test_the_operator_stops_it_and_the_stages_are_held(tried):
+    run = tried()
+    run.link.meddling = [(15.0, SequenceControl(action="stop"))]
+
+    run(ACQUIRE, {**HOLD, "duration_s": 600.0}, HOLD)
+
+    assert run.outcomes() == ["done", "stopped"]
+    assert "stopped by the operator" in run.error
+    assert run.link.mode() == "STANDBY"
+
+
+@pytest.mark.parametrize("when_s", [0.5, 15.0])
+def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
+    def interrupt(_link):
+        raise KeyboardInterrupt
+
+    run = tried("plant.loops.right.star_offset_sky_arcsec_max=60.0")
+    run.link.meddling = [(when_s, interrupt)]
+
+    with pytest.raises(KeyboardInterrupt):
+        run(ACQUIRE, {"step": "target", "offset_az_px": 3.0, "offset_el_px": 0.0, "dwell_s": 60.0})
+
+    assert run.attempts[-1].outcome == "stopped"
+    assert run.link.mode() == "STANDBY"
+    target = RIG.loops["right"].target_px
+    assert run.link.target_px() == [target.az, target.el]
+
+
+def test_a_pause_within_a_hold_is_not_judged_and_not_counted(tried):
+    run = tried()
+    run.link.meddling = [
+        (15.0, SequenceControl(action="pause")),
+        (200.0, SequenceControl(action="resume")),
+    ]
+
+    run(ACQUIRE, {**HOLD, "duration_s": 10.0, "timeout_s": 5.0})
+
+    assert run.outcomes() == ["done", "done"]
+    assert run.attempts[1].ended_s > 200.0
+    assert figures(run.attempts[1])["frames_seen"] == 500
+    assert run.states == ["running", "paused", "running", "done"]
+
+
+def test_a_pause_within_a_motion_takes_effect_after_it(tried):
+    run = tried()
+    run.link.meddling = [
+        (15.0, SequenceControl(action="pause")),
+        (100.0, SequenceControl(action="resume")),
+    ]
+
+    run(ACQUIRE, {"step": "jog", "dwell_s": 12.0}, {"step": "wait", "duration_s": 1.0})
+
+    assert run.outcomes() == ["done", "done", "done"]
+    jog, wait = run.attempts[1:]
+    assert jog.ended_s < 60.0
+    assert wait.ended_s > 100.0
+
+
+def test_a_target_that_fails_goes_back_to_the_rig_files(tried):
+    run = tried()
+    away = {"step": "target", "offset_az_px": 2.0, "offset_el_px": -1.0, "dwell_s": 12.0}
+
+    run(ACQUIRE, away, {**away, "offset_az_px": 3.0, "rms_limit_px": 1e-4})
+
+    assert run.outcomes() == ["done", "done", "failed"]
+    target = RIG.loops["right"].target_px
+    assert run.link.target_px() == [target.az, target.el]
+
+
+def test_motions_that_a_lost_star_ends_are_not_taken_for_whole_but_made_again(tried):
+    def jump(link):
+        link._simulation.plants["right"].constants.spot_origin_px[:] += np.array([40.0, 0.0])
+
+    run = tried()
+    run.link.meddling = [(15.0, jump)]
+
+    run(ACQUIRE, {"step": "chirp", "channel": "fsm_az", "duration_s": 20.0, "attempts": 2})
+
+    assert run.outcomes() == ["done", "failed", "done"]
+    assert "ended early, in ACQUISITION, by star lost" in run.attempts[1].message
+    assert figures(run.attempts[2])["seen_fraction"] > 0.99
+
+
+def test_motions_that_the_operator_stops_end_at_once(tried):
+    run = tried()
+    run.link.meddling = [(15.0, SequenceControl(action="stop"))]
+
+    run(ACQUIRE, {"step": "chirp", "channel": "fsm_az", "duration_s": 100.0})
+
+    assert run.outcomes() == ["done", "stopped"]
+    assert run.attempts[-1].ended_s < 15.5
+    assert run.link.mode() == "STANDBY"
+
+
+def test_attempts_of_a_run_are_recorded_once_each(rig):
+    records = []
+    link = SimulatedLink(rig, 0)
+    link._simulation._also = records.append
+    sequence = load_sequence(shipped_folder() / "acquire.toml", rig)
+
+    attempts = run_sequence(link, rig, sequence)
+
+    recorded = [record for record in records if type(record).__name__ == "SequenceAttempt"]
+    assert recorded == attempts

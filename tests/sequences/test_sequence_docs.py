@@ -1,0 +1,39 @@
+"""docs/sequences.md is true: its tables, its file and its programs."""
+
+import tomllib
+
+import pytest
+from documents import between, blocks
+from step_tables import common_keys, step_keys
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.sequences.behaviours import problems
+from fitctl.sequences.reading import sequence_from_document
+
+
+def shown(language):
+    found = [block for block in blocks(language) if block.document.name == "sequences.md"]
+    assert found
+    return found
+
+
+def test_the_tables_are_those_of_the_steps():
+    assert between("sequences.md", "sequence-common") == common_keys()
+    assert between("sequences.md", "sequence-steps") == step_keys()
+
+
+@pytest.mark.parametrize("block", shown("TOML"), ids=str)
+def test_a_sequence_that_is_shown_is_well(block):
+    sequence = sequence_from_document(tomllib.loads(block.text), str(block))
+
+    rig = load_rig(default_rig_path())
+    assert [problem for step in sequence.steps for problem in problems(step, rig)] == []
+
+
+@pytest.mark.parametrize("block", shown("python"), ids=str)
+def test_a_program_that_is_shown_runs(block):
+    names = {}
+
+    exec(compile(block.text, str(block), "exec"), names)
+
+    assert names["held"]["rms_az_px"] < 0.1

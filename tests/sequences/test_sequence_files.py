@@ -1,0 +1,147 @@
+"""Sequence files: every mistake is one line that says where."""
+
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.sequences.behaviours import BEHAVIOURS
+from fitctl.sequences.reading import (
+    STEPS,
+    load_sequence,
+    sequence_from_document,
+    shipped_folder,
+)
+
+RIG = load_rig(default_rig_path())
+HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
+
+
+def mistakes(tmp_path, text, rig=RIG):
+    path = tmp_path / "a.toml"
+    path.write_text(HEAD + text)
+    with pytest.raises(ConfigError) as caught:
+        load_sequence(path, rig)
+    return [line.removeprefix(f"{path}: ") for line in str(caught.value).splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ('step = "hold"', "step 1 (hold): duration_s: is missing"),
+        ('step = "hold", duration_s = -1.0', "step 1 (hold): duration_s: must be greater than 0"),
+        ('step = "hold", duration_s = "long"', "step 1 (hold): duration_s: must be a valid number"),
+        (
+            'step = "wait", duration_s = 1.0, timeout = 1.0',
+            "timeout: unknown key; did you mean timeout_s?",
+        ),
+        ('step = "hodl"', "'hodl' is no step; there are standby, acquire, hold"),
+        ("duration_s = 1.0", "step 1: step is missing"),
+        ('step = "acquire", attempts = 0', "attempts: must be greater than or equal to 1"),
+        ('step = "acquire", timeout_s = inf', "timeout_s: must be"),
+        (
+            'step = "acquire", loop = "left"',
+            "step 1 (acquire): loop 'left': rig fit-mock has right",
+        ),
+        ('step = "jog", jog_px = 4.0', "would go 5.66 px from its target; max_offset_px is 5"),
+        ('step = "jog", max_offset_sky_arcsec = 1.0', "max_offset_sky_arcsec is 1"),
+        ('step = "jog", jog_px = 30.0, max_offset_px = 100.0', "a place is off the frame"),
+        ('step = "jog", dwell_s = 5.0', "steady_after_s must be below dwell_s, 5 s"),
+        ('step = "controller", name = "../a.json"', "name: must be"),
+        ('step = "experiment", what = "response"', "what: must be"),
+        ('step = "experiment", what = "hysteresis"', "max_offset_px is 5"),
+        ('step = "chirp", channel = "stack1"', "channel: must be"),
+        ('step = "chirp", channel = "fsm_az", to_hz = 1000.0', "frequencies must lie in"),
+        ('step = "chirp", channel = "fsm_az", duration_s = 601.0', "duration_s: must be less"),
+        ('step = "plate_scale", amplitude_px = 6.0', "max_offset_px is 5"),
+    ],
+)
+def test_a_mistake_is_one_line_that_says_where(tmp_path, step, said):
+    if step.endswith('"hysteresis"'):
+        step += ", max_offset_px = 0.5"
+        said = said.replace("is 5", "is 0.5")
+
+    found = mistakes(tmp_path, f"steps = [{{ {step} }}]\n")
+
+    assert len(found) == 1
+    assert said in found[0]
+
+
+def test_every_mistake_is_told(tmp_path):
+    found = mistakes(
+        tmp_path,
+        'stpes = 1\nsteps = [{ step = "hold" }, { step = "wait", duration_s = 0 }, { step = "of" }]',
+    )
+
+    assert len(found) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("", "steps: is missing"), ("steps = []", "steps: "), ("a = [", "not TOML")]
+)
+def test_what_is_no_sequence_is_refused(tmp_path, text, said):
+    assert any(said in line for line in mistakes(tmp_path, text))
+
+
+def test_where_a_rig_has_two_loops_each_step_names_its_own(tmp_path):
+    document = tomllib.loads(default_rig_path().read_text())
+    two = RIG.model_copy(update={"loops": {"left": RIG.loops["right"], **RIG.loops}})
+
+    assert list(document["loops"]) == ["right"]
+    assert mistakes(tmp_path, 'steps = [{ step = "acquire" }]', two) == [
+        "step 1 (acquire): loop is missing: rig fit-mock has left, right"
+    ]
+
+
+@pytest.mark.parametrize(
+    "rig", sorted(default_rig_path().parent.glob("*.toml")), ids=lambda p: p.stem
+)
+def test_shipped_sequences_are_well_for_every_shipped_rig(rig):
+    settings = load_rig(rig)
+
+    assert [load_sequence(path, settings).name for path in shipped_folder().glob("*.toml")]
+
+
+def test_every_step_has_a_behaviour():
+    assert set(STEPS) == set(BEHAVIOURS)
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+keys = st.sampled_from(sorted({key for kind in STEPS.values() for key in kind.model_fields}))
+documents = st.fixed_dictionaries(
+    {"schema_version": st.just(1), "name": st.just("a"), "description": st.just("b")},
+    optional={
+        "steps": st.lists(
+            st.dictionaries(keys | st.text(max_size=4), values)
+            | st.builds(
+                lambda step, rest: {**rest, "step": step},
+                st.sampled_from(sorted(STEPS)),
+                st.dictionaries(keys, values, max_size=4),
+            )
+            | values,
+            max_size=3,
+        )
+    },
+)
+
+
+@given(documents)
+def test_any_document_is_a_sequence_or_a_list_of_mistakes(document):
+    mistakes_told, sequence = [], None
+    try:
+        sequence = sequence_from_document(document, "any.toml")
+    except ConfigError as error:
+        mistakes_told = str(error).split("\n")
+
+    assert (sequence is None) == bool(mistakes_told)
+    assert all(line.startswith("any.toml: ") for line in mistakes_told)
+    if sequence is not None:
+        assert sequence_from_document(sequence.model_dump(), "again.toml") == sequence

@@ -1,0 +1,32 @@
+"""Interlocks of a real supervisor: the computer is measured, consoles are told, a reset comes back."""
+
+import pytest
+
+from fitctl.supervisor.messages import Reset
+
+from .conftest import Rig
+
+
+@pytest.fixture
+def supervisor(tmp_path):
+    """One that asks for more room on the disk than there is; it needs no devices to say so."""
+    rig = Rig(tmp_path)
+    rig.common += ["--set", "interlocks.disk_space.low=1e18"]
+    rig.endpoints = {}
+    try:
+        rig.start_supervisor()
+        yield rig
+    finally:
+        rig.close()
+
+
+def test_too_little_room_is_told_and_no_reset_makes_it_go_away(supervisor):
+    seen = supervisor.follow(lambda telemetry: telemetry.loops[0].interlocks, 20.0)
+
+    (trip,) = seen[-1].loops[0].interlocks
+    assert (trip.name, trip.action) == ("disk_space", "warn")
+    assert trip.reason.endswith("make room, or choose another logging.folder")
+    assert any(trip.reason in event.message for one in seen for event in one.events)
+    reply = supervisor.client.send(Reset(name="disk_space"))
+    assert not reply.accepted
+    assert "it would trip again" in reply.text

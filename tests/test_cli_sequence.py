@@ -1,0 +1,99 @@
+"""`fitctl sequence` as a stranger meets it."""
+
+import json
+
+import pytest
+
+from fitctl.cli import main
+from fitctl.sequences.reading import shipped_folder
+
+HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
+WAIT = HEAD + 'steps = [{ step = "wait", duration_s = 5.0 }]\n'
+
+
+@pytest.fixture
+def sequence(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["sequence", *map(str, arguments)])
+        said = capsys.readouterr()
+        return end.value.code or 0, said.out, said.err
+
+    return run
+
+
+def written(tmp_path, text):
+    path = tmp_path / "tried.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_sequences_are_listed(sequence):
+    status, out, _ = sequence("list")
+
+    assert status == 0
+    listed = [line.split()[0] for line in out.splitlines()]
+    assert listed == sorted(path.stem for path in shipped_folder().glob("*.toml"))
+
+
+def test_check_says_every_mistake_on_a_line(sequence, tmp_path):
+    path = written(tmp_path, HEAD + 'steps = [{ step = "hold" }, { step = "jog", jog_px = 4.0 }]\n')
+    status, out, err = sequence("check", path)
+
+    assert status == 2
+    assert out == ""
+    assert err.splitlines() == [f"{path}: step 1 (hold): duration_s: is missing"]
+
+    path.write_text(path.read_text().replace('"hold"', '"hold", duration_s = 1.0'))
+    status, _, err = sequence("check", path)
+    assert status == 2
+    assert len(err.splitlines()) == 1
+    assert "step 2 (jog): the star would go 5.66 px" in err
+
+
+def test_check_tells_what_is_well(sequence):
+    status, out, _ = sequence("check", "jog")
+
+    assert status == 0
+    assert "well; 3 steps for rig fit-mock" in out
+
+
+@pytest.mark.parametrize("command", ["check", "dry-run", "run"])
+def test_a_file_that_is_not_there_is_told_with_those_that_are(sequence, command):
+    status, _, err = sequence(command, "jgo")
+
+    assert status == 2
+    assert "no such sequence file" in err
+    assert "jog" in err
+
+
+def test_a_dry_run_prints_every_attempt_and_the_virtual_time(sequence, tmp_path):
+    status, out, _ = sequence("dry-run", written(tmp_path, WAIT))
+
+    assert status == 0
+    head, wait, time = out.splitlines()
+    assert "outcome" in head
+    assert wait.split()[:4] == ["1", "wait", "1", "done"]
+    assert float(time.split()[0]) == pytest.approx(5.0, abs=0.5)
+
+
+def test_a_dry_run_that_fails_has_status_1_and_says_why(sequence, tmp_path):
+    path = written(tmp_path, HEAD + 'steps = [{ step = "hold", duration_s = 1.0, attempts = 2 }]\n')
+    status, out, err = sequence("dry-run", path, "--json")
+
+    assert status == 1
+    told = json.loads(out)
+    assert [attempt["outcome"] for attempt in told["attempts"]] == ["failed", "failed"]
+    assert told["attempts"][0]["figures"] == {}
+    assert "hold needs VERNIER" in told["failure"]
+    assert err.splitlines()[-1] == f"sequence tried: {told['failure']}"
+
+
+@pytest.mark.parametrize("command", [["run", "jog"], ["stop"]])
+def test_without_a_supervisor_there_is_one_line_and_status_1(sequence, tmp_path, command):
+    status, _, err = sequence(*command, "--set", f"service.folder={tmp_path / 'none'}")
+
+    assert status == 1
+    assert "no supervisor answers" in err.splitlines()[-1]
