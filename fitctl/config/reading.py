@@ -34,13 +34,15 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     ConfigError
         One line for each thing that is wrong: file, key, what is allowed.
     """
-    document = _read_toml(path, "copy rigs/fit-mock.toml or name another with --rig")
+    document = read_toml(
+        path, "no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+    )
     base = document.pop("base", None)
     if base is not None:
         if not isinstance(base, str):
             msg = f"{path}: base: must be a file name (is {base!r})"
             raise ConfigError(msg)
-        under = _read_toml(path.parent / base, f"it is the base of {path}")
+        under = read_toml(path.parent / base, f"no such rig file; it is the base of {path}")
         lay_over(under, document)
         document = under
     fragments = document.pop("include", [])
@@ -50,7 +52,8 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     said_in = dict.fromkeys(_problems(document), str(path))
     for name in fragments:
         fragment = path.parent / name
-        lay_over(document, _read_toml(fragment, f"it is in the include list of {path}"))
+        missing = f"no such rig file; it is in the include list of {path}"
+        lay_over(document, read_toml(fragment, missing))
         # What is wrong from here on, and was not before, is this fragment's.
         said_in = {what: said_in.get(what, str(fragment)) for what in _problems(document)}
     for override in overrides:
@@ -67,11 +70,18 @@ def _problems(document: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], 
     return []
 
 
-def _read_toml(path: Path, hint: str) -> dict[str, Any]:
+def read_toml(path: Path, missing: str) -> dict[str, Any]:
+    """A TOML file's content; `missing` is said where there is no file.
+
+    Raises
+    ------
+    ConfigError
+        If it is missing, cannot be read or is not TOML.
+    """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        msg = f"{path}: no such rig file; {hint}"
+        msg = f"{path}: {missing}"
         raise ConfigError(msg) from None
     except (OSError, UnicodeDecodeError) as error:
         msg = f"{path}: cannot be read: {error}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -12,6 +11,7 @@ from pydantic import ValidationError
 
 from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings
+from fitctl.config.reading import read_toml
 from fitctl.sequences.behaviours import problems
 from fitctl.sequences.steps import AnyStep, Sequence, Step
 
@@ -62,18 +62,8 @@ def read_sequence(path: Path) -> Sequence:
     ConfigError
         One line for each mistake.
     """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.toml")))
-        msg = f"{path}: no such sequence file; shipped are {names}"
-        raise ConfigError(msg) from None
-    except (OSError, UnicodeDecodeError) as error:
-        msg = f"{path}: cannot be read: {error}"
-        raise ConfigError(msg) from None
-    except tomllib.TOMLDecodeError as error:
-        msg = f"{path}: not TOML: {error}"
-        raise ConfigError(msg) from None
+    names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.toml")))
+    document = read_toml(path, f"no such sequence file; shipped are {names}")
     return sequence_from_document(document, str(path))
 
 
