@@ -19,14 +19,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.model.optics import scales
 from fitctl.processes import end_process, last_line, signals_ignored, start_process
 from fitctl.supervisor.client import Client
+from fitctl.supervisor.endpoints import make_service_folder
 from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
 from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.run import only_supervisor
 from fitctl.supervisor.simulate import pair, rms
 
 JUDGED_S = 30.0
@@ -43,6 +45,7 @@ class Instrument:
     """A running mock instrument."""
 
     client: Client
+    sockets: Path
     folder: Path
     bench_port: int
     started_s: float
@@ -60,7 +63,10 @@ class Instrument:
 
 @contextmanager
 def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[Instrument]:
-    """Start everything on free ports and a folder of its own; end everything, whatever happens.
+    """Start everything on free ports; end everything, whatever happens.
+
+    Its sockets are where the rig file has them, so that other commands find the demo; where another
+    supervisor has that rig, they are in a folder of the demo's own.
 
     Raises
     ------
@@ -80,11 +86,14 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
         devices = [
             f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
         ]
-        settings = _set([*devices, f"service.folder={folder}"])
+        sockets = _socket_folder(load_rig(rig_path, overrides), folder)
+        settings = _set([*devices, f"service.folder={sockets}"])
         supervisor = _start(folder, "supervisor", ["run", *common, *settings])
         processes.append(supervisor)
         bench_port = int(endpoints["mocks.bench_port"])
-        running = Instrument(Client(folder), folder, bench_port, started_s, supervisor, mocks)
+        running = Instrument(
+            Client(sockets), sockets, folder, bench_port, started_s, supervisor, mocks
+        )
         try:
             _wait(running, lambda _: True, "the supervisor's first telemetry")
             yield running
@@ -117,7 +126,7 @@ def acquire_in_background(running: Instrument) -> threading.Thread:
     """The same beside a console, with a telemetry connection of its own; failures show as events there."""
 
     def work() -> None:
-        beside = Client(running.folder)
+        beside = Client(running.sockets)
         try:
             acquire(Instrument(**{**vars(running), "client": beside}))
         except (DemoError, ConnectionError):
@@ -246,6 +255,16 @@ def to_json(result: dict[str, Any]) -> str:
 
 def _set(overrides: Sequence[str]) -> list[str]:
     return [part for override in overrides for part in ("--set", override)]
+
+
+def _socket_folder(rig: Rig, other: Path) -> Path:
+    """The rig's own, or the other where a supervisor has that."""
+    try:
+        folder = make_service_folder(rig)
+        with only_supervisor(folder):
+            return folder
+    except ConfigError:
+        return other
 
 
 def _start(folder: Path, name: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:

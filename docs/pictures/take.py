@@ -15,7 +15,7 @@ SIZE = (120, 40)
 
 async def take(running: demo.Instrument, path: Path) -> None:
     """Attach a console without a terminal, wait, and save what it shows."""
-    app = ConsoleApp(Client(running.folder))
+    app = ConsoleApp(Client(running.sockets))
     async with app.run_test(size=SIZE) as pilot:
         end_s = time.monotonic() + SECONDS
         while time.monotonic() < end_s:

@@ -111,7 +111,7 @@ def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
     finally:
         end_process(console, _CONSOLE_END_S)
     thread.join(timeout=5.0)
-    newest = demos.newest_telemetry(running.folder)
+    newest = demos.newest_telemetry(running.sockets)
     if newest is not None and newest.recorder is not None:
         typer.echo(f"log: {newest.recorder.path}")
     return 0 if console.returncode == 0 else FAILED

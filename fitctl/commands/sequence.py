@@ -160,7 +160,10 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
             failure = str(error)
         finally:
             progress.stop()
-            typer.echo(_json(sequence.name, failure, attempts) if as_json else _table(attempts))
+            if as_json:
+                typer.echo(_json(sequence.name, failure, attempts))
+            elif attempts:
+                typer.echo(_table(attempts))
     if failure:
         typer.echo(f"sequence {sequence.name}: {failure}", err=True)
         return FAILED

@@ -11,9 +11,10 @@ import psutil
 import pytest
 
 from fitctl.logging.reading import log_info, tick_arrays
+from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Recover
 
-from .conftest import end, fitctl
+from .conftest import Rig, end, fitctl
 
 pytestmark = pytest.mark.timeout(300)
 SUMMARY_KEYS = {
@@ -145,6 +146,26 @@ def test_a_demo_that_ends_without_its_star_says_so_by_its_status(tmp_path):
 
     assert process.returncode == 1
     assert json.loads(output.splitlines()[-1])["judged_s"] == 0.0
+
+
+def test_other_commands_find_a_running_demo_and_a_second_keeps_out_of_its_way(tmp_path):
+    rig = Rig(tmp_path)
+
+    def demo_of_it(*arguments):
+        return fitctl("demo", "--headless", *rig.common, *arguments, stdout=subprocess.PIPE)
+
+    try:
+        rig.supervisor, rig.client = demo_of_it(), Client(rig.sockets)
+        rig.follow_to("ACQUISITION")
+        second = demo_of_it("--duration", 3)
+        second.communicate(timeout=60)
+        assert second.returncode == 1  # it ran, and had no time for its star
+
+        status = fitctl("send", "status", *rig.common, stdout=subprocess.PIPE)
+        assert status.communicate(timeout=30)[0].startswith("right ")
+        assert status.returncode == 0
+    finally:
+        rig.close()
 
 
 @pytest.mark.parametrize("after_s", [0.3, 0.8, 1.5, 2.2])
