@@ -46,7 +46,7 @@ class Instrument:
 
     client: Client
     sockets: Path
-    folder: Path
+    errors: Path
     bench_port: int
     started_s: float
     supervisor: subprocess.Popen[bytes]
@@ -56,7 +56,7 @@ class Instrument:
         """Raise DemoError if a part of it has ended."""
         for name, process in (("mocks", self.mocks), ("supervisor", self.supervisor)):
             if process.poll() is not None:
-                why = last_line(self.folder / f"{name}.err") or "it left no message"
+                why = last_line(self.errors / f"{name}.err") or "it left no message"
                 msg = f"{name} ended with status {process.returncode}: {why}"
                 raise DemoError(msg)
 

@@ -102,7 +102,7 @@ def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
             "--rig",
             str(rig_path),
             "--set",
-            f"service.folder={running.folder}",
+            f"service.folder={running.sockets}",
             "--quitting-ends-instrument",
         ]
     )

@@ -2,8 +2,10 @@
 
 import json
 import os
+import select
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -166,6 +168,37 @@ def test_other_commands_find_a_running_demo_and_a_second_keeps_out_of_its_way(tm
         assert status.returncode == 0
     finally:
         rig.close()
+
+
+def test_on_a_terminal_the_demo_shows_its_instrument_and_ends_with_q(tmp_path):
+    ours, theirs = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fitctl", "demo", "--set", f"logging.folder={tmp_path}"],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        env=os.environ | {"TERM": "xterm-256color", "TMPDIR": str(tmp_path)},
+        start_new_session=True,
+    )
+    os.close(theirs)
+    try:
+        assert "live" in shown_until("live", ours)
+        os.write(ours, b"q")
+        assert f"log: {tmp_path}" in shown_until("log: ", ours)
+        assert process.wait(30) == 0
+    finally:
+        end(process)
+        os.close(ours)
+
+
+def shown_until(text, terminal, limit_s=60.0):
+    """What a program writes to its terminal, up to the piece that has `text`."""
+    seen = b""
+    end_s = time.monotonic() + limit_s
+    while text.encode() not in seen and time.monotonic() < end_s:
+        if select.select([terminal], [], [], 0.5)[0]:
+            seen += os.read(terminal, 65536)
+    return seen.decode(errors="replace")
 
 
 @pytest.mark.parametrize("after_s", [0.3, 0.8, 1.5, 2.2])
