@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import threading
 import time
-from typing import NamedTuple
+from collections.abc import Callable, Coroutine
+from typing import Any, NamedTuple
 
 from fitctl import config
 from fitctl.drivers.interface import ServoAmplifiers
@@ -88,9 +88,10 @@ BACK_ENDS = {
 
 
 class Bench:
-    """A driver and, in an event loop of its own thread, the mock that it is configured for."""
+    """A driver and, in the loop of another thread, the mock that it is configured for."""
 
-    def __init__(self, name: str, *overrides: str) -> None:
+    def __init__(self, in_loop: Callable[[Coroutine], Any], name: str, *overrides: str) -> None:
+        self._in_loop = in_loop
         self.link_fault = BACK_ENDS[name].link_fault
         self.motors = SimulatedMotors()
         rig_file = RIGS / BACK_ENDS[name].rig
@@ -98,10 +99,7 @@ class Bench:
         rig = config.load_rig(rig_file, overrides)
         _, mocks = rig.mock_parts()
         self.mock = amplifier_mock(rig.loops[LOOP].siderostat, mocks.loops[LOOP], self.motors)
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever)
-        self._thread.start()
-        listening = self._run(self.mock.start())
+        listening = in_loop(self.mock.start())
         self.endpoints = endpoint_keys(name, LOOP, listening)
         devices = [f"{key}={value}" for key, value in self.endpoints.items() if key[0] == "l"]
         self.siderostat = config.load_rig(rig_file, [*overrides, *devices]).loops[LOOP].siderostat
@@ -120,18 +118,10 @@ class Bench:
 
     def close(self) -> None:
         self.driver.close()
-        self._run(self.mock.stop())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(5)
-        left = asyncio.all_tasks(self._loop)
-        self._loop.close()
-        assert not left
+        self._in_loop(self.mock.stop())
 
     def _call(self, action, *arguments) -> None:
         async def run() -> None:
             action(*arguments)
 
-        self._run(run())
-
-    def _run(self, coroutine):
-        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(5)
+        self._in_loop(run())

@@ -16,16 +16,15 @@ import time
 from collections import deque
 
 from fitctl.config import BalAnalogDevice, Siderostat
-from fitctl.drivers.bal_analog.link import DEVICE, ModbusLink
+from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, held, reach_rad
+from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
     EXCEPTION_FLAG,
     EXCEPTIONS,
     Message,
-    decode_identity,
     decode_registers,
     encode_exchange,
-    encode_identify,
     lines,
     signed,
     unwrap,
@@ -43,10 +42,7 @@ from fitctl.drivers.interface import (
     ServoReading,
 )
 
-_NAMES = ("azimuth", "elevation")
 _STILL = (0.0, 0.0)
-_SLACK = 1.5  # of what a motor can turn between two readings
-_MARGIN_RAD = 0.05
 _MOST_OUTSTANDING = 100
 
 
@@ -67,8 +63,8 @@ class BalAnalogAmplifiers:
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
         self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
-        self._most_rad_s = _SLACK * siderostat.velocity_limit_rad_s
-        self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / self._most_rad_s
+        most_rad_s = SLACK * siderostat.velocity_limit_rad_s
+        self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / most_rad_s
         self._link: ModbusLink | None = None
         self._enable = False
         self._counts: tuple[int, int] | None = None
@@ -92,12 +88,12 @@ class BalAnalogAmplifiers:
         self._asked_s = -math.inf
         self._link = ModbusLink(self._device)
         try:
-            texts = decode_identity(self._link.ask(encode_identify()))
+            identity = self._link.identify()
             self._settle()
         except BaseException:
             self._drop()
             raise
-        return DeviceIdentity(texts[0] or "unknown", texts[1] or "Modbus I/O", "", texts[2])
+        return identity
 
     def enable(self) -> None:
         """Power both axes at zero velocity.
@@ -187,20 +183,12 @@ class BalAnalogAmplifiers:
     # ------------------------------------------------------------ requests
     def _request(self, link: ModbusLink, velocity_rad_s: AzEl) -> float:
         """Send one transaction, velocities within the motors' limit; returns when."""
-        most_rad_s = self._velocity_limit_rad_s
-        if not all(map(math.isfinite, velocity_rad_s)):
-            msg = f"velocities must be finite numbers of rad/s, not {velocity_rad_s}"
-            raise ValueError(msg)
+        wanted_rad_s = held(velocity_rad_s, self._velocity_limit_rad_s)
         device = self._device
         scale = device.velocity_rad_s_per_v
         az, el = (
-            velocity_to_counts(
-                max(-most_rad_s, min(most_rad_s, wanted_rad_s)),
-                rad_s_per_v,
-                device.full_scale_v,
-                device.full_scale_counts,
-            )
-            for wanted_rad_s, rad_s_per_v in zip(velocity_rad_s, (scale.az, scale.el), strict=True)
+            velocity_to_counts(wanted, rad_s_per_v, device.full_scale_v, device.full_scale_counts)
+            for wanted, rad_s_per_v in zip(wanted_rad_s, (scale.az, scale.el), strict=True)
         )
         enable = word_of(self._enable, self._enable, device.enabled_level)
         pdu = encode_exchange(
@@ -242,7 +230,7 @@ class BalAnalogAmplifiers:
         az_counts, el_counts = self._counts
         fault = "; ".join(
             f"{name}: fault line"
-            for name, is_up in zip(_NAMES, lines(faults, self._device.fault_level), strict=True)
+            for name, is_up in zip(AXES, lines(faults, self._device.fault_level), strict=True)
             if is_up
         )
         return ServoReading(
@@ -280,8 +268,8 @@ class BalAnalogAmplifiers:
                 f"a reading within {self._blind_s:.2f} s, for the counters not to wrap unseen"
             )
             raise self._timeout(expected, f"one after {since_s:.2f} s")
-        most_counts = (_MARGIN_RAD + self._most_rad_s * since_s) / self._rad_per_count
-        for name, before, now in zip(_NAMES, near, (az, el), strict=True):
+        most_counts = reach_rad(self._velocity_limit_rad_s, since_s) / self._rad_per_count
+        for name, before, now in zip(AXES, near, (az, el), strict=True):
             if abs(now - before) > most_counts:
                 raise DeviceFault(
                     DEVICE,

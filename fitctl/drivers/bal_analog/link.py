@@ -11,10 +11,16 @@ import socket
 import time
 
 from fitctl.config import BalAnalogDevice
-from fitctl.drivers.bal_analog.protocol import Message, frame, take_message
-from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
+from fitctl.drivers.amplifiers import DEVICE
+from fitctl.drivers.bal_analog.protocol import (
+    Message,
+    decode_identity,
+    encode_identify,
+    frame,
+    take_message,
+)
+from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
 
-DEVICE = "siderostat amplifiers"
 _MESSAGE_BYTES_MAX = 260
 
 
@@ -101,6 +107,16 @@ class ModbusLink:
             if message.transaction == number:
                 return message.pdu
         return b""
+
+    def identify(self) -> DeviceIdentity:
+        """Who the station is; many cannot say.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceProtocolError
+        """
+        maker, model, firmware = decode_identity(self.ask(encode_identify()))
+        return DeviceIdentity(maker or "unknown", model or "Modbus I/O", "", firmware)
 
     def close(self) -> None:
         """Disconnect; safe to call twice."""

@@ -5,19 +5,16 @@ from __future__ import annotations
 from contextlib import closing
 
 from fitctl.config import BalAnalogDevice, Siderostat
-from fitctl.drivers.bal_analog.link import DEVICE, ModbusLink
+from fitctl.drivers.amplifiers import AXES, DEVICE
+from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     READ_HOLDING_REGISTERS,
-    decode_identity,
     decode_registers,
-    encode_identify,
     encode_read,
     lines,
 )
-from fitctl.drivers.interface import DeviceIdentity, DeviceRefused, DeviceTimeout
+from fitctl.drivers.interface import DeviceRefused, DeviceTimeout
 from fitctl.drivers.probe import Probe, round_trip_s
-
-_NAMES = ("azimuth", "elevation")
 
 
 def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
@@ -30,7 +27,7 @@ def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
     """
     device = siderostat.device
     with closing(ModbusLink(device)) as link:
-        maker, model, firmware = decode_identity(link.ask(encode_identify()))
+        identity = link.identify()
         read = encode_read(device.first_input_register)
         answer = link.ask(read)
         if not answer:
@@ -47,8 +44,7 @@ def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
         question_s = round_trip_s(lambda: link.ask(read))
     disagreements = tuple(
         f"{name}'s fault line is up: look at the amplifier's lamps and remove the cause"
-        for name, is_up in zip(_NAMES, lines(faults, device.fault_level), strict=True)
+        for name, is_up in zip(AXES, lines(faults, device.fault_level), strict=True)
         if is_up
     )
-    identity = DeviceIdentity(maker or "unknown", model or "Modbus I/O", "", firmware)
     return Probe(identity, question_s, disagreements)

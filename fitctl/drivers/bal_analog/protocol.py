@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 REGISTERS = 3
-AXES = 2
 COUNTER_MODULUS = 1 << 16
 
 READ_HOLDING_REGISTERS = 3

@@ -34,6 +34,6 @@ def probe_drive(siderostat: Siderostat) -> Probe:
             code = node.read(protocol.ERROR_CODE + offset, 0, "H")
             if code:
                 disagreements.append(
-                    f"{name} reports error 0x{code:04X}: remove its cause; fitctl clears it at standby"
+                    f"{name} reports {protocol.error_text(code)}: remove its cause; fitctl clears it at standby"
                 )
     return Probe(identity, question_s, tuple(disagreements))

@@ -15,10 +15,10 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
 
 from fitctl.config import EnsembleDevice, Siderostat
-from fitctl.drivers.ensemble.link import DEVICE, EnsembleLink
+from fitctl.drivers.amplifiers import AXES, DEVICE, held, reach_rad
+from fitctl.drivers.ensemble.link import EnsembleLink
 from fitctl.drivers.ensemble.protocol import (
     AxisStatus,
     Parameter,
@@ -34,16 +34,11 @@ from fitctl.drivers.interface import (
     DeviceFault,
     DeviceIdentity,
     DeviceMismatch,
-    DeviceRefused,
     DeviceUnreachable,
     ServoReading,
 )
 
-T = TypeVar("T")
-_NAMES = ("azimuth", "elevation")
 _POLL_S = 0.005
-_LIMIT_SLACK = 1.5  # of what a motor can turn between two readings
-_LIMIT_MARGIN_RAD = 0.05
 
 
 class EnsembleAmplifiers:
@@ -81,7 +76,7 @@ class EnsembleAmplifiers:
         self.close()
         self._link = EnsembleLink(self._device)
         try:
-            self._link.probe()
+            identity = self._link.probe()
             for axis in range(2):
                 self._set_up(axis)
             self._command("WAIT MODE NOWAIT")
@@ -89,8 +84,7 @@ class EnsembleAmplifiers:
         except BaseException:
             self._drop()
             raise
-        axes = " and ".join(f"@{number}" for number in self._device.axes)
-        return DeviceIdentity("Aerotech", f"Ensemble, axes {axes}", "", "")
+        return identity
 
     def enable(self) -> None:
         """Power both axes, standing still.
@@ -156,9 +150,7 @@ class EnsembleAmplifiers:
         ValueError
             A velocity is not finite.
         """
-        if not all(map(math.isfinite, velocity_rad_s)):
-            msg = f"velocities must be finite numbers of rad/s, not {velocity_rad_s}"
-            raise ValueError(msg)
+        velocity_rad_s = held(velocity_rad_s, self._velocity_limit_rad_s)
         self._opened()
         for axis in range(2):
             self._free_run(axis, velocity_rad_s[axis])
@@ -174,7 +166,7 @@ class EnsembleAmplifiers:
             enabled=all(status & AxisStatus.ENABLED for status in self._status),
             fault="; ".join(
                 f"{name}: {fault_text(faults)}"
-                for name, faults in zip(_NAMES, self._faults, strict=True)
+                for name, faults in zip(AXES, self._faults, strict=True)
                 if faults
             ),
         )
@@ -217,17 +209,17 @@ class EnsembleAmplifiers:
         self._read_faults(axis)
 
     def _free_run(self, axis: int, velocity_rad_s: float) -> None:
-        """Say a velocity, within the motor's limit, unless it was the last one said too."""
-        most_rad_s = self._velocity_limit_rad_s
-        velocity_rad_s = max(-most_rad_s, min(most_rad_s, velocity_rad_s))
+        """Say a velocity, unless it was the last one said too."""
         units_s = f"{velocity_rad_s / self._rad_per_unit[axis]:.{self._digits[axis]}f}"
         if units_s == self._sent[axis] or not self._status[axis] & AxisStatus.ENABLED:
             return
         self._sent[axis] = units_s
-        if self._opened().command(f"FREERUN {self._at(axis)} {units_s}") is not Reply.DONE:
+        link, command = self._opened(), f"FREERUN {self._at(axis)} {units_s}"
+        reply = link.command(command)
+        if reply is not Reply.DONE:
             self._sent[axis] = ""
             if not self._read_faults(axis) and self._is_enabled(axis):
-                raise self._refused(f"FREERUN {self._at(axis)} {units_s}", "a refusal")
+                raise link.refused(command, reply)
 
     def _look_after(self, axis: int, what: int) -> None:
         """Read the status or the faults of an axis; both where it has just lost its power."""
@@ -246,8 +238,8 @@ class EnsembleAmplifiers:
         if last is None:
             return
         since_s, before_rad = read_s - last[0], last[1]
-        most_rad = _LIMIT_MARGIN_RAD + _LIMIT_SLACK * self._velocity_limit_rad_s * since_s
-        for name, before, now in zip(_NAMES, before_rad, position_rad, strict=True):
+        most_rad = reach_rad(self._velocity_limit_rad_s, since_s)
+        for name, before, now in zip(AXES, before_rad, position_rad, strict=True):
             if abs(now - before) > most_rad:
                 raise DeviceFault(
                     DEVICE,
@@ -287,25 +279,16 @@ class EnsembleAmplifiers:
         return self._number(f"GETPARM({self._at(axis)}, {parameter.value})")
 
     def _command(self, text: str) -> None:
-        reply = self._opened().command(text)
+        link = self._opened()
+        reply = link.command(text)
         if reply is not Reply.DONE:
-            raise self._refused(text, reply.name.lower().replace("_", " "))
+            raise link.refused(text, reply)
 
     def _number(self, text: str) -> float:
-        return self._value(text, parse_number)
+        return self._opened().value(text, parse_number)
 
     def _bits(self, text: str) -> int:
-        return self._value(text, parse_bits)
-
-    def _value(self, text: str, parse: Callable[[str], T]) -> T:
-        link = self._opened()
-        answer = link.query(text)
-        if isinstance(answer, Reply):
-            raise self._refused(text, answer.name.lower().replace("_", " "))
-        try:
-            return parse(answer)
-        except ValueError:
-            raise link.nonsense(f"a number in answer to {text}", repr(answer)) from None
+        return self._opened().value(text, parse_bits)
 
     def _opened(self) -> EnsembleLink:
         if self._link is None:
@@ -313,13 +296,9 @@ class EnsembleAmplifiers:
             raise DeviceUnreachable(DEVICE, self._device.port, expected, "none", "open it again")
         return self._link
 
-    def _refused(self, text: str, got: str) -> DeviceRefused:
-        hint = "check siderostat.device.axes, and the controller's firmware"
-        return DeviceRefused(DEVICE, self._device.port, f"{text} to be done", got, hint)
-
     def _mismatch(self, axis: int, expected: str, got: str) -> DeviceMismatch:
         hint = "set them in the controller with its maker's tool"
-        what = f"{_NAMES[axis]}: {expected}"
+        what = f"{AXES[axis]}: {expected}"
         return DeviceMismatch(DEVICE, self._device.port, what, got, hint)
 
     def _axis_fault(self, axis: int, goal: str, got: str) -> DeviceFault:
@@ -327,7 +306,7 @@ class EnsembleAmplifiers:
         return DeviceFault(
             DEVICE,
             self._device.port,
-            f"{_NAMES[axis]} {goal}",
+            f"{AXES[axis]} {goal}",
             f"{got}; {faults}" if faults else got,
             "remove its cause, then recover",
         )

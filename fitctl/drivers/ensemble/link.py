@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import TypeVar
 
 import serial
 
 from fitctl.config import EnsembleDevice
+from fitctl.drivers.amplifiers import DEVICE
 from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, PROBE, Reply
-from fitctl.drivers.interface import DeviceProtocolError, DeviceTimeout, DeviceUnreachable
+from fitctl.drivers.interface import (
+    DeviceIdentity,
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
 
-DEVICE = "siderostat amplifiers"
+T = TypeVar("T")
 _REPLIES = {reply.value: reply for reply in Reply}
 _BLANKS = b"\r\n "
 _POLL_S = 0.02  # how long one read waits; the time limit is counted above it
@@ -32,7 +41,6 @@ class EnsembleLink:
     """
 
     def __init__(self, device: EnsembleDevice) -> None:
-        self.endpoint = device.port
         self._device = device
         try:
             self._port = serial.serial_for_url(
@@ -51,7 +59,7 @@ class EnsembleLink:
                 "check its power and cable, its Ethernet socket's set-up, and siderostat.device.port",
             ) from error
 
-    def probe(self) -> None:
+    def probe(self) -> DeviceIdentity:
         """See that a controller answers, whatever it was saying before.
 
         Raises
@@ -61,6 +69,8 @@ class EnsembleLink:
         deadline_s = self._send(PROBE)
         while self._byte(PROBE, deadline_s) != Reply.NOT_UNDERSTOOD.value:
             pass
+        axes = " and ".join(f"@{number}" for number in self._device.axes)
+        return DeviceIdentity("Aerotech", f"Ensemble, axes {axes}", "", "")
 
     def command(self, text: str) -> Reply:
         """Have a command done; returns what became of it.
@@ -89,9 +99,30 @@ class EnsembleLink:
             if value:
                 return value
 
+    def value(self, text: str, parse: Callable[[str], T]) -> T:
+        """Ask for a value and insist on one; `parse` raises ValueError where it is none.
+
+        Raises
+        ------
+        DeviceTimeout, DeviceUnreachable, DeviceRefused, DeviceProtocolError
+        """
+        answer = self.query(text)
+        if isinstance(answer, Reply):
+            raise self.refused(text, answer)
+        try:
+            return parse(answer)
+        except ValueError:
+            raise self.nonsense(f"a number in answer to {text}", repr(answer)) from None
+
     def close(self) -> None:
         """Let go of the port; safe to call twice."""
         self._port.close()
+
+    def refused(self, text: str, reply: Reply) -> DeviceRefused:
+        """The error for a command that the controller has not done."""
+        got = reply.name.lower().replace("_", " ")
+        hint = "check siderostat.device.axes, and the controller's firmware"
+        return DeviceRefused(DEVICE, self._device.port, f"{text} to be done", got, hint)
 
     def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
         """The error for an answer that cannot be; the link is closed."""

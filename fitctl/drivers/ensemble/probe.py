@@ -5,15 +5,8 @@ from __future__ import annotations
 from contextlib import closing
 
 from fitctl.config import EnsembleDevice, Siderostat
-from fitctl.drivers.ensemble.link import DEVICE, EnsembleLink
-from fitctl.drivers.ensemble.protocol import (
-    Parameter,
-    Reply,
-    fault_text,
-    parse_bits,
-    parse_number,
-)
-from fitctl.drivers.interface import DeviceIdentity, DeviceRefused
+from fitctl.drivers.ensemble.link import EnsembleLink
+from fitctl.drivers.ensemble.protocol import Parameter, fault_text, parse_bits, parse_number
 from fitctl.drivers.probe import Probe, round_trip_s
 
 
@@ -28,35 +21,20 @@ def probe_ensemble(siderostat: Siderostat[EnsembleDevice]) -> Probe:
     device = siderostat.device
     disagreements = []
     with closing(EnsembleLink(device)) as link:
-        link.probe()
+        identity = link.probe()
         for axis in device.axes:
             low, high = (
-                parse_number(_value(link, f"GETPARM(@{axis}, {parameter.value})"))
+                link.value(f"GETPARM(@{axis}, {parameter.value})", parse_number)
                 for parameter in (Parameter.SOFTWARE_LIMIT_LOW, Parameter.SOFTWARE_LIMIT_HIGH)
             )
             if low >= high:
                 disagreements.append(
                     f"axis @{axis} has no software limits: set SoftwareLimitLow and SoftwareLimitHigh"
                 )
-            faults = parse_bits(_value(link, f"AXISFAULT(@{axis})"))
+            faults = link.value(f"AXISFAULT(@{axis})", parse_bits)
             if faults:
                 disagreements.append(
                     f"axis @{axis} is in fault ({fault_text(faults)}): remove its cause"
                 )
         question_s = round_trip_s(lambda: link.query(f"PFBKPROG(@{device.axes[0]})"))
-    axes = " and ".join(f"@{axis}" for axis in device.axes)
-    identity = DeviceIdentity("Aerotech", f"Ensemble, axes {axes}", "", "")
     return Probe(identity, question_s, tuple(disagreements))
-
-
-def _value(link: EnsembleLink, text: str) -> str:
-    answer = link.query(text)
-    if isinstance(answer, Reply):
-        got = answer.name.lower().replace("_", " ")
-        hint = "check siderostat.device.axes"
-        raise DeviceRefused(DEVICE, link.endpoint, f"an answer to {text}", got, hint)
-    try:
-        parse_number(answer)
-    except ValueError:
-        raise link.nonsense(f"a number in answer to {text}", repr(answer)) from None
-    return answer

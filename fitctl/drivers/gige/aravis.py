@@ -10,13 +10,20 @@ import contextlib
 import importlib
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from fitctl.config import Camera
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.features import EXPOSURE_TOLERANCE, GAIN_TOLERANCE, RATE_TOLERANCE
+from fitctl.drivers.gige.features import (
+    EXPOSURE_TOLERANCE,
+    GAIN_TOLERANCE,
+    RATE_TOLERANCE,
+    expect,
+    mismatch,
+)
 from fitctl.drivers.gige.gvcp import DEVICE
 from fitctl.drivers.gige.heartbeat import Heartbeat
 from fitctl.drivers.gige.ticks import CameraTime, mid_exposure_s
@@ -46,7 +53,9 @@ class AravisCamera:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._endpoint = f"{camera.device.address}:{camera.device.gvcp_port}"
+        self._endpoint = camera.device.endpoint
+        self._expect = partial(expect, self._endpoint)
+        self._mismatch = partial(mismatch, self._endpoint)
         self._aravis: Any = None
         self._device: Any = None
         self._stream: Any = None
@@ -124,7 +133,9 @@ class AravisCamera:
         """
         heartbeat = self._opened()
         if self._stream is None:
-            raise self._mismatch("a started stream", "none")
+            raise DeviceMismatch(
+                DEVICE, self._endpoint, "a started stream", "none", "call start() first"
+            )
         deadline_s = time.monotonic() + timeout_s
         while True:
             if heartbeat.error is not None:
@@ -234,15 +245,6 @@ class AravisCamera:
                 DEVICE, self._endpoint, "an open camera", "a closed one", "open() it"
             )
         return self._heartbeat
-
-    def _expect(self, name: str, wanted: float, actual: float, tolerance: float) -> None:
-        if abs(actual - wanted) > tolerance * abs(wanted):
-            raise self._mismatch(f"{name} = {wanted:g}", f"{actual:g}")
-
-    def _mismatch(self, expected: str, got: str) -> DeviceMismatch:
-        return DeviceMismatch(
-            DEVICE, self._endpoint, expected, got, "correct [camera] in the rig file to this camera"
-        )
 
     @contextlib.contextmanager
     def _translated(self, expected: str) -> Iterator[None]:

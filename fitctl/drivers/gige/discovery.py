@@ -8,7 +8,7 @@ import time
 from typing import NamedTuple
 
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import DEVICE
+from fitctl.drivers.gige.gvcp import DEVICE, text_of
 from fitctl.drivers.gige.protocol import Command, MalformedPacketError, Register, TextRegister
 from fitctl.drivers.interface import DeviceIdentity, DeviceUnreachable
 
@@ -108,5 +108,4 @@ def decode_found(packet: bytes) -> FoundCamera:
 
 
 def _text(payload: bytes, register: TextRegister) -> str:
-    data = payload[register.address : register.address + register.length]
-    return data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
+    return text_of(payload[register.address : register.address + register.length])

@@ -74,12 +74,7 @@ class GigeCamera:
         self._channel = channel
         try:
             _take_control(channel, device.heartbeat_s)
-            identity = DeviceIdentity(
-                maker=channel.read_text(protocol.MAKER),
-                model=channel.read_text(protocol.MODEL),
-                serial=channel.read_text(protocol.SERIAL_NUMBER),
-                firmware=channel.read_text(protocol.DEVICE_VERSION),
-            )
+            identity = channel.read_identity()
             self._features = Features(channel)
             self._features.stop()  # whatever the last program has left running
             self._exposure_s = self._features.configure(self._camera)
@@ -190,8 +185,7 @@ class GigeCamera:
 
     def _opened(self) -> tuple[ControlChannel, Features, Heartbeat]:
         if self._channel is None or self._features is None or self._heartbeat is None:
-            device = self._camera.device
-            endpoint = f"{device.address}:{device.gvcp_port}"
+            endpoint = self._camera.device.endpoint
             raise DeviceUnreachable(DEVICE, endpoint, "an open camera", "a closed one", "open() it")
         return self._channel, self._features, self._heartbeat
 

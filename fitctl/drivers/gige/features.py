@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 from fitctl.config import Camera
@@ -79,7 +80,8 @@ class Features:
             def is_open(self) -> bool:
                 return True
 
-        self._endpoint = channel.endpoint
+        self._expect = partial(expect, channel.endpoint)
+        self._mismatch = partial(mismatch, channel.endpoint)
         self._errors: type[Exception] = genapi.GenericException
         self._integer: type[Any] = genapi.IInteger
         self._readable = {genapi.EAccessMode.RW, genapi.EAccessMode.RO}
@@ -242,11 +244,15 @@ class Features:
         except self._errors as error:
             raise self._mismatch(f"command {name}", str(error)) from error
 
-    def _expect(self, name: str, wanted: float, actual: float, tolerance: float) -> None:
-        if abs(actual - wanted) > tolerance * abs(wanted):
-            raise self._mismatch(f"{name} = {wanted:g}", f"{actual:g}")
 
-    def _mismatch(self, expected: str, got: str) -> DeviceMismatch:
-        return DeviceMismatch(
-            DEVICE, self._endpoint, expected, got, "correct [camera] in the rig file to this camera"
-        )
+def expect(endpoint: str, name: str, wanted: float, actual: float, tolerance: float) -> None:
+    """See that a camera has taken a number. Raises DeviceMismatch."""
+    if abs(actual - wanted) > tolerance * abs(wanted):
+        raise mismatch(endpoint, f"{name} = {wanted:g}", f"{actual:g}")
+
+
+def mismatch(endpoint: str, expected: str, got: str) -> DeviceMismatch:
+    """The error for a camera that is not what the rig file says."""
+    return DeviceMismatch(
+        DEVICE, endpoint, expected, got, "correct [camera] in the rig file to this camera"
+    )

@@ -12,6 +12,7 @@ import time
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Command, MalformedPacketError, Register
 from fitctl.drivers.interface import (
+    DeviceIdentity,
     DeviceProtocolError,
     DeviceRefused,
     DeviceTimeout,
@@ -101,8 +102,16 @@ class ControlChannel:
 
     def read_text(self, register: protocol.TextRegister) -> str:
         """Read a string register."""
-        data = self.read_memory(*register)
-        return data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
+        return text_of(self.read_memory(*register))
+
+    def read_identity(self) -> DeviceIdentity:
+        """Read who the camera says it is."""
+        return DeviceIdentity(
+            maker=self.read_text(protocol.MAKER),
+            model=self.read_text(protocol.MODEL),
+            serial=self.read_text(protocol.SERIAL_NUMBER),
+            firmware=self.read_text(protocol.DEVICE_VERSION),
+        )
 
     def request_resend(self, request: protocol.Resend) -> None:
         """Ask for stream packets again; there is no answer, and no other command delays this.
@@ -225,6 +234,11 @@ class ControlChannel:
         return DeviceProtocolError(
             DEVICE, self.endpoint, expected, got, "is this a GigE Vision camera?"
         )
+
+
+def text_of(data: bytes) -> str:
+    """What a string register says."""
+    return data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
 
 
 def _check_address(address: str, endpoint: str) -> None:

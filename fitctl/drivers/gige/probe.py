@@ -10,7 +10,7 @@ from fitctl.drivers.gige.features import Features
 from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.gige.limits import disagreements
 from fitctl.drivers.gige.protocol import Register
-from fitctl.drivers.interface import DeviceError, DeviceIdentity
+from fitctl.drivers.interface import DeviceError
 from fitctl.drivers.probe import Probe, round_trip_s
 
 _ANY_CONTROL = protocol.CONTROL | protocol.CONTROL_EXCLUSIVE
@@ -28,12 +28,7 @@ def probe_camera(camera: Camera) -> Probe:
     device = camera.device
     channel = ControlChannel(device.address, device.gvcp_port, device.response_timeout_s)
     with closing(channel):
-        identity = DeviceIdentity(
-            *map(
-                channel.read_text,
-                (protocol.MAKER, protocol.MODEL, protocol.SERIAL_NUMBER, protocol.DEVICE_VERSION),
-            )
-        )
+        identity = channel.read_identity()
         question_s = round_trip_s(lambda: channel.read_register(Register.VERSION))
         controlled = channel.read_register(Register.CONTROL_PRIVILEGE)
         told = [_CONTROLLED] if controlled & _ANY_CONTROL else []

@@ -1,13 +1,11 @@
 """The analogue back end against scripted stations, and what is its own with the mock."""
 
-import contextlib
-import socket
-import threading
 import time
 
 import pytest
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
+from scripted_server import scripted_server
 
 from fitctl import config
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
@@ -35,10 +33,6 @@ class Script:
         self.faults = 0
         self.respond = self.answer
         self.requests = []
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-        self.port = self._listener.getsockname()[1]
 
     def answer(self, message):
         if message.pdu[0] != 23:
@@ -47,29 +41,20 @@ class Script:
         pdu = bytes([23, 6]) + b"".join(value.to_bytes(2, "big") for value in registers)
         return frame(message.transaction, message.unit, pdu)
 
-    def _serve(self):
-        with contextlib.suppress(OSError):
-            while True:
-                client, _ = self._listener.accept()
-                pending = bytearray()
-                with client, contextlib.suppress(OSError):
-                    while data := client.recv(1000):
-                        pending += data
-                        while (message := take_message(pending)) is not None:
-                            self.requests.append(message.pdu)
-                            client.sendall(self.respond(message))
-
-    def close(self):
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        self._thread.join(5)
+    def talk(self, client):
+        pending = bytearray()
+        while data := client.recv(1000):
+            pending += data
+            while (message := take_message(pending)) is not None:
+                self.requests.append(message.pdu)
+                client.sendall(self.respond(message))
 
 
 @pytest.fixture
 def script():
     script = Script()
-    yield script
-    script.close()
+    with scripted_server(script.talk) as script.port:
+        yield script
 
 
 @pytest.fixture

@@ -60,9 +60,9 @@ def enabled(bench):
     amplifiers.close()
 
 
-def error_from(amplifiers, velocity_rad_s=TURNING):
-    """What exchanging ends in."""
-    end_s = time.monotonic() + LIMIT_S
+def error_from(amplifiers, velocity_rad_s=TURNING, within_s=LIMIT_S):
+    """What exchanging ends in; None if it goes on."""
+    end_s = time.monotonic() + within_s
     while time.monotonic() < end_s:
         try:
             amplifiers.exchange(velocity_rad_s)
@@ -99,18 +99,7 @@ def test_when_it_is_over_the_amplifiers_are_had_again(bench, enabled, kind):
     enabled.reset_fault()
     enabled.enable()
     assert bench.motors.enabled == [True, True]
-    assert error_from_a_while(enabled) is None
-
-
-def error_from_a_while(amplifiers, seconds=0.2):
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        try:
-            amplifiers.exchange(STILL)
-        except DeviceError as error:
-            return error
-        time.sleep(0.002)
-    return None
+    assert error_from(enabled, STILL, within_s=0.2) is None
 
 
 @pytest.mark.parametrize("kind", ["drop", "freeze", "link_loss", "disconnect", "corrupt"])
@@ -174,7 +163,7 @@ def test_a_jumped_encoder_is_said_until_it_is_reset_and_commands_still_reach_the
         wanted = pytest.approx(list(velocity_rad_s), abs=1e-4)
         wait_until(lambda wanted=wanted: bench.motors.velocity_rad_s == wanted)
     enabled.reset_fault()
-    assert error_from_a_while(enabled) is None
+    assert error_from(enabled, STILL, within_s=0.2) is None
 
 
 def test_a_stuck_axis_is_read_where_it_stands(bench, enabled):

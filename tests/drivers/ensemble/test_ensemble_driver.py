@@ -1,11 +1,10 @@
 """The Ensemble driver against controllers that differ from the mock, and on its other wires."""
 
 import contextlib
-import socket
-import threading
 import time
 
 import pytest
+from scripted_server import scripted_server
 
 from fitctl import config
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
@@ -45,25 +44,13 @@ class Script:
     def __init__(self, answers):
         self.answers = WELL | answers
         self.heard = []
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-        self.port = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
 
-    def _serve(self):
-        with contextlib.suppress(OSError):
-            while True:
-                client, _ = self._listener.accept()
-                with client, client.makefile("rb") as lines, contextlib.suppress(OSError):
-                    for line in lines:
-                        command = line.decode().strip()
-                        self.heard.append(command)
-                        client.sendall(self.answers.get(command, "%\n").encode())
-
-    def close(self):
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        self._thread.join(5)
+    def talk(self, client):
+        with client.makefile("rb") as lines:
+            for line in lines:
+                command = line.decode().strip()
+                self.heard.append(command)
+                client.sendall(self.answers.get(command, "%\n").encode())
 
 
 @pytest.fixture
@@ -79,9 +66,9 @@ def scripted(settings, bench_of):
 
         def make(**update):
             script = Script(update.pop("answers", {}))
-            stack.callback(script.close)
+            port = f"socket://127.0.0.1:{stack.enter_context(scripted_server(script.talk))}"
             device = settings.device.model_copy(
-                update={"port": script.port, "response_timeout_s": 0.2} | update
+                update={"port": port, "response_timeout_s": 0.2} | update
             )
             driver = EnsembleAmplifiers(settings.model_copy(update={"device": device}))
             stack.callback(driver.close)
@@ -243,6 +230,12 @@ def test_an_axis_that_does_not_come_up_is_an_error_and_both_are_disabled(scripte
         driver.enable()
     assert script.heard.index("ENABLE @1") < script.heard.index("DISABLE @0")
     assert "DISABLE @1" in script.heard
+
+
+def test_asked_only_what_is_no_status_word_is_an_error_too(scripted, settings):
+    driver, _ = scripted(answers={"AXISFAULT(@1)": "%1.5\n"})
+    with pytest.raises(DeviceProtocolError, match=r"a number in answer to AXISFAULT\(@1\)"):
+        probe_ensemble(settings.model_copy(update={"device": driver._device}))
 
 
 # ---------------------------------------------------------------- with the mock

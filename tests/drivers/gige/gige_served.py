@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Camera, Fault, GigeMock, default_rig_path, load_rig
+from fitctl.drivers.gige.driver import GigeCamera
+from fitctl.drivers.interface import Frame
 from fitctl.mocks.gige.camera import GigeCameraMock
 
 IMAGE = np.random.default_rng(1).integers(0, 65536, (40, 40), dtype=np.uint16)
@@ -29,6 +31,13 @@ def mock_settings(**changes: Any) -> GigeMock:
     """The default rig's mock camera with some settings changed."""
     _, mocks = load_rig(default_rig_path()).mock_parts()
     return mocks.camera.model_copy(update=changes)
+
+
+def received(camera: GigeCamera, count: int) -> list[Frame]:
+    """So many frames, none of which takes longer than any stall of the machine."""
+    frames = [camera.next_frame(5.0) for _ in range(count)]
+    assert None not in frames
+    return [frame for frame in frames if frame is not None]
 
 
 class Served:

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gige_served import IMAGE, Served, camera_settings, mock_settings
+from gige_served import IMAGE, Served, camera_settings, mock_settings, received
 from numpy.typing import NDArray
 
 from fitctl.config import Camera
@@ -21,17 +21,10 @@ from fitctl.drivers.interface import (
     DeviceRefused,
     DeviceTimeout,
     DeviceUnreachable,
-    Frame,
 )
 
 Serve = Callable[..., Served]
 Connect = Callable[..., GigeCamera]
-
-
-def frames(camera: GigeCamera, count: int) -> list[Frame]:
-    received = [camera.next_frame(5.0) for _ in range(count)]
-    assert None not in received
-    return [frame for frame in received if frame is not None]
 
 
 def drain(camera: GigeCamera) -> None:
@@ -42,7 +35,7 @@ def drain(camera: GigeCamera) -> None:
 def test_the_image_arrives_bit_for_bit(serve: Serve, connect: Connect) -> None:
     camera = connect(serve())
     camera.start()
-    (frame,) = frames(camera, 1)
+    (frame,) = received(camera, 1)
     np.testing.assert_array_equal(frame.image, IMAGE)
     assert frame.image.dtype == np.uint16
 
@@ -52,7 +45,7 @@ def test_an_image_of_many_packets_arrives_bit_for_bit(serve: Serve, connect: Con
     image = np.random.default_rng(2).integers(0, 65536, (123, 200), dtype=np.uint16)
     camera = connect(serve(lambda _: image, **size), packet_size_bytes=576, **size)
     camera.start()
-    (frame,) = frames(camera, 1)
+    (frame,) = received(camera, 1)
     np.testing.assert_array_equal(frame.image, image)
 
 
@@ -62,7 +55,7 @@ def test_other_pixel_formats_arrive_as_the_numbers_that_the_camera_counts(
 ) -> None:
     camera = connect(serve(), pixel_format=pixel_format)
     camera.start()
-    (frame,) = frames(camera, 1)
+    (frame,) = received(camera, 1)
     np.testing.assert_array_equal(frame.image, IMAGE >> shift)
     assert frame.image.dtype == np.uint16
 
@@ -70,7 +63,7 @@ def test_other_pixel_formats_arrive_as_the_numbers_that_the_camera_counts(
 def test_the_gain_is_set(serve: Serve, connect: Connect) -> None:
     camera = connect(serve(lambda _: np.full((40, 40), 1000, np.uint16)), gain=20.0)
     camera.start()
-    (frame,) = frames(camera, 1)
+    (frame,) = received(camera, 1)
     assert np.all(frame.image == 10000)
 
 
@@ -84,7 +77,7 @@ def test_the_description_is_read_plain_or_zipped(
 def test_a_delay_between_packets_is_set_and_kept(serve: Serve, connect: Connect) -> None:
     camera = connect(serve(), packet_delay_s=0.003)  # leader, three of pixels, trailer
     camera.start()
-    for frame in frames(camera, 3):
+    for frame in received(camera, 3):
         assert frame.received_s - frame.mid_exposure_s >= 0.034 + 3 * 0.003
 
 
@@ -114,11 +107,11 @@ def test_the_frame_carries_the_middle_of_its_exposure(serve: Serve, connect: Con
 
     camera = connect(serve(render))
     camera.start()
-    received = frames(camera, 10)
-    for frame in received:
+    taken = received(camera, 10)
+    for frame in taken:
         assert frame.mid_exposure_s == pytest.approx(rendered[frame.number - 1], abs=1e-3)
         assert frame.received_s - frame.mid_exposure_s >= 0.034  # frame_delay_s, less the clocks
-    assert [b.number - a.number for a, b in pairwise(received)] == [1] * 9
+    assert [b.number - a.number for a, b in pairwise(taken)] == [1] * 9
 
 
 def test_frames_of_a_camera_without_a_clock_are_as_old_as_the_rig_file_says(
@@ -126,7 +119,7 @@ def test_frames_of_a_camera_without_a_clock_are_as_old_as_the_rig_file_says(
 ) -> None:
     camera = connect(serve(mock=mock_settings(clock=False)), frame_delay_s=0.03)
     camera.start()
-    (frame,) = frames(camera, 1)
+    (frame,) = received(camera, 1)
     assert frame.received_s - frame.mid_exposure_s == pytest.approx(0.03)
 
 
@@ -142,7 +135,7 @@ def test_frames_after_a_new_start_are_new(serve: Serve, connect: Connect) -> Non
     for _ in range(2):
         camera.start()
         started_s = time.monotonic()
-        (frame,) = frames(camera, 1)
+        (frame,) = received(camera, 1)
         assert frame.number == 1
         assert frame.mid_exposure_s > started_s - 0.05
         camera.stop()
@@ -187,14 +180,14 @@ def test_the_driver_keeps_control_for_longer_than_a_heartbeat(
 ) -> None:
     camera = connect(serve(), heartbeat_s=0.5)
     camera.start()
-    assert len(frames(camera, 50)) == 50
+    assert len(received(camera, 50)) == 50
 
 
 def test_a_camera_that_has_gone_is_noticed_at_once(serve: Serve, connect: Connect) -> None:
     served = serve()
     camera = connect(served)
     camera.start()
-    frames(camera, 2)
+    received(camera, 2)
     served.stop()
     gone_s = time.monotonic()
     with pytest.raises(DeviceUnreachable, match=f"camera at 127.0.0.1:{served.port}"):
@@ -219,7 +212,7 @@ def test_a_camera_can_be_opened_again_after_it_came_back(serve: Serve, connect: 
     camera.close()
     camera.open()
     camera.start()
-    assert len(frames(camera, 2)) == 2
+    assert len(received(camera, 2)) == 2
 
 
 @pytest.mark.parametrize(
@@ -246,7 +239,7 @@ def test_exposure_and_rate_are_set_whichever_limits_the_other(
 ) -> None:
     camera = connect(serve(), frame_rate_hz=rate_hz, exposure_s=exposure_s)
     camera.start()
-    first, second = frames(camera, 2)
+    first, second = received(camera, 2)
     step_s = (second.mid_exposure_s - first.mid_exposure_s) / (second.number - first.number)
     assert step_s == pytest.approx(1 / rate_hz, abs=1e-3)
 

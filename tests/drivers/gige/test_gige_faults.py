@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gige_served import IMAGE, Served
+from gige_served import IMAGE, Served, received
 
 from fitctl.drivers.gige.driver import GigeCamera
-from fitctl.drivers.interface import DeviceError, DeviceMismatch, DeviceUnreachable, Frame
+from fitctl.drivers.interface import DeviceError, DeviceMismatch, DeviceUnreachable
 from fitctl.mocks.gige.camera import FAULTS
 from fitctl.mocks.gige.picture import HOT_PIXEL
 
@@ -29,12 +29,6 @@ def running(serve: Serve, connect: Connect, image=IMAGE, **changes) -> tuple[Ser
     camera = connect(served, **FAST | changes)
     camera.start()
     return served, camera
-
-
-def received(camera: GigeCamera, count: int) -> list[Frame]:
-    frames = [camera.next_frame(5.0) for _ in range(count)]
-    assert None not in frames
-    return [frame for frame in frames if frame is not None]
 
 
 def image_after(camera: GigeCamera, when_s: float) -> np.ndarray:

@@ -1,12 +1,12 @@
 import socket
 import threading
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scripted_server import scripted_server
 
 from fitctl.config import ConfigError, Fault, default_rig_path, load_rig
 from fitctl.drivers.interface import (
@@ -68,27 +68,16 @@ def dac(station):
     driver.close()
 
 
-@contextmanager
 def scripted_station(answer):
     """A station that answers every request by `answer(function_code, data)`, in a right header."""
 
-    def serve():
-        try:
-            link, _ = listener.accept()
-        except OSError:
-            return
-        with link:
-            while len(request := link.recv(300)) >= 8:
-                pdu = answer(request[7], request[8:])
-                length = (len(pdu) + 1).to_bytes(2, "big")
-                link.sendall(request[:4] + length + request[6:7] + pdu)
+    def talk(link):
+        while len(request := link.recv(300)) >= 8:
+            pdu = answer(request[7], request[8:])
+            length = (len(pdu) + 1).to_bytes(2, "big")
+            link.sendall(request[:4] + length + request[6:7] + pdu)
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield listener.getsockname()[1]
-        listener.shutdown(socket.SHUT_RDWR)
-        thread.join(10)
+    return scripted_server(talk)
 
 
 def correctly(function_code, data):
