@@ -5,8 +5,6 @@ The mock's side is the Modbus server of all mocks: see fuzz_modbus_dac.py.
 
 from __future__ import annotations
 
-import sys
-
 from fitctl.drivers.bal_analog.protocol import (
     READ_HOLDING_REGISTERS,
     READ_WRITE_MULTIPLE_REGISTERS,
@@ -39,14 +37,7 @@ def _read(pdu: bytes) -> None:
             continue
 
 
-def main() -> None:
-    """Fuzz until told to stop; libFuzzer's options."""
-    import atheris
-
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, TestOneInput)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    main()
+    from harness import fuzz
+
+    fuzz(TestOneInput)

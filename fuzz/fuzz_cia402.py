@@ -9,7 +9,6 @@ import asyncio
 import math
 import queue
 import socket
-import sys
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -35,11 +34,6 @@ _FROM_DRIVE = (0x581, 0x581, 0x581, 0x181, 0x281, 0x081, 0x701, 0x123)
 _LOOP = asyncio.new_event_loop()
 
 
-def _must(hold: object) -> None:
-    if not hold:
-        raise AssertionError
-
-
 class _Motors:
     """Stand still; are told finite velocities only."""
 
@@ -47,7 +41,8 @@ class _Motors:
         return 0.0, 0.0
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
-        _must(math.isfinite(az) and math.isfinite(el))
+        assert math.isfinite(az)
+        assert math.isfinite(el)
 
     def set_enabled(self, axis: int, enabled: bool) -> None:
         """Power is of no matter here."""
@@ -97,7 +92,7 @@ def _with_drive(use: Callable[[Cia402DriveMock, _Client], None]) -> None:
             client.data_received(encode_frame(CanFrame(protocol.NMT_ID, b"\x81\x00")))
             transport.sent = b""
             client.data_received(b"t6018" + b"4000100000000000" + b"\r")
-            _must(b"t58184300100092" in transport.sent)
+            assert b"t58184300100092" in transport.sent
         finally:
             mock._power_off()
             for event in mock._events:
@@ -112,7 +107,7 @@ def read_line(data: bytes) -> None:
         frame = decode_frame(data)
     except ValueError:
         return
-    _must(encode_frame(frame)[:-1].upper() == data.upper())
+    assert encode_frame(frame)[:-1].upper() == data.upper()
 
 
 def serve_bytes(data: bytes) -> None:
@@ -138,7 +133,7 @@ def serve_sdo(data: bytes) -> None:
         server = SdoServer(mock.dictionary)
         for start in range(0, len(data), 8):
             answer = server.answer(data[start : start + 8])
-            _must(answer is None or len(answer) == 8)
+            assert answer is None or len(answer) == 8
 
     _with_drive(use)
 
@@ -153,7 +148,7 @@ class _Scripted:
 
     def send(self, *frames: tuple[int, bytes]) -> None:
         for _can_id, data in frames:
-            _must(len(data) <= 8)
+            assert len(data) <= 8
 
     def receive(self, _timeout_s: float) -> tuple[int, bytes] | None:
         return next(self._frames, None)
@@ -191,7 +186,7 @@ def exchange(data: bytes) -> None:
             reading = amplifiers.exchange((1.0, -1.0))
         except DeviceError:
             continue
-        _must(reading is None or all(map(math.isfinite, (reading.time_s, *reading.position_rad))))
+        assert reading is None or all(map(math.isfinite, (reading.time_s, *reading.position_rad)))
     amplifiers.close()
 
 
@@ -216,7 +211,7 @@ def hear_line(data: bytes) -> None:
                 frame = link.receive(0.0)
             except DeviceError:
                 continue
-            _must(frame is None or (0 <= frame[0] < 2**11 and len(frame[1]) <= 8))
+            assert frame is None or (0 <= frame[0] < 2**11 and len(frame[1]) <= 8)
 
 
 _READERS = (read_line, serve_bytes, serve_frames, serve_sdo, ask_node, exchange, hear_line)
@@ -228,14 +223,7 @@ def TestOneInput(data: bytes) -> None:  # noqa: N802 - the name that fuzzers cal
         _READERS[data[0] % len(_READERS)](data[1:])
 
 
-def main() -> None:
-    """Fuzz until stopped; arguments as libFuzzer's."""
-    import atheris
-
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, TestOneInput)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    main()
+    from harness import fuzz
+
+    fuzz(TestOneInput)

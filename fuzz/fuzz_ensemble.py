@@ -5,8 +5,6 @@ The first byte chooses the side, the rest is what comes over the line.
 
 from __future__ import annotations
 
-import sys
-
 from fitctl.drivers.ensemble.protocol import (
     EOS,
     Parameter,
@@ -66,14 +64,7 @@ def _mock_takes(data: bytes) -> None:
             parse_bits(format_bits(axis.status))
 
 
-def main() -> None:
-    """Fuzz until told to stop; libFuzzer's options."""
-    import atheris
-
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, TestOneInput)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    main()
+    from harness import fuzz
+
+    fuzz(TestOneInput)

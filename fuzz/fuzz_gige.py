@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 
@@ -61,14 +60,14 @@ def stream(data: bytes) -> None:
         with contextlib.suppress(DeviceError):
             frame = assembler.add(memoryview(packet))
             if frame is not None:
-                _must(frame.number > number, "a frame number that does not ascend")
-                _must(frame.image.shape == (SIZE_PX, SIZE_PX), "another size")
+                assert frame.number > number, "a frame number that does not ascend"
+                assert frame.image.shape == (SIZE_PX, SIZE_PX), "another size"
                 number = frame.number
         assembler.ask_again()
         for request in asked:
             # Leader and two of pixels.
-            _must(0 <= request.first <= request.last < 3, f"asked for {request}")
-    _must(assembler.frames + assembler.lost == number, "a frame that is not counted")
+            assert 0 <= request.first <= request.last < 3, f"asked for {request}"
+    assert assembler.frames + assembler.lost == number, "a frame that is not counted"
 
 
 @cache
@@ -92,7 +91,7 @@ def commands(data: bytes) -> None:
             if reply is not None:
                 p.decode_answer(reply)
         reply = mock.answer(p.encode_command(p.Command.DISCOVERY, 1), CLIENTS[0])
-        _must(reply is not None and len(reply) == 8 + p.DISCOVERY_BYTES, "no answer any more")
+        assert len(reply or b"") == 8 + p.DISCOVERY_BYTES, "no answer any more"
         for client in CLIENTS:
             release = p.encode_words(p.Register.CONTROL_PRIVILEGE, 0)
             mock.answer(p.encode_command(p.Command.WRITEREG, 1, release), client)
@@ -104,25 +103,13 @@ def commands(data: bytes) -> None:
 TARGETS: tuple[Callable[[bytes], None], ...] = (answers, description, stream, commands)
 
 
-def _must(holds: bool, otherwise: str) -> None:
-    if not holds:
-        raise AssertionError(otherwise)
-
-
 def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris' name for it
     """Feed one parser; whatever is raised is a finding."""
     if data:
         TARGETS[data[0] % len(TARGETS)](data[1:])
 
 
-def main() -> None:
-    """Fuzz until told to stop; see ``-help=1``."""
-    import atheris
-
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, TestOneInput)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    main()
+    from harness import fuzz
+
+    fuzz(TestOneInput)

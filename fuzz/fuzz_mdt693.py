@@ -5,8 +5,6 @@ The first byte chooses the side and the dialect, the rest is what comes over the
 
 from __future__ import annotations
 
-import sys
-
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.mdt693 import protocol
 from fitctl.mocks.mdt693.amplifier import Amplifier
@@ -73,14 +71,7 @@ def _mock_takes(dialect: int, line: bytes) -> None:
             protocol.parse_answer(text, answer)
 
 
-def main() -> None:
-    """Run atheris, with its own command line."""
-    import atheris
-
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, TestOneInput)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    main()
+    from harness import fuzz
+
+    fuzz(TestOneInput)

@@ -6,7 +6,6 @@ The first byte chooses who reads the rest. ``python fuzz/fuzz_modbus_dac.py CORP
 from __future__ import annotations
 
 import socket
-import sys
 
 import numpy as np
 
@@ -40,21 +39,16 @@ _MODEL = DataModel(
 )
 
 
-def _must(hold: object) -> None:
-    if not hold:
-        raise AssertionError
-
-
 def read_pdu(data: bytes) -> None:
     """A request gets its own answer or an exception of the standard."""
     if not data:
         return
     got = answer(data[:253], _MODEL)
-    _must(len(got) <= 253)
-    _must(got[0] & 0x7F == data[0] & 0x7F)
+    assert len(got) <= 253
+    assert got[0] & 0x7F == data[0] & 0x7F
     if got[0] & 0x80:
-        _must(len(got) == 2)
-        _must(1 <= got[1] <= 4)
+        assert len(got) == 2
+        assert 1 <= got[1] <= 4
 
 
 def read_tcp(data: bytes) -> None:
@@ -64,10 +58,10 @@ def read_tcp(data: bytes) -> None:
     try:
         for message in tcp.take_messages(pending):
             (back,) = tcp.take_messages(bytearray(server.respond(message)))
-            _must((back.transaction, back.unit) == (message.transaction, message.unit))
+            assert (back.transaction, back.unit) == (message.transaction, message.unit)
     except tcp.OutOfStep:
         return
-    _must(len(pending) < 260)
+    assert len(pending) < 260
 
 
 def read_rtu(data: bytes) -> None:
@@ -75,7 +69,7 @@ def read_rtu(data: bytes) -> None:
     server = rtu.ModbusRtuServer(_MODEL, Faults(WIRE_FAULTS), unit=1, baud_rate=115200)
     for frame in (data, data + rtu.crc16(data)):
         framed = server.respond(frame)
-        _must(not framed or rtu.parse_frame(framed) is not None)
+        assert not framed or rtu.parse_frame(framed) is not None
 
 
 def _use(dac: ModbusDac) -> None:
@@ -86,8 +80,8 @@ def _use(dac: ModbusDac) -> None:
         except DeviceError:
             continue
         if isinstance(got, np.ndarray):
-            _must(got.shape == (3,))
-            _must(np.all((got >= 0) & (got <= _DAC.full_scale_v)))
+            assert got.shape == (3,)
+            assert np.all((got >= 0) & (got <= _DAC.full_scale_v))
 
 
 def drive_tcp(data: bytes) -> None:
@@ -151,14 +145,7 @@ def TestOneInput(data: bytes) -> None:  # noqa: N802 - the name that fuzzers cal
         _READERS[data[0] % len(_READERS)](data[1:])
 
 
-def main() -> None:
-    """Fuzz until stopped; arguments as libFuzzer's."""
-    import atheris
-
-    atheris.instrument_all()
-    atheris.Setup(sys.argv, TestOneInput)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    main()
+    from harness import fuzz
+
+    fuzz(TestOneInput)

@@ -74,6 +74,11 @@ class Faults:
         """All that is wrong now."""
         return list(self._active.values())
 
+    @property
+    def away(self) -> bool:
+        """Cut off or without power."""
+        return self.value("disconnect") is not None or self.value("reboot") is not None
+
     def on_change(self, watcher: Callable[[str], None]) -> None:
         """Call `watcher` with the kind of each fault that begins or ends."""
         self._watchers.append(watcher)
@@ -186,9 +191,7 @@ class Wire:
     @property
     def dead(self) -> bool:
         """Nothing goes in or out now: also what a client sends is to be thrown away."""
-        return any(
-            self._faults.value(kind) is not None for kind in ("freeze", "disconnect", "reboot")
-        )
+        return self._faults.away or self._faults.value("freeze") is not None
 
     def close(self) -> None:
         """Forget what is still to be sent."""

@@ -46,12 +46,17 @@ class FaultyMotors:
     motors : Motors
     faults : Faults
         With `WIRE_FAULTS` and `AXIS_FAULTS` among its kinds.
+    counts_per_rev : int
+        Of the encoders.
+
+    Attributes
+    ----------
     counts_per_rad : float
         Of the encoders.
     """
 
-    def __init__(self, motors: Motors, faults: Faults, counts_per_rad: float) -> None:
-        self.counts_per_rad = counts_per_rad
+    def __init__(self, motors: Motors, faults: Faults, counts_per_rev: int) -> None:
+        self.counts_per_rad = counts_per_rev / (2 * math.pi)
         self._motors = motors
         self._faults = faults
         self._zero_rad: Sequence[float] = (0.0, 0.0)

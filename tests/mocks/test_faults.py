@@ -1,7 +1,7 @@
 import asyncio
-import functools
 
 import pytest
+from mock_bench import in_a_loop
 
 from fitctl.config import Fault
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, UnknownFault, Wire
@@ -10,14 +10,6 @@ KINDS = WIRE_FAULTS | {
     "hot_pixel": FaultKind("a pixel shines", "DN", 5000.0),
     "stuck": FaultKind("an axis does not move", parts=("az", "el")),
 }
-
-
-def in_a_loop(test):
-    @functools.wraps(test)
-    def run(*args, **kwargs):
-        asyncio.run(test(*args, **kwargs))
-
-    return run
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from importlib.resources import files
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
+from mock_bench import ToldMotors
 
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.mocks.cia402.drive import Cia402DriveMock
@@ -17,24 +18,9 @@ EDS = str(files("fitctl.mocks.cia402") / "fit_drive.eds")
 RPM_RAD_S = 2 * 3.141592653589793 / 60
 
 
-class RecordingMotors:
-    def __init__(self):
-        self.velocity_rad_s = (0.0, 0.0)
-        self.enabled = [False, False]
-
-    def position_rad(self):
-        return 0.0, 0.0
-
-    def command_velocity_rad_s(self, az, el):
-        self.velocity_rad_s = (az, el)
-
-    def set_enabled(self, axis, enabled):
-        self.enabled[axis] = enabled
-
-
 @pytest.fixture
 def motors():
-    return RecordingMotors()
+    return ToldMotors()
 
 
 @pytest.fixture

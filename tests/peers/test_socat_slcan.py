@@ -5,6 +5,7 @@ import subprocess
 import time
 
 import pytest
+from mock_bench import ToldMotors
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
@@ -19,23 +20,12 @@ pytestmark = [
 ]
 
 
-class StillMotors:
-    def position_rad(self):
-        return 1.0, -1.0
-
-    def command_velocity_rad_s(self, az, el):
-        """Nothing turns."""
-
-    def set_enabled(self, axis, enabled):
-        """Nothing has current."""
-
-
 @pytest.fixture
 def mock_port(in_loop):
     siderostat = load_rig(default_rig_path()).loops["right"].siderostat
 
     async def made():
-        mock = Cia402DriveMock(siderostat, StillMotors(), port=0)
+        mock = Cia402DriveMock(siderostat, ToldMotors(1.0, -1.0), port=0)
         return mock, await mock.start()
 
     mock, port = in_loop(made())

@@ -9,6 +9,7 @@ from collections import Counter
 
 import pytest
 from can.interfaces.slcan import slcanBus
+from mock_bench import ToldMotors
 
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
@@ -24,17 +25,6 @@ pytestmark = [
 LINKTYPE_CAN_SOCKETCAN = 227
 PCAP_HEADER = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, LINKTYPE_CAN_SOCKETCAN)
 REMOTE = 0x4000_0000
-
-
-class Motors:
-    def position_rad(self):
-        return 1.0, -1.0
-
-    def command_velocity_rad_s(self, az, el):
-        """Nothing turns."""
-
-    def set_enabled(self, axis, enabled):
-        """Nothing has current."""
 
 
 class Recorder:
@@ -74,7 +64,7 @@ def conversation(in_loop):
     siderostat = load_rig(default_rig_path()).loops["right"].siderostat
 
     async def made():
-        mock = Cia402DriveMock(siderostat, Motors(), port=0)
+        mock = Cia402DriveMock(siderostat, ToldMotors(1.0, -1.0), port=0)
         return mock, await mock.start()
 
     async def set_fault(mock, on):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import math
 from collections.abc import Sequence
 
 from fitctl.config import BalAnalogDevice, BalAnalogMock, Siderostat
@@ -18,6 +16,7 @@ from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel
 from fitctl.mocks.modbus.tcp import ModbusTcpServer
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
+from fitctl.mocks.timers import Periodic, Watchdog
 
 FAULTS = (
     WIRE_FAULTS
@@ -79,14 +78,12 @@ class BalAnalogMockStation:
         self.enabled = [False, False]
         self._device = device = siderostat.device
         self._settings = settings
-        self._motors = FaultyMotors(
-            motors, self.faults, siderostat.encoder_counts_per_rev / (2 * math.pi)
-        )
+        self._motors = FaultyMotors(motors, self.faults, siderostat.encoder_counts_per_rev)
         self._latched = [False, False]
         self._safe = [0, 0, word_of(False, False, device.enabled_level)]
         self._outputs = list(self._safe)
-        self._watchdog: asyncio.TimerHandle | None = None
-        self._hold: asyncio.TimerHandle | None = None
+        self._watchdog = Watchdog(self._trip, settings.watchdog_s)
+        self._hold = Periodic(self._hold_outputs)
         outputs, inputs = (
             range(first, first + REGISTERS)
             for first in (device.first_output_register, device.first_input_register)
@@ -113,16 +110,14 @@ class BalAnalogMockStation:
             If the port is taken.
         """
         port = await self._server.start()
-        self._hold_outputs()
+        self._hold.set_period(_HOLD_S)
         return port
 
     async def stop(self) -> None:
         """Take all power and disconnect everyone; safe to call twice."""
         self.faults.close()
-        self._stop_watchdog()
-        if self._hold is not None:
-            self._hold.cancel()
-            self._hold = None
+        self._watchdog.stop()
+        self._hold.set_period(0)
         self._outputs = list(self._safe)
         self._apply()
         await self._server.stop()
@@ -138,9 +133,7 @@ class BalAnalogMockStation:
             if 0 <= place < REGISTERS:  # what is written to an input is lost
                 self._outputs[place] = value
         self._apply()
-        self._stop_watchdog()
-        loop = asyncio.get_running_loop()
-        self._watchdog = loop.call_later(self._settings.watchdog_s, self._trip)
+        self._watchdog.feed()
 
     def _inputs(self) -> list[int]:
         counters = [
@@ -154,14 +147,8 @@ class BalAnalogMockStation:
         return [*(counter % COUNTER_MODULUS for counter in counters), faults]
 
     def _trip(self) -> None:
-        self._stop_watchdog()
         self._outputs = list(self._safe)
         self._apply()
-
-    def _stop_watchdog(self) -> None:
-        if self._watchdog is not None:
-            self._watchdog.cancel()
-            self._watchdog = None
 
     # ------------------------------------------------------------ the amplifiers
     def _judge(self) -> None:
@@ -186,7 +173,6 @@ class BalAnalogMockStation:
         """An output stays as it is, but the motors take a command for a moment only."""
         if any(self.enabled):
             self._command_motors()
-        self._hold = asyncio.get_running_loop().call_later(_HOLD_S, self._hold_outputs)
 
     def _command_motors(self) -> None:
         az, el = map(self._velocity_rad_s, range(len(AXES)))
@@ -203,6 +189,6 @@ class BalAnalogMockStation:
 
     def _take_fault(self, kind: str) -> None:
         if kind == "reboot":
-            self._stop_watchdog()
+            self._watchdog.stop()
             self._outputs = list(self._safe)
         self._apply()

@@ -70,6 +70,11 @@ def command_of(controlword: int) -> Command:
     return Command.ENABLE_OPERATION if controlword & 0x08 else Command.SWITCH_ON
 
 
+def exponent_of(unit: int) -> int:
+    """The power of ten in the top byte of object 60A9, signed."""
+    return (unit >> 24 ^ 0x80) - 0x80
+
+
 class Axis:
     """State, mode, target, ramp and fault of one axis.
 
@@ -113,8 +118,7 @@ class Axis:
     @property
     def unit_rad_s(self) -> float:
         """One unit of velocity on the wire."""
-        exponent = (self.unit_velocity >> 24 ^ 0x80) - 0x80
-        return 10.0**exponent * RAD_S_PER_RPM
+        return 10.0 ** exponent_of(self.unit_velocity) * RAD_S_PER_RPM
 
     @property
     def moves(self) -> bool:
@@ -154,7 +158,7 @@ class Axis:
         if self.state is State.QUICK_STOP_ACTIVE and resumes:
             self._enter(State.OPERATION_ENABLED)
         else:
-            self._enter(TRANSITIONS.get((self.state, command), self.state))
+            self.command(command)
 
     def advance(self, elapsed_s: float, position_counts: int, rad_per_count: float) -> None:
         """Bring the demand on by some time; a motor that was to be stopped and has been loses current.

@@ -14,7 +14,6 @@ stop.
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 from functools import partial
 
@@ -29,9 +28,9 @@ from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
 from fitctl.mocks.cia402.slcan import SlcanAdapter
 from fitctl.mocks.cia402.slcan_frames import CanFrame
-from fitctl.mocks.cia402.timers import Periodic, Watchdog
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
+from fitctl.mocks.timers import Periodic, Watchdog
 
 FAULTS = (
     WIRE_FAULTS
@@ -85,9 +84,7 @@ class Cia402DriveMock:
         self.faults = Faults(FAULTS)
         self._port = port
         self._node_id = siderostat.device.node_id
-        self._motors = FaultyMotors(
-            motors, self.faults, siderostat.encoder_counts_per_rev / (2 * math.pi)
-        )
+        self._motors = FaultyMotors(motors, self.faults, siderostat.encoder_counts_per_rev)
         self._encoders = Encoders(self._motors)
         self._adapter = SlcanAdapter(siderostat.device.bitrate, self.faults, self._receive)
         self.nmt_state = NmtState.STOPPED

@@ -6,7 +6,7 @@ from collections.abc import Callable, Container
 
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.protocol import AbortCode, State
-from fitctl.mocks.cia402.axis import FAULT_REACTIONS, QUICK_STOP_OPTIONS, Axis
+from fitctl.mocks.cia402.axis import FAULT_REACTIONS, QUICK_STOP_OPTIONS, Axis, exponent_of
 from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoAbortError, constant
 
 VENDOR_ID = 0x0000_F170
@@ -85,8 +85,7 @@ def axis_objects(
         changed()
 
     def set_unit(unit: int) -> None:
-        exponent = (unit >> 24 ^ 0x80) - 0x80
-        if unit & 0xFF_FFFF != protocol.UNIT_RPM or not -3 <= exponent <= 0:
+        if unit & 0xFF_FFFF != protocol.UNIT_RPM or not -3 <= exponent_of(unit) <= 0:
             raise SdoAbortError(AbortCode.INVALID_VALUE)
         if axis.state is State.OPERATION_ENABLED:
             raise SdoAbortError(AbortCode.DEVICE_STATE)

@@ -67,7 +67,7 @@ class _Client(asyncio.Protocol):
         self.transport = cast("asyncio.Transport", transport)
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._adapter.clients.add(self)
-        if self._adapter.away:
+        if self._adapter.faults.away:
             self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -216,11 +216,6 @@ class SlcanAdapter:
         self._server: asyncio.Server | None = None
         faults.on_change(self._cut_connections)
 
-    @property
-    def away(self) -> bool:
-        """Cut off or without power."""
-        return any(self.faults.value(kind) is not None for kind in ("disconnect", "reboot"))
-
     async def start(self, port: int) -> int:
         """Listen on 127.0.0.1; returns the port, which is a free one if `port` is 0."""
         loop = asyncio.get_running_loop()
@@ -255,7 +250,7 @@ class SlcanAdapter:
                 client.deliver(frame, line)
 
     def _cut_connections(self, _kind: str) -> None:
-        if self.away:
+        if self.faults.away:
             self._drop_clients()
 
     def _drop_clients(self) -> None:

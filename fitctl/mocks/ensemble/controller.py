@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import math
-import os
-import tty
-from contextlib import suppress
-from typing import NamedTuple, cast
+from collections.abc import Callable
+from typing import cast
 
 from fitctl.config import EnsembleDevice, EnsembleMock, Siderostat
 from fitctl.drivers.ensemble.protocol import EOS, AxisFault, Parameter
@@ -16,6 +13,8 @@ from fitctl.mocks.ensemble.commands import Interpreter
 from fitctl.mocks.ensemble.line import Client
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
+from fitctl.mocks.pty import Endpoints, Pty
+from fitctl.mocks.timers import Periodic, Watchdog
 
 FAULTS = (
     WIRE_FAULTS
@@ -33,13 +32,6 @@ _CAUSES = {
     "amplifier_fault": AxisFault.AMPLIFIER,
     "following_error": AxisFault.POSITION_ERROR,
 }
-
-
-class Endpoints(NamedTuple):
-    """Where the mock can be spoken to."""
-
-    tcp_port: int
-    pty_path: str
 
 
 class EnsembleControllerMock:
@@ -81,14 +73,14 @@ class EnsembleControllerMock:
     ) -> None:
         self.faults = Faults(FAULTS)
         self._settings = settings
-        counts_per_rad = siderostat.encoder_counts_per_rev / (2 * math.pi)
-        self._motors = FaultyMotors(motors, self.faults, counts_per_rad)
-        self._units_per_rad = counts_per_rad / settings.counts_per_unit
+        self._motors = FaultyMotors(motors, self.faults, siderostat.encoder_counts_per_rev)
+        self._units_per_rad = self._motors.counts_per_rad / settings.counts_per_unit
         self._power_up()
         self._listener: asyncio.Server | None = None
-        self._links: set[_Link] = set()
-        self._pty: _Pty | None = None
-        self._cycle_timer: asyncio.TimerHandle | None = None
+        self.links: set[_Link] = set()
+        self._pty: Pty | None = None
+        self._pty_client: Client | None = None
+        self._cycle = Periodic(self._run_cycle)
         self._stepped_s = 0.0
         self.faults.on_change(self._take_fault)
 
@@ -104,18 +96,21 @@ class EnsembleControllerMock:
         self._listener = await loop.create_server(
             lambda: _Link(self), "127.0.0.1", self._settings.tcp_port
         )
-        self._pty = _Pty(self)
+        self._pty = Pty()
+        self._pty_client = self.new_client(self._pty.write)
+        self._pty.read_into(self._pty_client.receive)
         self._stepped_s = loop.time()
         self._run_cycle()
+        self._cycle.set_period(CYCLE_S)
         return Endpoints(self._listener.sockets[0].getsockname()[1], self._pty.path)
 
     async def stop(self) -> None:
         """Take all power, disconnect everyone; safe to call twice."""
         self.faults.close()
         self._power_up()
-        if self._cycle_timer is not None:
-            self._cycle_timer.cancel()
-            self._cycle_timer = None
+        self._cycle.set_period(0)
+        if self._pty_client is not None:
+            self._pty_client.close()
         if self._pty is not None:
             self._pty.close()
             self._pty = None
@@ -125,24 +120,14 @@ class EnsembleControllerMock:
         self._abort_links()
         await asyncio.sleep(0)  # transports close their sockets on the loop's next turn
 
-    def new_client(self, link: _Link | _Pty) -> Client:
+    def new_client(self, write: Callable[[bytes], None]) -> Client:
         """What serves a connection."""
-        return Client(self.faults, self._answer, self._settings.reply_s, link.write)
-
-    @property
-    def away(self) -> bool:
-        """Cut off or without power."""
-        return any(self.faults.value(kind) is not None for kind in ("disconnect", "reboot"))
+        return Client(self.faults, self._answer, self._settings.reply_s, write)
 
     @property
     def idle_timeout_s(self) -> float:
         """A connection is closed after so long without a byte."""
         return self._settings.idle_timeout_s
-
-    @property
-    def links(self) -> set[_Link]:
-        """Those who are connected over TCP."""
-        return self._links
 
     def _power_up(self) -> None:
         parameters = [self._parameters() for _ in AXES]
@@ -180,8 +165,6 @@ class EnsembleControllerMock:
     def _run_cycle(self) -> None:
         self._step()
         self._drive()
-        loop = asyncio.get_running_loop()
-        self._cycle_timer = loop.call_later(CYCLE_S, self._run_cycle)
 
     def _step(self) -> None:
         now_s = asyncio.get_running_loop().time()
@@ -207,11 +190,11 @@ class EnsembleControllerMock:
             for name, cause in _CAUSES.items():
                 if self.faults.value(name, part) is not None:
                     axis.causes |= cause
-        if self.away:
+        if self.faults.away:
             self._abort_links()
 
     def _abort_links(self) -> None:
-        for link in list(self._links):
+        for link in list(self.links):
             link.transport.abort()
 
 
@@ -222,18 +205,18 @@ class _Link(asyncio.Protocol):
 
     def __init__(self, controller: EnsembleControllerMock) -> None:
         self._controller = controller
-        self._idle: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
-        self._client = self._controller.new_client(self)
+        self._client = self._controller.new_client(self.write)
         self._controller.links.add(self)
-        self._wait_for_more()
-        if self._controller.away:
+        self._idle = Watchdog(self.transport.close, self._controller.idle_timeout_s)
+        self._idle.feed()
+        if self._controller.faults.away:
             self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        self._wait_for_more()
+        self._idle.feed()
         self._client.receive(data)
 
     def write(self, data: bytes) -> None:
@@ -249,44 +232,6 @@ class _Link(asyncio.Protocol):
         self.transport.resume_reading()
 
     def connection_lost(self, error: Exception | None) -> None:
-        self._stop_waiting()
+        self._idle.stop()
         self._client.close()
         self._controller.links.discard(self)
-
-    def _wait_for_more(self) -> None:
-        self._stop_waiting()
-        loop = asyncio.get_running_loop()
-        self._idle = loop.call_later(self._controller.idle_timeout_s, self.transport.close)
-
-    def _stop_waiting(self) -> None:
-        if self._idle is not None:
-            self._idle.cancel()
-            self._idle = None
-
-
-class _Pty:
-    """The serial port."""
-
-    def __init__(self, controller: EnsembleControllerMock) -> None:
-        # The clients' end stays open here too, so that ours sees no error when a client leaves.
-        self._ours, self._theirs = os.openpty()
-        os.set_blocking(self._ours, False)
-        tty.setraw(self._theirs)
-        self.path = os.ttyname(self._theirs)
-        self._client = controller.new_client(self)
-        asyncio.get_running_loop().add_reader(self._ours, self._take)
-
-    def write(self, data: bytes) -> None:
-        """Send; without flow control, what nobody reads is lost."""
-        with suppress(BlockingIOError):
-            os.write(self._ours, data)
-
-    def close(self) -> None:
-        asyncio.get_running_loop().remove_reader(self._ours)
-        self._client.close()
-        os.close(self._ours)
-        os.close(self._theirs)
-
-    def _take(self) -> None:
-        with suppress(BlockingIOError):
-            self._client.receive(os.read(self._ours, 4096))

@@ -79,11 +79,7 @@ _TEXTS_AT_START = {
     protocol.SERIAL_NUMBER: "FIT01",
 }
 _TEXTS = (
-    protocol.MAKER,
-    protocol.MODEL,
-    protocol.DEVICE_VERSION,
-    protocol.MAKER_INFORMATION,
-    protocol.SERIAL_NUMBER,
+    *_TEXTS_AT_START,
     protocol.USER_NAME,
     TextRegister(Register.XML_URL_1, protocol.XML_URL_BYTES),
     TextRegister(Register.XML_URL_2, protocol.XML_URL_BYTES),

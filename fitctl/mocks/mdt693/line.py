@@ -1,14 +1,10 @@
-"""The serial line of the mock: bytes at the pace of a baud rate, commands out of bytes, and a pty."""
+"""The serial line of the mock: bytes at the pace of a baud rate, and commands out of bytes."""
 
 from __future__ import annotations
 
 import asyncio
-import os
 import re
-import termios
-import tty
 from collections.abc import Callable
-from contextlib import suppress
 
 from fitctl.drivers.mdt693.protocol import BITS_PER_BYTE, TERMINATOR
 from fitctl.mocks.mdt693.controller import COMMAND_BYTES_MAX
@@ -98,56 +94,3 @@ def write_to(writer: asyncio.StreamWriter, data: bytes) -> None:
     """Send to a TCP client; without flow control, what nobody reads is lost."""
     if not writer.is_closing() and writer.transport.get_write_buffer_size() < _UNREAD_BYTES_MAX:
         writer.write(data)
-
-
-class Pty:
-    """A raw pty whose far end is given to clients by its path; made inside an event loop.
-
-    Parameters
-    ----------
-    baud_rate : int
-        At which its far end is set, until a client sets another.
-
-    Attributes
-    ----------
-    path : str
-    reader : StreamReader
-        What clients write.
-    """
-
-    def __init__(self, baud_rate: int) -> None:
-        self._master, self._slave = (
-            os.openpty()
-        )  # the slave stays open: no error when clients leave
-        tty.setraw(self._slave)
-        attributes = termios.tcgetattr(self._slave)
-        attributes[4:6] = [getattr(termios, f"B{baud_rate}", attributes[4])] * 2
-        termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
-        self._speed = attributes[4]
-        self.path = os.ttyname(self._slave)
-        self.reader = asyncio.StreamReader()
-        self._transport: asyncio.ReadTransport | None = None
-
-    async def open(self) -> None:
-        """Begin to read."""
-        loop = asyncio.get_running_loop()
-        self._transport, _ = await loop.connect_read_pipe(
-            lambda: asyncio.StreamReaderProtocol(self.reader),
-            os.fdopen(self._master, "rb", buffering=0),
-        )
-
-    def is_at_our_baud_rate(self) -> bool:
-        """Whether the client's baud rate is the device's."""
-        return termios.tcgetattr(self._slave)[4] == self._speed
-
-    def write(self, data: bytes) -> None:
-        """Send to whoever reads; without flow control, what nobody reads is lost."""
-        with suppress(BlockingIOError):
-            os.write(self._master, data)
-
-    async def close(self) -> None:
-        """Close both ends."""
-        if self._transport is not None:
-            self._transport.close()
-            await asyncio.sleep(0)  # the transport closes the master on the loop's next turn
-        os.close(self._slave)

@@ -6,14 +6,14 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 from fitctl import config
 from fitctl.drivers.mdt693.protocol import BITS_PER_BYTE, TERMINATOR
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
 from fitctl.mocks.mdt693.amplifier import CHANNELS, Amplifier
 from fitctl.mocks.mdt693.controller import Controller
-from fitctl.mocks.mdt693.line import CommandSplitter, Pty, Sender, write_to
+from fitctl.mocks.mdt693.line import CommandSplitter, Sender, write_to
+from fitctl.mocks.pty import Endpoints, Pty
 
 FAULTS = WIRE_FAULTS | {
     "silent": FaultKind("commands are obeyed and not answered: the line back is broken"),
@@ -22,14 +22,6 @@ FAULTS = WIRE_FAULTS | {
         "an output stays at its highest voltage, whatever it is told", parts=tuple(CHANNELS)
     ),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Endpoints:
-    """Where the mock can be spoken to."""
-
-    tcp_port: int
-    pty_path: str
 
 
 class Mdt693Mock:
@@ -115,10 +107,12 @@ class Mdt693Mock:
             If the port is taken.
         """
         self._listener = await asyncio.start_server(self._serve_tcp, "127.0.0.1", self._port)
+        reader = asyncio.StreamReader()
         self._pty = pty = Pty(self._settings.baud_rate)
-        await pty.open()
+        reader.set_transport(pty)  # which it pauses while much is unread
+        pty.read_into(reader.feed_data)
         self._pty_task = asyncio.create_task(
-            self._serve(pty.reader, pty.write, pty.is_at_our_baud_rate)
+            self._serve(reader, pty.write, pty.is_at_our_baud_rate)
         )
         self._on_outputs(self.amplifier.outputs_v)
         return Endpoints(self._listener.sockets[0].getsockname()[1], pty.path)
@@ -135,7 +129,7 @@ class Mdt693Mock:
         await asyncio.gather(*tasks, return_exceptions=True)
         self._pty_task = None
         if self._pty is not None:
-            await self._pty.close()
+            self._pty.close()
             self._pty = None
 
     async def _serve_tcp(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import termios
-import tty
 from collections.abc import Callable
-from contextlib import suppress
 
 from fitctl.drivers.modbus_dac.protocol import PDU_BYTES_MAX, rtu_silence_s
 from fitctl.mocks.faults import Faults, Wire
 from fitctl.mocks.modbus.pdu import BROADCAST_FUNCTIONS, DataModel, answer
+from fitctl.mocks.pty import Pty
 
 _BROADCAST = 0
 _BITS_PER_BYTE = 11  # start, eight data, parity or a second stop, stop
 _FRAME_BYTES_MAX = 1 + PDU_BYTES_MAX + 2
-_INPUT_SPEED, _OUTPUT_SPEED = 4, 5  # their places in what tcgetattr gives
-_CLOSED = -1
 
 
 def crc16(data: bytes) -> bytes:
@@ -62,36 +57,27 @@ class ModbusRtuServer:
     def __init__(self, model: DataModel, faults: Faults, *, unit: int, baud_rate: int) -> None:
         self._model = model
         self._unit = unit
+        self._baud_rate = baud_rate
         self._silence_s = rtu_silence_s(baud_rate)
         self._byte_s = _BITS_PER_BYTE / baud_rate
-        self._speed = getattr(termios, f"B{baud_rate}", None)  # None: not one that a pty can tell
         self._wire = Wire(faults, self._write)
         self._pending = bytearray()
         self._due: asyncio.TimerHandle | None = None
-        self._ours = self._theirs = _CLOSED
+        self._pty: Pty | None = None
 
     async def start(self) -> str:
         """Open the pty; returns the path of the clients' end."""
-        # The clients' end stays open here too, so that ours sees no error when a client leaves.
-        self._ours, self._theirs = os.openpty()
-        os.set_blocking(self._ours, False)
-        tty.setraw(self._theirs)
-        if self._speed is not None:
-            mode = termios.tcgetattr(self._theirs)
-            mode[_INPUT_SPEED] = mode[_OUTPUT_SPEED] = self._speed
-            termios.tcsetattr(self._theirs, termios.TCSANOW, mode)
-        asyncio.get_running_loop().add_reader(self._ours, self._take)
-        return os.ttyname(self._theirs)
+        self._pty = Pty(self._baud_rate)
+        self._pty.read_into(self._take)
+        return self._pty.path
 
     async def stop(self) -> None:
         """Close the pty; safe to call twice."""
         self._wire.close()
         self._cancel()
-        if self._ours != _CLOSED:
-            asyncio.get_running_loop().remove_reader(self._ours)
-            os.close(self._ours)
-            os.close(self._theirs)
-            self._ours = self._theirs = _CLOSED
+        if self._pty is not None:
+            self._pty.close()
+            self._pty = None
 
     def respond(self, data: bytes) -> bytes:
         """The framed answer to what came between two silences; empty where it gets none."""
@@ -105,21 +91,14 @@ class ModbusRtuServer:
             return b""
         return frame(unit, answer(request, self._model)) if unit == self._unit else b""
 
-    def _take(self) -> None:
-        try:
-            data = os.read(self._ours, 1024)
-        except OSError:  # nothing there after all
-            return
-        if self._wire.dead or not self._hears():
+    def _take(self, data: bytes) -> None:
+        if self._wire.dead or self._pty is None or not self._pty.is_at_our_baud_rate():
             self._pending.clear()
             return
         room = _FRAME_BYTES_MAX + 1 - len(self._pending)
         self._pending += data[:room]
         # A pty gives at once what a line gives byte by byte.
         self._after(len(data) * self._byte_s + self._silence_s, self._frame_ends)
-
-    def _hears(self) -> bool:
-        return self._speed in {None, termios.tcgetattr(self._theirs)[_OUTPUT_SPEED]}
 
     def _frame_ends(self) -> None:
         data = bytes(self._pending)
@@ -137,6 +116,5 @@ class ModbusRtuServer:
             self._due = None
 
     def _write(self, data: bytes) -> None:
-        # Without flow control, what nobody reads is lost.
-        with suppress(BlockingIOError):
-            os.write(self._ours, data)
+        if self._pty is not None:
+            self._pty.write(data)

@@ -91,11 +91,6 @@ class ModbusTcpServer:
         self._listener: asyncio.Server | None = None
         faults.on_change(self._cut_links)
 
-    @property
-    def away(self) -> bool:
-        """Cut off or without power."""
-        return any(self.faults.value(kind) is not None for kind in ("disconnect", "reboot"))
-
     async def start(self) -> int:
         """Listen; returns the port.
 
@@ -128,7 +123,7 @@ class ModbusTcpServer:
         return frame(request._replace(pdu=pdu))
 
     def _cut_links(self, kind: str) -> None:
-        if self.away:
+        if self.faults.away:
             self._abort_links()
 
     def _abort_links(self) -> None:
@@ -149,7 +144,7 @@ class _Link(asyncio.Protocol):
         self.transport = cast(asyncio.Transport, transport)
         self._wire = Wire(self._server.faults, self.transport.write)
         self._server.links.add(self)
-        if self._server.away:
+        if self._server.faults.away:
             self.transport.abort()
 
     def data_received(self, data: bytes) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from fitctl.config import DacMock, ModbusDacDevice
 from fitctl.drivers.modbus_dac.protocol import CHANNELS, counts_max, decode_counts, encode_volts
@@ -12,18 +10,13 @@ from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel, DeviceFailure
 from fitctl.mocks.modbus.rtu import ModbusRtuServer
 from fitctl.mocks.modbus.tcp import ModbusTcpServer
+from fitctl.mocks.pty import Endpoints
+from fitctl.mocks.timers import Watchdog
 
 FAULTS = WIRE_FAULTS | {
     "watchdog_trip": FaultKind("outputs are at their safe value, and every request is refused"),
 }
 _IDENTITY = (b"fitctl", b"mock D/A", b"1.0")
-
-
-class Endpoints(NamedTuple):
-    """Where the mock can be spoken to."""
-
-    tcp_port: int
-    pty_path: str
 
 
 class ModbusDacMock:
@@ -85,7 +78,7 @@ class ModbusDacMock:
         self._safe = encode_volts([settings.safe_v] * CHANNELS, dac.full_scale_v, dac.bits)
         self._counts = list(self._safe)
         self._latched = False
-        self._watchdog: asyncio.TimerHandle | None = None
+        self._watchdog = Watchdog(self._trip, settings.watchdog_s)
         first = dac.first_register
         model = DataModel(
             {HOLDING_REGISTERS: range(first, first + CHANNELS)}, self._read, self._write, _IDENTITY
@@ -122,7 +115,7 @@ class ModbusDacMock:
     async def stop(self) -> None:
         """Close both ends; safe to call twice."""
         self.faults.close()
-        self._stop_watchdog()
+        self._watchdog.stop()
         await self._tcp.stop()
         await self._rtu.stop()
 
@@ -139,9 +132,7 @@ class ModbusDacMock:
         counts = list(self._counts)
         counts[channel : channel + len(values)] = values
         self._set(counts)
-        self._stop_watchdog()
-        loop = asyncio.get_running_loop()
-        self._watchdog = loop.call_later(self._settings.watchdog_s, self._trip)
+        self._watchdog.feed()
 
     def _refuse_if_tripped(self) -> None:
         if self._latched or self.faults.value("watchdog_trip") is not None:
@@ -154,21 +145,16 @@ class ModbusDacMock:
             self._on_outputs(self.outputs_v)
 
     def _trip(self) -> None:
-        self._stop_watchdog()
+        self._watchdog.stop()
         self.watchdog_trips += 1
         self._latched = self._settings.watchdog_latches
         self._set(list(self._safe))
-
-    def _stop_watchdog(self) -> None:
-        if self._watchdog is not None:
-            self._watchdog.cancel()
-            self._watchdog = None
 
     def _take_fault(self, kind: str) -> None:
         if kind == "watchdog_trip" and self.faults.value(kind) is not None:
             self._trip()
         if kind == "reboot":  # both its ends: power gone, power back
-            self._stop_watchdog()
+            self._watchdog.stop()
             self._latched = False
             self._counts = list(self._safe)
             self._on_outputs(self.outputs_v)

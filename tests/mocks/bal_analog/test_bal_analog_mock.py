@@ -5,6 +5,7 @@ import functools
 import math
 
 import pytest
+from mock_bench import ToldMotors
 from pymodbus.client import AsyncModbusTcpClient
 
 from fitctl import config
@@ -16,24 +17,6 @@ SETTINGS = RIG.mocks.loops["right"].bal_analog.model_copy(
     update={"modbus_port": 0, "counters_at_start": [65530, 3]}
 )
 COUNTS_PER_RAD = 4000 / (2 * math.pi)
-
-
-class ToldMotors:
-    """Motors that are where a test puts them, and know what they were told."""
-
-    def __init__(self):
-        self.enabled = [False, False]
-        self.velocity_rad_s = (0.0, 0.0)
-        self.angles_rad = (0.0, 0.0)
-
-    def position_rad(self):
-        return self.angles_rad
-
-    def command_velocity_rad_s(self, az, el):
-        self.velocity_rad_s = (az, el)
-
-    def set_enabled(self, axis, enabled):
-        self.enabled[axis] = enabled
 
 
 def served(test=None, device=None, **update):

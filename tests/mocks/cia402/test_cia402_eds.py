@@ -6,6 +6,7 @@ from importlib.resources import files
 import canopen
 import pytest
 from canopen import objectdictionary as od
+from mock_bench import ToldMotors
 
 from fitctl import config
 from fitctl.mocks.cia402.dictionary import SdoAbortError
@@ -23,24 +24,13 @@ TYPES = {
 }
 
 
-class NoMotors:
-    def position_rad(self):
-        return 0.0, 0.0
-
-    def command_velocity_rad_s(self, az, el):
-        """Nothing turns."""
-
-    def set_enabled(self, axis, enabled):
-        """Nothing has current."""
-
-
 @pytest.fixture(scope="module")
 def real():
     """The dictionary of a drive that was just started."""
     siderostat = config.load_rig(config.default_rig_path()).loops["right"].siderostat
 
     async def started():
-        mock = Cia402DriveMock(siderostat, NoMotors(), port=0)
+        mock = Cia402DriveMock(siderostat, ToldMotors(), port=0)
         await mock.start()
         await mock.stop()
         return mock.dictionary

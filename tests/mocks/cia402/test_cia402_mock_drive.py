@@ -6,6 +6,7 @@ import time
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mock_bench import ToldMotors
 
 from fitctl import config
 from fitctl.config import Fault
@@ -20,22 +21,6 @@ RPM_RAD_S = 2 * 3.141592653589793 / 60
 
 def fault(kind, **settings):
     return Fault(device="right.drive", kind=kind, **settings)
-
-
-class RecordingMotors:
-    def __init__(self):
-        self.angle_rad = [0.0, 0.0]
-        self.velocity_rad_s = (0.0, 0.0)
-        self.enabled = [False, False]
-
-    def position_rad(self):
-        return self.angle_rad
-
-    def command_velocity_rad_s(self, az, el):
-        self.velocity_rad_s = (az, el)
-
-    def set_enabled(self, axis, enabled):
-        self.enabled[axis] = enabled
 
 
 class Bus:
@@ -149,7 +134,7 @@ def on_drive(script):
 
     async def run():
         siderostat = config.load_rig(config.default_rig_path()).loops["right"].siderostat
-        motors = RecordingMotors()
+        motors = ToldMotors()
         mock = Cia402DriveMock(siderostat, motors, port=0)
         port = await mock.start()
         bus = await Bus.on(port)
@@ -337,14 +322,14 @@ def test_a_software_limit_holds_the_axis_and_lets_it_back():
         await bus.enable(0)
         await bus.write(protocol.TARGET_VELOCITY, (60).to_bytes(4, "little"))
         assert not await bus.statusword() & protocol.SW_INTERNAL_LIMIT
-        motors.angle_rad = [1000 * COUNT_RAD, 0]
+        motors.angles_rad = [1000 * COUNT_RAD, 0]
         while not await bus.statusword() & protocol.SW_INTERNAL_LIMIT:
             pass
         assert motors.velocity_rad_s == (0, 0)
         await bus.write(protocol.TARGET_VELOCITY, (-60).to_bytes(4, "little", signed=True))
         assert motors.velocity_rad_s[0] == pytest.approx(-60 * RPM_RAD_S)
         assert not await bus.statusword() & protocol.SW_INTERNAL_LIMIT
-        motors.angle_rad = [-1001 * COUNT_RAD, 0]
+        motors.angles_rad = [-1001 * COUNT_RAD, 0]
         while motors.velocity_rad_s[0]:  # without any message
             await asyncio.sleep(0.001)
 
@@ -394,7 +379,7 @@ def test_a_pdo_cycle():
         statuswords = [data for can_id, data in bus.passed_over if can_id == 0x281]
         assert statuswords[-1] == "37 12 37 12"  # each change was told
 
-        motors.angle_rad = [10 * COUNT_RAD, -1.4 * COUNT_RAD]
+        motors.angles_rad = [10 * COUNT_RAD, -1.4 * COUNT_RAD]
         bus.send(0x201, "60 ea 00 00 a0 15 ff ff")  # 60 and -60 rpm
         await bus.ask("40 ff 60 00 00000000", "43 ff 60 00 00 00 00 00")
         assert motors.velocity_rad_s == (0, 0)  # not before SYNC
@@ -402,7 +387,7 @@ def test_a_pdo_cycle():
         await bus.see(0x181, "0a 00 00 00 ff ff ff ff")
         assert motors.velocity_rad_s == pytest.approx((60 * RPM_RAD_S, -60 * RPM_RAD_S))
 
-        motors.angle_rad = [2**31 * COUNT_RAD, 0]  # the counter wraps
+        motors.angles_rad = [2**31 * COUNT_RAD, 0]  # the counter wraps
         bus.send(0x080)
         await bus.see(0x181, "00 00 00 80 00 00 00 00")
 
@@ -514,7 +499,7 @@ def test_a_tpdo_on_change_at_sync():
 def test_a_tpdo_can_be_asked_for_by_a_remote_frame():
     async def script(bus, _mock, motors):
         await bus.map_pdos()
-        motors.angle_rad = [10 * COUNT_RAD, 0]
+        motors.angles_rad = [10 * COUNT_RAD, 0]
         bus.ask_for(0x181)  # not operational yet
         bus.send(0x000, "01 01")
         bus.ask_for(0x181)
@@ -525,7 +510,7 @@ def test_a_tpdo_can_be_asked_for_by_a_remote_frame():
         await bus.write(0x1800, (0x181).to_bytes(4, "little"), 1)
         bus.send(0x080)
         await bus.statusword()
-        motors.angle_rad = [20 * COUNT_RAD, 0]
+        motors.angles_rad = [20 * COUNT_RAD, 0]
         bus.ask_for(0x181)
         await bus.see(0x181, "0a 00 00 00 00 00 00 00")
 
@@ -616,7 +601,7 @@ def test_after_a_reboot_all_is_as_at_power_up_and_counters_start_anew():
     async def script(bus, mock, motors):
         await bus.enable(0)
         await bus.write(protocol.HEARTBEAT_PRODUCER, (20).to_bytes(2, "little"))
-        motors.angle_rad = [100 * COUNT_RAD, 0]
+        motors.angles_rad = [100 * COUNT_RAD, 0]
         mock.faults.set(fault("reboot", value=0.01))
         assert motors.enabled == [False, False]
         while mock.faults.active:
@@ -624,7 +609,7 @@ def test_after_a_reboot_all_is_as_at_power_up_and_counters_start_anew():
         assert mock.nmt_state == 0x7F
         assert mock.heartbeat_ms == 0
         await bus.connect_again()
-        motors.angle_rad = [101 * COUNT_RAD, 0]
+        motors.angles_rad = [101 * COUNT_RAD, 0]
         await bus.ask("40 64 60 00 00000000", "43 64 60 00 01 00 00 00")
         assert protocol.state_of(await bus.statusword()) is State.SWITCH_ON_DISABLED
 

@@ -9,6 +9,7 @@ import hypothesis
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mock_bench import ToldMotors
 
 from fitctl import config
 from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
@@ -21,23 +22,6 @@ RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
 SIDEROSTAT = RIG.loops["right"].siderostat
 SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
 PERIOD_S = 0.002
-
-
-class StillMotors:
-    """Motors that obey nobody."""
-
-    def __init__(self):
-        self.enabled = [False, False]
-        self.angles_rad = (0.0, 0.0)
-
-    def position_rad(self):
-        return self.angles_rad
-
-    def command_velocity_rad_s(self, az, el):
-        self.velocity_rad_s = (az, el)
-
-    def set_enabled(self, axis, enabled):
-        self.enabled[axis] = enabled
 
 
 def spoken(test=None, **update):
@@ -53,7 +37,7 @@ def spoken(test=None, **update):
 
     async def serve(test):
         settings = SETTINGS.model_copy(update=update)
-        mock = EnsembleControllerMock(SIDEROSTAT, settings, StillMotors())
+        mock = EnsembleControllerMock(SIDEROSTAT, settings, ToldMotors())
         ends = await mock.start()
         reader, writer = await asyncio.open_connection("127.0.0.1", ends.tcp_port)
 

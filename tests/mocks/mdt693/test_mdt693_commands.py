@@ -5,12 +5,9 @@ import itertools
 
 import pytest
 from mdt693_terminal import A_301, B_110, EXACT, QUIET, SETTINGS, amplifier
+from mock_bench import in_a_loop
 
 from fitctl.mocks.mdt693.amplifier import Amplifier
-
-
-def in_a_loop(test):
-    return lambda: asyncio.run(test())
 
 
 @in_a_loop

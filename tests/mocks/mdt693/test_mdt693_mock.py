@@ -7,13 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mdt693_terminal import A_301, B_105, B_110, COMPATIBLE, QUIET, amplifier
+from mock_bench import in_a_loop
 
 from fitctl.mocks.mdt693.line import CommandSplitter
-
-
-def in_a_loop(test):
-    return lambda: asyncio.run(test())
-
 
 # ---------------------------------------------------------------- dialects
 

@@ -1,12 +1,12 @@
 """Read these as transcripts of a serial line: what a master sends, and what the station answers."""
 
 import asyncio
-import functools
 import os
 import termios
 from contextlib import asynccontextmanager
 
 import pytest
+from mock_bench import in_a_loop
 
 from fitctl.config import Fault
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
@@ -15,14 +15,6 @@ from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel
 
 READ = bytes.fromhex("01 03 00 00 00 01 84 0a")
 WRITE = bytes.fromhex("01 06 00 00 12 34 84 bd")
-
-
-def in_a_loop(test):
-    @functools.wraps(test)
-    def run(*args, **kwargs):
-        asyncio.run(test(*args, **kwargs))
-
-    return run
 
 
 class Line:

@@ -2,10 +2,10 @@
 
 import asyncio
 import contextlib
-import functools
 import socket
 
 import pytest
+from mock_bench import in_a_loop
 
 from fitctl.config import DacMock, Fault, default_rig_path, load_rig
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
@@ -17,14 +17,6 @@ HALF = "80 00"
 READ_ALL = "00 01 00 00 00 06 01 03 00 00 00 03"
 IDENTIFY = "00 01 00 00 00 05 01 2b 0e 01 00"
 WRITE_FIRST = "00 01 00 00 00 06 01 06 00 00 ff ff"
-
-
-def in_a_loop(test):
-    @functools.wraps(test)
-    def run(*args, **kwargs):
-        asyncio.run(test(*args, **kwargs))
-
-    return run
 
 
 class Master:

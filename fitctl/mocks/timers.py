@@ -1,4 +1,4 @@
-"""Timers of the mock drive, on the running event loop."""
+"""Timers of the mocks, on the running event loop."""
 
 from __future__ import annotations
 
@@ -37,18 +37,22 @@ class Watchdog:
     Feeding is a store and a clock reading, whatever the rate; the timer moves only when it fires.
     """
 
-    def __init__(self, expired: Callable[[], None]) -> None:
+    def __init__(self, expired: Callable[[], None], timeout_s: float = 0.0) -> None:
         self._expired = expired
-        self._timeout_s = 0.0
+        self._timeout_s = timeout_s
         self._fed_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
     def set_timeout(self, timeout_s: float) -> None:
         """Wait for the first feeding, with this timeout; 0 switches off."""
+        self.stop()
+        self._timeout_s = timeout_s
+
+    def stop(self) -> None:
+        """Wait for the first feeding again."""
         if self._timer:
             self._timer.cancel()
             self._timer = None
-        self._timeout_s = timeout_s
 
     def feed(self) -> None:
         """Put off the end; the first feeding arms."""
