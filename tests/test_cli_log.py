@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "logging"))
-from log_samples import RUN_INFO, SETTINGS, contents, frame, one_of_each, tick, write_log
+from log_samples import (
+    RUN_INFO,
+    SETTINGS,
+    SMALL_CHUNKS,
+    contents,
+    frame,
+    one_of_each,
+    tick,
+    write_log,
+)
 
 from fitctl.cli import main
 from fitctl.commands.log import app
@@ -18,7 +27,6 @@ from fitctl.logging.reading import log_info
 from fitctl.logging.records import AnyRecord
 from fitctl.logging.writer import LogWriter
 
-SMALL_CHUNKS = SETTINGS.model_copy(update={"chunk_bytes": 4096})
 RECORDS = [RUN_INFO, *one_of_each(), *(r for n in range(2, 12) for r in (tick(n), frame(n)))]
 
 
@@ -208,6 +216,8 @@ def test_keep_marks_and_unmarks(log, whole):
         (["info", "."], ".: cannot be opened: Is a directory"),
         (["verify", "TEXT"], "is not an MCAP log"),
         (["recover", "TEXT"], "is not an MCAP log"),
+        (["recover", "."], ".: cannot be opened: Is a directory"),
+        (["cut", "LOG", "--out", ".", "--overwrite"], ".: cannot be opened: Is a directory"),
         (["cut", "LOG", "--from", "noon"], "--from noon: expected seconds, or UTC such as"),
         (["cut", "LOG", "--from", "nan"], "--from nan: is no time"),
         (["cut", "LOG", "--to", "1e300"], "--to 1e300: is no time"),

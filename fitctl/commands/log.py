@@ -72,17 +72,18 @@ def info(
     from fitctl.logging.reading import log_info
 
     with _one_line():
-        found = log_info(log)
+        found, kept, recording = log_info(log), is_kept(log), in_use(log)
     if as_json:
-        typer.echo(json.dumps(_info_document(found, kept=is_kept(log), recording=in_use(log))))
+        typer.echo(json.dumps(_info_document(found, kept=kept, recording=recording)))
         return
-    unfinished = "being recorded" if in_use(log) else "cut off; `fitctl log recover` mends it"
+    unfinished = "being recorded" if recording else "cut off; `fitctl log recover` mends it"
     state = "finished" if found.finished else unfinished
-    typer.echo(f"{found.path}: {state}{'; kept' if is_kept(log) else ''}")
-    start = (
-        time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(found.start_s)) if found.counts else ""
-    )
-    typer.echo(f"from {start}, {found.duration_s:.1f} s" if found.counts else "without any record")
+    typer.echo(f"{found.path}: {state}{'; kept' if kept else ''}")
+    if found.counts:
+        start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(found.start_s))
+        typer.echo(f"from {start}, {found.duration_s:.1f} s")
+    else:
+        typer.echo("without any record")
     width = max(map(len, found.counts), default=0)
     for topic, count in sorted(found.counts.items()):
         typer.echo(f"  {topic:<{width}}  {count}")

@@ -30,6 +30,7 @@ DAMAGE = (
     MemoryError,  # and such a length
     OverflowError,
 )
+MEND = "`fitctl log recover` saves what is sound into a new file"
 
 
 @contextlib.contextmanager
@@ -58,5 +59,5 @@ def up_to_the_tear(path: Path, finished: bool) -> Iterator[None]:
         yield
     except DAMAGE as error:
         if finished:
-            msg = f"{path}: is damaged: {error}; `fitctl log recover` saves what is sound into a new file"
+            msg = f"{path}: is damaged: {error}; {MEND}"
             raise LogError(msg) from error

@@ -35,8 +35,21 @@ def new_log_path(folder: Path, rig_name: str, start: datetime) -> Path:
 
 
 def in_use(path: Path) -> bool:
-    """Whether some recorder has this log open; false where the folder knows no locks."""
-    with contextlib.suppress(FileNotFoundError), path.open("rb") as stream:
+    """Whether some recorder has this log open; false where the folder knows no locks.
+
+    Raises
+    ------
+    LogError
+        If there is something of that name that cannot be opened.
+    """
+    try:
+        stream = path.open("rb")
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        msg = f"{path}: cannot be opened: {error.strerror}; a log is a file that may be read"
+        raise LogError(msg) from error
+    with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -100,7 +113,7 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> list
     Raises
     ------
     LogError
-        If a file cannot be deleted.
+        If a file cannot be deleted, or not be asked whether it is in use.
     """
     name = re.compile(re.escape(rig_name) + r"_\d{8}T\d{6}Z(_\d+)?\.mcap")
     logs = []

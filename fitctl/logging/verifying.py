@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import DAMAGE, opened
+from fitctl.logging.files import DAMAGE, MEND, opened
 from fitctl.logging.folder import in_use
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.records import FrameRecord, RecorderStatus
@@ -23,7 +23,6 @@ from fitctl.logging.schemas import TOPICS
 _AFTER_SUMMARY_BYTES = 4 + len(
     MCAP0_MAGIC
 )  # what the summary's checksum does not cover: itself, the end
-_MEND = "`fitctl log recover` saves what is sound into a new file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +80,7 @@ def verify(path: Path) -> Verdict:
                 if len(message.data) != message.step * message.height:
                     problems.append(f"frame {entry.sequence}: its data is not as large as it says")
         if finished and not in_order == counts == Counter(log_info(path).counts):
-            problems.append(f"its index is not of its contents; {_MEND}")
+            problems.append(f"its index is not of its contents; {MEND}")
     except LogError as error:
         problems.append(str(error).removeprefix(f"{path}: "))
     return Verdict(counts.total(), lost, frames_missing, tuple(problems))
@@ -90,7 +89,7 @@ def verify(path: Path) -> Verdict:
 def _unfinished(path: Path) -> str:
     if in_use(path):
         return "is being recorded just now; stop the recorder, or look again when it has begun another file"
-    return f"is cut off; {_MEND}"
+    return f"is cut off; {MEND}"
 
 
 def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:
@@ -110,11 +109,11 @@ def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:
                 ends.append(record)
         footer = ends[-1]
         if len(ends) != 2 or not isinstance(footer, Footer):
-            return counts, [f"is damaged: its index is not where it should be; {_MEND}"]
+            return counts, [f"is damaged: its index is not where it should be; {MEND}"]
         stream.seek(footer.summary_start)
         summary_crc = zlib.crc32(stream.read(size - _AFTER_SUMMARY_BYTES - footer.summary_start))
     except DAMAGE as error:
-        return counts, [f"is damaged: {error}; {_MEND}"]
+        return counts, [f"is damaged: {error}; {MEND}"]
     if footer.summary_crc not in {0, summary_crc}:
-        return counts, [f"its index is damaged: wrong checksum; {_MEND}"]
+        return counts, [f"its index is damaged: wrong checksum; {MEND}"]
     return counts, []

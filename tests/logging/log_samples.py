@@ -1,5 +1,7 @@
 """Records to log, and the recorder as a process of its own."""
 
+import contextlib
+import resource
 import subprocess
 import sys
 import time
@@ -36,6 +38,7 @@ SETTINGS = Logging(
     retain_bytes=2_000_000_000,
     retain_days=365.0,
 )
+SMALL_CHUNKS = SETTINGS.model_copy(update={"chunk_bytes": 4096})
 RUN_INFO = RunInfo(
     time_s=100.0,
     wall_minus_monotonic_s=1_795_000_000.25,
@@ -92,6 +95,17 @@ def contents(path):
         (entry.topic, entry.sequence, zlib.crc32(entry.message.SerializeToString()))
         for entry in read_records(path)
     ]
+
+
+@contextlib.contextmanager
+def files_end_at(size_bytes):
+    """A disk that is full once a file is so large."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 RECORDER = """

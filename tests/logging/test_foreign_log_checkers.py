@@ -48,16 +48,25 @@ def written(tmp_path, content, compression="zstd"):
     return writer.path
 
 
+def pymcap_finds_nothing_wrong(run, path):
+    printed = run("pymcap-cli", "doctor", "--format", "jsonl", path)
+    summary = json.loads(printed.splitlines()[-1])
+    assert (summary["errors"], summary["warnings"], summary["complete"]) == (0, 0, True), printed
+
+
+def rerun_finds_every_topic_in_order(run, path):
+    printed = run("rerun", "mcap", "check", "--full", path)
+    rows = [line.split() for line in printed.splitlines() if " /fit/" in line]
+    assert len(rows) == len(one_of_each())
+    assert {row[0] for row in rows} == {"ok"}
+
+
 @pytest.mark.parametrize(
     ("content", "compression"),
     [("full", "zstd"), ("full", "lz4"), ("no run info", "none"), ("empty", "zstd")],
 )
 def test_pymcap_doctor_finds_nothing_wrong(tmp_path, run, content, compression):
-    printed = run(
-        "pymcap-cli", "doctor", "--format", "jsonl", written(tmp_path, content, compression)
-    )
-    summary = json.loads(printed.splitlines()[-1])
-    assert (summary["errors"], summary["warnings"], summary["complete"]) == (0, 0, True), printed
+    pymcap_finds_nothing_wrong(run, written(tmp_path, content, compression))
 
 
 def recovered(path, target):
@@ -77,19 +86,12 @@ def halved_and_merged(path, target):
 def test_both_accept_what_is_made_from_a_log(tmp_path, run, change):
     target = tmp_path / "changed.mcap"
     change(written(tmp_path, "full"), target)
-    summary = json.loads(run("pymcap-cli", "doctor", "--format", "jsonl", target).splitlines()[-1])
-    assert (summary["errors"], summary["warnings"], summary["complete"]) == (0, 0, True)
-    printed = run("rerun", "mcap", "check", "--full", target)
-    rows = [line.split() for line in printed.splitlines() if " /fit/" in line]
-    assert len(rows) == len(one_of_each())
-    assert {row[0] for row in rows} == {"ok"}
+    pymcap_finds_nothing_wrong(run, target)
+    rerun_finds_every_topic_in_order(run, target)
 
 
 def test_rerun_check_finds_every_topic_in_order(tmp_path, run):
-    printed = run("rerun", "mcap", "check", "--full", written(tmp_path, "full"))
-    rows = [line.split() for line in printed.splitlines() if " /fit/" in line]
-    assert len(rows) == len(one_of_each())
-    assert {row[0] for row in rows} == {"ok"}
+    rerun_finds_every_topic_in_order(run, written(tmp_path, "full"))
 
 
 def test_rerun_converts_every_topic_with_its_types(tmp_path, run):

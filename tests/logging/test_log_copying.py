@@ -1,15 +1,15 @@
 """Recovered, cut and merged logs."""
 
-import resource
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_samples import (
     RUN_INFO,
     SETTINGS,
+    SMALL_CHUNKS,
     WALL_S,
     contents,
+    files_end_at,
     frame,
     one_of_each,
     tick,
@@ -23,7 +23,6 @@ from fitctl.logging.verifying import verify
 from fitctl.logging.writer import LogWriter
 
 FOREVER_NS = 2**63
-SMALL_CHUNKS = SETTINGS.model_copy(update={"chunk_bytes": 4096})
 RECORDS = [RUN_INFO, *(record for n in range(12) for record in (tick(n), frame(n)))]
 
 
@@ -141,13 +140,9 @@ def test_a_log_that_is_being_recorded_is_never_overwritten(tmp_path):
 
 def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path):
     path = write_log(tmp_path / "a.mcap", RECORDS)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
-    try:
-        with pytest.raises(LogError, match=r"b\.mcap: cannot be written: File too large"):
-            merge([path], tmp_path / "b.mcap")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    full = pytest.raises(LogError, match=r"b\.mcap: cannot be written: File too large")
+    with files_end_at(10_000), full:
+        merge([path], tmp_path / "b.mcap")
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -1,5 +1,4 @@
 import os
-import resource
 import tempfile
 import time
 from pathlib import Path
@@ -8,7 +7,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import RUN_INFO, SETTINGS, WALL_S, contents, frame, one_of_each, tick, write_log
+from log_samples import (
+    RUN_INFO,
+    SETTINGS,
+    WALL_S,
+    contents,
+    files_end_at,
+    frame,
+    one_of_each,
+    tick,
+    write_log,
+)
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records, tick_arrays
@@ -180,17 +189,13 @@ def test_a_read_only_folder_is_named_with_the_next_step():
 
 def test_a_full_disk_is_one_clear_error_and_the_log_stays_readable(tmp_path):
     writer = LogWriter(tmp_path / "a.mcap", SETTINGS)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
-    try:
+    with files_end_at(50_000):
         with pytest.raises(LogError, match=r"a\.mcap: cannot be written: File too large.*room"):
             write_frames(writer, 100)
         with pytest.raises(LogError, match="an earlier write failed"):
             writer.write(frame(100), WALL_S)
         writer.close()
         writer.close()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert 6 <= len(list(read_records(writer.path))) <= 15
 
 

@@ -1,14 +1,13 @@
 """Files that follow each other, and what stays of them."""
 
 import os
-import resource
 import time
 from datetime import UTC, datetime, timedelta
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import RUN_INFO, SETTINGS, WALL_S, contents, frame, tick
+from log_samples import RUN_INFO, SETTINGS, WALL_S, contents, files_end_at, frame, tick
 from pydantic import ValidationError
 
 from fitctl.config import Logging
@@ -193,6 +192,21 @@ def test_recording_goes_on_where_nothing_can_be_deleted(tmp_path, monkeypatch):
     assert len(contents(log.path)) == 1
 
 
+def test_recording_goes_on_where_something_else_has_an_old_logs_name(tmp_path):
+    folder = tmp_path / name_of(1)
+    folder.mkdir()
+    os.utime(folder, (0, 0))
+    with RotatingLog(SETTINGS, "bench", tmp_path) as log:
+        log.write(tick(1), WALL_S)
+        assert log.take_notes() == [
+            (
+                "warning",
+                f"{folder}: cannot be opened: Is a directory; a log is a file that may be read",
+            )
+        ]
+    assert len(contents(log.path)) == 1
+
+
 def test_a_limit_that_would_leave_no_finished_file_is_refused():
     document = SETTINGS.model_dump() | {"rotate_bytes": 1_000_000, "retain_bytes": 1_999_999}
     with pytest.raises(ValidationError, match="retain_bytes must be at least twice rotate_bytes"):
@@ -214,13 +228,9 @@ def test_names_tell_rig_and_start_and_never_clash(tmp_path):
 
 
 def test_a_file_that_cannot_be_begun_leaves_none_behind(tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, hard))
-    try:
-        with pytest.raises(LogError, match=r"a\.mcap: cannot be written: File too large"):
-            LogWriter(tmp_path / "a.mcap", SETTINGS)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    full = pytest.raises(LogError, match=r"a\.mcap: cannot be written: File too large")
+    with files_end_at(10), full:
+        LogWriter(tmp_path / "a.mcap", SETTINGS)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -151,6 +151,17 @@ def offer_for(queue, duration_s, first=0):
     return number
 
 
+def record_what_waits(queue, endpoint, folder):
+    """One more recorder, until nothing waits."""
+    recorder = start_recorder(endpoint, folder, SHIPPED)
+    try:
+        wait_until(lambda: (queue.pump(), queue.waiting == 0)[1], timeout_s=20)
+    finally:
+        recorder.terminate()
+        recorder.wait(20)
+        recorder.stdout.close()
+
+
 def numbers(path):
     return [entry.message.number for entry in read_records(path, ["/fit/right/tick"])]
 
@@ -179,13 +190,7 @@ def test_a_full_disk_costs_nothing_once_there_is_room_again(queue, tmp_path):
         first.stderr.close()
     times_s = tick_arrays(path, "right")["time_s"]
     assert full_s - times_s[-1] <= MAY_BE_LOST_S + worst_s[0]
-    second = start_recorder(f"ipc://{tmp_path}/records", folder, SHIPPED)
-    try:
-        wait_until(lambda: (queue.pump(), queue.waiting == 0)[1], timeout_s=20)
-    finally:
-        second.terminate()
-        second.wait(20)
-        second.stdout.close()
+    record_what_waits(queue, f"ipc://{tmp_path}/records", folder)
     files = [numbers(path) for path in logs_in(folder)]
     assert set().union(*files) == set(range(count))
     assert queue.lost == 0
@@ -204,12 +209,6 @@ def test_recorders_killed_again_and_again_lose_nothing_while_the_supervisor_live
         recorder.kill()
         recorder.wait()
         recorder.stdout.close()
-    last = start_recorder(f"ipc://{tmp_path}/records", folder, SHIPPED)
-    try:
-        wait_until(lambda: (queue.pump(), queue.waiting == 0)[1], timeout_s=20)
-    finally:
-        last.terminate()
-        last.wait(20)
-        last.stdout.close()
+    record_what_waits(queue, f"ipc://{tmp_path}/records", folder)
     assert set().union(*(numbers(path) for path in begun(folder))) == set(range(count))
     assert queue.lost == 0
