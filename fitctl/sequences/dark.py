@@ -53,9 +53,8 @@ def _done(step: steps.Dark, view: View) -> Result | None:
         raise StepFailed(msg)
     view.looks.clear()
     newest = view.telemetry.frame
-    if newest is not None and newest.time_s >= view.began_s:
-        numbers = [frame.number for frame in view.frames[-1:]]
-        view.frames += [newest] if newest.number not in numbers else []
+    if newest is not None and newest.time_s >= view.began_s and newest not in view.frames[-1:]:
+        view.frames.append(newest)
     if len(view.frames) < step.frames:
         return None
     figures, camera = measure_dark(stack_of(view.frames)), view.rig.camera

@@ -7,10 +7,10 @@ a thread of its own.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -18,8 +18,8 @@ from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.sequences import steps
 from fitctl.sequences.links import Link, SimulatedLink
 from fitctl.sequences.methods import StepMethods
-from fitctl.sequences.reading import find_sequence, load_sequence, make_step
-from fitctl.sequences.runner import Runner, ending, run_sequence
+from fitctl.sequences.reading import find_sequence, load_sequence
+from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import Figures, SequenceError
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import service_folder
@@ -89,9 +89,6 @@ class Instrument(StepMethods[Figures]):
         if self._client is not None:
             self._client.close()
 
-    def _do(self, kind: type[steps.Step], keys: Mapping[str, Any]) -> Figures:
-        return self.run(make_step(kind, keys))
-
     def run(self, step: steps.Step) -> Figures:
         """Run one step; its figures, NaN where a value could not be had.
 
@@ -102,15 +99,11 @@ class Instrument(StepMethods[Figures]):
         ConnectionError
             If the supervisor does not answer.
         """
-        runner = self._runner = Runner(self._link, self.rig, NAME, 1)
-        runner.contact.begin()
-        with ending(runner):
-            record = runner.run(step)
-        found = msgspec.json.decode(record.figures_json, type=dict[str, float | None])
-        return {name: float("nan") if value is None else value for name, value in found.items()}
+        self._runner = Runner(self._link, self.rig, NAME, 1)
+        return _figures(self._runner, [step])[0]
 
     def run_sequence(self, file: Path | str) -> list[Figures]:
-        """Run a sequence file, or a shipped sequence by its name; the figures of each step.
+        """Run a sequence file, or a shipped sequence by its name; the figures of each step, as :meth:`run`.
 
         Raises
         ------
@@ -120,12 +113,8 @@ class Instrument(StepMethods[Figures]):
             As :meth:`run`.
         """
         sequence = load_sequence(find_sequence(Path(file)), self.rig)
-        attempts = run_sequence(self._link, self.rig, sequence)
-        return [
-            msgspec.json.decode(attempt.figures_json)
-            for attempt in attempts
-            if attempt.outcome == "done"
-        ]
+        self._runner = Runner(self._link, self.rig, sequence.name, len(sequence.steps))
+        return _figures(self._runner, sequence.steps)
 
     def send(self, command: AnyCommand) -> Reply:
         """Give one command of :mod:`fitctl.supervisor.messages`."""
@@ -147,14 +136,24 @@ class Instrument(StepMethods[Figures]):
         self._link.send(Stop())
 
     def end_step(self) -> None:
-        """From another thread: end the step that is running; the stages are held where they are."""
+        """From another thread: end the step or the file that is running; the stages are held where they are."""
         if self._runner is not None:
             self._runner.contact.stop_wanted.set()
+
+
+def _figures(runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
+    """Run steps; the figures of each, NaN where a value could not be had."""
+    done = [attempt for attempt in run_steps(runner, todo) if attempt.outcome == "done"]
+    found = [
+        msgspec.json.decode(attempt.figures_json, type=dict[str, float | None]) for attempt in done
+    ]
+    return [{k: float("nan") if v is None else v for k, v in each.items()} for each in found]
 
 
 class AsyncInstrument(StepMethods[Awaitable[Figures]]):
     """The same, to be awaited; cancelling a step ends it and holds the stages.
 
+    A step that waits for another one's end has not begun: cancelled, it never does, and the other goes on.
     Takes what :class:`Instrument` takes, and is made by ``async with``.
     """
 
@@ -188,19 +187,19 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
     async def _in_thread(self, work: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
-    def _do(self, kind: type[steps.Step], keys: Mapping[str, Any]) -> Awaitable[Figures]:
-        return self.run(make_step(kind, keys))
-
     async def run(self, step: steps.Step) -> Figures:
         """Run one step, as :meth:`Instrument.run`."""
         instrument = self._instrument
-        working = asyncio.ensure_future(self._in_thread(lambda: instrument.run(step)))
+        runner = Runner(instrument._link, instrument.rig, NAME, 1)  # of its own, to be ended alone
+        running = self._thread.submit(_figures, runner, [step])
+        ended = asyncio.wrap_future(running)
         try:
-            return await asyncio.shield(working)
+            return (await asyncio.shield(ended))[0]
         except asyncio.CancelledError:
-            instrument.end_step()
-            await asyncio.wait([working])
-            working.exception()  # it was stopped, as it was to be
+            if not running.cancel():
+                runner.contact.stop_wanted.set()
+                await asyncio.wait([ended])
+                ended.exception()  # it was stopped, as it was to be
             raise
 
     async def telemetry(self) -> Telemetry:

@@ -8,6 +8,7 @@ from typing import Any, Generic, Literal, TypedDict, TypeVar, Unpack
 
 from fitctl.config import ControllerName
 from fitctl.sequences import steps
+from fitctl.sequences.reading import make_step
 
 R_co = TypeVar("R_co", covariant=True)
 
@@ -39,7 +40,11 @@ class StepMethods(ABC, Generic[R_co]):
     """The steps, each of which gives its figures, with units in their names."""
 
     @abstractmethod
-    def _do(self, kind: type[steps.Step], keys: Mapping[str, Any]) -> R_co: ...
+    def run(self, step: steps.Step) -> R_co:
+        """Run one step."""
+
+    def _do(self, kind: type[steps.Step], keys: Mapping[str, Any]) -> R_co:
+        return self.run(make_step(kind, keys))
 
     def standby(self, **limits: Unpack[Limits]) -> R_co:
         """Devices on and ready, the stages held where they are."""

@@ -60,11 +60,8 @@ def _controller_done(step: steps.Controller, view: View) -> Result | None:
 
 
 def _wait_done(step: steps.Wait, view: View) -> Result | None:
+    view.looks.clear()  # nobody judges them, and a long wait would fill the memory
     return Result({}, "") if view.gone_s >= step.duration_s else None
-
-
-def _run_off(_step: steps.Off, view: View) -> None:
-    let_go(_step, view)
 
 
 def _off_done(_step: steps.Off, view: View) -> Result | None:
@@ -87,5 +84,5 @@ PLAIN = {
     ),
     "controller": Behaviour(POWERED | {Mode.OFF}, _controller_done, _run_controller),
     "wait": Behaviour(POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True),
-    "off": Behaviour(POWERED | {Mode.OFF}, _off_done, _run_off),
+    "off": Behaviour(POWERED | {Mode.OFF}, _off_done, let_go),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
@@ -184,7 +184,7 @@ class Runner:
 
 
 @contextmanager
-def ending(runner: Runner) -> Iterator[None]:
+def _ending(runner: Runner) -> Iterator[None]:
     """Tell how it ended, whatever happens inside; a stop becomes a SequenceError."""
     try:
         yield
@@ -208,6 +208,15 @@ def ending(runner: Runner) -> Iterator[None]:
     runner.contact.end("done")
 
 
+def run_steps(runner: Runner, steps: Iterable[Step]) -> list[SequenceAttempt]:
+    """Begin, run these steps, end; gives and raises what :func:`run_sequence` does."""
+    runner.contact.begin()
+    with _ending(runner):
+        for step in steps:
+            runner.run(step)
+    return runner.attempts
+
+
 def run_sequence(
     link: Link,
     rig: Rig,
@@ -224,8 +233,4 @@ def run_sequence(
         If the supervisor does not answer or falls silent.
     """
     runner = Runner(link, rig, sequence.name, len(sequence.steps), on_status)
-    runner.contact.begin()
-    with ending(runner):
-        for step in sequence.steps:
-            runner.run(step)
-    return runner.attempts
+    return run_steps(runner, sequence.steps)

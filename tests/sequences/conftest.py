@@ -1,5 +1,6 @@
 """Sequences on the virtual clock, and somebody who meddles with them."""
 
+import msgspec
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
@@ -64,6 +65,9 @@ class Run:
             self.attempts.append(status.last_attempt)
         if self.states[-1:] != [status.state]:
             self.states.append(status.state)
+
+    def figures(self, number=-1):
+        return msgspec.json.decode(self.attempts[number].figures_json)
 
     def outcomes(self):
         return [attempt.outcome for attempt in self.attempts]

@@ -1,6 +1,5 @@
 """Dark frames: bias and noise that are known come back; light is refused."""
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -43,7 +42,7 @@ def test_a_camera_that_is_not_as_the_rig_file_says_is_found_out(tried):
     run({"step": "standby"}, {"step": "dark", "frames": 60})
 
     assert run.outcomes() == ["done", "done"]
-    found = msgspec.json.decode(run.attempts[-1].figures_json)
+    found = run.figures()
     assert found["bias_dn"] == pytest.approx(1000.0, abs=2.0)
     assert found["noise_dn"] == pytest.approx(20.0, rel=0.05)
     assert "bias 1000" in run.attempts[-1].message

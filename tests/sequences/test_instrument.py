@@ -3,6 +3,7 @@
 import asyncio
 import inspect
 import math
+import threading
 from typing import get_args, get_type_hints
 
 import pytest
@@ -56,18 +57,33 @@ def test_stop_is_safe_and_no_step_runs_after_it():
         assert mode(instrument) == "SAFE"
 
 
+def file_of(folder, *steps):
+    path = folder / "a.toml"
+    head = 'schema_version = 1\nname = "a"\ndescription = "b"\n'
+    path.write_text(f"{head}steps = [{', '.join(f'{{ {step} }}' for step in steps)}]\n")
+    return path
+
+
 def test_a_file_runs_from_python(tmp_path):
-    file = tmp_path / "a.toml"
-    file.write_text(
-        'schema_version = 1\nname = "a"\ndescription = "b"\n'
-        'steps = [{ step = "acquire" }, { step = "off" }]\n'
-    )
+    file = file_of(tmp_path, 'step = "acquire"', 'step = "off"')
     with Instrument(NEAR, simulate=True) as instrument:
         acquired, off = instrument.run_sequence(file)
 
         assert acquired["acquired_s"] > 0
         assert off == {}
         assert mode(instrument) == "OFF"
+
+
+def test_a_file_is_ended_from_another_thread_and_the_stages_are_held(tmp_path):
+    file = file_of(tmp_path, 'step = "acquire"', 'step = "hold", duration_s = 2000.0')
+    with Instrument(NEAR, simulate=True) as instrument:
+        instrument.acquire()
+        ending = threading.Timer(0.2, instrument.end_step)
+        ending.start()
+        with pytest.raises(SequenceError, match="stopped by its program"):
+            instrument.run_sequence(file)
+        ending.join()
+        assert mode(instrument) == "STANDBY"
 
 
 def test_without_a_supervisor_there_is_no_instrument(tmp_path):
@@ -121,6 +137,40 @@ def test_a_cancelled_step_is_ended_and_the_stages_are_held():
     assert asyncio.run(night()) == "STANDBY"
 
 
+def test_a_step_that_is_cancelled_as_soon_as_it_begins_is_ended_too():
+    async def night():
+        async with AsyncInstrument(NEAR, simulate=True) as instrument:
+            await instrument.acquire()
+            holding = asyncio.create_task(instrument.hold(1000.0))
+            await asyncio.sleep(0)
+            holding.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await holding
+            return (await instrument.telemetry()).time_s
+
+    assert asyncio.run(night()) < 500.0
+
+
+def test_a_step_that_is_cancelled_before_its_turn_leaves_the_one_that_runs_alone():
+    async def night():
+        async with AsyncInstrument(NEAR, simulate=True) as instrument:
+            await instrument.acquire()
+            holding = asyncio.create_task(instrument.hold(10.0))
+            await asyncio.sleep(0)
+            waiting = asyncio.create_task(instrument.wait(1000.0))
+            await asyncio.sleep(0)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            return await holding, await instrument.telemetry()
+
+    held, telemetry = asyncio.run(night())
+
+    assert held["frames_seen"] == 500
+    assert telemetry.loops[0].mode == "VERNIER"
+    assert telemetry.time_s < 500.0
+
+
 @pytest.mark.parametrize("name", STEPS)
 def test_every_step_is_a_method_with_its_keys_and_defaults(name):
     fields = {key: field for key, field in STEPS[name].model_fields.items() if key != "step"}
@@ -137,7 +187,7 @@ def test_every_step_is_a_method_with_its_keys_and_defaults(name):
         assert required or parameter.default == fields[key].default
 
 
-def test_a_figure_that_could_not_be_had_is_not_a_number(monkeypatch):
+def test_a_figure_that_could_not_be_had_is_not_a_number(monkeypatch, tmp_path):
     from fitctl.sequences import plain
     from fitctl.sequences.behaviour import Result
 
@@ -145,6 +195,8 @@ def test_a_figure_that_could_not_be_had_is_not_a_number(monkeypatch):
     monkeypatch.setitem(fitctl.sequences.runner.BEHAVIOURS, "wait", never)
     with Instrument(NEAR, simulate=True) as instrument:
         assert math.isnan(instrument.wait(1.0)["a_s"])
+        (waited,) = instrument.run_sequence(file_of(tmp_path, 'step = "wait", duration_s = 1.0'))
+        assert math.isnan(waited["a_s"])
 
 
 def test_fitctl_has_only_what_it_has():

@@ -1,6 +1,5 @@
 """Plate scale: matrices that are known come back, and what cannot be believed is refused."""
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -122,7 +121,7 @@ def test_a_rig_file_that_is_wrong_is_found_out(tried, scale):
     run({"step": "acquire"}, {"step": "wait", "duration_s": 10.0}, {"step": "plate_scale"})
 
     assert run.outcomes() == ["done"] * 3
-    found = msgspec.json.decode(run.attempts[-1].figures_json)
+    found = run.figures()
     assert found["siderostat_scale"] == pytest.approx(scale, rel=0.02)
     assert found["fsm_scale"] == pytest.approx(1.0, rel=0.02)
     assert abs(found["siderostat_rotation_deg"]) < 1.0

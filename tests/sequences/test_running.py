@@ -1,6 +1,5 @@
 """How a sequence runs: attempts, time limits, pauses, and every way to end one."""
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -13,10 +12,6 @@ from fitctl.supervisor.messages import Hold, SequenceControl, Stop
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
 RIG = load_rig(default_rig_path())
-
-
-def figures(attempt):
-    return msgspec.json.decode(attempt.figures_json)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +32,7 @@ def test_a_held_star_is_judged_against_the_requirement(tried):
     run(ACQUIRE, HOLD, {**HOLD, "rms_limit_px": 1e-4, "attempts": 2})
 
     assert run.outcomes() == ["done", "done", "failed", "failed"]
-    held = figures(run.attempts[1])
+    held = run.figures(1)
     assert 0 < held["rms_az_px"] < held["limit_px"] == RIG.loops["right"].requirement_px
     assert held["frames_seen"] == 250
     assert "required 0.0001 px" in run.error
@@ -144,7 +139,7 @@ def test_a_pause_within_a_hold_is_not_judged_and_not_counted(tried):
 
     assert run.outcomes() == ["done", "done"]
     assert run.attempts[1].ended_s > 200.0
-    assert figures(run.attempts[1])["frames_seen"] == 500
+    assert run.figures(1)["frames_seen"] == 500
     assert run.states == ["running", "paused", "running", "done"]
 
 
@@ -185,7 +180,7 @@ def test_motions_that_a_lost_star_ends_are_not_taken_for_whole_but_made_again(tr
 
     assert run.outcomes() == ["done", "failed", "done"]
     assert "ended early, in ACQUISITION, by star lost" in run.attempts[1].message
-    assert figures(run.attempts[2])["seen_fraction"] > 0.99
+    assert run.figures(2)["seen_fraction"] > 0.99
 
 
 def test_motions_that_the_operator_stops_end_at_once(tried):
