@@ -28,7 +28,7 @@ def change_mode(r: Any, mode: int) -> None:
 
 @jit
 def start_search(s: Any, r: Any) -> None:
-    """``StellarLoop._start_search``."""
+    """``StellarLoop._start_search`` and ``Search.begin``."""
     change_mode(r, ACQUISITION)
     for axis in range(2):
         if not r.star_known:
@@ -63,7 +63,7 @@ def start_vernier(s: Any, r: Any, step_s: float, settle_s: float) -> None:
 
 @jit
 def judge_search(s: Any, r: Any, exposed_s: float) -> bool:
-    """``StellarLoop._judge_search``; False where the search has ended without a star."""
+    """``Search.judge``; False where the search has ended without a star."""
     if not r.sighted:
         if r.star_visible:
             r.sighted, r.sighted_s, r.sighting_frames = 1, exposed_s, 0

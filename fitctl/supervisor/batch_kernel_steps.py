@@ -76,22 +76,26 @@ def following_error_rad(r: Any) -> float:
 def centroid(
     s: Any, light_dn: Floats, first_row: int, first_column: int, window_az: int, window_el: int
 ) -> Any:
-    """``StarSensor._centroid`` about a window on a part of the frame: azimuth, elevation, flux."""
+    """``StarSensor._centroid`` about a window on a part of the frame: azimuth, elevation, flux.
+
+    All nan where there is no light, or one pixel has most of it.
+    """
     top, left = window_el - HALF_WINDOW_PX - first_row, window_az - HALF_WINDOW_PX - first_column
     window_dn = light_dn[top : top + _SIDE_PX, left : left + _SIDE_PX]
-    flux = az_moment = el_moment = 0.0
+    flux = az_moment = el_moment = peak = 0.0
     for row in range(_SIDE_PX):
         # A sum of its own for each row: one long sum would wait for itself.
         row_dn = row_moment = 0.0
         for column in range(_SIDE_PX):
             dn = window_dn[row, column] - s.bias_dn
+            peak = max(peak, dn)
             row_dn += dn
             row_moment += dn * (column - HALF_WINDOW_PX)
         flux += row_dn
         az_moment += row_moment
         el_moment += row_dn * (row - HALF_WINDOW_PX)
-    if flux <= 0:
-        return math.nan, math.nan, flux
+    if flux <= 0 or peak > LARGEST_PEAK * flux:
+        return math.nan, math.nan, math.nan
     return window_az + az_moment / flux, window_el + el_moment / flux, flux
 
 
@@ -143,8 +147,7 @@ def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
     search_dn[:] = frame_dn
     for _ in range(MAX_CANDIDATES):
         el, az = divmod(np.argmax(search_dn), s.width_px)
-        peak_dn = search_dn[el, az] - s.bias_dn
-        if peak_dn < s.threshold_dn:
+        if search_dn[el, az] - s.bias_dn < s.threshold_dn:
             return
         window_az, window_el = window_about(az, s.largest_az_px), window_about(el, s.largest_el_px)
         az_px, el_px, flux = centroid(s, frame_dn, 0, 0, window_az, window_el)
@@ -153,7 +156,7 @@ def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
             window_el = window_about(el_px, s.largest_el_px)
             az_px, el_px, flux = centroid(s, frame_dn, 0, 0, window_az, window_el)
         centred = abs(az_px - window_az) <= 1.0 and abs(el_px - window_el) <= 1.0
-        if accepted(s, flux) and centred and peak_dn <= LARGEST_PEAK * flux:
+        if accepted(s, flux) and centred:
             see(s, r, az_px, el_px)
             return
         top, left = max(0, el - HALF_WINDOW_PX), max(0, az - HALF_WINDOW_PX)

@@ -80,6 +80,13 @@ def test_every_design_makes_the_same_run_from_the_search_to_the_held_star(contro
             id="flight rate",
         ),
         pytest.param(["loops.right.siderostat.travel_sky_arcsec=60.0"], id="end of travel"),
+        pytest.param(
+            [
+                "plant.loops.right.spots=[{name='pointing', offset_px={az=0.0, el=0.0}, "
+                "flux_dn=28000.0, diameter_px=1.5}]"
+            ],
+            id="now and then most light in one pixel",
+        ),
     ],
 )  # fmt: skip
 def test_unusual_rigs_make_the_same_run(overrides):
