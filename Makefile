@@ -69,9 +69,6 @@ fuzz: $(READY)  ## Coverage-guided fuzzing of every parser, FUZZ_S seconds each 
 bench-sim: $(READY)  ## How many times real time the simulation and the batch run
 	$(BIN)/python -m benchmarks.simulate $(ARGS)
 
-LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
-    --custom-compile-command "make lock" --quiet
-
 bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
 	$(BIN)/python -m benchmarks.recorder $(ARGS)
 
@@ -80,6 +77,9 @@ bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN serv
 	$(BIN)/python -m benchmarks.roundtrips
 	$(BIN)/python -m benchmarks.can
 	$(BIN)/python -m benchmarks.gvsp
+
+LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+    --custom-compile-command "make lock" --quiet
 
 lock: $(READY)  ## Resolve the requirements anew (needs uv)
 	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --group dev $(LOCK) -o requirements/dev.lock

@@ -37,13 +37,12 @@ from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.gige.camera import GigeCameraMock
-from fitctl.mocks.mdt693.server import Endpoints as Mdt693Endpoints
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus.rtu import frame as rtu_frame
 from fitctl.mocks.modbus.tcp import Adu
 from fitctl.mocks.modbus.tcp import frame as tcp_frame
-from fitctl.mocks.modbus_dac.server import Endpoints as DacEndpoints
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
+from fitctl.mocks.pty import Endpoints
 
 STARTS_WITHIN_S = 20.0
 ANSWERS_WITHIN_S = 5.0
@@ -81,7 +80,7 @@ def _rig(name: str, *settings: str) -> tuple[Loop, LoopMocks]:
     return rig.loops["right"], rig.mock_parts()[1].loops["right"]
 
 
-async def _mdt693(*settings: str) -> Mdt693Endpoints:
+async def _mdt693(*settings: str) -> Endpoints:
     loop, mocks = _rig("fit-mock.toml", *settings)
     return await Mdt693Mock(mocks.mdt693, loop.fsm.piezo, lambda _: None, port=0).start()
 
@@ -95,7 +94,7 @@ async def _mdt693_pty() -> str:
     return (await _mdt693()).pty_path
 
 
-async def _dac() -> DacEndpoints:
+async def _dac() -> Endpoints:
     loop, mocks = _rig("fit-mock.toml")
     return await ModbusDacMock(loop.fsm.dac, mocks.dac, lambda _: None, port=0).start()
 

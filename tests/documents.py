@@ -79,6 +79,11 @@ def between(document, name):
     return text.split(f"<!-- {name}: begin -->\n")[1].split(f"\n<!-- {name}: end -->")[0]
 
 
+def table(head, rows):
+    """A table as documents have it."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
 def prose(document):
     """A document without its fenced blocks."""
     return FENCED.sub("", document.read_text())

@@ -25,6 +25,7 @@ from documents import (
     commands,
     prose,
     quoted,
+    table,
 )
 
 from fitctl.cli import app
@@ -48,10 +49,6 @@ OUTSIDE = {"git", "cd", "cp", "sudo", "uv", "pip", "python3", "export", "source"
 INSTALLED = {"rerun", "pymcap-cli", "pytest", "python", "ruff", "mypy"}
 LONGEST_RUN_S = 60.0  # of virtual time
 NEARBY_PX = np.array([30.0, -10.0])  # a star that is found and held within 20 s
-
-
-def table(head, rows):
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
 def ours():

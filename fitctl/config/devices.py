@@ -32,6 +32,11 @@ class GigeDevice(Settings):
     response_timeout_s: TimeoutS
     heartbeat_s: Annotated[float, Field(ge=0.5, le=60)]
 
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return f"{self.address}:{self.gvcp_port}"
+
 
 class Camera(Settings):
     """The focal plane and the camera that reads it."""

@@ -17,10 +17,9 @@ def camera_health(
     rig: Rig, counts: CameraCounts, is_open: bool, identities: Identities, now_s: float
 ) -> DeviceHealth:
     """The camera, which all loops share."""
-    device = rig.camera.device
     return _health(
         CAMERA,
-        f"{device.address}:{device.gvcp_port}",
+        rig.camera.device.endpoint,
         is_open,
         f"{counts.frames} frames, {counts.lost} lost",
         identities,

@@ -22,7 +22,6 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.pair import Design, Measurement, Pair
 from fitctl.controllers.prefilter import Prefilter
-from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
 from fitctl.logging.records import (
     AnyRecord,
@@ -38,6 +37,7 @@ from fitctl.model.optics import scales
 from fitctl.supervisor.interlocks import Interlocks
 from fitctl.supervisor.modes import FOLLOWING, TRACKING, Mode, Trigger, transition
 from fitctl.supervisor.quantities import Quantities, places
+from fitctl.supervisor.search import Search
 from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.stages import Stages
 
@@ -47,15 +47,6 @@ _SEVERITY: dict[Trigger, Severity] = {
     Trigger.STAR_LOST: "warning",
     Trigger.SEARCH_EXHAUSTED: "warning",
 }
-
-
-@dataclass
-class Sighting:
-    """A star seen during the search: the siderostat goes back to where it saw it, and looks again."""
-
-    motor_rad: Floats
-    since_s: float
-    frames: int = 0
 
 
 @dataclass
@@ -120,15 +111,11 @@ class StellarLoop:
         self._clock = clock
         self._report = report
         self._scale = scales(rig, loop)
-        self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         self._period_s = rig.camera.period_s
         self._due_after_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._sensor = StarSensor(rig.camera, loop)
         self._estimator = StarEstimator(self._scale, self.target_px)
-        self._plan = plan_spiral(rig, name)
-        self._spiral = Spiral(self._plan)
-        self._spiral_centre_rad = np.zeros(2)
-        self._sighting: Sighting | None = None
+        self.search = Search(rig, name, self._estimator)
         self._prefilter = Prefilter(loop.prefilter.time_constant_s, self._period_s, self.target_px)
         self._coarse_step_rad_per_px = (
             loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * self._period_s
@@ -246,28 +233,13 @@ class StellarLoop:
         return why_not
 
     def _judge_search(self, frame: Frame, star: Star | None) -> None:
-        acquisition = self.settings.acquisition
-        now_s = frame.mid_exposure_s
-        sighting = self._sighting
-        if sighting is None:
-            if star is not None:
-                # Back to where it was seen, with the star in the middle of the field.
-                back_rad = self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
-                self._sighting = Sighting(back_rad, now_s)
-            elif self._spiral.exhausted:
-                self.fire(
-                    Trigger.SEARCH_EXHAUSTED,
-                    f"no star within {acquisition.search_radius_sky_arcsec:g} arcsec of the start; "
-                    "check shutter and pointing, then acquire again",
-                )
+        found = self.search.judge(star, frame.mid_exposure_s)
+        if found is None:
             return
-        settled = now_s >= sighting.since_s + acquisition.settle_s
-        sighting.frames = sighting.frames + 1 if star is not None and settled else 0
-        if sighting.frames >= acquisition.found_frames:
-            self.fire(Trigger.STAR_FOUND, f"star on {sighting.frames} frames in a row")
-        elif now_s > sighting.since_s + acquisition.settle_s + acquisition.confirm_timeout_s:
-            self._event("warning", "a sighting was not confirmed; the search goes on")
-            self._sighting = None
+        if found.trigger is None:
+            self._event("warning", found.reason)
+        else:
+            self.fire(found.trigger, found.reason)
 
     def _judge_tracking(self, star: Star | None) -> None:
         findings, acquisition = self._findings, self.settings.acquisition
@@ -334,17 +306,13 @@ class StellarLoop:
             self._start_search()
         elif self.mode is Mode.COARSE:
             self._prefilter.reset(self.target_px)
-            self._sighting = None
         elif self.mode is Mode.VERNIER:
             self._start_pair()
 
     def _start_search(self) -> None:
-        """A new spiral, about where the star is expected: on the target, or where it was last seen."""
+        """About where the star is expected: on the target, or where it was last seen."""
         self._estimator.expect(self.target_px, self.servo.position_rad, np.zeros(2))
-        # The expected star belongs in the middle of the field, where the search sees farthest.
-        self._spiral_centre_rad = self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
-        self._spiral = Spiral(self._plan)
-        self._sighting = None
+        self.search.begin()
 
     # ------------------------------------------------------------ control laws
 
@@ -354,13 +322,7 @@ class StellarLoop:
 
     def _search(self, _seen: Seen) -> None:
         self.stages.mirror_to_bias()
-        if self._sighting is not None:
-            self.stages.siderostat_to(self._sighting.motor_rad)
-            return
-        offset_px = self._spiral.advance(self._period_s)
-        self.stages.siderostat_to(
-            self._spiral_centre_rad + offset_px / self._scale.motor_px_per_rad
-        )
+        self.stages.siderostat_to(self.search.advance(self._period_s))
 
     def _pull_in(self, seen: Seen) -> None:
         self.stages.mirror_to_bias()
@@ -526,7 +488,7 @@ class StellarLoop:
             siderostat_setpoint_el_rad=setpoint_el_rad,
             siderostat_az_sky_arcsec=motor_az_rad * sky_arcsec_per_rad,
             siderostat_el_sky_arcsec=motor_el_rad * sky_arcsec_per_rad,
-            search_progress=self._spiral.progress if self.mode is Mode.ACQUISITION else math.nan,
+            search_progress=self.search.progress if self.mode is Mode.ACQUISITION else math.nan,
         )
 
     def _near_edge(self, star: Star) -> bool:

@@ -2,15 +2,104 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import Clock
 from fitctl.config import Mdt693Device
 from fitctl.drivers.interface import DeviceMismatch, PiezoAmplifier
-from fitctl.logging.records import PiezoReading
+from fitctl.logging.records import AnyRecord, Event, PiezoReading
+from fitctl.supervisor.loop import StellarLoop
+from fitctl.supervisor.power import told
 
 Floats = NDArray[np.float64]
+
+
+class PiezoWatch:
+    """Has one loop's piezo amplifier asked now and then, and judges what it answers.
+
+    Parameters
+    ----------
+    loop : StellarLoop
+    piezo : PiezoAmplifier
+    clock : Clock
+    executor : Executor
+        Asks it: that takes longer than a tick.
+    record : callable
+        Takes readings and events; must not block.
+
+    Attributes
+    ----------
+    error : str
+        What was wrong the last time; empty if nothing was.
+    """
+
+    def __init__(
+        self,
+        loop: StellarLoop,
+        piezo: PiezoAmplifier,
+        clock: Clock,
+        executor: Executor,
+        record: Callable[[AnyRecord], None],
+    ) -> None:
+        self.error = ""
+        self._loop = loop
+        self._settings = loop.settings.fsm.piezo
+        self._piezo = piezo
+        self._clock = clock
+        self._executor = executor
+        self._record = record
+        self._asked_s = 0.0
+        self._answer: Future[PiezoReading] | None = None
+
+    def begin(self) -> None:
+        """It was opened and checked just now."""
+        self.error = ""
+        self._asked_s = self._clock.now_s()
+
+    def forget(self) -> None:
+        """It is opened anew: an answer that is still to come says nothing about it then."""
+        self._answer = None
+
+    def ask(self) -> None:
+        """Ask, if it is time to."""
+        now_s = self._clock.now_s()
+        if self._answer is None and now_s >= self._asked_s + self._settings.poll_s:
+            self._asked_s = now_s
+            self._answer = self._executor.submit(
+                read_piezo, self._piezo, self._loop.name, self._clock
+            )
+
+    def judge(self) -> None:
+        """Take its answer, if it has come: SAFE where a stack is not as told, or at the second bad one."""
+        answer = self._answer
+        if answer is None or not answer.done():
+            return
+        self._answer = None
+        error, told_v = answer.exception(), self._loop.stages.take_told_range()
+        if error is None:
+            reading = answer.result()
+            self._loop.measured.of_piezo(reading)
+            self._record(reading)
+            error = disagreement(reading, self._settings, *told_v)
+        before, self.error = self.error, "" if error is None else told(error)
+        if error is None:
+            return
+        if before or isinstance(error, DeviceMismatch):
+            self._loop.fail(self.error)
+        else:  # on a line without checksum one bad answer says little
+            self._record(
+                Event(
+                    time_s=self._clock.now_s(),
+                    severity="warning",
+                    source=self._loop.name,
+                    message=f"{self.error}; asking again",
+                )
+            )
+            self._asked_s -= self._settings.poll_s
 
 
 def read_piezo(piezo: PiezoAmplifier, loop_name: str, clock: Clock) -> PiezoReading:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.drivers.interface import DeviceIdentity, Devices
+from fitctl.drivers.interface import DeviceError, DeviceIdentity, Devices
 from fitctl.supervisor.servo import SiderostatServo
 
 CAMERA = "camera"
@@ -73,3 +73,8 @@ def close_devices(
             close()
         except Exception as error:
             closed_badly(device, error)
+
+
+def told(error: BaseException) -> str:
+    """A device's error tells itself; any other is told with its type."""
+    return str(error) if isinstance(error, DeviceError) else repr(error)

@@ -110,12 +110,11 @@ class Quantities:
 def places(rig: Rig, loop_name: str) -> dict[str, str]:
     """Each part of the rig by name and endpoint, as errors of devices call it."""
     loop = rig.loops[loop_name]
-    camera, dac, piezo = rig.camera.device, loop.fsm.dac, loop.fsm.piezo
     return {
-        "camera": f"camera at {camera.address}:{camera.gvcp_port}",
+        "camera": f"camera at {rig.camera.device.endpoint}",
         "mirror": f"mirror {loop_name}",
         "star": f"star of {loop_name}",
         "siderostat": f"siderostat {loop_name} at {loop.siderostat.device.endpoint}",
-        "D/A": f"D/A at {dac.endpoint}",
-        "piezo amplifier": f"piezo amplifier at {piezo.port}",
+        "D/A": f"D/A at {loop.fsm.dac.endpoint}",
+        "piezo amplifier": f"piezo amplifier at {loop.fsm.piezo.port}",
     }

@@ -53,11 +53,13 @@ class SequenceBoard:
             )
             return Reply(accepted=False, text=text)
         before = self._status
-        same = before is not None and before.run == status.run
-        wanted = before.wanted if same and before is not None else "run"
+        if before is not None and before.run != status.run:
+            before = None  # another one's orders are not handed on
         self._heard_s = self._clock.now_s()
-        self._status = msgspec.structs.replace(status, wanted=wanted)
-        self._tell_change(before if same else None, status)
+        self._status = msgspec.structs.replace(
+            status, wanted="run" if before is None else before.wanted
+        )
+        self._tell_change(before, status)
         return Reply(accepted=True)
 
     def control(self, action: Literal["pause", "resume", "stop"]) -> Reply:

@@ -21,7 +21,6 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
-    DeviceMismatch,
     Devices,
     Frame,
 )
@@ -30,7 +29,6 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     LoopTiming,
-    PiezoReading,
     Severity,
 )
 from fitctl.supervisor.drives import refused_drives
@@ -54,8 +52,8 @@ from fitctl.supervisor.messages import (
     Stop,
 )
 from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
-from fitctl.supervisor.piezo import disagreement, read_piezo
-from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices
+from fitctl.supervisor.piezo import PiezoWatch
+from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices, told
 from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.servo import Periodic, SiderostatServo
 from fitctl.supervisor.timing import TimingBook
@@ -118,21 +116,22 @@ class Supervisor:
         self._devices = devices
         self._clock = clock
         self._executor = executor
-        self._log = record
+        self._record = record
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
         self._notes: deque[tuple[Severity, str, str]] = deque()
         self._job: Job | None = None
         self._opening: set[str] = set()
         self._abandoned: set[str] = set()
-        self._polls: dict[str, Job] = {}
         self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
-        self._piezo_read_s = dict.fromkeys(rig.loops, 0.0)
-        self._piezo_error = dict.fromkeys(rig.loops, "")
+        self._piezos = {
+            name: PiezoWatch(loop, devices.loops[name].piezo, clock, executor, record)
+            for name, loop in self.loops.items()
+        }
         self._camera_ready = False
         self._last_frame_s = clock.now_s()
         self._identities: dict[str, DeviceIdentity] = {}
-        self._timing = TimingBook(clock, rig, self._record)
+        self._timing = TimingBook(clock, rig, self._timed)
 
     # ------------------------------------------------------------ from any thread
 
@@ -192,7 +191,10 @@ class Supervisor:
                     data=frame.image.tobytes(),
                 )
             )
-        self._poll_piezos()
+        if self._job is None:
+            for name, piezo in self._piezos.items():
+                if self.loops[name].stages.ready:
+                    piezo.ask()
         if self._clock.now_s() - self._reported_s >= 1.0:
             self._once_a_second()
 
@@ -330,7 +332,7 @@ class Supervisor:
         if error is None:
             self.loops[name].use(future.result())
         else:
-            self._event("error", name, f"no design {controller}: {_told(error)}")
+            self._event("error", name, f"no design {controller}: {told(error)}")
 
     def _start_experiment(self, command: Experiment, names: list[str]) -> Reply:
         if len(names) != 1:
@@ -351,7 +353,7 @@ class Supervisor:
     def _open(self, names: list[str], trigger: Trigger) -> None:
         for name in names:
             self.loops[name].stages.ready = False
-            self._polls.pop(name, None)
+            self._piezos[name].forget()
         self._opening, self._abandoned = set(names), set()
         self._event("info", "supervisor", "opening and checking all devices")
         with_camera = not self._camera_well
@@ -366,7 +368,7 @@ class Supervisor:
         abandoned, self._opening, self._abandoned = bool(self._abandoned), set(), set()
         error = future.exception()
         if error is not None:
-            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {_told(error)}")
+            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {told(error)}")
             self._close(names, with_camera)
             return
         if abandoned:
@@ -381,8 +383,7 @@ class Supervisor:
         for name in names:
             loop = self.loops[name]
             loop.start_from(opened.stack_v[name])
-            self._piezo_read_s[name] = self._clock.now_s()
-            self._piezo_error[name] = ""
+            self._piezos[name].begin()
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
             self.servos[name].take_timing()
             loop.fire(trigger, "all devices open, checked and enabled")
@@ -407,7 +408,7 @@ class Supervisor:
         )
 
     def _closed_badly(self, device: str, error: Exception) -> None:
-        self.note("warning", "supervisor", f"{device} did not close well: {_told(error)}")
+        self.note("warning", "supervisor", f"{device} did not close well: {told(error)}")
 
     def _make_safer(self, loop: StellarLoop) -> None:
         if self._clock.now_s() - loop.mode_since_s > self.rig.supervisor.safe_disable_after_s:
@@ -421,10 +422,8 @@ class Supervisor:
         while self._designs and self._designs[0].future.done():
             design = self._designs.popleft()
             design.done(design.future)
-        for name, poll in list(self._polls.items()):
-            if poll.future.done():
-                del self._polls[name]
-                poll.done(poll.future)
+        for piezo in self._piezos.values():
+            piezo.judge()
 
     # ------------------------------------------------------------ once a second
 
@@ -442,50 +441,14 @@ class Supervisor:
         counts = self._devices.camera.counts()
         self._record(camera_health(self.rig, counts, self._camera_well, self._identities, now_s))
         for name, loop in self.loops.items():
-            trouble = self._piezo_error[name]
+            trouble = self._piezos[name].error
             loop.measured.of_piezo_error(trouble, now_s)
             for row in loop_health(loop, trouble, self._identities, now_s):
                 self._record(row)
 
-    def _poll_piezos(self) -> None:
-        now_s = self._clock.now_s()
-        for name, loop in self.loops.items():
-            due_s = self._piezo_read_s[name] + loop.settings.fsm.piezo.poll_s
-            if (
-                loop.stages.ready
-                and now_s >= due_s
-                and name not in self._polls
-                and self._job is None
-            ):
-                self._piezo_read_s[name] = now_s
-                future = self._executor.submit(
-                    read_piezo, self._devices.loops[name].piezo, name, self._clock
-                )
-                self._polls[name] = Job(future, partial(self._piezo_was_read, name))
-
-    def _piezo_was_read(self, name: str, future: Future) -> None:
-        loop, error = self.loops[name], future.exception()
-        settings, told_v = loop.settings.fsm.piezo, loop.stages.take_told_range()
-        if error is None:
-            self._record(future.result())
-            error = disagreement(future.result(), settings, *told_v)
-        before = self._piezo_error[name]
-        self._piezo_error[name] = "" if error is None else _told(error)
-        if error is None:
-            return
-        if before or isinstance(error, DeviceMismatch):
-            loop.fail(_told(error))
-        else:  # on a line without checksum one bad answer says little
-            self._event("warning", name, f"{_told(error)}; asking again")
-            self._piezo_read_s[name] -= settings.poll_s
-
-    def _record(self, record: AnyRecord) -> None:
-        """To the log and the consoles; some records carry what interlocks judge."""
-        if isinstance(record, PiezoReading):
-            self.loops[record.loop].measured.of_piezo(record)
-        elif isinstance(record, LoopTiming):
-            self.loops[record.loop].measured.of_timing(record)
-        self._log(record)
+    def _timed(self, record: LoopTiming) -> None:
+        self.loops[record.loop].measured.of_timing(record)
+        self._record(record)
 
     def _event(self, severity: Severity, source: str, message: str) -> None:
         self._record(
@@ -500,8 +463,3 @@ class Supervisor:
 
 def _refusal(text: str) -> Reply:
     return Reply(accepted=False, text=text)
-
-
-def _told(error: BaseException) -> str:
-    """A device's error tells itself; any other is told with its type."""
-    return str(error) if isinstance(error, DeviceError) else repr(error)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.logging.records import AnyRecord, LoopTiming, Tick
+from fitctl.logging.records import LoopTiming, Tick
 from fitctl.supervisor.servo import SiderostatServo
 
 
@@ -19,7 +19,7 @@ class TimingBook:
     thread does nothing but wait for its deadline.
     """
 
-    def __init__(self, clock: Clock, rig: Rig, record: Callable[[AnyRecord], None]) -> None:
+    def __init__(self, clock: Clock, rig: Rig, record: Callable[[LoopTiming], None]) -> None:
         self._clock = clock
         self._stall_s = rig.supervisor.stall_s
         self._record = record

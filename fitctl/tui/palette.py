@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, cast
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 
 from fitctl.config import CONTROLLERS
-from fitctl.supervisor.messages import Reset, SetController, SetTarget
+from fitctl.supervisor.messages import AnyCommand, Reset, SetController, SetTarget
 
 if TYPE_CHECKING:
     from fitctl.tui.app import ConsoleApp
@@ -49,49 +50,43 @@ class TargetProvider(Provider):
             yield Hit(1.0, label, partial(app.give, command), help="Through the prefilter")
 
 
-class ControllerProvider(Provider):
-    """Offers every controller by name."""
+class _ListProvider(Provider):
+    """Offers the commands of a list by their names."""
 
     async def discover(self) -> Hits:
         """All of them."""
-        for name, command in _CONTROLLERS.items():
-            yield DiscoveryHit(name, self._give(command), help=_CONTROLLER_HELP)
+        for name, command, told in self._offers():
+            yield DiscoveryHit(name, self._give(command), help=told)
 
     async def search(self, query: str) -> Hits:
         """Those that match."""
         matcher = self.matcher(query)
-        for name, command in _CONTROLLERS.items():
+        for name, command, told in self._offers():
             score = matcher.match(name)
             if score > 0:
-                yield Hit(
-                    score, matcher.highlight(name), self._give(command), help=_CONTROLLER_HELP
-                )
+                yield Hit(score, matcher.highlight(name), self._give(command), help=told)
 
-    def _give(self, command: SetController) -> Callable[[], object]:
+    @abstractmethod
+    def _offers(self) -> Iterator[tuple[str, AnyCommand, str]]:
+        """Name, command and what there is to say about it."""
+
+    def _give(self, command: AnyCommand) -> Callable[[], object]:
         return partial(cast("ConsoleApp", self.app).give, command)
 
 
-class ResetProvider(Provider):
+class ControllerProvider(_ListProvider):
+    """Offers every controller by name."""
+
+    def _offers(self) -> Iterator[tuple[str, AnyCommand, str]]:
+        for name in CONTROLLERS:
+            told = "In VERNIER the mirror goes on where it is"
+            yield f"controller {name}", SetController(name=name), told
+
+
+class ResetProvider(_ListProvider):
     """Offers to let go of each tripped interlock of the shown loop."""
 
-    async def discover(self) -> Hits:
-        """All of them."""
-        for text, reason, give in self._resets():
-            yield DiscoveryHit(text, give, help=reason)
-
-    async def search(self, query: str) -> Hits:
-        """Those that match."""
-        matcher = self.matcher(query)
-        for text, reason, give in self._resets():
-            score = matcher.match(text)
-            if score > 0:
-                yield Hit(score, matcher.highlight(text), give, help=reason)
-
-    def _resets(self) -> Iterator[tuple[str, str, Callable[[], object]]]:
-        app = cast("ConsoleApp", self.app)
-        for trip in app.state.loop.state.interlocks if app.state.loop else []:
-            yield f"reset {trip.name}", trip.reason, partial(app.give, Reset(name=trip.name))
-
-
-_CONTROLLERS = {f"controller {name}": SetController(name=name) for name in CONTROLLERS}
-_CONTROLLER_HELP = "In VERNIER the mirror goes on where it is"
+    def _offers(self) -> Iterator[tuple[str, AnyCommand, str]]:
+        loop = cast("ConsoleApp", self.app).state.loop
+        for trip in loop.state.interlocks if loop else []:
+            yield f"reset {trip.name}", Reset(name=trip.name), trip.reason

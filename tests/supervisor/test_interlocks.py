@@ -1,7 +1,5 @@
 """The table of interlocks by itself: what trips a row, what it does then, and what ends it."""
 
-import re
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +8,8 @@ from fitctl.config import QUANTITIES, ConfigError, Interlock, default_rig_path, 
 from fitctl.config.interlocks import ModeName
 from fitctl.supervisor.interlocks import Interlocks
 from fitctl.supervisor.modes import Mode
-from tests.documents import ROOT
+from tests.documents import between
+from tests.documents import table as table_of
 
 TICK_S = 0.02
 FIRST, SECOND = "fsm_range_fraction", "dac_round_trip_s"
@@ -259,14 +258,6 @@ def test_a_row_that_cannot_be_is_refused_in_one_line(override, said):
 # ---------------------------------------------------------------- the document
 
 
-def documented(name):
-    text = (ROOT / "docs" / "interlocks.md").read_text()
-    lines = text.split(f"<!-- {name}: begin -->")[1].split(f"<!-- {name}: end -->")[0].strip()
-    return [
-        [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines.splitlines()
-    ][2:]
-
-
 def limits(shipped):
     parts = {
         "below {:g}": shipped.low,
@@ -280,7 +271,7 @@ def limits(shipped):
 def test_the_document_has_the_table_of_the_rig_file():
     shipped = load_rig(default_rig_path()).interlocks
 
-    assert documented("interlocks") == [
+    rows = [
         [
             f"`{name}`",
             f"`{its.quantity}`",
@@ -292,9 +283,17 @@ def test_the_document_has_the_table_of_the_rig_file():
         for name, its in shipped.items()
     ]
 
+    assert between("interlocks.md", "interlocks") == table_of(
+        ["interlock", "quantity", "trips when", "in the modes", "action", "reset by"], rows
+    )
+
 
 def test_the_document_has_the_quantities_of_the_code():
-    assert documented("quantities") == [
+    rows = [
         [f"`{name}`", its.part, its.meaning.replace("|", "\\|"), its.remedy]
         for name, its in QUANTITIES.items()
     ]
+
+    assert between("interlocks.md", "quantities") == table_of(
+        ["quantity", "of the", "what it is", "what to do when it trips a row"], rows
+    )

@@ -125,7 +125,7 @@ def test_the_next_search_is_about_the_same_place_as_the_one_that_found_nothing(s
     centres_rad = []
     for _ in range(3):
         until(simulation, Mode.ACQUISITION, limit_s=5.0)
-        centres_rad.append(simulation.supervisor.loops["right"]._spiral_centre_rad)
+        centres_rad.append(simulation.supervisor.loops["right"].search.centre_rad)
         until(simulation, Mode.STANDBY, limit_s=15.0)
         simulation.command(Acquire())
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -16,6 +17,7 @@ from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
+NEAR = "plant.loops.right.star_offset_sky_arcsec_max=5.0"  # found at once
 
 
 def fitctl(*arguments, **options):
@@ -131,12 +133,20 @@ class Rig:
             self.sockets.rmdir()
 
 
-@pytest.fixture
-def rig(tmp_path):
-    rig = Rig(tmp_path)
+@contextmanager
+def running(folder, *settings, file=None):
+    """Mock testbed and supervisor of a rig, with some values replaced."""
+    rig = Rig(folder, file)
+    rig.common += [part for setting in settings for part in ("--set", setting)]
     try:
         rig.start_mocks("--free-ports")
         rig.start_supervisor()
         yield rig
     finally:
         rig.close()
+
+
+@pytest.fixture
+def rig(tmp_path):
+    with running(tmp_path) as rig:
+        yield rig

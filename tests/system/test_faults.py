@@ -1,6 +1,7 @@
 """What the supervisor makes of each fault of each device: where it goes, what it says, and the way back."""
 
 import time
+from contextlib import ExitStack
 
 import pytest
 
@@ -9,10 +10,9 @@ from fitctl.config import default_rig_path
 from fitctl.mocks.bench import ClearFaults, SetFault, ask_faults
 from fitctl.supervisor.messages import Acquire, Recover, Standby
 
-from .conftest import Rig
+from .conftest import NEAR, running
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.fault]
-NEAR = ["--set", "plant.loops.right.star_offset_sky_arcsec_max=5.0"]  # found at once
 STAYS_S = 3.0
 SAFE_WITHIN_S = 15.0
 TRIES = 3  # the machine itself may stand still while the loop comes back
@@ -171,25 +171,19 @@ RUNS = {f"{where} {kind}": end for where, table in ENDS.items() for kind, end in
 @pytest.fixture(scope="module")
 def rigs(tmp_path_factory):
     """The rig of a name, running; the one before it is ended."""
-    running = {}
+    with ExitStack() as stack:
+        started = {}
 
-    def end():
-        for rig in running.values():
-            rig.close()
-        running.clear()
+        def start(name):
+            if name not in started:
+                stack.close()
+                started.clear()
+                folder = tmp_path_factory.mktemp("faults")
+                file = default_rig_path().parent / f"{name}.toml"
+                started[name] = stack.enter_context(running(folder, NEAR, file=file))
+            return started[name]
 
-    def start(name):
-        if name not in running:
-            end()
-            file = default_rig_path().parent / f"{name}.toml"
-            rig = running[name] = Rig(tmp_path_factory.mktemp("faults"), file)
-            rig.common += NEAR
-            rig.start_mocks("--free-ports")
-            rig.start_supervisor()
-        return running[name]
-
-    yield start
-    end()
+        yield start
 
 
 def tell(rig, question):

@@ -9,7 +9,7 @@ import pytest
 from fitctl.logging.reading import log_info, read_records, tick_arrays
 from fitctl.logging.verifying import verify
 
-from .conftest import Rig
+from .conftest import NEAR, running
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.fault]
 QUEUE_RECORDS = 300  # what some three seconds bring
@@ -18,15 +18,8 @@ MAY_BE_LOST_S = 1.0
 
 @pytest.fixture
 def rig(tmp_path):
-    rig = Rig(tmp_path)
-    rig.common += ["--set", "plant.loops.right.star_offset_sky_arcsec_max=5.0"]  # found at once
-    rig.common += ["--set", f"logging.queue_records={QUEUE_RECORDS}"]
-    try:
-        rig.start_mocks("--free-ports")
-        rig.start_supervisor()
+    with running(tmp_path, NEAR, f"logging.queue_records={QUEUE_RECORDS}") as rig:
         yield rig
-    finally:
-        rig.close()
 
 
 def limit_files(process, size):
