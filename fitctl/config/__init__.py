@@ -38,7 +38,7 @@ from fitctl.config.mocks import (
     Mdt693Mock,
 )
 from fitctl.config.plant import AirPath, Hysteresis, Spot
-from fitctl.config.reading import lay_over, load_rig, rig_from_document
+from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_json
 from fitctl.config.rig import Rig, default_rig_path
 
 __all__ = [
@@ -83,4 +83,5 @@ __all__ = [
     "lay_over",
     "load_rig",
     "rig_from_document",
+    "rig_from_json",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -126,6 +127,24 @@ def rig_from_document(
             for problem in error.errors()
         ]
         raise ConfigError("\n".join(lines)) from None
+
+
+def rig_from_json(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
+    """Validate a rig that was written as JSON, such as the one in a log; overrides as in :func:`load_rig`.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`load_rig`; `origin` is what it calls the rig.
+    """
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        msg = f"{origin}: not JSON: {error}"
+        raise ConfigError(msg) from None
+    for override in overrides:
+        _override(document, override)
+    return rig_from_document(document, origin)
 
 
 def _override(document: dict[str, Any], text: str) -> None:

@@ -6,12 +6,14 @@ A field's unit is in its name; a value that does not exist at a tick is NaN.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import msgspec
 
 RECORD_VERSION = 1
 Severity = Literal["info", "warning", "error"]
+FailingDevice = Literal["camera", "siderostat", "D/A", "injector", "piezo"]
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, tag=True):
@@ -68,6 +70,16 @@ class Tick(Record, frozen=True, kw_only=True):
     siderostat_az_sky_arcsec: float
     siderostat_el_sky_arcsec: float
     search_progress: float
+    # What the tick took from outside besides the frame, so that it can be replayed: when the D/A took the
+    # voltages, how long it and the amplifiers took, the least following error since the last tick, and the
+    # encoders as last read.
+    fsm_written_s: float = math.nan
+    dac_round_trip_s: float = math.nan
+    amplifier_round_trip_s: float = math.nan
+    following_error_rad: float = math.nan
+    encoder_read_s: float = math.nan
+    encoder_az_rad: float = math.nan
+    encoder_el_rad: float = math.nan
 
 
 class FrameRecord(Record, frozen=True, kw_only=True):
@@ -81,7 +93,7 @@ class FrameRecord(Record, frozen=True, kw_only=True):
 
 
 class ModeChange(Record, frozen=True, kw_only=True):
-    """A loop went from one mode to another."""
+    """A loop went from one mode to another; the motor angles are what it then took them to be."""
 
     loop: str
     source: str
@@ -89,6 +101,56 @@ class ModeChange(Record, frozen=True, kw_only=True):
     target_number: int
     trigger: str
     reason: str
+    siderostat_az_rad: float = math.nan
+    siderostat_el_rad: float = math.nan
+
+
+class CommandRecord(Record, frozen=True, kw_only=True):
+    """A command that came to the loop, from whom, and how it was answered; an empty loop is all loops."""
+
+    loop: str
+    command: str
+    arguments_json: str
+    sender: str
+    accepted: bool
+    text: str
+
+
+class DevicesOpened(Record, frozen=True, kw_only=True):
+    """A loop's devices were opened: what the D/A was found set to; or why they could not be."""
+
+    loop: str
+    stack1_v: float
+    stack2_v: float
+    stack3_v: float
+    encoders_jumped: bool
+    error: str
+
+
+class DeviceFailure(Record, frozen=True, kw_only=True):
+    """A device failed while it was used; told once, however long it lasts. The kind is the error's class."""
+
+    loop: str
+    device: FailingDevice
+    kind: str
+    error: str
+
+
+class ControllerChange(Record, frozen=True, kw_only=True):
+    """Another design is at work from the next tick on; motor angles as in :class:`ModeChange`."""
+
+    loop: str
+    source: str
+    target: str
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+
+
+class QuantityReading(Record, frozen=True, kw_only=True):
+    """What interlocks judge of the computer, about once a second; of all loops."""
+
+    name: str
+    value: float
 
 
 class ExperimentStart(Record, frozen=True, kw_only=True):
@@ -185,6 +247,11 @@ AnyRecord = (
     | Tick
     | FrameRecord
     | ModeChange
+    | CommandRecord
+    | DevicesOpened
+    | DeviceFailure
+    | ControllerChange
+    | QuantityReading
     | ExperimentStart
     | InjectionRecord
     | Event

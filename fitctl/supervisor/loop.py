@@ -22,11 +22,13 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.pair import Design, Measurement, Pair
 from fitctl.controllers.prefilter import Prefilter
-from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
+from fitctl.drivers.interface import DeviceError, Frame, MirrorDac, ServoReading
 from fitctl.logging.records import (
     AnyRecord,
+    ControllerChange,
     Event,
     ExperimentStart,
+    FailingDevice,
     InjectionRecord,
     ModeChange,
     Severity,
@@ -36,12 +38,14 @@ from fitctl.model.drives import SIDEROSTAT, Drive, channel_values, experiment_s
 from fitctl.model.optics import scales
 from fitctl.supervisor.interlocks import Interlocks
 from fitctl.supervisor.modes import FOLLOWING, TRACKING, Mode, Trigger, transition
+from fitctl.supervisor.power import failure_record
 from fitctl.supervisor.quantities import Quantities, places
 from fitctl.supervisor.search import Search
-from fitctl.supervisor.servo import SiderostatServo
+from fitctl.supervisor.servo import ServoState, SiderostatServo
 from fitctl.supervisor.stages import Stages
 
 Floats = NDArray[np.float64]
+_NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 _SEVERITY: dict[Trigger, Severity] = {
     Trigger.FAULT: "error",
     Trigger.STAR_LOST: "warning",
@@ -69,11 +73,17 @@ class Experiment:
 
 
 class Seen(NamedTuple):
-    """A frame's star, if any, and where the stages were at its mid-exposure, each shape (2,)."""
+    """What a tick goes by.
+
+    A frame's star, if any; where the stages were at its mid-exposure, each shape (2,); how the servo is now,
+    and when that is.
+    """
 
     star: Star | None
     mirror_rad: Floats
     motor_rad: Floats
+    servo: ServoState
+    now_s: float
 
 
 class StellarLoop:
@@ -142,14 +152,15 @@ class StellarLoop:
 
     def tick(self, frame: Frame | None, frames_lost: int) -> Tick:
         """One tick, with the newest frame or without one."""
+        servo = self.servo.look()
         started_s = self._clock.now_s()
         self._note_injections()
-        seen = self._sense(frame)
-        self._judge(frame, seen.star)
-        self._judge_interlocks(frame, seen.star)
+        seen = self._sense(frame, servo, started_s)
+        self._judge(frame, seen)
+        self._judge_interlocks(frame, seen)
         self._move(frame, seen)
         self._write()
-        tick = self._record(frame, seen, started_s, frames_lost)
+        tick = self._record(frame, seen, frames_lost)
         self.measured.of_tick(tick.compute_s, tick.time_s)
         return tick
 
@@ -159,20 +170,21 @@ class StellarLoop:
         if action == "flatten":
             self.stages.mirror_to_bias()
         elif self._flattened and self.mode is Mode.VERNIER:
-            self._start_pair()
+            self._start_pair(seen.motor_rad)
         self._flattened = action == "flatten"
         # Without a frame to track by, the stages wait where they are.
         waits = frame is None and self.mode in TRACKING
         if action not in {"hold", "flatten"} and not waits:
             self._laws[self.mode](seen)
 
-    def _sense(self, frame: Frame | None) -> Seen:
+    def _sense(self, frame: Frame | None, servo: ServoState, now_s: float) -> Seen:
         """What a frame shows belongs to where the stages were when it was exposed."""
         if frame is None:
-            return Seen(None, self.stages.mirror_now_rad, self.servo.position_rad)
+            return Seen(None, self.stages.mirror_now_rad, servo.position_rad, servo, now_s)
         motor_rad = self.servo.position_at(frame.mid_exposure_s)
         mirror_rad = self.stages.mirror_at(frame.mid_exposure_s)
-        return Seen(self._find(frame, mirror_rad, motor_rad), mirror_rad, motor_rad)
+        star = self._find(frame, mirror_rad, motor_rad)
+        return Seen(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
         if self.mode in FOLLOWING and self._findings.lost == 0:
@@ -187,24 +199,24 @@ class StellarLoop:
             self._estimator.observe(_position(star), motor_rad, mirror_rad)
         return star
 
-    def _judge(self, frame: Frame | None, star: Star | None) -> None:
+    def _judge(self, frame: Frame | None, seen: Seen) -> None:
         """Errors of devices and findings: what leads to another mode."""
-        if self.servo.fault is not None:
-            self.fail(str(self.servo.fault))
+        if seen.servo.fault is not None:
+            self.device_failed("siderostat", seen.servo.fault)
         elif frame is not None and self.mode is Mode.ACQUISITION:
-            self._judge_search(frame, star)
+            self._judge_search(frame, seen.star)
         elif self.mode is Mode.EXPERIMENT and self.stages.injector.fault is not None:
             self.stages.ready = False
-            self.fail(str(self.stages.injector.fault))
+            self.device_failed("injector", self.stages.injector.fault)
         elif frame is not None and self.mode in FOLLOWING:
-            self._judge_tracking(star)
+            self._judge_tracking(seen.star)
 
-    def _judge_interlocks(self, frame: Frame | None, star: Star | None) -> None:
+    def _judge_interlocks(self, frame: Frame | None, seen: Seen) -> None:
         """Measure, judge by the rig file's table, and tell; what holds or flattens, :meth:`_move` asks for."""
-        now_s, measured, interlocks = self._clock.now_s(), self.measured, self.interlocks
+        now_s, measured, interlocks = seen.now_s, self.measured, self.interlocks
         if frame is not None:
-            measured.of_frame(frame, star, now_s)
-        measured.of_stages(self.servo, self.stages, now_s)
+            measured.of_frame(frame, seen.star, now_s)
+        measured.of_stages(seen.servo, self.stages, now_s)
         for trip, over in interlocks.judge(self.mode.name, now_s, measured.readings):
             if over:
                 self._event("info", f"interlock {trip.name} is over")
@@ -269,12 +281,13 @@ class StellarLoop:
         row = transition(self.mode, trigger)
         if row is None:
             return False
-        now_s = self._clock.now_s()
+        now_s, motor_rad = self._clock.now_s(), self.servo.position_rad
         source, self.mode = self.mode, row.target
         if source is not self.mode:
             self.mode_since_s = now_s
         self._findings = Findings()
-        self._enter(source)
+        self._enter(source, motor_rad)
+        motor_az_rad, motor_el_rad = motor_rad.tolist()
         self.last_change = ModeChange(
             time_s=now_s,
             loop=self.name,
@@ -283,35 +296,44 @@ class StellarLoop:
             target_number=int(row.target),
             trigger=trigger.name,
             reason=reason,
+            siderostat_az_rad=motor_az_rad,
+            siderostat_el_rad=motor_el_rad,
         )
         self._report(self.last_change)
         self._event(_SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}")
         return True
 
     def fail(self, reason: str) -> None:
-        """A device failed: SAFE, or, where that changes nothing, an event; the same failure is told once."""
+        """Something is wrong: SAFE, or, where that changes nothing, an event; the same is told once."""
         if not self.fire(Trigger.FAULT, reason) and reason != self._last_failure:
             self._event("error", reason)
         self._last_failure = reason
 
-    def _enter(self, source: Mode) -> None:
+    def device_failed(self, device: FailingDevice, error: Exception) -> None:
+        """A device failed while it was used."""
+        if str(error) != self._last_failure:
+            now_s = self._clock.now_s()
+            self._report(failure_record(now_s, self.name, device, error))
+        self.fail(str(error))
+
+    def _enter(self, source: Mode, motor_rad: Floats) -> None:
         if source is Mode.EXPERIMENT:
             self._end_experiment()
         if self.mode is Mode.SAFE:
             self.servo.stop()
         elif self.mode is Mode.STANDBY:
-            self.servo.hold()
+            self.servo.hold(motor_rad)
             self.stages.siderostat_held()
         elif self.mode is Mode.ACQUISITION:
-            self._start_search()
+            self._start_search(motor_rad)
         elif self.mode is Mode.COARSE:
             self._prefilter.reset(self.target_px)
         elif self.mode is Mode.VERNIER:
-            self._start_pair()
+            self._start_pair(motor_rad)
 
-    def _start_search(self) -> None:
+    def _start_search(self, motor_rad: Floats) -> None:
         """About where the star is expected: on the target, or where it was last seen."""
-        self._estimator.expect(self.target_px, self.servo.position_rad, np.zeros(2))
+        self._estimator.expect(self.target_px, motor_rad, np.zeros(2))
         self.search.begin()
 
     # ------------------------------------------------------------ control laws
@@ -345,10 +367,9 @@ class StellarLoop:
             command.mirror_rad, hysteresis_inverse=self._pair.design.hysteresis_inverse
         )
 
-    def _move_as_told(self, _seen: Seen) -> None:
-        experiment = self._experiment
+    def _move_as_told(self, seen: Seen) -> None:
+        experiment, now_s = self._experiment, seen.now_s
         assert experiment is not None  # noqa: S101  # the mode is entered with one
-        now_s = self._clock.now_s()
         if now_s >= experiment.end_s:
             self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
             return
@@ -364,10 +385,21 @@ class StellarLoop:
 
     def use(self, design: Design) -> None:
         """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
-        before = self.controller
+        before, motor_rad = self.controller, self.servo.position_rad
         self._pair = self._pair_of(design)
         if self.mode is Mode.VERNIER:
-            self._start_pair()
+            self._start_pair(motor_rad)
+        az_rad, el_rad = motor_rad.tolist()
+        self._report(
+            ControllerChange(
+                time_s=self._clock.now_s(),
+                loop=self.name,
+                source=before,
+                target=design.name,
+                siderostat_az_rad=az_rad,
+                siderostat_el_rad=el_rad,
+            )
+        )
         self._event("info", f"controller {before} -> {design.name}")
 
     def start_experiment(self, name: str, drives: list[Drive]) -> bool:
@@ -404,11 +436,11 @@ class StellarLoop:
     def _pair_of(self, design: Design) -> Pair:
         return Pair(design, self._scale, self.settings.fsm.range_rad)
 
-    def _start_pair(self) -> None:
+    def _start_pair(self, motor_rad: Floats) -> None:
         held_rad = self.stages.mirror_held_rad(
             hysteresis_inverse=self._pair.design.hysteresis_inverse
         )
-        self._pair.start(held_rad, self.servo.position_rad, self._prefilter.value_px)
+        self._pair.start(held_rad, motor_rad, self._prefilter.value_px)
 
     # ------------------------------------------------------------ stages
 
@@ -438,14 +470,15 @@ class StellarLoop:
         try:
             self.stages.write()
         except DeviceError as error:
-            self.fail(str(error))
+            self.device_failed("D/A", error)
 
     # ------------------------------------------------------------ records
 
-    def _record(self, frame: Frame | None, seen: Seen, started_s: float, frames_lost: int) -> Tick:
+    def _record(self, frame: Frame | None, seen: Seen, frames_lost: int) -> Tick:
         """What this tick was: names, times and numbers as they are logged."""
         done_s = self._clock.now_s()
-        star, stages = seen.star, self.stages
+        star, stages, servo = seen.star, self.stages, seen.servo
+        read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or _NO_READING
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
         star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
         target_az_px, target_el_px = self._prefilter.value_px.tolist()
@@ -462,7 +495,7 @@ class StellarLoop:
             mode_number=int(self.mode),
             mid_exposure_s=exposed_s,
             frame_age_s=math.nan if frame is None else frame.received_s - exposed_s,
-            compute_s=done_s - started_s,
+            compute_s=done_s - seen.now_s,
             late=frame is not None and done_s - exposed_s > self._due_after_s,
             frames_lost=frames_lost,
             star_visible=star is not None,
@@ -489,6 +522,13 @@ class StellarLoop:
             siderostat_az_sky_arcsec=motor_az_rad * sky_arcsec_per_rad,
             siderostat_el_sky_arcsec=motor_el_rad * sky_arcsec_per_rad,
             search_progress=self.search.progress if self.mode is Mode.ACQUISITION else math.nan,
+            fsm_written_s=stages.written_s,
+            dac_round_trip_s=stages.round_trip_s,
+            amplifier_round_trip_s=servo.round_trip_s,
+            following_error_rad=servo.following_rad,
+            encoder_read_s=read_s,
+            encoder_az_rad=encoder_az_rad,
+            encoder_el_rad=encoder_el_rad,
         )
 
     def _near_edge(self, star: Star) -> bool:

@@ -13,7 +13,7 @@ from fitctl.config import Mdt693Device
 from fitctl.drivers.interface import DeviceMismatch, PiezoAmplifier
 from fitctl.logging.records import AnyRecord, Event, PiezoReading
 from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.power import told
+from fitctl.supervisor.power import failure_record, told
 
 Floats = NDArray[np.float64]
 
@@ -74,17 +74,23 @@ class PiezoWatch:
             )
 
     def judge(self) -> None:
-        """Take its answer, if it has come: SAFE where a stack is not as told, or at the second bad one."""
+        """Take its answer, if it has come."""
         answer = self._answer
         if answer is None or not answer.done():
             return
         self._answer = None
+        self.take(answer)
+
+    def take(self, answer: Future[PiezoReading]) -> None:
+        """Judge an answer: SAFE where a stack is not as told, or at the second bad one."""
         error, told_v = answer.exception(), self._loop.stages.take_told_range()
         if error is None:
             reading = answer.result()
             self._loop.measured.of_piezo(reading)
             self._record(reading)
             error = disagreement(reading, self._settings, *told_v)
+        else:
+            self._record(failure_record(self._clock.now_s(), self._loop.name, "piezo", error))
         before, self.error = self.error, "" if error is None else told(error)
         if error is None:
             return

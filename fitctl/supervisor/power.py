@@ -1,17 +1,18 @@
-"""Opening and closing all devices of some loops: slow work, done by the executor."""
+"""Opening and closing all devices of some loops: slow work, done by the executor; and how errors are told."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.drivers.interface import DeviceError, DeviceIdentity, Devices
+from fitctl.logging.records import DeviceFailure, FailingDevice
 from fitctl.supervisor.servo import SiderostatServo
 
-CAMERA = "camera"
+CAMERA: Final = "camera"
 ClosedBadly = Callable[[str, Exception], None]
 
 
@@ -78,3 +79,12 @@ def close_devices(
 def told(error: BaseException) -> str:
     """A device's error tells itself; any other is told with its type."""
     return str(error) if isinstance(error, DeviceError) else repr(error)
+
+
+def failure_record(
+    now_s: float, loop_name: str, device: FailingDevice, error: BaseException
+) -> DeviceFailure:
+    """For the log: which device, and its error."""
+    return DeviceFailure(
+        time_s=now_s, loop=loop_name, device=device, kind=type(error).__name__, error=told(error)
+    )

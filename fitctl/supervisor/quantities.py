@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from fitctl.config import Rig
 from fitctl.controllers.centroid import Star
 from fitctl.drivers.interface import Frame, ServoReading
 from fitctl.logging.records import LoopTiming, PiezoReading
 from fitctl.supervisor.interlocks import Reading
-from fitctl.supervisor.servo import SiderostatServo
+from fitctl.supervisor.servo import ServoState
 from fitctl.supervisor.stages import Stages
 
 
@@ -27,6 +29,7 @@ class Quantities:
         self._delay_s = rig.camera.frame_delay_s
         self._star_flux_dn = loop.star_flux_dn
         self._range_rad = loop.fsm.range_rad
+        self._servo_period_s = 1.0 / loop.siderostat.servo.rate_hz
         self._velocity_limit_rad_s = loop.siderostat.velocity_limit_rad_s
         self._limit_v = loop.fsm.piezo.limit_v
         self._exposed_s: float | None = None
@@ -52,7 +55,7 @@ class Quantities:
         if star is not None:
             readings["star_flux_fraction"] = (star.flux_dn / self._star_flux_dn, now_s, "")
 
-    def of_stages(self, servo: SiderostatServo, stages: Stages, now_s: float) -> None:
+    def of_stages(self, servo: ServoState, stages: Stages, now_s: float) -> None:
         """Where mirror and siderostat are, and how their devices are."""
         readings = self.readings
         az_rad, el_rad = stages.mirror_rad.tolist()
@@ -66,12 +69,11 @@ class Quantities:
         readings["amplifier_fault"] = (
             (0.0, now_s, "") if fault is None else (1.0, now_s, str(fault))
         )
-        periods = servo.round_trip_s / servo.period_s
+        periods = servo.round_trip_s / self._servo_period_s
         readings["amplifier_round_trip_periods"] = (periods, now_s, "")
-        following_rad = servo.take_following_rad()
-        if following_rad is not None:
-            readings["following_error_rad"] = (following_rad, now_s, "")
-        reading, before = servo.newest_reading, self._read
+        if not math.isnan(servo.following_rad):
+            readings["following_error_rad"] = (servo.following_rad, now_s, "")
+        reading, before = servo.reading, self._read
         if reading is None or reading is before:
             return
         self._read = reading

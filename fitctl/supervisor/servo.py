@@ -50,6 +50,29 @@ class ServoTiming(NamedTuple):
     skipped: int
 
 
+class ServoState(NamedTuple):
+    """The servo as one tick takes it.
+
+    Attributes
+    ----------
+    position_rad : array, shape (2,)
+        Motor angles as last read.
+    reading : ServoReading or None
+        What the amplifiers said last; None if nothing since they were opened.
+    fault : DeviceError or None
+    following_rad : float
+        The least following error since last asked; NaN where the motors followed nothing.
+    round_trip_s : float
+        Of the last exchange with the amplifiers.
+    """
+
+    position_rad: Floats
+    reading: ServoReading | None
+    fault: DeviceError | None
+    following_rad: float
+    round_trip_s: float
+
+
 class SiderostatServo:
     """One loop's siderostat.
 
@@ -107,7 +130,7 @@ class SiderostatServo:
         self.late_s: deque[float] = deque(maxlen=4096)
         self.skipped = 0
         self.round_trip_s = 0.0
-        self._least_following_rad: float | None = None
+        self._least_following_rad = math.nan
 
     # ------------------------------------------------------------ from any thread
 
@@ -127,23 +150,19 @@ class SiderostatServo:
         self._stopped = True
         self._wish_rad = None
 
-    def hold(self) -> None:
-        """Servo about where the motors are now."""
-        self.move_to(self.position_rad)
+    def hold(self, position_rad: Floats) -> None:
+        """Servo about where the motors are, shape (2,), by their newest reading."""
+        self.move_to(position_rad)
         self._stopped = False
 
-    @property
-    def newest_reading(self) -> ServoReading | None:
-        """What the amplifiers said last."""
+    def look(self) -> ServoState:
+        """How it is now; the following error is taken anew from here on."""
+        following_rad, self._least_following_rad = self._least_following_rad, math.nan
         try:
-            return self._history[-1]
+            reading = self._history[-1]
         except IndexError:  # none since it was opened
-            return None
-
-    def take_following_rad(self) -> float | None:
-        """The least following error since last asked; None where the motors followed nothing."""
-        least, self._least_following_rad = self._least_following_rad, None
-        return least
+            reading = None
+        return ServoState(self.position_rad, reading, self.fault, following_rad, self.round_trip_s)
 
     def position_at(self, time_s: float) -> Floats:
         """Motor angles at a recent time, shape (2,), interpolated between readings."""
@@ -228,8 +247,7 @@ class SiderostatServo:
             self._servo.reset(reading.position_rad)
             return
         following_rad = self._servo.following_error_rad(reading.position_rad)
-        least_rad = self._least_following_rad
-        if least_rad is None or following_rad < least_rad:
+        if not self._least_following_rad <= following_rad:  # not a number fails this too
             self._least_following_rad = following_rad
         if following_rad <= self._settings.following_error_limit_rad:
             self._followed_s = reading.time_s

@@ -7,12 +7,14 @@ may take longer than a tick (opening, closing and polling devices) is handed to 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from functools import partial
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from fitctl.clock import Clock
@@ -26,9 +28,12 @@ from fitctl.drivers.interface import (
 )
 from fitctl.logging.records import (
     AnyRecord,
+    CommandRecord,
+    DevicesOpened,
     Event,
     FrameRecord,
     LoopTiming,
+    QuantityReading,
     Severity,
 )
 from fitctl.supervisor.drives import refused_drives
@@ -119,12 +124,13 @@ class Supervisor:
         self._record = record
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
         self._notes: deque[tuple[Severity, str, str]] = deque()
+        self._measured: deque[QuantityReading] = deque()
         self._job: Job | None = None
         self._opening: set[str] = set()
         self._abandoned: set[str] = set()
         self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
-        self._piezos = {
+        self.piezos = {
             name: PiezoWatch(loop, devices.loops[name].piezo, clock, executor, record)
             for name, loop in self.loops.items()
         }
@@ -150,10 +156,9 @@ class Supervisor:
         self._notes.append((severity, source, message))
 
     def measured(self, name: str, value: float) -> None:
-        """A quantity of all loops, for their interlocks; from any thread."""
-        now_s = self._clock.now_s()
-        for loop in self.loops.values():
-            loop.measured.put(name, value, now_s)
+        """Leave a quantity of all loops, for their interlocks, for the next step; from any thread."""
+        reading = QuantityReading(time_s=self._clock.now_s(), name=name, value=value)
+        self._measured.append(reading)
 
     @property
     def periodic(self) -> list[Periodic]:
@@ -168,9 +173,13 @@ class Supervisor:
         self._finish_jobs()
         while self._commands:
             command, reply = self._commands.popleft()
-            reply(self._obey(command))
+            answer = self._obey(command)
+            self._log_command(command, answer)
+            reply(answer)
         while self._notes:
             self._event(*self._notes.popleft())
+        while self._measured:
+            self._take_measured(self._measured.popleft())
         lost = self._devices.camera.counts().lost if self._camera_ready else 0
         for loop in self.loops.values():
             was_safe = loop.mode is Mode.SAFE
@@ -192,7 +201,7 @@ class Supervisor:
                 )
             )
         if self._job is None:
-            for name, piezo in self._piezos.items():
+            for name, piezo in self.piezos.items():
                 if self.loops[name].stages.ready:
                     piezo.ask()
         if self._clock.now_s() - self._reported_s >= 1.0:
@@ -202,6 +211,7 @@ class Supervisor:
         """Every loop to SAFE."""
         for loop in self.loops.values():
             loop.fire(Trigger.STOP, reason)
+        self._log_command(Stop(), Reply(accepted=True, text=reason))
 
     def at_rest(self) -> bool:
         """Every mirror that can still be commanded is at its bias."""
@@ -247,9 +257,31 @@ class Supervisor:
     def _camera_lost(self, error: DeviceError) -> None:
         self._camera_ready = False
         for loop in self.loops.values():
-            loop.fail(str(error))
+            loop.device_failed(CAMERA, error)
 
     # ------------------------------------------------------------ commands
+
+    def _log_command(self, command: AnyCommand, answer: Reply) -> None:
+        if isinstance(command, SequenceReport):
+            return  # of a program about itself; what it does to the rig comes as commands of their own
+        arguments = msgspec.structs.asdict(command)
+        del arguments["version"], arguments["loop"]
+        self._record(
+            CommandRecord(
+                time_s=self._clock.now_s(),
+                loop=command.loop,
+                command=type(command).__name__,
+                arguments_json=msgspec.json.encode(arguments).decode(),
+                sender="",
+                accepted=answer.accepted,
+                text=answer.text,
+            )
+        )
+
+    def _take_measured(self, reading: QuantityReading) -> None:
+        for loop in self.loops.values():
+            loop.measured.put(reading.name, reading.value, reading.time_s)
+        self._record(reading)
 
     def _named(self, command: AnyCommand) -> list[str]:
         return [name for name in self.loops if command.loop in {"", name}]
@@ -353,7 +385,7 @@ class Supervisor:
     def _open(self, names: list[str], trigger: Trigger) -> None:
         for name in names:
             self.loops[name].stages.ready = False
-            self._piezos[name].forget()
+            self.piezos[name].forget()
         self._opening, self._abandoned = set(names), set()
         self._event("info", "supervisor", "opening and checking all devices")
         with_camera = not self._camera_well
@@ -367,6 +399,7 @@ class Supervisor:
     ) -> None:
         abandoned, self._opening, self._abandoned = bool(self._abandoned), set(), set()
         error = future.exception()
+        self._log_opened(names, None if error else future.result(), told(error) if error else "")
         if error is not None:
             self._event("error", "supervisor", f"{trigger.name.lower()} failed: {told(error)}")
             self._close(names, with_camera)
@@ -383,10 +416,25 @@ class Supervisor:
         for name in names:
             loop = self.loops[name]
             loop.start_from(opened.stack_v[name])
-            self._piezos[name].begin()
+            self.piezos[name].begin()
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
             self.servos[name].take_timing()
             loop.fire(trigger, "all devices open, checked and enabled")
+
+    def _log_opened(self, names: list[str], opened: Opened | None, error: str) -> None:
+        for name in names:
+            v1, v2, v3 = [math.nan] * 3 if opened is None else opened.stack_v[name].tolist()
+            self._record(
+                DevicesOpened(
+                    time_s=self._clock.now_s(),
+                    loop=name,
+                    stack1_v=v1,
+                    stack2_v=v2,
+                    stack3_v=v3,
+                    encoders_jumped=self.servos[name].encoders_jumped,
+                    error=error,
+                )
+            )
 
     def _turn_off(self, names: list[str]) -> None:
         for name in names:
@@ -422,7 +470,7 @@ class Supervisor:
         while self._designs and self._designs[0].future.done():
             design = self._designs.popleft()
             design.done(design.future)
-        for piezo in self._piezos.values():
+        for piezo in self.piezos.values():
             piezo.judge()
 
     # ------------------------------------------------------------ once a second
@@ -441,7 +489,7 @@ class Supervisor:
         counts = self._devices.camera.counts()
         self._record(camera_health(self.rig, counts, self._camera_well, self._identities, now_s))
         for name, loop in self.loops.items():
-            trouble = self._piezos[name].error
+            trouble = self.piezos[name].error
             loop.measured.of_piezo_error(trouble, now_s)
             for row in loop_health(loop, trouble, self._identities, now_s):
                 self._record(row)

@@ -75,14 +75,14 @@ def run(servo, periods):
 def test_enabling_moves_nothing(servo, amplifiers):
     amplifiers.position_rad = (3.0, -2.0)
     run(servo, 50)
-    servo.hold()
+    servo.hold(servo.position_rad)
     run(servo, 50)
 
     assert np.all(np.array(amplifiers.commands) == 0)
 
 
 def test_a_set_point_is_reached_and_held(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     servo.move_to(np.array([0.5, -0.25]))
     run(servo, 100)
 
@@ -90,7 +90,7 @@ def test_a_set_point_is_reached_and_held(servo, amplifiers):
 
 
 def test_velocity_and_acceleration_stay_within_the_rigs_limits(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     for step in range(100):
         servo.move_to(np.array([step * 1.0, 0.0]))
         run(servo, 10)
@@ -101,7 +101,7 @@ def test_velocity_and_acceleration_stay_within_the_rigs_limits(servo, amplifiers
 
 
 def test_stop_means_velocity_zero_in_the_very_next_period(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     servo.move_to(np.array([1.0, 1.0]))
     run(servo, 5)
     assert amplifiers.commands[-1] != (0.0, 0.0)
@@ -113,7 +113,7 @@ def test_stop_means_velocity_zero_in_the_very_next_period(servo, amplifiers):
 
 
 def test_a_set_point_after_a_stop_does_nothing_until_hold(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     servo.stop()
     servo.move_to(np.array([1.0, 1.0]))
     run(servo, 20)
@@ -122,7 +122,7 @@ def test_a_set_point_after_a_stop_does_nothing_until_hold(servo, amplifiers):
 
 
 def test_a_missing_reading_is_bridged_and_many_are_a_fault(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     amplifiers.silent = True
     run(servo, 10)
     assert servo.fault is None
@@ -134,7 +134,7 @@ def test_a_missing_reading_is_bridged_and_many_are_a_fault(servo, amplifiers):
 
 
 def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     servo.move_to(np.array([0.9, 0.0]))
     run(servo, 5)
     amplifiers.silent = True
@@ -151,7 +151,7 @@ def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
 @pytest.mark.parametrize(("late_s", "period_s"), [(0.1, 0.002), (0.2, 0.5)])
 def test_readings_too_old_to_servo_by_are_no_readings(servo, amplifiers, late_s, period_s):
     """Late on a wire that is asked again meanwhile, or on one whose every answer is waited for."""
-    servo.hold()
+    servo.hold(servo.position_rad)
     amplifiers.late_s, amplifiers.period_s = late_s, period_s
     servo.period()
     servo.move_to(np.array([3.0, 0.0]))
@@ -179,7 +179,7 @@ def test_an_axis_that_disables_itself_is_a_fault(servo, amplifiers):
 
 
 def test_a_stuck_axis_shows_as_following_error(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     amplifiers.stuck = True
     servo.move_to(np.array([3.0, 0.0]))
     run(servo, 60)
@@ -189,7 +189,7 @@ def test_a_stuck_axis_shows_as_following_error(servo, amplifiers):
 
 @pytest.mark.parametrize("trouble", ["fault", "stuck", "surprise"])
 def test_after_any_fault_the_motors_keep_being_told_to_stand_still(servo, amplifiers, trouble):
-    servo.hold()
+    servo.hold(servo.position_rad)
     servo.move_to(np.array([3.0, 0.0]))
     run(servo, 10)
     assert amplifiers.commands[-1] != (0.0, 0.0)
@@ -226,7 +226,7 @@ def test_nothing_is_powered_before_its_position_has_been_read(amplifiers):
     amplifiers.readings_until_heard = 30
     servo = SiderostatServo("right", rig.loops["right"], amplifiers, amplifiers.clock, 0.02)
     servo.open()
-    servo.hold()
+    servo.hold(servo.position_rad)
     run(servo, 100)
 
     assert np.all(np.array(amplifiers.commands) == 0)
@@ -253,7 +253,7 @@ def test_encoders_that_jumped_while_nobody_looked_are_noticed(servo, amplifiers)
 
 
 def test_a_reversal_at_full_speed_is_no_following_error(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     for target in (1.0, 2.0, 0.0, 2.0, 0.0):
         servo.move_to(np.array([target, -target]))
         run(servo, 15)
@@ -274,7 +274,7 @@ def test_a_disable_that_fails_shows_as_a_fault(servo, amplifiers, monkeypatch):
 
 
 def test_position_at_a_past_time_is_interpolated(servo, amplifiers):
-    servo.hold()
+    servo.hold(servo.position_rad)
     servo.move_to(np.array([0.5, 0.0]))
     run(servo, 12)
     before, after = servo._history[-3], servo._history[-2]
