@@ -180,6 +180,18 @@ class SequenceAttempt(Record, frozen=True, kw_only=True):
     figures_json: str
 
 
+class CommandRecord(Record, frozen=True, kw_only=True):
+    """A command and its answer: who gave it, from where, and its values as JSON."""
+
+    sender: str
+    address: str
+    command: str
+    loop: str
+    values_json: str
+    accepted: bool
+    text: str
+
+
 AnyRecord = (
     RunInfo
     | Tick
@@ -193,6 +205,7 @@ AnyRecord = (
     | LoopTiming
     | RecorderStatus
     | SequenceAttempt
+    | CommandRecord
 )
 
 

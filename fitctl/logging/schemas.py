@@ -21,6 +21,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from fitctl.logging.records import (
     AnyRecord,
+    CommandRecord,
     DeviceHealth,
     Event,
     ExperimentStart,
@@ -47,6 +48,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     DeviceHealth: "/fit/devices/health",
     RecorderStatus: "/fit/recorder/status",
     SequenceAttempt: "/fit/sequence/attempts",
+    CommandRecord: "/fit/commands",
 }
 """RunInfo is missing because it is kept as metadata: see :func:`run_metadata`."""
 

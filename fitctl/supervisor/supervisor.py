@@ -118,7 +118,7 @@ class Supervisor:
         self._executor = executor
         self._record = record
         self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
-        self._notes: deque[tuple[Severity, str, str]] = deque()
+        self._left: deque[AnyRecord] = deque()
         self._job: Job | None = None
         self._opening: set[str] = set()
         self._abandoned: set[str] = set()
@@ -147,7 +147,12 @@ class Supervisor:
 
     def note(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
-        self._notes.append((severity, source, message))
+        now_s = self._clock.now_s()
+        self.leave(Event(time_s=now_s, severity=severity, source=source, message=message))
+
+    def leave(self, record: AnyRecord) -> None:
+        """Leave a record for the next step, from any thread."""
+        self._left.append(record)
 
     def measured(self, name: str, value: float) -> None:
         """A quantity of all loops, for their interlocks; from any thread."""
@@ -169,8 +174,8 @@ class Supervisor:
         while self._commands:
             command, reply = self._commands.popleft()
             reply(self._obey(command))
-        while self._notes:
-            self._event(*self._notes.popleft())
+        while self._left:
+            self._record(self._left.popleft())
         lost = self._devices.camera.counts().lost if self._camera_ready else 0
         for loop in self.loops.values():
             was_safe = loop.mode is Mode.SAFE
