@@ -8,13 +8,14 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 from typer.exceptions import TyperException
 
-from fitctl.commands import log, sequence
-from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
+from fitctl.commands import keys, log, sequence
+from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SeedOption, SetOption
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
@@ -36,6 +37,7 @@ fault = typer.Typer(help="Make something go wrong with running mock devices.", n
 app.add_typer(fault, name="fault")
 app.add_typer(log.app, name="log")
 app.add_typer(sequence.app, name="sequence")
+app.add_typer(keys.app, name="keys")
 
 ControllerOption = Annotated[
     str | None,
@@ -234,36 +236,48 @@ def run(
 def console(
     rig: RigOption = None,
     overrides: SetOption = None,
+    remote: RemoteOption = None,
     quitting_ends_instrument: Annotated[
         bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
     ] = False,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig."""
+    from fitctl.commands.connecting import connect
     from fitctl.commands.instrument import run_console
 
-    run_console(_rig(rig, overrides), quitting_ends_instrument=quitting_ends_instrument)
+    client = connect(rig, overrides, remote)
+    run_console(client, quitting_ends_instrument=quitting_ends_instrument)
 
 
-@app.command()
+class _SendCommand(TyperCommand):
+    """Its help ends with every command, from the table that they are made from."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        from fitctl.supervisor.command_table import WORDS
+
+        with formatter.section("Commands"):
+            formatter.write_dl([(row.usage, row.help) for row in WORDS.values()])
+
+
+@app.command(cls=_SendCommand)
 def send(
-    command: Annotated[
-        str,
-        typer.Argument(
-            help="standby, acquire, hold, stop, recover, off, status, shutdown, "
-            "target AZ_PX EL_PX or controller NAME."
-        ),
-    ],
-    values: Annotated[
-        list[str] | None, typer.Argument(help="What target and controller need.")
-    ] = None,
+    command: Annotated[str, typer.Argument(help="One of those below.")],
+    values: Annotated[list[str] | None, typer.Argument(help="What it needs.")] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
+    remote: RemoteOption = None,
     loop: Annotated[str, typer.Option(help="One loop by name; without it, all.")] = "",
 ) -> None:
     """Give one command to the running supervisor of a rig."""
+    from fitctl.commands.connecting import connect
     from fitctl.commands.instrument import send_command
+    from fitctl.supervisor.command_table import command_of
 
-    raise typer.Exit(send_command(_rig(rig, overrides), command, values or [], loop))
+    wanted = command_of(command, values or [], loop)
+    if remote is None and loop and loop not in (loops := _rig(rig, overrides).loops):
+        msg = f"send: --loop {loop!r}: the rig has {', '.join(loops)}"
+        raise ConfigError(msg)
+    raise typer.Exit(send_command(connect(rig, overrides, remote), wanted))
 
 
 @app.command()

@@ -30,12 +30,13 @@ from documents import (
 
 from fitctl.cli import app
 from fitctl.commands.fault import kinds as fault_kinds
-from fitctl.commands.instrument import command_of
 from fitctl.config import default_rig_path, load_rig, rig_from_document
 from fitctl.logging.records import RecorderStatus
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.logging.writer import LogWriter
 from fitctl.mocks.faults import WIRE_FAULTS
+from fitctl.supervisor.command_table import COMMANDS as COMMAND_ROWS
+from fitctl.supervisor.command_table import command_of
 from fitctl.supervisor.messages import Acquire, Shutdown, Status
 from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
 from fitctl.supervisor.run import run_info
@@ -135,8 +136,7 @@ def test_every_command_exists_with_its_options(found):
 
 def sent_command(words):
     options = parsed("send", words)
-    rig = load_rig(default_rig_path())
-    return command_of(rig, options["command"], options["values"] or [], options["loop"])
+    return command_of(options["command"], options["values"] or [], options["loop"])
 
 
 def masked(lines):
@@ -267,6 +267,18 @@ def test_the_console_keys_are_those_of_the_console():
     rows = [[f"`{command.key}`", command.label, command.help] for command in OPERATOR_COMMANDS]
 
     assert between("operating.md", "keys") == table(["key", "command", "what it does"], rows)
+
+
+def test_the_commands_are_those_of_the_table():
+    rows = [
+        [f"`{row.usage}`", row.help, row.needs, f"`{row.key}`" if row.key else ""]
+        for row in COMMAND_ROWS
+        if row.word
+    ]
+
+    assert between("remote.md", "commands") == table(
+        ["`fitctl send`", "what it does", "needs", "console key"], rows
+    )
 
 
 def test_the_faults_are_those_of_the_mocks():

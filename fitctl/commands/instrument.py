@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgspec
 import numpy as np
 import typer
 import zmq
@@ -35,31 +34,6 @@ from fitctl.supervisor.messages import Telemetry
 FAILED = 1
 _REPORT_TIMEOUT_S = 0.5
 _CONSOLE_END_S = 3.0
-
-COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
-    "standby": messages.Standby,
-    "acquire": messages.Acquire,
-    "hold": messages.Hold,
-    "stop": messages.Stop,
-    "recover": messages.Recover,
-    "off": messages.Off,
-    "status": messages.Status,
-    "shutdown": messages.Shutdown,
-}
-
-
-class WithValues(NamedTuple):
-    """A command that needs values, and their names in the order in which they are given."""
-
-    make: type[messages.SetTarget | messages.SetController | messages.Reset]
-    fields: tuple[str, ...]
-
-
-WITH_VALUES = {
-    "target": WithValues(messages.SetTarget, ("az_px", "el_px")),
-    "controller": WithValues(messages.SetController, ("name",)),
-    "reset": WithValues(messages.Reset, ("name",)),
-}
 
 
 # ---------------------------------------------------------------- demo
@@ -278,49 +252,17 @@ def run_recorder(rig: Rig, *, parent_pid: int | None) -> None:
 # ---------------------------------------------------------------- a running instrument
 
 
-def run_console(rig: Rig, *, quitting_ends_instrument: bool) -> None:
+def run_console(client: Client, *, quitting_ends_instrument: bool) -> None:
     """Attach a console."""
     from fitctl.tui.app import ConsoleApp
 
-    app = ConsoleApp(Client(service_folder(rig)), quit_shuts_down=quitting_ends_instrument)
+    app = ConsoleApp(client, quit_shuts_down=quitting_ends_instrument, clock=client.now_s)
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     app.run()
 
 
-def command_of(rig: Rig, name: str, values: Sequence[str], loop: str) -> messages.AnyCommand:
-    """The command that words on a command line ask for.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such command or loop, or its values are not what it needs.
-    """
-    if loop and loop not in rig.loops:
-        msg = f"send: --loop {loop!r}: rig {rig.name} has {', '.join(rig.loops)}"
-        raise ConfigError(msg)
-    if name not in COMMANDS | WITH_VALUES:
-        msg = f"send: {name} is no command; there are {', '.join(COMMANDS | WITH_VALUES)}"
-        raise ConfigError(msg)
-    fields = WITH_VALUES[name].fields if name in WITH_VALUES else ()
-    if len(values) != len(fields):
-        needs = " ".join(fields) or "no values"
-        msg = f"send: {name} needs {needs} (is {' '.join(values) or 'nothing'})"
-        raise ConfigError(msg)
-    if name in COMMANDS:
-        return COMMANDS[name](loop=loop)
-    given: dict[str, object] = dict(zip(fields, values, strict=True))
-    try:
-        # Numbers come as text here; msgspec reads them, and checks what they may be.
-        return msgspec.convert(given | {"loop": loop}, WITH_VALUES[name].make, strict=False)
-    except msgspec.ValidationError as error:
-        msg = f"send: {name} {' '.join(values)}: {error}"
-        raise ConfigError(msg) from None
-
-
-def send_command(rig: Rig, name: str, values: Sequence[str], loop: str) -> int:
+def send_command(client: Client, command: messages.AnyCommand) -> int:
     """Give one command and print the answer; returns the exit status."""
-    command = command_of(rig, name, values, loop)
-    client = Client(service_folder(rig))
     try:
         reply = client.send(command)
     except ConnectionError as error:

@@ -17,6 +17,12 @@ SetOption = Annotated[
         "--set", metavar="KEY=VALUE", help="Replace a value of the rig file; may be repeated."
     ),
 ]
+RemoteOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--remote", metavar="FILE", help="A key file: the rig is on another machine that knows it."
+    ),
+]
 SeedOption = Annotated[
     int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
 ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 import typer
 
-from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
+from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SeedOption, SetOption
 from fitctl.config import Rig, default_rig_path, load_rig
 
 if TYPE_CHECKING:
@@ -81,14 +81,16 @@ def run(
     file: SequenceArgument,
     rig: RigOption = None,
     overrides: SetOption = None,
+    remote: RemoteOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
     from fitctl.supervisor.client import Client
     from fitctl.supervisor.endpoints import service_folder
+    from fitctl.supervisor.keys import read_key_of
 
     settings, sequence = _load(file, rig, overrides)
-    client = Client(service_folder(settings))
+    client = Client(service_folder(settings) if remote is None else read_key_of(settings, remote))
     try:
         status = _run(settings, sequence, client, as_json=as_json)
     finally:
@@ -97,31 +99,33 @@ def run(
 
 
 @app.command()
-def pause(rig: RigOption = None, overrides: SetOption = None) -> None:
+def pause(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
     """Pause the sequence that is running: after its step, or at once within hold and wait."""
-    _steer("pause", rig, overrides)
+    _steer("pause", rig, overrides, remote)
 
 
 @app.command()
-def resume(rig: RigOption = None, overrides: SetOption = None) -> None:
+def resume(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
     """Let a paused sequence go on."""
-    _steer("resume", rig, overrides)
+    _steer("resume", rig, overrides, remote)
 
 
 @app.command()
-def stop(rig: RigOption = None, overrides: SetOption = None) -> None:
+def stop(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
     """End the sequence that is running; its stages are held. For SAFE, see `fitctl send stop`."""
-    _steer("stop", rig, overrides)
+    _steer("stop", rig, overrides, remote)
 
 
 def _steer(
-    action: Literal["pause", "resume", "stop"], rig: Path | None, overrides: list[str] | None
+    action: Literal["pause", "resume", "stop"],
+    rig: Path | None,
+    overrides: list[str] | None,
+    remote: Path | None,
 ) -> None:
-    from fitctl.supervisor.client import Client
-    from fitctl.supervisor.endpoints import service_folder
+    from fitctl.commands.connecting import connect
     from fitctl.supervisor.messages import SequenceControl
 
-    client = Client(service_folder(load_rig(rig or default_rig_path(), overrides or ())))
+    client = connect(rig, overrides, remote)
     try:
         reply = client.send(SequenceControl(action=action))
     except ConnectionError as error:

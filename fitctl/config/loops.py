@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ipaddress import ip_address
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
@@ -126,9 +127,33 @@ class Supervisor(Settings):
 
 
 class Service(Settings):
-    """Where the supervisor's sockets live."""
+    """Where the supervisor can be reached, by whom, and how often; an empty address is none."""
 
     folder: str
+    lease_s: Annotated[float, Field(ge=10, le=3600)]
+    commands_per_s: Annotated[float, Field(ge=5, le=1000)]
+    tcp_address: str
+    command_port: Annotated[int, Field(ge=1, le=65535)]
+    telemetry_port: Annotated[int, Field(ge=1, le=65535)]
+    keys_folder: str
+
+    @field_validator("tcp_address")
+    @classmethod
+    def _address(cls, text: str) -> str:
+        if text:
+            try:
+                ip_address(text)
+            except ValueError:
+                msg = 'must be an address of this machine, such as "10.0.0.5", or "0.0.0.0" for all, or empty'
+                raise ValueError(msg) from None
+        return text
+
+    @model_validator(mode="after")
+    def _two_ports(self) -> Service:
+        if self.command_port == self.telemetry_port:
+            msg = "telemetry_port must differ from command_port"
+            raise ValueError(msg)
+        return self
 
 
 class Logging(Settings):

@@ -106,12 +106,13 @@ class ModeChange(Record, frozen=True, kw_only=True):
 
 
 class CommandRecord(Record, frozen=True, kw_only=True):
-    """A command that came to the loop, from whom, and how it was answered; an empty loop is all loops."""
+    """A command and its answer: who gave it, from where, and its values as JSON; an empty loop is all loops."""
 
-    loop: str
-    command: str
-    arguments_json: str
     sender: str
+    address: str
+    command: str
+    loop: str
+    values_json: str
     accepted: bool
     text: str
 
@@ -247,7 +248,6 @@ AnyRecord = (
     | Tick
     | FrameRecord
     | ModeChange
-    | CommandRecord
     | DevicesOpened
     | DeviceFailure
     | ControllerChange
@@ -260,6 +260,7 @@ AnyRecord = (
     | LoopTiming
     | RecorderStatus
     | SequenceAttempt
+    | CommandRecord
 )
 
 

@@ -44,7 +44,6 @@ TOPICS: dict[type[AnyRecord], str] = {
     Tick: "/fit/{loop}/tick",
     FrameRecord: "/fit/camera/frame",
     ModeChange: "/fit/{loop}/mode",
-    CommandRecord: "/fit/commands",
     ControllerChange: "/fit/{loop}/controller",
     DevicesOpened: "/fit/{loop}/opened",
     DeviceFailure: "/fit/{loop}/failure",
@@ -57,6 +56,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     DeviceHealth: "/fit/devices/health",
     RecorderStatus: "/fit/recorder/status",
     SequenceAttempt: "/fit/sequence/attempts",
+    CommandRecord: "/fit/commands",
 }
 """RunInfo is missing because it is kept as metadata: see :func:`run_metadata`."""
 

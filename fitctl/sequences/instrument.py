@@ -23,6 +23,7 @@ from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import Figures, SequenceError
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import service_folder
+from fitctl.supervisor.keys import RemoteKey, read_key_of
 from fitctl.supervisor.messages import AnyCommand, Reply, Status, Stop, Telemetry
 
 NAME = "python"  # under which consoles see steps that a program runs
@@ -43,13 +44,15 @@ class Instrument(StepMethods[Figures]):
         On the virtual clock, in this process; otherwise the rig's running supervisor works.
     folder : path, optional
         The supervisor's socket folder, where it is not the one that the rig file says.
+    remote : path, optional
+        A key file, for a rig on another machine.
     seed : int
         Of a simulation.
 
     Raises
     ------
     ConfigError
-        If the rig file cannot be used.
+        If the rig file or the key file cannot be used.
     ConnectionError
         If no supervisor answers.
     """
@@ -60,6 +63,7 @@ class Instrument(StepMethods[Figures]):
         *,
         simulate: bool = False,
         folder: Path | str | None = None,
+        remote: Path | str | None = None,
         seed: int = 0,
     ) -> None:
         self.rig = rig if isinstance(rig, Rig) else load_rig(Path(rig or default_rig_path()))
@@ -70,7 +74,7 @@ class Instrument(StepMethods[Figures]):
             self.rig.mock_parts()
             self._link = SimulatedLink(self.rig, seed)
         else:
-            self._client = Client(service_folder(self.rig) if folder is None else Path(folder))
+            self._client = Client(_where(self.rig, folder, remote))
             self._link = self._client
             try:
                 self._client.send(Status())
@@ -141,6 +145,12 @@ class Instrument(StepMethods[Figures]):
             self._runner.contact.stop_wanted.set()
 
 
+def _where(rig: Rig, folder: Path | str | None, remote: Path | str | None) -> Path | RemoteKey:
+    if remote is not None:
+        return read_key_of(rig, Path(remote))
+    return service_folder(rig) if folder is None else Path(folder)
+
+
 def _figures(runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
     """Run steps; the figures of each, NaN where a value could not be had."""
     done = [attempt for attempt in run_steps(runner, todo) if attempt.outcome == "done"]
@@ -163,9 +173,12 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         *,
         simulate: bool = False,
         folder: Path | str | None = None,
+        remote: Path | str | None = None,
         seed: int = 0,
     ) -> None:
-        self._make = lambda: Instrument(rig, simulate=simulate, folder=folder, seed=seed)
+        self._make = lambda: Instrument(
+            rig, simulate=simulate, folder=folder, remote=remote, seed=seed
+        )
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="instrument")
         self._blocking: Instrument | None = None
 

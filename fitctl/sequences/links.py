@@ -7,8 +7,8 @@ from typing import Protocol
 
 from fitctl.config import Rig
 from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
-from fitctl.supervisor.service import ServiceState, TelemetryBuffer
 from fitctl.supervisor.simulate import Simulation
+from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 
 class Link(Protocol):

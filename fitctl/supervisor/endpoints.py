@@ -43,6 +43,11 @@ def _own_folder() -> Path:
     return Path(tempfile.gettempdir()) / f"fitctl-{os.getuid()}"
 
 
+def tcp_endpoint(host: str, port: int) -> str:
+    """As ZeroMQ writes it."""
+    return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+
 def make_service_folder(rig: Rig) -> Path:
     """Make the folder, mode 0700.
 

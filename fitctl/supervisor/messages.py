@@ -1,7 +1,11 @@
-"""What travels between the supervisor and its consoles: one schema for commands, replies and telemetry."""
+"""What travels between the supervisor and its consoles: one schema for commands, replies and telemetry.
+
+:mod:`fitctl.supervisor.command_table` says of each command how people call it and who may give it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import msgspec
@@ -21,6 +25,7 @@ from fitctl.logging.records import (
 from fitctl.model.drives import Drive
 
 PROTOCOL_VERSION = 1
+MAX_COMMAND_BYTES = 4096  # what is longer never reaches the supervisor
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
@@ -31,7 +36,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknow
 
 
 class Standby(Command, frozen=True, kw_only=True):
-    """From OFF: connect and enable all devices, then STANDBY."""
+    """From OFF: connect and enable all devices."""
 
 
 class Acquire(Command, frozen=True, kw_only=True):
@@ -39,7 +44,7 @@ class Acquire(Command, frozen=True, kw_only=True):
 
 
 class Hold(Command, frozen=True, kw_only=True):
-    """Stop tracking where the stages are: STANDBY."""
+    """Stop tracking where the stages are."""
 
 
 class Stop(Command, frozen=True, kw_only=True):
@@ -47,11 +52,11 @@ class Stop(Command, frozen=True, kw_only=True):
 
 
 class Recover(Command, frozen=True, kw_only=True):
-    """From SAFE: reconnect what is lost, reset faults, then STANDBY."""
+    """From SAFE: reconnect, reset faults, then STANDBY."""
 
 
 class Off(Command, frozen=True, kw_only=True):
-    """From STANDBY or SAFE: disable the amplifiers and let go of the devices."""
+    """From STANDBY or SAFE: disable amplifiers, let go of devices."""
 
 
 class SetTarget(Command, frozen=True, kw_only=True):
@@ -81,7 +86,11 @@ class Experiment(Command, frozen=True, kw_only=True):
 
 
 class Status(Command, frozen=True, kw_only=True):
-    """Ask for one telemetry message."""
+    """Tell the mode of every loop; from whoever has the instrument, keep it."""
+
+
+class TakeOver(Command, frozen=True, kw_only=True):
+    """Take the instrument over from whoever has it."""
 
 
 class Shutdown(Command, frozen=True, kw_only=True):
@@ -134,6 +143,7 @@ AnyCommand = (
     | Reset
     | Experiment
     | Status
+    | TakeOver
     | Shutdown
     | RecorderReport
     | SequenceReport
@@ -146,6 +156,22 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
     accepted: bool
     text: str = ""
+    time_s: float = 0.0  # the supervisor's monotonic clock, for a client on another machine
+
+
+def decode_command(payload: bytes) -> AnyCommand | Reply:
+    """A command as it came, or the refusal that tells what is wrong with it."""
+    try:
+        command = _decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        return Reply(accepted=False, text=f"not a command: {error}")
+    if command.version != PROTOCOL_VERSION:
+        text = f"this supervisor speaks version {PROTOCOL_VERSION}, not {command.version}"
+        return Reply(accepted=False, text=text)
+    return command
+
+
+_decode: Callable[[bytes], AnyCommand] = msgspec.msgpack.Decoder(AnyCommand).decode
 
 
 class TrippedInterlock(msgspec.Struct, frozen=True, kw_only=True):
@@ -176,6 +202,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """Sent `telemetry_hz` times a second.
 
     Ticks, events and mode changes are those since the last message; of everything else it has the newest.
+    ``commander`` is who has the instrument, empty while nobody has.
     """
 
     version: int = PROTOCOL_VERSION
@@ -196,3 +223,4 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     records_lost: int
     scheduling: str
     running_sequence: SequenceStatus | None = None
+    commander: str = ""

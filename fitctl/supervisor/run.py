@@ -37,9 +37,10 @@ from fitctl.supervisor.realtime import (
     lock_memory,
     quiet_interpreter,
 )
-from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
+from fitctl.supervisor.service import Service
 from fitctl.supervisor.servo import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
+from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 _RECORDER_ERRORS = "recorder.err"
 _HOUSEKEEPING_S = 1.0

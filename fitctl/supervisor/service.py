@@ -1,136 +1,51 @@
-"""The supervisor's door: commands by ROUTER, telemetry by PUB, on Unix sockets that only their owner reads.
+"""The supervisor's service: commands come in by its doors, are admitted or refused, and telemetry goes out.
 
 One thread, so that nothing here can hold the loop: records are left in bounded buffers and picked up
-from there, replies likewise.
+from there, replies likewise. However much comes in, it takes a bounded part of the interpreter.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TypeVar
+from typing import NamedTuple
 
 import msgspec
 import zmq
 
 from fitctl.clock import Clock
-from fitctl.logging.records import (
-    DeviceHealth,
-    Event,
-    FrameRecord,
-    LoopTiming,
-    ModeChange,
-    PiezoReading,
-    Record,
-    RecorderStatus,
-    Tick,
-)
-from fitctl.model.optics import scales
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
+from fitctl.supervisor.admission import Admission, Sender
+from fitctl.supervisor.command_table import ROWS, command_record
+from fitctl.supervisor.doors import FRAMES, Door, KeyedDoor, Parcel, local_door
 from fitctl.supervisor.messages import (
-    PROTOCOL_VERSION,
     AnyCommand,
-    LoopState,
     RecorderReport,
     Reply,
     Status,
-    Telemetry,
+    Stop,
+    TakeOver,
+    decode_command,
 )
-from fitctl.supervisor.modes import usable_commands
 from fitctl.supervisor.supervisor import Supervisor
+from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
-_POLL_MS = 5
-_MAX_COMMAND_BYTES = 4096
-_BUFFERED_TICKS = 2000
-_BUFFERED_EVENTS = 500
-
-T = TypeVar("T")
-
-
-class TelemetryBuffer:
-    """Records on their way to the consoles; filled by the loop, emptied by the service."""
-
-    def __init__(self) -> None:
-        self.frame: FrameRecord | None = None
-        self.recorder: RecorderStatus | None = None
-        self._ticks: deque[Tick] = deque(maxlen=_BUFFERED_TICKS)
-        self._events: deque[Event] = deque(maxlen=_BUFFERED_EVENTS)
-        self._changes: deque[ModeChange] = deque(maxlen=_BUFFERED_EVENTS)
-        self._devices: dict[str, DeviceHealth] = {}
-        self._piezo: dict[str, PiezoReading] = {}
-        self._timing: dict[str, LoopTiming] = {}
-
-    def add(self, record: Record) -> None:
-        """Take one record; never blocks."""
-        match record:
-            case Tick():
-                self._ticks.append(record)
-            case FrameRecord():
-                self.frame = record
-            case Event():
-                self._events.append(record)
-            case ModeChange():
-                self._changes.append(record)
-            case DeviceHealth():
-                self._devices[record.device] = record
-            case PiezoReading():
-                self._piezo[record.loop] = record
-            case LoopTiming():
-                self._timing[record.loop] = record
-            case RecorderStatus():
-                self.recorder = record
-
-    def telemetry(self, supervisor: Supervisor, state: ServiceState, now_s: float) -> Telemetry:
-        """Everything since the last call."""
-        return Telemetry(
-            sequence=state.sequence,
-            time_s=now_s,
-            wall_minus_monotonic_s=state.wall_minus_monotonic_s,
-            rig_name=supervisor.rig.name,
-            pid=state.pid,
-            loops=[
-                LoopState(
-                    name=name,
-                    mode=loop.mode.name,
-                    since_s=loop.mode_since_s,
-                    requirement_px=loop.settings.requirement_px,
-                    sky_arcsec_per_px=scales(supervisor.rig, loop.settings).sky_arcsec_per_px,
-                    usable_commands=[t.name.capitalize() for t in usable_commands(loop.mode)],
-                    controller=loop.controller,
-                    last_change=loop.last_change,
-                    interlocks=list(loop.interlocks.tripped),
-                )
-                for name, loop in supervisor.loops.items()
-            ],
-            ticks=_drain(self._ticks),
-            events=_drain(self._events),
-            mode_changes=_drain(self._changes),
-            frame=self.frame,
-            devices=list(self._devices.values()),
-            piezo=list(self._piezo.values()),
-            timing=list(self._timing.values()),
-            recorder=self.recorder,
-            records_lost=state.records_lost(),
-            scheduling=state.scheduling,
-            running_sequence=supervisor.sequences.status(),
-        )
+SOURCE = "service"  # of its events
+_ROUND_MS = 5
+_FRAMES_A_ROUND = 16 * FRAMES
+_HANDSHAKES_A_ROUND = 8
+_JOINED_STOPS = 1000
+_LOOK_S = 0.25
+_TELL_S = 5.0
 
 
-def _drain(buffer: deque[T]) -> list[T]:
-    return [buffer.popleft() for _ in range(len(buffer))]
+class Waiting(NamedTuple):
+    """Whom an answer is for."""
 
-
-class ServiceState(msgspec.Struct):
-    """What telemetry carries besides records."""
-
-    pid: int
-    wall_minus_monotonic_s: float
-    scheduling: str
-    records_lost: Callable[[], int]
-    sequence: int = 0
+    door: Door
+    parcel: Parcel
 
 
 class Service(threading.Thread):
@@ -141,9 +56,14 @@ class Service(threading.Thread):
     supervisor : Supervisor
     buffer : TelemetryBuffer
     folder : Path
-        Where the sockets are made.
+        Where the Unix sockets are made.
     state : ServiceState
     clock : Clock
+
+    Raises
+    ------
+    ConfigError
+        If the rig's TCP address or its keys cannot be used.
     """
 
     def __init__(
@@ -155,24 +75,32 @@ class Service(threading.Thread):
         clock: Clock,
     ) -> None:
         super().__init__(name="service", daemon=True)
+        settings = supervisor.rig.service
         self._supervisor = supervisor
         self._buffer = buffer
         self._state = state
         self._clock = clock
         self._period_s = 1.0 / supervisor.rig.supervisor.telemetry_hz
         self._ending = threading.Event()
-        self._replies: SimpleQueue[tuple[bytes, bytes, Reply]] = SimpleQueue()
-        self._decode = msgspec.msgpack.Decoder(AnyCommand).decode
+        self._replies: SimpleQueue[tuple[Waiting, Reply, str | None]] = SimpleQueue()
+        self._stops: dict[str, deque[Waiting]] = {}  # by loop: who waits with one that is under way
+        self._dropped: Counter[tuple[str, str]] = Counter()
+        self._tell_s = 0.0
         self._encode = msgspec.msgpack.Encoder().encode
+        self._admission = Admission(settings.lease_s, settings.commands_per_s)
+        self._too_many = Reply(
+            accepted=False,
+            text=f"more than {settings.commands_per_s:g} commands a second; wait, then try again",
+        )
+        self._keyed: KeyedDoor | None = None
+        if settings.tcp_address:
+            self._keyed = KeyedDoor(
+                supervisor.rig, lambda problem: supervisor.note("warning", SOURCE, problem)
+            )
         self._context = zmq.Context()
-        self._router = self._context.socket(zmq.ROUTER)
-        self._router.setsockopt(zmq.MAXMSGSIZE, _MAX_COMMAND_BYTES)
-        self._router.setsockopt(zmq.LINGER, 200)
-        self._router.bind(f"ipc://{folder / COMMAND_SOCKET}")
-        self._publisher = self._context.socket(zmq.PUB)
-        self._publisher.setsockopt(zmq.SNDHWM, 50)
-        self._publisher.setsockopt(zmq.LINGER, 200)
-        self._publisher.bind(f"ipc://{folder / TELEMETRY_SOCKET}")
+        self._doors = [local_door(self._context, folder)]
+        if self._keyed is not None:
+            self._doors.append(self._keyed.door)
 
     def stop(self) -> None:
         """Publish once more, send what replies there are, and end."""
@@ -181,50 +109,114 @@ class Service(threading.Thread):
 
     def run(self) -> None:
         """Serve; this is the thread."""
-        due_s = self._clock.now_s()
+        poller = zmq.Poller()
+        for door in self._doors:
+            poller.register(door.router, zmq.POLLIN)
+        if self._keyed is not None:
+            poller.register(self._keyed.zap, zmq.POLLIN)
+        publish_s = look_s = self._clock.now_s()
         try:
             while not self._ending.is_set():
-                if self._router.poll(_POLL_MS):
-                    self._receive()
+                if poller.poll(_ROUND_MS) and self._serve():
+                    self._ending.wait(_ROUND_MS / 1000)  # more may be there: the loop comes first
                 self._send_replies()
                 now_s = self._clock.now_s()
-                if now_s >= due_s:
+                if now_s >= publish_s:
                     self._publish(now_s)
-                    due_s = max(due_s + self._period_s, now_s)
+                    publish_s = max(publish_s + self._period_s, now_s)
+                if now_s >= look_s:
+                    self._look_after_keys()
+                    self._tell_dropped(now_s)
+                    look_s = now_s + _LOOK_S
             self._send_replies()
             self._publish(self._clock.now_s())
         finally:
-            self._router.close()
-            self._publisher.close()
+            self._doors[0].close()
             self._context.term()
+            if self._keyed is not None:
+                self._keyed.close()
 
-    def _publish(self, now_s: float) -> None:
-        self._publisher.send(self._encode(self._telemetry(now_s)), zmq.NOBLOCK)
+    # ------------------------------------------------------------ commands
 
-    def _telemetry(self, now_s: float) -> Telemetry:
-        self._state.sequence += 1
-        return self._buffer.telemetry(self._supervisor, self._state, now_s)
+    def _serve(self) -> bool:
+        """Take a bounded number of messages from each door; True if one had as many."""
+        if self._keyed is not None:
+            self._keyed.admit(_HANDSHAKES_A_ROUND)
+        busy = False
+        for door in self._doors:
+            parcels, more = door.take(_FRAMES_A_ROUND)
+            for parcel in parcels:
+                self._receive(Waiting(door, parcel))
+            busy = busy or more
+        return busy
 
-    def _receive(self) -> None:
-        parts = self._router.recv_multipart()
-        if len(parts) != 3:
-            return  # not one of our clients; there is nobody to answer
-        identity, tag, payload = parts
-        try:
-            command = self._decode(payload)
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            self._answer(identity, tag, Reply(accepted=False, text=f"not a command: {error}"))
+    def _receive(self, waiting: Waiting) -> None:
+        sender, now_s = waiting.parcel.sender, self._clock.now_s()
+        if sender is None:
+            self._answer(waiting, Reply(accepted=False, text="this key has been revoked"))
             return
-        if command.version != PROTOCOL_VERSION:
-            text = f"this supervisor speaks version {PROTOCOL_VERSION}, not {command.version}"
-            self._answer(identity, tag, Reply(accepted=False, text=text))
-        elif isinstance(command, RecorderReport):
-            self._buffer.recorder = command.status
-            self._answer(identity, tag, Reply(accepted=True))
-        elif isinstance(command, Status):
-            self._answer(identity, tag, Reply(accepted=True, text=self._status_text()))
+        command = decode_command(waiting.parcel.payload)
+        within_rate = self._admission.within_rate(sender, now_s)
+        if not within_rate and not isinstance(command, Stop):
+            self._drop(sender, "over the rate limit")
+            self._answer(waiting, self._too_many)
+        elif isinstance(command, Reply):
+            self._drop(sender, "no commands")
+            self._answer(waiting, command)
+        elif not within_rate and self._joins_a_stop(waiting, command, sender):
+            self._drop(sender, "stops besides one under way")
         else:
-            self._supervisor.post(command, lambda reply: self._replies.put((identity, tag, reply)))
+            self._obey(waiting, command, sender, now_s)
+
+    def _joins_a_stop(self, waiting: Waiting, command: AnyCommand, sender: Sender) -> bool:
+        """Whether this stop, of too many, waits for the answer to one that is under way."""
+        if sender.role != "commander" or command.loop not in self._stops:
+            return False
+        self._stops[command.loop].append(waiting)
+        return True
+
+    def _obey(self, waiting: Waiting, command: AnyCommand, sender: Sender, now_s: float) -> None:
+        commander = self._admission.commander(now_s)
+        refusal = self._admission.refusal(sender, command, now_s)
+        match command:
+            case _ if refusal:
+                self._answer_here(waiting, command, Reply(accepted=False, text=refusal))
+            case Status():
+                text = self._status_text()
+                self._answer_here(waiting, command, Reply(accepted=True, text=text))
+            case RecorderReport():
+                self._buffer.recorder = command.status
+                self._answer_here(waiting, command, Reply(accepted=True))
+            case TakeOver():
+                text = self._taken_over(commander, sender.name)
+                self._answer_here(waiting, command, Reply(accepted=True, text=text))
+            case _:
+                stops = isinstance(command, Stop)
+                if stops:
+                    self._stops.setdefault(command.loop, deque(maxlen=_JOINED_STOPS))
+                done = partial(self._done, waiting, command.loop if stops else None)
+                self._supervisor.post(command, done, sender.name, sender.address)
+
+    def _taken_over(self, before: str, now: str) -> str:
+        told = f"{now} has the instrument"
+        if before not in {"", now}:
+            told += f", taken over from {before}"
+            self._supervisor.note("warning", SOURCE, told)
+        return told
+
+    def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
+        """Leave the reply for this thread; called from the supervisor's."""
+        self._replies.put((waiting, reply, stopped))
+
+    def _answer_here(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
+        """Answer what does not reach the supervisor, and keep who asked."""
+        sender = waiting.parcel.sender
+        if sender is not None and ROWS[type(command)].logged:
+            now_s = self._clock.now_s()
+            self._supervisor.leave(
+                command_record(command, reply, sender.name, sender.address, now_s)
+            )
+        self._answer(waiting, reply)
 
     def _status_text(self) -> str:
         return ", ".join(
@@ -234,9 +226,39 @@ class Service(threading.Thread):
     def _send_replies(self) -> None:
         while True:
             try:
-                self._answer(*self._replies.get_nowait())
+                waiting, reply, stopped = self._replies.get_nowait()
             except Empty:
                 return
+            self._answer(waiting, reply)
+            for joined in self._stops.pop(stopped, ()) if stopped is not None else ():
+                self._answer(joined, reply)
 
-    def _answer(self, identity: bytes, tag: bytes, reply: Reply) -> None:
-        self._router.send_multipart([identity, tag, self._encode(reply)], zmq.NOBLOCK)
+    def _answer(self, waiting: Waiting, reply: Reply) -> None:
+        timed = msgspec.structs.replace(reply, time_s=self._clock.now_s())
+        parcel = waiting.parcel
+        waiting.door.answer(parcel.identity, parcel.tag, self._encode(timed))
+
+    # ------------------------------------------------------------ telemetry and housekeeping
+
+    def _publish(self, now_s: float) -> None:
+        self._state.sequence += 1
+        self._state.commander = self._admission.commander(now_s)
+        payload = self._encode(self._buffer.telemetry(self._supervisor, self._state, now_s))
+        for door in self._doors:
+            door.publish(payload)
+
+    def _look_after_keys(self) -> None:
+        for name in self._keyed.refresh() if self._keyed is not None else ():
+            self._admission.release(name)
+            self._supervisor.note("warning", SOURCE, f"the key {name} was revoked or changed")
+
+    def _drop(self, sender: Sender, why: str) -> None:
+        self._dropped[sender.name, why] += 1
+
+    def _tell_dropped(self, now_s: float) -> None:
+        """Say how many messages were not taken, now and then."""
+        if self._dropped and now_s >= self._tell_s:
+            for (name, why), count in self._dropped.items():
+                self._supervisor.note("warning", SOURCE, f"{name}: {count} messages, {why}")
+            self._dropped.clear()
+            self._tell_s = now_s + _TELL_S

@@ -14,7 +14,6 @@ from concurrent.futures import Executor, Future
 from functools import partial
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from fitctl.clock import Clock
@@ -28,7 +27,6 @@ from fitctl.drivers.interface import (
 )
 from fitctl.logging.records import (
     AnyRecord,
-    CommandRecord,
     DevicesOpened,
     Event,
     FrameRecord,
@@ -36,6 +34,7 @@ from fitctl.logging.records import (
     QuantityReading,
     Severity,
 )
+from fitctl.supervisor.command_table import ROWS, command_record
 from fitctl.supervisor.drives import refused_drives
 from fitctl.supervisor.health import camera_health, loop_health
 from fitctl.supervisor.loop import StellarLoop
@@ -83,6 +82,15 @@ class Job(NamedTuple):
     done: Callable[[Future], None]
 
 
+class Posted(NamedTuple):
+    """A command on its way to the next step: whom it answers, and who gave it from where."""
+
+    command: AnyCommand
+    reply: Callable[[Reply], None]
+    sender: str
+    address: str
+
+
 class Supervisor:
     """One rig under control.
 
@@ -122,8 +130,8 @@ class Supervisor:
         self._clock = clock
         self._executor = executor
         self._record = record
-        self._commands: deque[tuple[AnyCommand, Callable[[Reply], None]]] = deque()
-        self._notes: deque[tuple[Severity, str, str]] = deque()
+        self._commands: deque[Posted] = deque()
+        self._left: deque[AnyRecord] = deque()
         self._measured: deque[QuantityReading] = deque()
         self._job: Job | None = None
         self._opening: set[str] = set()
@@ -141,7 +149,13 @@ class Supervisor:
 
     # ------------------------------------------------------------ from any thread
 
-    def post(self, command: AnyCommand, reply: Callable[[Reply], None]) -> None:
+    def post(
+        self,
+        command: AnyCommand,
+        reply: Callable[[Reply], None],
+        sender: str = "",
+        address: str = "",
+    ) -> None:
         """Leave a command for the next step; `reply` is called from there.
 
         A stop takes the velocity from the siderostats here and now; the rest follows at the next step.
@@ -149,11 +163,16 @@ class Supervisor:
         if isinstance(command, Stop):
             for name in self._named(command):
                 self.servos[name].stop()
-        self._commands.append((command, reply))
+        self._commands.append(Posted(command, reply, sender, address))
 
     def note(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
-        self._notes.append((severity, source, message))
+        now_s = self._clock.now_s()
+        self.leave(Event(time_s=now_s, severity=severity, source=source, message=message))
+
+    def leave(self, record: AnyRecord) -> None:
+        """Leave a record for the next step, from any thread."""
+        self._left.append(record)
 
     def measured(self, name: str, value: float) -> None:
         """Leave a quantity of all loops, for their interlocks, for the next step; from any thread."""
@@ -172,12 +191,12 @@ class Supervisor:
         frame = self._next_frame()
         self._finish_jobs()
         while self._commands:
-            command, reply = self._commands.popleft()
-            answer = self._obey(command)
-            self._log_command(command, answer)
-            reply(answer)
-        while self._notes:
-            self._event(*self._notes.popleft())
+            posted = self._commands.popleft()
+            answer = self._obey(posted.command)
+            self._log_command(posted, answer)
+            posted.reply(answer)
+        while self._left:
+            self._record(self._left.popleft())
         while self._measured:
             self._take_measured(self._measured.popleft())
         lost = self._devices.camera.counts().lost if self._camera_ready else 0
@@ -211,7 +230,8 @@ class Supervisor:
         """Every loop to SAFE."""
         for loop in self.loops.values():
             loop.fire(Trigger.STOP, reason)
-        self._log_command(Stop(), Reply(accepted=True, text=reason))
+        now_s = self._clock.now_s()
+        self._record(command_record(Stop(), Reply(accepted=True, text=reason), "fitctl", "", now_s))
 
     def at_rest(self) -> bool:
         """Every mirror that can still be commanded is at its bias."""
@@ -261,22 +281,12 @@ class Supervisor:
 
     # ------------------------------------------------------------ commands
 
-    def _log_command(self, command: AnyCommand, answer: Reply) -> None:
-        if isinstance(command, SequenceReport):
-            return  # of a program about itself; what it does to the rig comes as commands of their own
-        arguments = msgspec.structs.asdict(command)
-        del arguments["version"], arguments["loop"]
-        self._record(
-            CommandRecord(
-                time_s=self._clock.now_s(),
-                loop=command.loop,
-                command=type(command).__name__,
-                arguments_json=msgspec.json.encode(arguments).decode(),
-                sender="",
-                accepted=answer.accepted,
-                text=answer.text,
+    def _log_command(self, posted: Posted, reply: Reply) -> None:
+        if ROWS[type(posted.command)].logged:
+            now_s = self._clock.now_s()
+            self._record(
+                command_record(posted.command, reply, posted.sender, posted.address, now_s)
             )
-        )
 
     def _take_measured(self, reading: QuantityReading) -> None:
         for loop in self.loops.values():

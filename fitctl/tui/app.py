@@ -18,7 +18,16 @@ from textual.events import Resize
 from textual.message import Message
 from textual.screen import Screen
 
-from fitctl.supervisor.messages import AnyCommand, Reply, Shutdown, Stop, Telemetry
+from fitctl.supervisor.command_table import ROWS, command_of
+from fitctl.supervisor.messages import (
+    AnyCommand,
+    Reply,
+    Shutdown,
+    Status,
+    Stop,
+    TakeOver,
+    Telemetry,
+)
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS
 from fitctl.tui.link import Link
 from fitctl.tui.palette import ControllerProvider, ResetProvider, TargetProvider
@@ -35,6 +44,7 @@ from fitctl.tui.widgets.traces import Traces
 
 RECEIVE_TIMEOUT_S = 0.2
 EXIT_WAIT_S = 2.5
+KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 UNREADABLE_NOTICE_S = 10.0  # at most one notice in this time
 UNREADABLE_PAUSE_S = 0.01  # a link that fails at once must not keep a processor busy
 DRAW_PERIODS_S: dict[type[Panel], float] = {
@@ -143,6 +153,7 @@ class ConsoleApp(App[None]):
         self._arrange(self.size.width, self.size.height)
         for period_s in sorted(set(DRAW_PERIODS_S.values())):
             self.set_interval(period_s, partial(self._draw, period_s))
+        self.set_interval(KEEP_S, partial(self.give, Status()))
         self._reader.start()
 
     def on_unmount(self) -> None:
@@ -246,6 +257,8 @@ class ConsoleApp(App[None]):
     def on_answered(self, message: Answered) -> None:
         """Say what became of a command, where that is not plain to see."""
         name = type(message.command).__name__
+        if name == "Status":
+            return  # that nobody answers is plain to see: telemetry is missing too
         if message.reply is None:
             text = message.problem
             if name == "Stop":
@@ -263,10 +276,12 @@ class ConsoleApp(App[None]):
             )
         elif name == "Stop":
             self.notify("all loops go to SAFE", title="■ STOP confirmed", timeout=3)
+        elif name == "TakeOver":
+            self.notify(message.reply.text, title="Taken over", timeout=5, markup=False)
 
     def action_command(self, name: str) -> None:
         """Give the command of a key."""
-        self.give(BY_NAME[name].make())
+        self.give(command_of(BY_NAME[name].word, (), ""))
 
     def action_next_loop(self) -> None:
         """Show the next loop."""
@@ -291,6 +306,11 @@ class ConsoleApp(App[None]):
         yield SystemCommand("Events", "All events at full length", self.action_events)
         yield SystemCommand("Next loop", "Show the next loop", self.action_next_loop)
         yield SystemCommand("Help", "Keys, modes and signs", self.action_help)
+        yield SystemCommand(
+            "Take over",
+            f"{ROWS[TakeOver].help}, to command in their stead",
+            partial(self.give, TakeOver()),
+        )
         yield SystemCommand(
             "Shut down the supervisor",
             "SAFE, OFF, then end the supervisor process",

@@ -23,8 +23,9 @@ from fitctl.supervisor.messages import (
     Status,
     Stop,
 )
-from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
+from fitctl.supervisor.service import Service
 from fitctl.supervisor.simulate import Simulation
+from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 
 class Served:

@@ -84,6 +84,8 @@ class Header(Panel):
             if len(state.loops) > 1:
                 place += f" {list(state.loops).index(state.shown) + 1}/{len(state.loops)}"
             line += [text(place, SKY)]
+            if newest.commander:
+                line += [text(f"  by {newest.commander}", DIM)]
         return spread(line, [*self._link(), text("  "), text(self._clock(), DIM)], columns)
 
     def _link(self) -> Line:

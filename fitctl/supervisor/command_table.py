@@ -1,0 +1,132 @@
+"""Every command: how people call it, and who may give it.
+
+Command line, console and documentation are made from this table and from the structs of
+:mod:`fitctl.supervisor.messages`, which say what a command does and which values it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import msgspec
+
+from fitctl.config import ConfigError
+from fitctl.logging.records import CommandRecord
+from fitctl.supervisor import messages
+from fitctl.supervisor.messages import AnyCommand, Command, Reply
+
+Needs = Literal["any key", "the Unix socket", "a commander's key", "the instrument"]
+
+
+class CommandRow(NamedTuple):
+    """One command.
+
+    Attributes
+    ----------
+    make : type
+        Its message.
+    needs : str
+        "the instrument" is a commander's key, and that nobody else has the lease.
+    word : str
+        On a command line; empty for what programs alone send.
+    key, label : str
+        In the console.
+    logged : bool
+        Each gets a record of its own in the log; reports, which come every second, do not.
+    """
+
+    make: type[AnyCommand]
+    needs: Needs
+    word: str = ""
+    key: str = ""
+    label: str = ""
+    logged: bool = True
+
+    @property
+    def name(self) -> str:
+        """As ``LoopState.usable_commands`` calls it."""
+        return self.make.__name__
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of its values, in the order in which they are given."""
+        common = {field.name for field in msgspec.structs.fields(Command)}
+        return tuple(
+            field.name for field in msgspec.structs.fields(self.make) if field.name not in common
+        )
+
+    @property
+    def usage(self) -> str:
+        """Its word and what must follow."""
+        return " ".join([self.word, *(value.upper() for value in self.values)])
+
+    @property
+    def help(self) -> str:
+        """What it does, as a part of a sentence."""
+        text = (self.make.__doc__ or "").partition("\n")[0].removesuffix(".")
+        return text if text[:2].isupper() else text[:1].lower() + text[1:]
+
+
+COMMANDS = (
+    CommandRow(messages.Stop, "a commander's key", "stop", "s", "STOP"),
+    CommandRow(messages.Standby, "the instrument", "standby", "b", "Standby"),
+    CommandRow(messages.Acquire, "the instrument", "acquire", "a", "Acquire"),
+    CommandRow(messages.Hold, "the instrument", "hold", "h", "Hold"),
+    CommandRow(messages.Recover, "the instrument", "recover", "r", "Recover"),
+    CommandRow(messages.Off, "the instrument", "off", "o", "Off"),
+    CommandRow(messages.SetTarget, "the instrument", "target"),
+    CommandRow(messages.SetController, "the instrument", "controller"),
+    CommandRow(messages.Reset, "the instrument", "reset"),
+    CommandRow(messages.Status, "any key", "status", logged=False),
+    CommandRow(messages.TakeOver, "a commander's key", "take-over"),
+    CommandRow(messages.Shutdown, "the instrument", "shutdown"),
+    CommandRow(messages.Experiment, "the instrument"),
+    CommandRow(messages.SequenceControl, "a commander's key"),
+    CommandRow(messages.SequenceReport, "a commander's key", logged=False),
+    CommandRow(messages.RecorderReport, "the Unix socket", logged=False),
+)
+ROWS = {row.make: row for row in COMMANDS}
+WORDS = {row.word: row for row in COMMANDS if row.word}
+
+
+def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
+    """The command that words on a command line ask for.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such command, or its values are not what it needs.
+    """
+    if word not in WORDS:
+        msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
+        raise ConfigError(msg)
+    row = WORDS[word]
+    if len(values) != len(row.values):
+        needs = " ".join(row.values) or "no values"
+        msg = f"send: {word} needs {needs} (is {' '.join(values) or 'nothing'})"
+        raise ConfigError(msg)
+    given = dict(zip(row.values, values, strict=True)) | {"loop": loop}
+    try:
+        # Numbers come as text here; msgspec reads them, and checks what they may be.
+        return msgspec.convert(given, row.make, strict=False)
+    except msgspec.ValidationError as error:
+        msg = f"send: {word} {' '.join(values)}: {error}"
+        raise ConfigError(msg) from None
+
+
+def command_record(
+    command: AnyCommand, reply: Reply, sender: str, address: str, now_s: float
+) -> CommandRecord:
+    """What the log keeps of a command and its answer."""
+    values = {name: getattr(command, name) for name in ROWS[type(command)].values}
+    return CommandRecord(
+        time_s=now_s,
+        sender=sender,
+        address=address,
+        command=type(command).__name__,
+        loop=command.loop,
+        values_json=msgspec.json.encode(values).decode(),
+        accepted=reply.accepted,
+        text=reply.text,
+    )

@@ -1,0 +1,261 @@
+"""Keys of remote operation: the server's own pair, the keys that it allows, and the file that a client gets.
+
+In the keys' folder, ``server.toml`` has the server's pair, and ``allowed/NAME.toml`` one allowed public key
+each. All are TOML, of mode 0600 and refused if others can read them. No name or path of them ever comes from
+the network.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import tempfile
+from contextlib import suppress
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+import zmq
+
+from fitctl.config import ConfigError, Rig
+
+Role = Literal["commander", "viewer"]
+KeyText = Annotated[str, msgspec.Meta(pattern=r"^[!-~]{40}$")]  # Z85, 32 bytes
+Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+PortNumber = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+
+
+class KeyPair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A CURVE key pair, each as 40 characters of Z85."""
+
+    public: KeyText
+    secret: KeyText
+
+
+class AllowedKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A client that the server lets in."""
+
+    name: Name
+    role: Role
+    public: KeyText
+
+
+class RemoteKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All that a client needs to reach one rig."""
+
+    rig: str
+    name: Name
+    role: Role
+    host: str
+    command_port: PortNumber
+    telemetry_port: PortNumber
+    server_public: KeyText
+    public: KeyText
+    secret: KeyText
+
+
+T = TypeVar("T", KeyPair, AllowedKey, RemoteKey)
+
+
+def keys_folder(rig: Rig) -> Path:
+    """Where the keys of a rig are."""
+    if rig.service.keys_folder:
+        return Path(rig.service.keys_folder).expanduser()
+    own = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    return Path(own).expanduser() / "fitctl" / "keys" / rig.name
+
+
+def server_pair(rig: Rig) -> KeyPair:
+    """The server's key pair; made when there is none yet.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be used or made.
+    """
+    path = keys_folder(rig) / "server.toml"
+    if not path.exists():
+        with suppress(FileExistsError):  # another process may have been quicker
+            _write_new(path, _new_pair())
+    return _read(path, KeyPair)
+
+
+def new_key(rig: Rig, name: str, role: Role, host: str, out: Path) -> RemoteKey:
+    """Make a client's key, allow it, and write the client's file.
+
+    Parameters
+    ----------
+    rig : Rig
+    name : str
+        Whose it is: small letters, digits, "-" and "_".
+    role : str
+    host : str
+        How the client reaches this machine; empty for `service.tcp_address`.
+    out : Path
+        The client's file; it must not exist.
+
+    Raises
+    ------
+    ConfigError
+        If there is such a name or file already, or the address cannot be known.
+    """
+    service = rig.service
+    host = host or service.tcp_address
+    if not host or (_is_address(host) and ip_address(host).is_unspecified):
+        msg = (
+            "keys: no address for the client to reach this machine at; give --host, or set "
+            f"service.tcp_address to one (is {service.tcp_address!r})"
+        )
+        raise ConfigError(msg)
+    pair = _new_pair()
+    key = RemoteKey(
+        rig=rig.name,
+        name=name,
+        role=role,
+        host=host,
+        command_port=service.command_port,
+        telemetry_port=service.telemetry_port,
+        server_public=server_pair(rig).public,
+        public=pair.public,
+        secret=pair.secret,
+    )
+    try:
+        msgspec.convert(msgspec.to_builtins(key), RemoteKey)
+    except msgspec.ValidationError as error:
+        msg = f"keys: {name!r} cannot be a name ({error}); use a-z, 0-9, - and _, at most 32"
+        raise ConfigError(msg) from None
+    allowed = _allowed_folder(rig) / f"{name}.toml"
+    if allowed.exists():
+        msg = f"keys: there is a key {name} already; revoke it first, or choose another name"
+        raise ConfigError(msg)
+    try:
+        _write_new(out, key)
+        _write_new(allowed, AllowedKey(name=name, role=role, public=pair.public))
+    except FileExistsError as error:
+        msg = f"{error.filename}: exists already; choose another"
+        raise ConfigError(msg) from None
+    return key
+
+
+def revoke_key(rig: Rig, name: str) -> None:
+    """Let a key in no more; a running supervisor sees it by itself.
+
+    Raises
+    ------
+    ConfigError
+        If there is none of that name.
+    """
+    known = [path.stem for path in _allowed_paths(rig)]
+    if name not in known:
+        msg = f"keys: no key is named {name}; there are {', '.join(known) or 'none'}"
+        raise ConfigError(msg)
+    (_allowed_folder(rig) / f"{name}.toml").unlink(missing_ok=True)
+
+
+def allowed_keys(rig: Rig) -> tuple[dict[str, AllowedKey], list[str]]:
+    """The allowed clients by public key, and what is wrong with files that allow nobody therefore."""
+    keys, problems = {}, []
+    for path in _allowed_paths(rig):
+        try:
+            key = _read(path, AllowedKey)
+        except ConfigError as error:
+            problems.append(str(error))
+            continue
+        if key.name == path.stem:
+            keys[key.public] = key
+        else:
+            problems.append(f"{path}: is named {key.name} inside; rename the file, or make it anew")
+    return keys, problems
+
+
+def keys_signature(rig: Rig) -> list[tuple[str, int, int, int]]:
+    """Something that changes when an allowed key does; cheap enough to be asked all the time."""
+    found = []
+    for path in _allowed_paths(rig):
+        with suppress(OSError):
+            status = path.stat()
+            found.append((path.name, status.st_ino, status.st_mtime_ns, status.st_mode))
+    return found
+
+
+def read_remote(path: Path) -> RemoteKey:
+    """A client's key file.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be used, or others can read it.
+    """
+    return _read(path, RemoteKey)
+
+
+def read_key_of(rig: Rig, path: Path) -> RemoteKey:
+    """A client's key file, which must be for this rig.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be used, or is for another.
+    """
+    key = read_remote(path)
+    if key.rig != rig.name:
+        msg = f"{path}: is a key to rig {key.rig}, not {rig.name}; give the rig file that goes with it"
+        raise ConfigError(msg)
+    return key
+
+
+def _allowed_folder(rig: Rig) -> Path:
+    return keys_folder(rig) / "allowed"
+
+
+def _allowed_paths(rig: Rig) -> list[Path]:
+    return sorted(_allowed_folder(rig).glob("*.toml"))
+
+
+def _new_pair() -> KeyPair:
+    public, secret = zmq.curve_keypair()
+    return KeyPair(public=public.decode(), secret=secret.decode())
+
+
+def _is_address(text: str) -> bool:
+    return bool(re.fullmatch(r"[\d.]+|[\da-fA-F:]+", text))
+
+
+def _read(path: Path, kind: type[T]) -> T:
+    """A key file that nobody else can read.
+
+    Its mode is asked of the open file, so that it is the one that is read.
+    """
+    try:
+        with path.open("rb") as file:
+            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+            text = file.read(65536)
+        if mode & 0o077:
+            msg = f"{path}: others may read it (mode {mode:04o}); make sure that nobody has, then: chmod 600"
+            raise ConfigError(msg)
+        return msgspec.toml.decode(text, type=kind)
+    except OSError as error:
+        msg = f"{path}: cannot be read: {error.strerror}; `fitctl keys new` makes key files"
+        raise ConfigError(msg) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        msg = f"{path}: is no key file of fitctl: {error}; `fitctl keys new` makes them"
+        raise ConfigError(msg) from None
+
+
+def _write_new(path: Path, content: msgspec.Struct) -> None:
+    """Write a file that must not exist, mode 0600; whoever sees it sees it whole."""
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # Made with mode 0600 from the beginning, and given its name when it is complete.
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".key-") as file:
+            file.write(msgspec.toml.encode(content))
+            file.flush()
+            os.fsync(file.fileno())
+            os.link(file.name, path)
+    except FileExistsError:
+        raise FileExistsError(0, "exists", str(path)) from None
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror}; choose another place"
+        raise ConfigError(msg) from None
