@@ -11,6 +11,7 @@ from fitctl.config.base import (
     Count,
     Fraction,
     NonNegative,
+    Port,
     Positive,
     Range,
     Settings,
@@ -126,9 +127,10 @@ class Supervisor(Settings):
 
 
 class Service(Settings):
-    """Where the supervisor's sockets live."""
+    """Where the supervisor's sockets live, and where Prometheus may ask."""
 
     folder: str
+    metrics_port: Port
 
 
 class Logging(Settings):
