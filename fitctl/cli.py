@@ -281,6 +281,34 @@ def send(
 
 
 @app.command()
+def status(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+    """Say how the running instrument of a rig is.
+
+    Exit status 0 if all is well, 1 if something is not, 3 if no supervisor answers.
+    """
+    from fitctl.commands.status import run_status
+
+    raise typer.Exit(run_status(_rig(rig, overrides), as_json=as_json))
+
+
+@app.command()
+def watch(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Each line is one JSON object; `kind` says what of.")
+    ] = False,
+    duration: Annotated[
+        float | None, typer.Option(min=0.1, metavar="SECONDS", help="Without it, until Ctrl-C.")
+    ] = None,
+) -> None:
+    """Print a line a second about the running instrument, and every event as it comes."""
+    from fitctl.commands.watch import run_watch
+
+    raise typer.Exit(run_watch(_rig(rig, overrides), duration, as_json=as_json))
+
+
+@app.command()
 def simulate(
     rig: RigOption = None,
     overrides: SetOption = None,
@@ -429,6 +457,16 @@ def record(
     from fitctl.commands.instrument import run_recorder
 
     run_recorder(_rig(rig, overrides), parent_pid=parent_pid)
+
+
+@app.command(hidden=True)
+def metrics(
+    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+) -> None:
+    """Serve metrics of the running instrument; the supervisor starts this by itself."""
+    from fitctl.commands.instrument import run_metrics
+
+    run_metrics(_rig(rig, overrides), parent_pid=parent_pid)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -37,11 +38,13 @@ from fitctl.logging.writer import LogWriter
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.supervisor.command_table import COMMANDS as COMMAND_ROWS
 from fitctl.supervisor.command_table import command_of
-from fitctl.supervisor.messages import Acquire, Shutdown, Status
+from fitctl.supervisor.messages import Acquire, Shutdown, Status, TrippedInterlock
+from fitctl.supervisor.metrics import InstrumentCollector
 from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
 from fitctl.supervisor.run import run_info
 from fitctl.supervisor.simulate import Simulation
 from fitctl.tui.commands import OPERATOR_COMMANDS
+from tests.tui.fake import FakeSupervisor
 
 MAKE_TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 CLI = typer.main.get_command(app)
@@ -313,6 +316,28 @@ def test_the_topics_of_a_log_are_those_of_the_schemas():
         rows.append([f"`{topic.format(loop=loop)}`", message.full_name, what, fields])
 
     assert between("logs.md", "topics") == table(["topic", "message", "what it is", "fields"], rows)
+
+
+def test_the_metrics_are_those_that_are_served():
+    supervisor = FakeSupervisor()
+    supervisor.interlocks = [
+        TrippedInterlock(name="any", since_s=0.0, action="warn", reset="itself", reason="")
+    ]
+    collector = InstrumentCollector()
+    collector.accept(supervisor.message(), time.monotonic())
+    rows = [
+        [
+            f"`{family.samples[0].name}`",
+            family.type,
+            ", ".join(family.samples[0].labels),
+            family.documentation,
+        ]
+        for family in collector.collect()
+    ]
+
+    assert between("running-as-a-service.md", "metrics") == table(
+        ["metric", "kind", "labels", "what it is"], rows
+    )
 
 
 def test_the_layers_are_those_of_the_import_contract():

@@ -213,7 +213,7 @@ def run_rig(rig: Rig, rig_arguments: Sequence[str], *, parent_pid: int | None) -
     end_with_parent(parent_pid)
     run_supervisor(
         rig,
-        ["record", *rig_arguments],
+        rig_arguments,
         lambda folder: print(f"supervising {rig.name}; sockets in {folder}", flush=True),
     )
 
@@ -247,6 +247,20 @@ def run_recorder(rig: Rig, *, parent_pid: int | None) -> None:
             raise ConfigError(str(error)) from None
         finally:
             client.close()
+
+
+def run_metrics(rig: Rig, *, parent_pid: int | None) -> None:
+    """Serve metrics until the supervisor ends us, or is gone."""
+    from fitctl.supervisor.metrics import serve_metrics
+
+    end_with_parent(parent_pid)
+    stop = threading.Event()
+    client = Client(service_folder(rig))
+    try:
+        with ended_by_signals(stop.set):
+            serve_metrics(client, rig.service.metrics_port, rig.name, stop)
+    finally:
+        client.close()
 
 
 # ---------------------------------------------------------------- a running instrument

@@ -12,6 +12,7 @@ from fitctl.config.base import (
     Count,
     Fraction,
     NonNegative,
+    Port,
     Positive,
     Range,
     Settings,
@@ -136,6 +137,7 @@ class Service(Settings):
     command_port: Annotated[int, Field(ge=1, le=65535)]
     telemetry_port: Annotated[int, Field(ge=1, le=65535)]
     keys_folder: str
+    metrics_port: Port
 
     @field_validator("tcp_address")
     @classmethod

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import gc
 import importlib.metadata
-import math
 import os
 import platform
 import tempfile
@@ -22,7 +21,8 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import design_json
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
-from fitctl.processes import end_process, ended_by_signals, last_line, start_process
+from fitctl.processes import ended_by_signals
+from fitctl.supervisor.children import Child
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
     COMMAND_SOCKET,
@@ -38,16 +38,22 @@ from fitctl.supervisor.realtime import (
     quiet_interpreter,
 )
 from fitctl.supervisor.service import Service
+from fitctl.supervisor.service_manager import (
+    ALIVE,
+    ENDING,
+    READY,
+    status_line,
+    tell_service_manager,
+)
 from fitctl.supervisor.servo import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 _RECORDER_ERRORS = "recorder.err"
+_METRICS_ERRORS = "metrics.err"
+_FILES = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, _RECORDER_ERRORS, _METRICS_ERRORS)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
-_RECORDER_END_S = 5.0
-_RECORDER_WELL_S = 10.0  # a recorder that lived this long is started again at once
-_RECORDER_PATIENCE_S = 60.0
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
 _VERSIONED = (
     "fitctl",
@@ -60,61 +66,6 @@ _VERSIONED = (
     "pymodbus",
     "genicam",
 )
-
-
-class Recorder:
-    """The recorder process, started again when it dies: at once, then ever more patiently.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        ``fitctl`` arguments that start it.
-    errors : Path
-        Where its error output goes.
-    note : callable
-        Takes events.
-    """
-
-    def __init__(
-        self, arguments: Sequence[str], errors: Path, note: Callable[[Severity, str, str], None]
-    ) -> None:
-        self._arguments = arguments
-        self._errors = errors
-        self._note = note
-        self._patience_s = 0.0
-        self._again_s = math.inf
-        self._start()
-
-    def check(self) -> None:
-        """Start it again if it has died and its time has come; called about once a second."""
-        now_s = time.monotonic()
-        code = self._process.poll()
-        if code is None:
-            if now_s - self._started_s > _RECORDER_WELL_S:
-                self._patience_s = 0.0
-        elif self._again_s == math.inf:
-            how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
-            why = last_line(self._errors)
-            self._again_s = now_s + self._patience_s
-            self._note(
-                "error",
-                "recorder",
-                f"the recorder {how}{': ' + why if why else ''}; a new one begins a new file"
-                + (f" in {self._patience_s:.0f} s" if self._patience_s else ""),
-            )
-            self._patience_s = min(max(1.0, 2 * self._patience_s), _RECORDER_PATIENCE_S)
-        if now_s >= self._again_s:
-            self._start()
-
-    def end(self) -> None:
-        """Let it write what it has and end."""
-        end_process(self._process, _RECORDER_END_S)
-
-    def _start(self) -> None:
-        with self._errors.open("wb") as errors:
-            self._process = start_process(self._arguments, stderr=errors)
-        self._started_s = time.monotonic()
-        self._again_s = math.inf
 
 
 def check_log_folder(folder: Path) -> None:
@@ -164,15 +115,15 @@ def only_supervisor(folder: Path) -> Iterator[None]:
 
 
 def run_supervisor(
-    rig: Rig, recorder_arguments: Sequence[str], on_ready: Callable[[Path], None]
+    rig: Rig, rig_arguments: Sequence[str], on_ready: Callable[[Path], None]
 ) -> None:
     """Supervise a rig until told to shut down, by a command or a signal.
 
     Parameters
     ----------
     rig : Rig
-    recorder_arguments : sequence of str
-        How to start the recorder: ``fitctl`` arguments that describe the same rig.
+    rig_arguments : sequence of str
+        ``fitctl`` options that describe the same rig to the recorder and the metrics.
     on_ready : callable
         Called with the socket folder once commands are answered.
 
@@ -188,7 +139,7 @@ def run_supervisor(
         ending = threading.Event()
         stack.enter_context(ended_by_signals(ending.set))
         stack.enter_context(only_supervisor(folder))
-        for name in (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, _RECORDER_ERRORS):
+        for name in _FILES:
             stack.callback((folder / name).unlink, missing_ok=True)
         clock = MonotonicClock()
         queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
@@ -201,8 +152,9 @@ def run_supervisor(
 
         executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
         supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
-        recorder = Recorder(recorder_arguments, folder / _RECORDER_ERRORS, supervisor.note)
-        stack.callback(recorder.end)
+        children = _children(rig, rig_arguments, folder, supervisor.note)
+        for child in children:
+            stack.callback(child.end)
         machine = Machine(
             log_folder, lambda: queue.waiting / rig.logging.queue_records, supervisor.measured
         )
@@ -222,8 +174,9 @@ def run_supervisor(
         for thread in threads:
             thread.start()
         on_ready(folder)
+        tell_service_manager(READY)
         try:
-            _loop(supervisor, service, queue, recorder, machine, executor, clock, ending)
+            _loop(supervisor, service, queue, children, machine, executor, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -232,11 +185,33 @@ def run_supervisor(
             queue.close()  # while the recorder, which the stack ends, still listens
 
 
+def _children(
+    rig: Rig,
+    rig_arguments: Sequence[str],
+    folder: Path,
+    note: Callable[[Severity, str, str], None],
+) -> list[Child]:
+    record = ["record", *rig_arguments]
+    children = [
+        Child("recorder", record, folder / _RECORDER_ERRORS, "a new one begins a new file", note)
+    ]
+    if rig.service.metrics_port:
+        serve = ["metrics", *rig_arguments]
+        children.append(
+            Child("metrics server", serve, folder / _METRICS_ERRORS, "a new one is started", note)
+        )
+    return children
+
+
+def _modes(supervisor: Supervisor) -> str:
+    return ", ".join(f"{name} {loop.mode.name}" for name, loop in supervisor.loops.items())
+
+
 def _loop(
     supervisor: Supervisor,
     service: Service,
     queue: RecordQueue,
-    recorder: Recorder,
+    children: Sequence[Child],
     machine: Machine,
     executor: ThreadPoolExecutor,
     clock: MonotonicClock,
@@ -250,10 +225,13 @@ def _loop(
                 housekeeping_s += _HOUSEKEEPING_S
                 queue.pump()
                 collect_young()
-                executor.submit(recorder.check)
+                for child in children:
+                    executor.submit(child.check)
                 executor.submit(machine.look)
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
+                tell_service_manager(ALIVE, status_line(_modes(supervisor)))
+        tell_service_manager(ENDING)
         supervisor.shutdown_wanted = True
         supervisor.stop("shutting down")
         end_s = clock.now_s() + _WIND_DOWN_S

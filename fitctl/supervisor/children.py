@@ -1,0 +1,81 @@
+"""Processes beside the supervisor, started again when they die: the recorder, and the metrics."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from fitctl.logging.records import Severity
+from fitctl.processes import end_process, last_line, start_process
+
+_END_S = 5.0
+_WELL_S = 10.0  # one that lived this long is started again at once
+_PATIENCE_S = 60.0
+
+
+class Child:
+    """A fitctl process, started again when it dies: at once, then ever more patiently.
+
+    Parameters
+    ----------
+    name : str
+        What people call it.
+    arguments : sequence of str
+        ``fitctl`` arguments that start it.
+    errors : Path
+        Where its error output goes.
+    again : str
+        What starting it again means, for people.
+    note : callable
+        Takes events.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        arguments: Sequence[str],
+        errors: Path,
+        again: str,
+        note: Callable[[Severity, str, str], None],
+    ) -> None:
+        self._name = name
+        self._arguments = arguments
+        self._errors = errors
+        self._again = again
+        self._note = note
+        self._patience_s = 0.0
+        self._again_s = math.inf
+        self._start()
+
+    def check(self) -> None:
+        """Start it again if it has died and its time has come; called about once a second."""
+        now_s = time.monotonic()
+        code = self._process.poll()
+        if code is None:
+            if now_s - self._started_s > _WELL_S:
+                self._patience_s = 0.0
+        elif self._again_s == math.inf:
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+            why = last_line(self._errors)
+            self._again_s = now_s + self._patience_s
+            self._note(
+                "error",
+                self._name,
+                f"the {self._name} {how}{': ' + why if why else ''}; {self._again}"
+                + (f" in {self._patience_s:.0f} s" if self._patience_s else ""),
+            )
+            self._patience_s = min(max(1.0, 2 * self._patience_s), _PATIENCE_S)
+        if now_s >= self._again_s:
+            self._start()
+
+    def end(self) -> None:
+        """Let it finish what it has and end."""
+        end_process(self._process, _END_S)
+
+    def _start(self) -> None:
+        with self._errors.open("wb") as errors:
+            self._process = start_process(self._arguments, stderr=errors)
+        self._started_s = time.monotonic()
+        self._again_s = math.inf
