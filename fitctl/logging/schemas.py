@@ -27,6 +27,7 @@ from fitctl.logging.records import (
     FrameRecord,
     InjectionRecord,
     LoopTiming,
+    Losses,
     ModeChange,
     PiezoReading,
     RecorderStatus,
@@ -46,6 +47,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     PiezoReading: "/fit/{loop}/piezo",
     DeviceHealth: "/fit/devices/health",
     RecorderStatus: "/fit/recorder/status",
+    Losses: "/fit/losses",
     SequenceAttempt: "/fit/sequence/attempts",
 }
 """RunInfo is missing because it is kept as metadata: see :func:`run_metadata`."""

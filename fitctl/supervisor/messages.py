@@ -12,6 +12,7 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     LoopTiming,
+    Losses,
     ModeChange,
     PiezoReading,
     RecorderStatus,
@@ -176,6 +177,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """Sent `telemetry_hz` times a second.
 
     Ticks, events and mode changes are those since the last message; of everything else it has the newest.
+    ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
     """
 
     version: int = PROTOCOL_VERSION
@@ -193,6 +195,11 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     piezo: list[PiezoReading]
     timing: list[LoopTiming]
     recorder: RecorderStatus | None
-    records_lost: int
+    losses: Losses
     scheduling: str
     running_sequence: SequenceStatus | None = None
+
+    @property
+    def records_lost(self) -> int:
+        """Records that the supervisor had to leave out of the log."""
+        return self.losses.records_lost

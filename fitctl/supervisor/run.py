@@ -213,7 +213,14 @@ def run_supervisor(
             wall_minus_monotonic_s=info.wall_minus_monotonic_s,
             scheduling=scheduling,
             records_lost=lambda: queue.lost,
+            records_offered=lambda: queue.offered,
         )
+
+        def housekeep() -> None:
+            queue.pump()
+            record(buffer.losses(state, clock.now_s()))
+            collect_young()
+
         service = Service(supervisor, buffer, folder, state, clock)
         threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
         quiet_interpreter()
@@ -222,7 +229,7 @@ def run_supervisor(
             thread.start()
         on_ready(folder)
         try:
-            _loop(supervisor, service, queue, recorder, machine, executor, clock, ending)
+            _loop(supervisor, service, housekeep, recorder, machine, executor, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -234,7 +241,7 @@ def run_supervisor(
 def _loop(
     supervisor: Supervisor,
     service: Service,
-    queue: RecordQueue,
+    housekeep: Callable[[], None],
     recorder: Recorder,
     machine: Machine,
     executor: ThreadPoolExecutor,
@@ -247,8 +254,7 @@ def _loop(
             supervisor.step()
             if clock.now_s() >= housekeeping_s:
                 housekeeping_s += _HOUSEKEEPING_S
-                queue.pump()
-                collect_young()
+                housekeep()
                 executor.submit(recorder.check)
                 executor.submit(machine.look)
                 if not service.is_alive():
