@@ -32,7 +32,7 @@ def tell(soak: Soak, what: str) -> None:
         f"{time.monotonic() - soak.started_s:7.0f} s  {len(course.struck):4} strikes  "
         f"supervisor {newest('supervisor'):.0f} MB, recorder {newest('recorder'):.0f} MB  "
         f"tick 99 % {quiet['tick_99_ms']:.1f} ms, worst {quiet['tick_worst_ms']:.1f} ms  "
-        f"lost {course.records_lost}  {what}",
+        f"lost {course.losses.records_lost if course.losses else 0}  {what}",
         file=sys.stderr,
         flush=True,
     )

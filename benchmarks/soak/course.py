@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitctl.logging.records import Event, LoopTiming, Tick
+from fitctl.logging.records import Event, LoopTiming, Losses, Tick
 from fitctl.supervisor.messages import Telemetry
 
 _EVENTS_KEPT = 60
@@ -89,6 +89,8 @@ class Course:
         Why the loop left VERNIER in quiet time.
     messages_missed : int
         Telemetry that this client did not get.
+    losses : Losses or None
+        Of the supervisor's queues, by the last message.
     """
 
     def __init__(self) -> None:
@@ -96,8 +98,7 @@ class Course:
         self.spans = {True: Span(), False: Span()}
         self.departures: list[str] = []
         self.messages_missed = 0
-        self.records_lost = 0
-        self.records_offered = 0
+        self.losses: Losses | None = None
         self.struck: list[Struck] = []
         self.newest: Telemetry | None = None
         self.events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
@@ -114,7 +115,7 @@ class Course:
             self.messages_missed += telemetry.sequence - self.newest.sequence - 1
         self.newest = telemetry
         self.events.extend(telemetry.events)
-        self.records_lost = telemetry.records_lost
+        self.losses = telemetry.losses
         span = self.spans[self.quiet]
         for tick in telemetry.ticks:
             if tick.number >= 0:

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from statistics import median
 from typing import Any
 
+from msgspec.structs import asdict
+
 from benchmarks.soak.growth import QUANTITIES, Growth
 from benchmarks.soak.logs import Audit
 from benchmarks.soak.run import BACK_WITHIN_S, Soak
@@ -19,9 +21,8 @@ _RUN_INFO = 1  # the run's description is offered too; it is no message of a fil
 def figures(soak: Soak, audit: Audit, seed: int, lasted_s: float, ended: str) -> dict[str, Any]:
     """All of it; times in the units of their names."""
     course = soak.course
-    lost = {"offered": course.records_offered, "counted_lost": course.records_lost}
-    lost |= {"written": audit.written, "written_twice": audit.twice}
-    lost["not_accounted_for"] = lost["offered"] - _RUN_INFO - lost["written"] - lost["counted_lost"]
+    losses = asdict(course.losses) if course.losses else {}
+    offered, lost = losses.get("records_offered", 0), losses.get("records_lost", 0)
     return {
         "seed": seed,
         "lasted_s": lasted_s,
@@ -35,13 +36,21 @@ def figures(soak: Soak, audit: Audit, seed: int, lasted_s: float, ended: str) ->
         },
         "quiet": course.spans[True].figures(),
         "struck": course.spans[False].figures(),
+        "load": {"median": median(soak.load), "most": max(soak.load)} if soak.load else {},
         "telemetry_missed": course.messages_missed,
-        "records": lost,
+        "queues": losses,
+        "records": {
+            "offered": offered,
+            "counted_lost": lost,
+            "written": audit.written,
+            "written_twice": audit.twice,
+            "not_accounted_for": offered - _RUN_INFO - audit.written - lost,
+        },
         "logs": {
             "files": audit.files,
             "cut_by_a_kill": audit.cut,
             "problems": audit.problems,
-            "bytes": audit.bytes,
+            "bytes": audit.size_bytes,
             "most_on_disk_bytes": soak.most_disk_bytes,
         },
     }
@@ -58,56 +67,61 @@ def sound(found: dict[str, Any]) -> bool:
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """A section for docs/reliability.md."""
-    records, logs = found["records"], found["logs"]
-    back = sorted(strike["back_s"] for strike in found["strikes"])
-    lines = [
-        f"{found['lasted_s'] / 60:.0f} minutes, seed {found['seed']}; {_count(len(back), 'strike')}, of "
-        f"{_count(len({strike['name'] for strike in found['strikes']}), 'kind')}. "
-        + (
-            f"The loop was back in VERNIER after {median(back):.1f} s (median), {back[-1]:.1f} s at worst; "
-            if back
-            else ""
-        )
-        + f"{len(found['not_back'])} took longer than {BACK_WITHIN_S:g} s. Unstruck, it left VERNIER "
-        f"{_count(len(found['left_vernier_unstruck']), 'time')}.",
-        "",
+    """A section for docs/reliability.md: tables, then what went wrong."""
+    wrong = [found["ended"]] if found["ended"] else []
+    wrong += [
+        f"{s['name']}: {s['back_s']:.0f} s; {'; '.join(s['told'])}" for s in found["not_back"]
+    ]
+    wrong += [f"unstruck: {why}" for why in found["left_vernier_unstruck"]]
+    wrong += found["logs"]["problems"]
+    tables = (
+        _table(("the whole", ""), _whole(found)),
         _table(
-            (
-                "process",
-                "quantity",
-                "after warm-up",
-                "at the end",
-                "most",
-                "growth an hour",
-                "95 %",
-            ),
+            ("process", "", "after warm-up", "at the end", "most", "growth an hour", "95 %"),
             _growth_rows(found["growth"]),
         ),
-        "",
         _table(
-            ("", "unstruck", "from a strike until back"),
+            ("timing", "unstruck", "from a strike until back"),
             (
                 (_name(key), _number(value), _number(found["struck"][key]))
                 for key, value in found["quiet"].items()
             ),
         ),
-        "",
-        f"Records: {records['offered']} offered, {records['written']} in the files, {records['counted_lost']} "
-        f"counted as lost, {records['not_accounted_for']} not accounted for; {records['written_twice']} are in "
-        f"two files. {_count(logs['files'], 'log')} of {logs['bytes'] / 1e6:.0f} MB together, of which "
-        f"{logs['cut_by_a_kill']} cut off by a kill and mended; {_count(len(logs['problems']), 'problem')}; "
-        f"never more than {logs['most_on_disk_bytes'] / 1e6:.0f} MB on the disk. The telemetry client missed "
-        f"{_count(found['telemetry_missed'], 'message')}.",
-    ]
-    wrong = [found["ended"]] if found["ended"] else []
-    wrong += [
-        f"{s['name']}: {s['back_s']:.0f} s; {'; '.join(s['told'])}" for s in found["not_back"]
-    ]
-    wrong += [f"unstruck: {reason}" for reason in found["left_vernier_unstruck"]] + logs["problems"]
-    if wrong:
-        lines += ["", *(f"- {line}" for line in wrong)]
-    return "\n".join([*lines, "", _slowest(found["strikes"])])
+        _slowest(found["strikes"]),
+        *(f"- {line}" for line in wrong),
+    )
+    return "\n\n".join(tables)
+
+
+def _whole(found: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    records, logs, strikes = found["records"], found["logs"], found["strikes"]
+    back_s = [strike["back_s"] for strike in strikes]
+    yield "lasted, min", f"{found['lasted_s'] / 60:.1f}"
+    yield "seed", str(found["seed"])
+    if strikes:
+        kinds = len({strike["name"] for strike in strikes})
+        yield "strikes", f"{len(strikes)}, of {kinds} kinds"
+        yield (
+            "back in VERNIER after, s",
+            f"{median(back_s):.1f} (median), {max(back_s):.1f} (worst)",
+        )
+    yield f"not back within {BACK_WITHIN_S:g} s", str(len(found["not_back"]))
+    yield "left VERNIER unstruck", str(len(found["left_vernier_unstruck"]))
+    if found["load"]:
+        load = found["load"]
+        yield "load of the machine", f"{load['median']:.1f} (median), {load['most']:.1f} (most)"
+    yield "records offered to the log", str(records["offered"])
+    yield "of these in its files", f"{records['written']}, {records['written_twice']} of them twice"
+    yield "counted as lost", str(records["counted_lost"])
+    yield "not accounted for", str(records["not_accounted_for"])
+    yield "files", f"{logs['files']}, {logs['bytes'] / 1e6:.0f} MB together"
+    yield "cut off by a kill, and mended", str(logs["cut_by_a_kill"])
+    yield "problems in them", str(len(logs["problems"]))
+    yield "most on the disk, MB", f"{logs['most_on_disk_bytes'] / 1e6:.0f}"
+    yield "telemetry that its client missed", str(found["telemetry_missed"])
+    for name, count in found["queues"].items():
+        if name.endswith("_unsent"):
+            yield name.replace("_", " "), str(count)
 
 
 def _growth_rows(growth: dict[str, dict[str, Any]]) -> Iterable[tuple[str, ...]]:
@@ -149,7 +163,3 @@ def _name(key: str) -> str:
 
 def _number(value: float) -> str:
     return f"{value:d}" if isinstance(value, int) else f"{value:.2f}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import threading
 import time
@@ -61,6 +62,7 @@ class Soak:
         self.samples = Samples()
         self.started_s = time.monotonic()
         self.most_disk_bytes = 0
+        self.load: list[float] = []  # the machine's, of the last minute
         self._running = running
         self._bench = bench
         self._audit = audit
@@ -171,6 +173,7 @@ class Soak:
             pids["recorder"] = recorder.pid
         self.samples.take(now_s, pids)
         self._audit.look()
+        self.load.append(os.getloadavg()[0])
         self.most_disk_bytes = max(self.most_disk_bytes, self._audit.disk_bytes)
 
 
