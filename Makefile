@@ -7,9 +7,10 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
+SOAK_S ?= 3600
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-sim fuzz lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-sim soak fuzz lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -65,6 +66,9 @@ $(PEERS): $(READY) requirements/peers.lock tests/peers/install tests/peers/canop
 fuzz: $(READY)  ## Coverage-guided fuzzing of every parser, FUZZ_S seconds each (needs atheris)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/fuzz.lock
 	@for target in fuzz/fuzz_*.py; do $(BIN)/python $$target -max_total_time=$(FUZZ_S) || exit 1; done
+
+soak: $(READY)  ## SOAK_S seconds on mocks with random faults: what grows, is late, is lost
+	$(BIN)/python -m benchmarks.soak --duration $(SOAK_S) $(ARGS)
 
 bench-sim: $(READY)  ## How many times real time the simulation and the batch run
 	$(BIN)/python -m benchmarks.simulate $(ARGS)

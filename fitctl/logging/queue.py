@@ -73,6 +73,11 @@ class RecordQueue:
             raise LogError(msg) from error
 
     @property
+    def offered(self) -> int:
+        """Records so far, taken or not."""
+        return self._next_sequence
+
+    @property
     def waiting(self) -> int:
         """Records that are not yet confirmed."""
         return len(self._kept)

@@ -228,6 +228,17 @@ class RecorderStatus(Record, frozen=True, kw_only=True):
     bytes_written: int
 
 
+class Losses(Record, frozen=True, kw_only=True):
+    """What was offered to each queue of the supervisor and what it let go, since the start; once a second."""
+
+    records_offered: int
+    records_lost: int
+    ticks_unsent: int
+    events_unsent: int
+    mode_changes_unsent: int
+    replies_unsent: int
+
+
 class SequenceAttempt(Record, frozen=True, kw_only=True):
     """One attempt at one step of a sequence, when it ended; figures as JSON, units in their names."""
 
@@ -259,6 +270,7 @@ AnyRecord = (
     | PiezoReading
     | LoopTiming
     | RecorderStatus
+    | Losses
     | SequenceAttempt
     | CommandRecord
 )

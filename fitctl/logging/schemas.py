@@ -31,6 +31,7 @@ from fitctl.logging.records import (
     FrameRecord,
     InjectionRecord,
     LoopTiming,
+    Losses,
     ModeChange,
     PiezoReading,
     QuantityReading,
@@ -55,6 +56,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     PiezoReading: "/fit/{loop}/piezo",
     DeviceHealth: "/fit/devices/health",
     RecorderStatus: "/fit/recorder/status",
+    Losses: "/fit/losses",
     SequenceAttempt: "/fit/sequence/attempts",
     CommandRecord: "/fit/commands",
 }

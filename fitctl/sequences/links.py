@@ -39,6 +39,7 @@ class SimulatedLink:
             wall_minus_monotonic_s=0.0,
             scheduling="virtual clock",
             records_lost=lambda: 0,
+            records_offered=lambda: 0,
         )
 
     def now_s(self) -> float:

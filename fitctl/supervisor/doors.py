@@ -85,10 +85,15 @@ class Door:
                     parcels.append(Parcel(identity, tag, payload, self._whose(frame)))
         return parcels, True
 
-    def answer(self, identity: bytes, tag: bytes, payload: bytes) -> None:
-        """Send a reply; one that cannot be sent now is not waited for."""
-        with suppress(zmq.Again):
+    def answer(self, identity: bytes, tag: bytes, payload: bytes) -> bool:
+        """Send a reply; False if whoever asked has gone, or does not read."""
+        try:
             self.router.send_multipart([identity, tag, payload], zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            if error.errno not in {zmq.EHOSTUNREACH, zmq.EAGAIN}:
+                raise
+            return False
+        return True
 
     def publish(self, payload: bytes) -> None:
         """Send telemetry to whoever listens."""
@@ -117,6 +122,7 @@ def router_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
     """A ROUTER with all its limits, not yet bound."""
     router = context.socket(zmq.ROUTER)
     router.setsockopt(zmq.MAXMSGSIZE, MAX_COMMAND_BYTES)
+    router.setsockopt(zmq.ROUTER_MANDATORY, 1)  # say when a reply cannot be sent
     router.setsockopt(zmq.RCVHWM, _QUEUED)
     router.setsockopt(zmq.SNDHWM, _QUEUED)
     router.setsockopt(zmq.LINGER, _LINGER_MS)

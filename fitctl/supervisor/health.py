@@ -21,7 +21,7 @@ def camera_health(
         CAMERA,
         rig.camera.device.endpoint,
         is_open,
-        f"{counts.frames} frames, {counts.lost} lost",
+        f"{counts.frames} frames, {counts.lost} lost, {counts.packets_lost} packets missed",
         identities,
         now_s,
     )

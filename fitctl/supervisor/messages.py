@@ -16,6 +16,7 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     LoopTiming,
+    Losses,
     ModeChange,
     PiezoReading,
     RecorderStatus,
@@ -203,6 +204,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
 
     Ticks, events and mode changes are those since the last message; of everything else it has the newest.
     ``commander`` is who has the instrument, empty while nobody has.
+    ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
     """
 
     version: int = PROTOCOL_VERSION
@@ -220,7 +222,12 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     piezo: list[PiezoReading]
     timing: list[LoopTiming]
     recorder: RecorderStatus | None
-    records_lost: int
+    losses: Losses
     scheduling: str
     running_sequence: SequenceStatus | None = None
     commander: str = ""
+
+    @property
+    def records_lost(self) -> int:
+        """Records that the supervisor had to leave out of the log."""
+        return self.losses.records_lost

@@ -166,7 +166,14 @@ def run_supervisor(
             wall_minus_monotonic_s=info.wall_minus_monotonic_s,
             scheduling=scheduling,
             records_lost=lambda: queue.lost,
+            records_offered=lambda: queue.offered,
         )
+
+        def housekeep() -> None:
+            queue.pump()
+            record(buffer.losses(state, clock.now_s()))
+            collect_young()
+
         service = Service(supervisor, buffer, folder, state, clock)
         threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
         quiet_interpreter()
@@ -176,7 +183,7 @@ def run_supervisor(
         on_ready(folder)
         tell_service_manager(READY)
         try:
-            _loop(supervisor, service, queue, children, machine, executor, clock, ending)
+            _loop(supervisor, service, housekeep, children, machine, executor, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -210,7 +217,7 @@ def _modes(supervisor: Supervisor) -> str:
 def _loop(
     supervisor: Supervisor,
     service: Service,
-    queue: RecordQueue,
+    housekeep: Callable[[], None],
     children: Sequence[Child],
     machine: Machine,
     executor: ThreadPoolExecutor,
@@ -223,8 +230,7 @@ def _loop(
             supervisor.step()
             if clock.now_s() >= housekeeping_s:
                 housekeeping_s += _HOUSEKEEPING_S
-                queue.pump()
-                collect_young()
+                housekeep()
                 for child in children:
                     executor.submit(child.check)
                 executor.submit(machine.look)

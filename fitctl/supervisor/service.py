@@ -236,7 +236,8 @@ class Service(threading.Thread):
     def _answer(self, waiting: Waiting, reply: Reply) -> None:
         timed = msgspec.structs.replace(reply, time_s=self._clock.now_s())
         parcel = waiting.parcel
-        waiting.door.answer(parcel.identity, parcel.tag, self._encode(timed))
+        if not waiting.door.answer(parcel.identity, parcel.tag, self._encode(timed)):
+            self._state.replies_unsent += 1
 
     # ------------------------------------------------------------ telemetry and housekeeping
 

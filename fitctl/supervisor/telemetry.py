@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import TypeVar
+from contextlib import suppress
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -13,6 +14,7 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     LoopTiming,
+    Losses,
     ModeChange,
     PiezoReading,
     Record,
@@ -30,15 +32,43 @@ _BUFFERED_EVENTS = 500
 T = TypeVar("T")
 
 
+class CountingBuffer(Generic[T]):
+    """What waits for one thread and comes from another; what there is no room for is counted in `lost`.
+
+    The oldest goes. Only the thread that fills it counts.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.lost = 0
+        self._size = size
+        self._waiting: deque[T] = deque()
+
+    def put(self, item: T) -> None:
+        """Add one; never blocks."""
+        self._waiting.append(item)
+        if len(self._waiting) > self._size:
+            with suppress(IndexError):  # drained at this very moment: nothing is lost
+                self._waiting.popleft()
+                self.lost += 1
+
+    def drain(self) -> list[T]:
+        """Take all of them, oldest first."""
+        taken: list[T] = []
+        with suppress(IndexError):
+            while True:
+                taken.append(self._waiting.popleft())
+        return taken
+
+
 class TelemetryBuffer:
     """Records on their way to the consoles; filled by the loop, emptied by the service."""
 
     def __init__(self) -> None:
         self.frame: FrameRecord | None = None
         self.recorder: RecorderStatus | None = None
-        self._ticks: deque[Tick] = deque(maxlen=_BUFFERED_TICKS)
-        self._events: deque[Event] = deque(maxlen=_BUFFERED_EVENTS)
-        self._changes: deque[ModeChange] = deque(maxlen=_BUFFERED_EVENTS)
+        self._ticks = CountingBuffer[Tick](_BUFFERED_TICKS)
+        self._events = CountingBuffer[Event](_BUFFERED_EVENTS)
+        self._changes = CountingBuffer[ModeChange](_BUFFERED_EVENTS)
         self._devices: dict[str, DeviceHealth] = {}
         self._piezo: dict[str, PiezoReading] = {}
         self._timing: dict[str, LoopTiming] = {}
@@ -47,13 +77,13 @@ class TelemetryBuffer:
         """Take one record; never blocks."""
         match record:
             case Tick():
-                self._ticks.append(record)
+                self._ticks.put(record)
             case FrameRecord():
                 self.frame = record
             case Event():
-                self._events.append(record)
+                self._events.put(record)
             case ModeChange():
-                self._changes.append(record)
+                self._changes.put(record)
             case DeviceHealth():
                 self._devices[record.device] = record
             case PiezoReading():
@@ -85,23 +115,31 @@ class TelemetryBuffer:
                 )
                 for name, loop in supervisor.loops.items()
             ],
-            ticks=_drain(self._ticks),
-            events=_drain(self._events),
-            mode_changes=_drain(self._changes),
+            ticks=self._ticks.drain(),
+            events=self._events.drain(),
+            mode_changes=self._changes.drain(),
             frame=self.frame,
             devices=list(self._devices.values()),
             piezo=list(self._piezo.values()),
             timing=list(self._timing.values()),
             recorder=self.recorder,
-            records_lost=state.records_lost(),
+            losses=self.losses(state, now_s),
             scheduling=state.scheduling,
             running_sequence=supervisor.sequences.status(),
             commander=state.commander,
         )
 
-
-def _drain(buffer: deque[T]) -> list[T]:
-    return [buffer.popleft() for _ in range(len(buffer))]
+    def losses(self, state: ServiceState, now_s: float) -> Losses:
+        """What every queue has let go so far."""
+        return Losses(
+            time_s=now_s,
+            records_offered=state.records_offered(),
+            records_lost=state.records_lost(),
+            ticks_unsent=self._ticks.lost,
+            events_unsent=self._events.lost,
+            mode_changes_unsent=self._changes.lost,
+            replies_unsent=state.replies_unsent,
+        )
 
 
 class ServiceState(msgspec.Struct):
@@ -111,5 +149,7 @@ class ServiceState(msgspec.Struct):
     wall_minus_monotonic_s: float
     scheduling: str
     records_lost: Callable[[], int]
+    records_offered: Callable[[], int]
     sequence: int = 0
     commander: str = ""
+    replies_unsent: int = 0

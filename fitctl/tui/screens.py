@@ -38,6 +38,11 @@ _SIGNS = (
         "the siderostat on the sky, az and el, in arcsec; to go: to its set-point, at the motors",
     ),
     ("median/worst", "of the last second, in ms: compute time, frame age, servo lateness"),
+    (
+        "late, lost, miss, stall",
+        "ticks too late, frames lost, servo readings missed, stalls of the machine",
+    ),
+    ("missed, unsent", "messages that this console was too slow for, that no console was sent"),
 )
 
 

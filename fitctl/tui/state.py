@@ -101,6 +101,8 @@ class ConsoleState:
         Newest first.
     shown : str
         Name of the loop on the screen.
+    missed : int
+        Messages of this supervisor that did not come, because this console or its link was too slow.
     """
 
     def __init__(self, started_s: float) -> None:
@@ -110,6 +112,7 @@ class ConsoleState:
         self.loops: dict[str, LoopView] = {}
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.shown = ""
+        self.missed = 0
         self._arrivals_s: deque[float] = deque(maxlen=RATE_MESSAGES)
 
     @property
@@ -124,7 +127,10 @@ class ConsoleState:
         if self.newest is not None and self.newest.pid != message.pid:
             self.loops.clear()  # another supervisor: its past is not this one's
             self.newest = None
+            self.missed = 0
             self._arrivals_s.clear()
+        if self.newest is not None:
+            self.missed += max(0, message.sequence - self.newest.sequence - 1)
         self._arrivals_s.append(now_s)
         self.newest, self.received_s = message, now_s
         self.events.extendleft(message.events)
@@ -157,6 +163,19 @@ class ConsoleState:
             return 0
         recorder = self.newest.recorder
         return max(self.newest.records_lost, recorder.lost if recorder else 0)
+
+    @property
+    def unsent(self) -> int:
+        """Ticks, events, mode changes and replies that the supervisor could give to no console."""
+        if self.newest is None:
+            return 0
+        losses = self.newest.losses
+        return (
+            losses.ticks_unsent
+            + losses.events_unsent
+            + losses.mode_changes_unsent
+            + losses.replies_unsent
+        )
 
     def show_next_loop(self) -> None:
         """Cycle through the loops."""

@@ -11,7 +11,7 @@ import zmq
 
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, default_rig_path, load_rig
-from fitctl.logging.records import RecorderStatus
+from fitctl.logging.records import Event, RecorderStatus
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import COMMAND_SOCKET, make_service_folder, service_folder
 from fitctl.supervisor.messages import (
@@ -25,7 +25,7 @@ from fitctl.supervisor.messages import (
 )
 from fitctl.supervisor.service import Service
 from fitctl.supervisor.simulate import Simulation
-from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
+from fitctl.supervisor.telemetry import CountingBuffer, ServiceState, TelemetryBuffer
 
 
 class Served:
@@ -36,7 +36,11 @@ class Served:
         self.buffer = TelemetryBuffer()
         self.simulation = Simulation(rig, 0, star_offset_px=(9.0, 4.0), record=self.buffer.add)
         state = ServiceState(
-            pid=os.getpid(), wall_minus_monotonic_s=0.0, scheduling="", records_lost=lambda: 7
+            pid=os.getpid(),
+            wall_minus_monotonic_s=0.0,
+            scheduling="",
+            records_lost=lambda: 7,
+            records_offered=lambda: 1000,
         )
         self.service = Service(
             self.simulation.supervisor, self.buffer, folder, state, MonotonicClock()
@@ -209,3 +213,55 @@ def test_without_a_supervisor_a_command_says_so_in_time(tmp_path):
     with pytest.raises(ConnectionError, match="fitctl run"):
         client.send(Status(), timeout_s=0.2)
     client.close()
+
+
+def test_what_telemetry_has_no_room_for_goes_oldest_first_and_is_counted():
+    buffer = CountingBuffer(3)
+    for item in range(5):
+        buffer.put(item)
+
+    assert (buffer.drain(), buffer.lost) == ([2, 3, 4], 2)
+    buffer.put(5)
+    assert (buffer.drain(), buffer.drain(), buffer.lost) == ([5], [], 2)
+
+
+def test_a_buffer_filled_and_drained_at_once_loses_nothing_uncounted():
+    buffer, taken, ending = CountingBuffer(4), [], threading.Event()
+
+    def drain():
+        while not ending.is_set():
+            taken.extend(buffer.drain())
+
+    drainer = threading.Thread(target=drain)
+    drainer.start()
+    for item in range(100_000):
+        buffer.put(item)
+    ending.set()
+    drainer.join()
+    taken += buffer.drain()
+
+    assert taken == sorted(set(taken))
+    assert len(taken) + buffer.lost == 100_000
+
+
+def test_what_the_service_was_too_slow_for_is_in_the_telemetry(served):
+    event = Event(time_s=0.0, severity="info", source="test", message="")
+    for _ in range(20_000):  # far more than fits between two messages
+        served.buffer.add(event)
+
+    losses = served.follow(lambda telemetry: telemetry.losses.events_unsent > 0).losses
+    assert (losses.records_offered, losses.records_lost) == (1000, 7)
+    assert (losses.ticks_unsent, losses.mode_changes_unsent) == (0, 0)
+
+
+def test_a_reply_to_somebody_who_has_gone_is_counted(served):
+    served.ending.set()  # the loop stands still, and answers once they have gone
+    served.stepper.join()
+    for _ in range(5):  # until the socket knows of their going
+        with pytest.raises(ConnectionError, match="no supervisor answers"):
+            served.client.send(Stop(), timeout_s=0.1)
+        served.simulation.supervisor.step()
+        seen = [served.follow(lambda _: True) for _ in range(3)]
+        if seen[-1].losses.replies_unsent:
+            return
+    raise AssertionError("never counted")

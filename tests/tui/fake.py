@@ -18,6 +18,7 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     LoopTiming,
+    Losses,
     ModeChange,
     PiezoReading,
     RecorderStatus,
@@ -88,6 +89,7 @@ class FakeSupervisor:
         self.sequence = 0
         self.faulty: dict[str, str] = {}
         self.records_lost = 0
+        self.ticks_unsent = 0
         self.interlocks: list[TrippedInterlock] = []
 
     @property
@@ -127,7 +129,15 @@ class FakeSupervisor:
                 lost=0,
                 bytes_written=9000 * self.number,
             ),
-            records_lost=self.records_lost,
+            losses=Losses(
+                time_s=now_s,
+                records_offered=60 * self.number,
+                records_lost=self.records_lost,
+                ticks_unsent=self.ticks_unsent,
+                events_unsent=0,
+                mode_changes_unsent=0,
+                replies_unsent=0,
+            ),
             scheduling="SCHED_OTHER: real-time priority not permitted",
         )
 

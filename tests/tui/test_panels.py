@@ -173,6 +173,22 @@ def test_lost_records_take_the_recorders_line():
     assert "✗ 1 234 RECORDS LOST" in plain(Timing(shown(supervisor)).draw(39, 3))[-1]
 
 
+@pytest.mark.parametrize("rows", [3, 9])
+def test_what_no_console_was_sent_stands_beside_the_other_counts(rows):
+    supervisor = FakeSupervisor()
+    assert "unsent" not in " ".join(plain(Timing(shown(supervisor)).draw(60, rows)))
+    supervisor.ticks_unsent = 12
+    assert "unsent 12!" in " ".join(plain(Timing(shown(supervisor)).draw(60, rows)))
+
+
+def test_the_header_says_how_much_a_slow_console_missed():
+    supervisor = FakeSupervisor()
+    state = shown(supervisor)
+    assert "missed" not in " ".join(plain(Header(state).draw(80, 3)))
+    state.accept(supervisor.messages(5)[-1], state.now_s)
+    assert "4 missed!" in " ".join(plain(Header(state).draw(80, 3)))
+
+
 def test_a_long_event_is_wrapped_under_itself():
     event = Event(time_s=START_S, severity="error", source="D/A", message="no answer " * 8)
     lines = plain(event_lines(event, 0.0, 39))

@@ -89,11 +89,23 @@ def test_another_supervisor_starts_with_an_empty_past():
 def test_lost_records_are_the_greater_of_both_counts():
     message = FakeSupervisor().message()
     recorder = msgspec.structs.replace(message.recorder, lost=7)
+    losses = msgspec.structs.replace(message.losses, records_lost=5)
     state = ConsoleState(START_S)
-    state.accept(msgspec.structs.replace(message, records_lost=5, recorder=recorder), START_S)
+    state.accept(msgspec.structs.replace(message, losses=losses, recorder=recorder), START_S)
     assert state.records_lost == 7
-    state.accept(msgspec.structs.replace(message, records_lost=5, recorder=None), START_S)
+    state.accept(msgspec.structs.replace(message, losses=losses, recorder=None), START_S)
     assert state.records_lost == 5
+
+
+def test_messages_that_did_not_come_are_counted_until_another_supervisor_speaks():
+    messages = FakeSupervisor(pid=1).messages(10)
+    state = ConsoleState(START_S)
+    for message in (*messages[:3], *messages[7:]):
+        state.accept(message, START_S)
+    assert state.missed == 4
+
+    state.accept(FakeSupervisor(pid=2).messages(20)[-1], START_S)
+    assert state.missed == 0
 
 
 def test_the_rate_of_messages_settles_at_theirs():

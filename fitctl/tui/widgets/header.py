@@ -94,7 +94,10 @@ class Header(Panel):
             return [text(" ◌ connecting ", PAPER, on=ORANGE, bold=True)]
         if state.stale:
             return [text(" ✗ link lost ", PAPER, on=RED, bold=True)]
-        return [text("●", GREEN), text(f" live {state.rate_hz:.0f} Hz", DIM)]
+        line = [text("●", GREEN), text(f" live {state.rate_hz:.0f} Hz", DIM)]
+        if state.missed:
+            line.append(text(f" {state.missed} missed!", ORANGE, bold=True))
+        return line
 
     def _clock(self) -> str:
         wall_s = self.state.wall_s(self.state.now_s)

@@ -109,8 +109,11 @@ class Timing(Panel):
         if loop.timing is None:
             return [[text("no timing yet", DIM)], recorder]
         if rows < TABLE_FROM_ROWS:
-            return [*_dense(loop.timing, newest.scheduling, columns), recorder]
-        table = _table(loop.timing)
+            return [
+                *_dense(loop.timing, self.state.unsent, newest.scheduling, columns),
+                recorder,
+            ]
+        table = _table(loop.timing, self.state.unsent)
         notes = textwrap.wrap(newest.scheduling, columns)[: rows - len(table) - 1]
         return [*table, *([text(note, DIM)] for note in notes), recorder]
 
@@ -127,7 +130,7 @@ def _recorder(newest: Telemetry, lost: int, columns: int) -> Line:
     return spread([text("● ", GREEN), text(name, INK)], [text(count, DIM)], columns)
 
 
-def _dense(timing: LoopTiming, scheduling: str, columns: int) -> list[Line]:
+def _dense(timing: LoopTiming, unsent: int, scheduling: str, columns: int) -> list[Line]:
     pairs = (
         ("tick", timing.compute_median_s, timing.compute_worst_s),
         ("age", timing.frame_age_median_s, timing.frame_age_worst_s),
@@ -136,7 +139,7 @@ def _dense(timing: LoopTiming, scheduling: str, columns: int) -> list[Line]:
     times: Line = []
     for name, median_s, worst_s in pairs:
         times += [text(f"{name} ", DIM), text(f"{_short_ms(median_s)}/{_short_ms(worst_s)} ", INK)]
-    counts = _counts(timing)
+    counts = _counts(timing, unsent)
     room = columns - width(counts) - 1
     return [
         [*times, text("ms", DIM)],
@@ -144,7 +147,7 @@ def _dense(timing: LoopTiming, scheduling: str, columns: int) -> list[Line]:
     ]
 
 
-def _table(timing: LoopTiming) -> list[Line]:
+def _table(timing: LoopTiming, unsent: int) -> list[Line]:
     rows = (
         ("compute", timing.compute_median_s, timing.compute_worst_s),
         ("frame age", timing.frame_age_median_s, timing.frame_age_worst_s),
@@ -158,17 +161,20 @@ def _table(timing: LoopTiming) -> list[Line]:
                 text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK),
             ]
         )
-    return [*lines, _counts(timing)]
+    return [*lines, _counts(timing, unsent)]
 
 
-def _counts(timing: LoopTiming) -> Line:
+def _counts(timing: LoopTiming, unsent: int) -> Line:
+    """What went wrong: in the last second; frames and what no console was sent since the start."""
     line: Line = []
-    for name, count in (
+    counts = [
         ("late", timing.late_ticks),
         ("lost", timing.frames_lost),
         ("miss", timing.servo_missed),
         ("stall", timing.stalls),
-    ):
+    ]
+    counts += [("unsent", unsent)] if unsent else []  # there is hardly room for it
+    for name, count in counts:
         line += [
             text(f"{name} ", DIM),
             text(f"{count}{'!' if count else ''} ", ORANGE if count else INK, bold=count > 0),
