@@ -14,8 +14,8 @@ import typer
 from typer.exceptions import TyperException
 
 from fitctl.commands import log, sequence
-from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
-from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption, rig_of
+from fitctl.config import ConfigError, default_rig_path
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
 # give, above all beside a loop that must not be late.
@@ -53,17 +53,13 @@ ParentOption = Annotated[
 ]
 
 
-def _rig(path: Path | None, overrides: list[str] | None) -> Rig:
-    return load_rig(path or default_rig_path(), overrides or ())
-
-
 def with_controller(
     path: Path | None, overrides: list[str] | None, controller: str | None
 ) -> list[str]:
     """The overrides, and with them one that gives every loop the named controller, if any."""
     if controller is None:
         return overrides or []
-    loops = _rig(path, overrides).loops
+    loops = rig_of(path, overrides).loops
     return [*(overrides or []), *(f"loops.{n}.vernier.controller={controller}" for n in loops)]
 
 
@@ -97,7 +93,7 @@ def demo(
     from fitctl.commands.instrument import run_demo
 
     overrides = with_controller(rig, overrides, controller)
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     console = not (headless or as_json) and sys.stdin.isatty() and sys.stdout.isatty()
     arguments = (rig or default_rig_path(), overrides, seed)
     raise typer.Exit(run_demo(settings, *arguments, duration, console=console, as_json=as_json))
@@ -124,7 +120,7 @@ def mocks(
     from fitctl.commands.fault import with_script
     from fitctl.commands.instrument import run_mocks
 
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     if faults is not None:
         settings = with_script(settings, faults)
     run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
@@ -138,7 +134,7 @@ def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOpti
     """
     from fitctl.commands.doctor import run_doctor
 
-    raise typer.Exit(run_doctor(_rig(rig, overrides), as_json=as_json))
+    raise typer.Exit(run_doctor(rig_of(rig, overrides), as_json=as_json))
 
 
 @app.command()
@@ -181,7 +177,7 @@ def fault_set(
     from fitctl.mocks.bench import SetFault
 
     wanted = SetFault(device, kind, part, value, for_s, probability)
-    change_faults(_rig(rig, overrides), wanted)
+    change_faults(rig_of(rig, overrides), wanted)
 
 
 @fault.command("clear")
@@ -196,7 +192,7 @@ def fault_clear(
     from fitctl.commands.fault import change_faults
     from fitctl.mocks.bench import ClearFaults
 
-    change_faults(_rig(rig, overrides), ClearFaults(device, kind, part))
+    change_faults(rig_of(rig, overrides), ClearFaults(device, kind, part))
 
 
 @fault.command("now")
@@ -205,7 +201,7 @@ def fault_now(rig: RigOption = None, overrides: SetOption = None) -> None:
     from fitctl.commands.fault import change_faults
     from fitctl.mocks.bench import ListFaults
 
-    change_faults(_rig(rig, overrides), ListFaults())
+    change_faults(rig_of(rig, overrides), ListFaults())
 
 
 @fault.command("kinds")
@@ -227,7 +223,7 @@ def run(
     from fitctl.commands.instrument import run_rig
 
     overrides = with_controller(rig, overrides, controller)
-    run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
+    run_rig(rig_of(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
 
 
 @app.command()
@@ -241,7 +237,7 @@ def console(
     """Attach an operator console to the running supervisor of a rig."""
     from fitctl.commands.instrument import run_console
 
-    run_console(_rig(rig, overrides), quitting_ends_instrument=quitting_ends_instrument)
+    run_console(rig_of(rig, overrides), quitting_ends_instrument=quitting_ends_instrument)
 
 
 @app.command()
@@ -263,7 +259,7 @@ def send(
     """Give one command to the running supervisor of a rig."""
     from fitctl.commands.instrument import send_command
 
-    raise typer.Exit(send_command(_rig(rig, overrides), command, values or [], loop))
+    raise typer.Exit(send_command(rig_of(rig, overrides), command, values or [], loop))
 
 
 @app.command()
@@ -290,7 +286,7 @@ def simulate(
     """
     from fitctl.commands.simulate import run_many, run_simulation
 
-    settings = _rig(rig, with_controller(rig, overrides, controller))
+    settings = rig_of(rig, with_controller(rig, overrides, controller))
     if runs == 1 and not scheduler:
         raise typer.Exit(run_simulation(settings, seed, duration, as_json=as_json))
     seeds = range(seed, seed + runs)
@@ -335,7 +331,7 @@ def identify(
     if (log is not None) + simulated + mock > 1:
         msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
         raise ConfigError(msg)
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     path = rig or default_rig_path()
     source, output = Source(log, simulated, mock, seed), Output(out, plot)
     raise typer.Exit(run(settings, path, overrides or [], what, loop, source, output))
@@ -369,7 +365,7 @@ def design(
     """
     from fitctl.commands.design import Output, run_design
 
-    run_design(_rig(rig, overrides), what, loop, Output(as_json, plot, out))
+    run_design(rig_of(rig, overrides), what, loop, Output(as_json, plot, out))
 
 
 @app.command()
@@ -392,7 +388,7 @@ def figures(
     """
     from fitctl.commands.figures import run_figures
 
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     raise typer.Exit(run_figures(settings, loop, seed, out, quick=quick))
 
 
@@ -401,7 +397,7 @@ def check(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Read a rig file and say whether it is well."""
     from fitctl.commands.instrument import check_plant
 
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     check_plant(settings)
     loops = ", ".join(settings.loops)
     typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
@@ -414,7 +410,7 @@ def record(
     """Record what a supervisor sends; the supervisor starts this by itself."""
     from fitctl.commands.instrument import run_recorder
 
-    run_recorder(_rig(rig, overrides), parent_pid=parent_pid)
+    run_recorder(rig_of(rig, overrides), parent_pid=parent_pid)
 
 
 def main(arguments: list[str] | None = None) -> None:
