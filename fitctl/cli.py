@@ -15,8 +15,15 @@ from typer.core import TyperCommand
 from typer.exceptions import TyperException
 
 from fitctl.commands import keys, log, sequence
-from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SeedOption, SetOption
-from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+from fitctl.commands.options import (
+    JsonOption,
+    RemoteOption,
+    RigOption,
+    SeedOption,
+    SetOption,
+    rig_of,
+)
+from fitctl.config import ConfigError, default_rig_path
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
 # give, above all beside a loop that must not be late.
@@ -55,17 +62,13 @@ ParentOption = Annotated[
 ]
 
 
-def _rig(path: Path | None, overrides: list[str] | None) -> Rig:
-    return load_rig(path or default_rig_path(), overrides or ())
-
-
 def with_controller(
     path: Path | None, overrides: list[str] | None, controller: str | None
 ) -> list[str]:
     """The overrides, and with them one that gives every loop the named controller, if any."""
     if controller is None:
         return overrides or []
-    loops = _rig(path, overrides).loops
+    loops = rig_of(path, overrides).loops
     return [*(overrides or []), *(f"loops.{n}.vernier.controller={controller}" for n in loops)]
 
 
@@ -99,7 +102,7 @@ def demo(
     from fitctl.commands.instrument import run_demo
 
     overrides = with_controller(rig, overrides, controller)
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     console = not (headless or as_json) and sys.stdin.isatty() and sys.stdout.isatty()
     arguments = (rig or default_rig_path(), overrides, seed)
     raise typer.Exit(run_demo(settings, *arguments, duration, console=console, as_json=as_json))
@@ -126,7 +129,7 @@ def mocks(
     from fitctl.commands.fault import with_script
     from fitctl.commands.instrument import run_mocks
 
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     if faults is not None:
         settings = with_script(settings, faults)
     run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
@@ -140,7 +143,7 @@ def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOpti
     """
     from fitctl.commands.doctor import run_doctor
 
-    raise typer.Exit(run_doctor(_rig(rig, overrides), as_json=as_json))
+    raise typer.Exit(run_doctor(rig_of(rig, overrides), as_json=as_json))
 
 
 @app.command()
@@ -183,7 +186,7 @@ def fault_set(
     from fitctl.mocks.bench import SetFault
 
     wanted = SetFault(device, kind, part, value, for_s, probability)
-    change_faults(_rig(rig, overrides), wanted)
+    change_faults(rig_of(rig, overrides), wanted)
 
 
 @fault.command("clear")
@@ -198,7 +201,7 @@ def fault_clear(
     from fitctl.commands.fault import change_faults
     from fitctl.mocks.bench import ClearFaults
 
-    change_faults(_rig(rig, overrides), ClearFaults(device, kind, part))
+    change_faults(rig_of(rig, overrides), ClearFaults(device, kind, part))
 
 
 @fault.command("now")
@@ -207,7 +210,7 @@ def fault_now(rig: RigOption = None, overrides: SetOption = None) -> None:
     from fitctl.commands.fault import change_faults
     from fitctl.mocks.bench import ListFaults
 
-    change_faults(_rig(rig, overrides), ListFaults())
+    change_faults(rig_of(rig, overrides), ListFaults())
 
 
 @fault.command("kinds")
@@ -229,7 +232,7 @@ def run(
     from fitctl.commands.instrument import run_rig
 
     overrides = with_controller(rig, overrides, controller)
-    run_rig(_rig(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
+    run_rig(rig_of(rig, overrides), _rig_arguments(rig, overrides), parent_pid=parent_pid)
 
 
 @app.command()
@@ -274,7 +277,7 @@ def send(
     from fitctl.supervisor.command_table import command_of
 
     wanted = command_of(command, values or [], loop)
-    if remote is None and loop and loop not in (loops := _rig(rig, overrides).loops):
+    if remote is None and loop and loop not in (loops := rig_of(rig, overrides).loops):
         msg = f"send: --loop {loop!r}: the rig has {', '.join(loops)}"
         raise ConfigError(msg)
     raise typer.Exit(send_command(connect(rig, overrides, remote), wanted))
@@ -288,7 +291,7 @@ def status(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOpti
     """
     from fitctl.commands.status import run_status
 
-    raise typer.Exit(run_status(_rig(rig, overrides), as_json=as_json))
+    raise typer.Exit(run_status(rig_of(rig, overrides), as_json=as_json))
 
 
 @app.command()
@@ -305,7 +308,7 @@ def watch(
     """Print a line a second about the running instrument, and every event as it comes."""
     from fitctl.commands.watch import run_watch
 
-    raise typer.Exit(run_watch(_rig(rig, overrides), duration, as_json=as_json))
+    raise typer.Exit(run_watch(rig_of(rig, overrides), duration, as_json=as_json))
 
 
 @app.command()
@@ -332,7 +335,7 @@ def simulate(
     """
     from fitctl.commands.simulate import run_many, run_simulation
 
-    settings = _rig(rig, with_controller(rig, overrides, controller))
+    settings = rig_of(rig, with_controller(rig, overrides, controller))
     if runs == 1 and not scheduler:
         raise typer.Exit(run_simulation(settings, seed, duration, as_json=as_json))
     seeds = range(seed, seed + runs)
@@ -377,7 +380,7 @@ def identify(
     if (log is not None) + simulated + mock > 1:
         msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
         raise ConfigError(msg)
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     path = rig or default_rig_path()
     source, output = Source(log, simulated, mock, seed), Output(out, plot)
     raise typer.Exit(run(settings, path, overrides or [], what, loop, source, output))
@@ -411,7 +414,7 @@ def design(
     """
     from fitctl.commands.design import Output, run_design
 
-    run_design(_rig(rig, overrides), what, loop, Output(as_json, plot, out))
+    run_design(rig_of(rig, overrides), what, loop, Output(as_json, plot, out))
 
 
 @app.command()
@@ -434,7 +437,7 @@ def figures(
     """
     from fitctl.commands.figures import run_figures
 
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     raise typer.Exit(run_figures(settings, loop, seed, out, quick=quick))
 
 
@@ -443,7 +446,7 @@ def check(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Read a rig file and say whether it is well."""
     from fitctl.commands.instrument import check_plant
 
-    settings = _rig(rig, overrides)
+    settings = rig_of(rig, overrides)
     check_plant(settings)
     loops = ", ".join(settings.loops)
     typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
@@ -456,7 +459,7 @@ def record(
     """Record what a supervisor sends; the supervisor starts this by itself."""
     from fitctl.commands.instrument import run_recorder
 
-    run_recorder(_rig(rig, overrides), parent_pid=parent_pid)
+    run_recorder(rig_of(rig, overrides), parent_pid=parent_pid)
 
 
 @app.command(hidden=True)
@@ -466,7 +469,7 @@ def metrics(
     """Serve metrics of the running instrument; the supervisor starts this by itself."""
     from fitctl.commands.instrument import run_metrics
 
-    run_metrics(_rig(rig, overrides), parent_pid=parent_pid)
+    run_metrics(rig_of(rig, overrides), parent_pid=parent_pid)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from fitctl.cli import main
-from fitctl.sequences.reading import shipped_folder
+from fitctl.sequences.reading import shipped_sequences
 
 HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
 WAIT = HEAD + 'steps = [{ step = "wait", duration_s = 5.0 }]\n'
@@ -35,7 +35,7 @@ def test_the_shipped_sequences_are_listed(sequence):
 
     assert status == 0
     listed = [line.split()[0] for line in out.splitlines()]
-    assert listed == sorted(path.stem for path in shipped_folder().glob("*.toml"))
+    assert listed == [path.stem for path in shipped_sequences()]
 
 
 def test_check_says_every_mistake_on_a_line(sequence, tmp_path):
@@ -77,6 +77,18 @@ def test_a_dry_run_prints_every_attempt_and_the_virtual_time(sequence, tmp_path)
     assert "outcome" in head
     assert wait.split()[:4] == ["1", "wait", "1", "done"]
     assert float(time.split()[0]) == pytest.approx(5.0, abs=0.5)
+
+
+def test_set_changes_the_sequence_and_the_rig(sequence, tmp_path):
+    path = written(tmp_path, WAIT)
+
+    status, out, _ = sequence(
+        "dry-run", path, "--set", "steps.wait.duration_s=20", "--set", "name=other"
+    )
+
+    assert status == 0
+    assert float(out.splitlines()[-1].split()[0]) == pytest.approx(20.0, abs=0.5)
+    assert "for rig other" in sequence("check", path, "--set", "name=other")[1]
 
 
 def test_a_dry_run_that_fails_has_status_1_and_says_why(sequence, tmp_path):

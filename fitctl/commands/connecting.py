@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.commands.options import rig_of
+from fitctl.config import ConfigError
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import service_folder
 from fitctl.supervisor.keys import read_remote
@@ -19,7 +20,7 @@ def connect(path: Path | None, overrides: list[str] | None, remote: Path | None)
         If the rig file or the key file cannot be used.
     """
     if remote is None:
-        return Client(service_folder(load_rig(path or default_rig_path(), overrides or ())))
+        return Client(service_folder(rig_of(path, overrides)))
     if path is not None or overrides:
         msg = f"--remote {remote}: the key file says which rig; leave out --rig and --set"
         raise ConfigError(msg)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from fitctl.config import Rig, default_rig_path, load_rig
+
 RigOption = Annotated[
     Path | None,
     typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
@@ -27,3 +29,14 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+
+
+def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
+    """The rig that the options name.
+
+    Raises
+    ------
+    ConfigError
+        If its file cannot be used.
+    """
+    return load_rig(path or default_rig_path(), overrides or ())

@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 import typer
 
-from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SeedOption, SetOption
-from fitctl.config import Rig, default_rig_path, load_rig
+from fitctl.commands.options import (
+    JsonOption,
+    RemoteOption,
+    RigOption,
+    SeedOption,
+    SetOption,
+    rig_of,
+)
+from fitctl.config import Rig
 
 if TYPE_CHECKING:
     from fitctl.logging.records import SequenceAttempt
@@ -26,30 +33,41 @@ app = typer.Typer(
 )
 
 SequenceArgument = Annotated[
-    Path, typer.Argument(metavar="FILE", help="A TOML file, or the name of a shipped sequence.")
+    Path,
+    typer.Argument(metavar="FILE", help="A TOML or YAML file, or the name of a shipped sequence."),
+]
+StepSetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the rig file, or of the sequence: steps.2.duration_s=60, or "
+        "steps.hold.duration_s=60 for every hold; may be repeated.",
+    ),
 ]
 
 
 def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Rig, Sequence]:
     from fitctl.sequences.reading import find_sequence, load_sequence
 
-    settings = load_rig(rig or default_rig_path(), overrides or ())
-    return settings, load_sequence(find_sequence(file), settings)
+    of_steps = [text for text in overrides or () if text.startswith("steps.")]
+    settings = rig_of(rig, [text for text in overrides or () if text not in of_steps])
+    return settings, load_sequence(find_sequence(file), settings, of_steps)
 
 
 @app.command("list")
 def list_() -> None:
     """Print the shipped sequences."""
-    from fitctl.sequences.reading import read_sequence, shipped_folder
+    from fitctl.sequences.reading import read_sequence, shipped_sequences
 
-    shipped = [read_sequence(path) for path in sorted(shipped_folder().glob("*.toml"))]
+    shipped = [read_sequence(path) for path in shipped_sequences()]
     width = max(len(sequence.name) for sequence in shipped)
     for sequence in shipped:
         typer.echo(f"{sequence.name:<{width}}  {sequence.description}")
 
 
 @app.command()
-def check(file: SequenceArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
+def check(file: SequenceArgument, rig: RigOption = None, overrides: StepSetOption = None) -> None:
     """Say what is wrong with a sequence for a rig, without the instrument."""
     settings, sequence = _load(file, rig, overrides)
     typer.echo(f"{file}: well; {len(sequence.steps)} steps for rig {settings.name}")
@@ -59,7 +77,7 @@ def check(file: SequenceArgument, rig: RigOption = None, overrides: SetOption = 
 def dry_run(
     file: SequenceArgument,
     rig: RigOption = None,
-    overrides: SetOption = None,
+    overrides: StepSetOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -80,7 +98,7 @@ def dry_run(
 def run(
     file: SequenceArgument,
     rig: RigOption = None,
-    overrides: SetOption = None,
+    overrides: StepSetOption = None,
     remote: RemoteOption = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -80,15 +80,27 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
         If it is missing, cannot be read or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_text(path, missing))
+    except tomllib.TOMLDecodeError as error:
+        msg = f"{path}: not TOML: {error}"
+        raise ConfigError(msg) from None
+
+
+def read_text(path: Path, missing: str) -> str:
+    """A file's text; `missing` is said where there is no file.
+
+    Raises
+    ------
+    ConfigError
+        If it is missing or cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         msg = f"{path}: {missing}"
         raise ConfigError(msg) from None
     except (OSError, UnicodeDecodeError) as error:
         msg = f"{path}: cannot be read: {error}"
-        raise ConfigError(msg) from None
-    except tomllib.TOMLDecodeError as error:
-        msg = f"{path}: not TOML: {error}"
         raise ConfigError(msg) from None
 
 
@@ -148,15 +160,7 @@ def rig_from_json(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
 
 
 def _override(document: dict[str, Any], text: str) -> None:
-    key, equals, value_text = text.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
-        msg = f"--set {text}: expected key.path=value, for example camera.frame_rate_hz=50.0"
-        raise ConfigError(msg)
-    try:
-        value = tomllib.loads(f"value = {value_text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = value_text
+    parts, value = parse_override(text, "camera.frame_rate_hz=50.0")
     table: Any = document
     for depth, part in enumerate(parts[:-1]):
         table = table.setdefault(part, {}) if isinstance(table, dict) else None
@@ -164,6 +168,25 @@ def _override(document: dict[str, Any], text: str) -> None:
             msg = f"--set {text}: {'.'.join(parts[: depth + 1])} is not a table"
             raise ConfigError(msg)
     table[parts[-1]] = value
+
+
+def parse_override(text: str, example: str) -> tuple[list[str], Any]:
+    """The parts of the key of ``key.path=value``, and the value: as TOML, or plain text where it is not.
+
+    Raises
+    ------
+    ConfigError
+        If it is not of that form.
+    """
+    key, equals, value_text = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        msg = f"--set {text}: expected key.path=value, for example {example}"
+        raise ConfigError(msg)
+    try:
+        return parts, tomllib.loads(f"value = {value_text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return parts, value_text
 
 
 def _explain(origin: str, problem: Any) -> str:

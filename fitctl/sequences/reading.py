@@ -1,9 +1,9 @@
-"""Sequence files: TOML in, a sequence or one line for each mistake out."""
+"""Sequence files: TOML or YAML in, a sequence or one line for each mistake out."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -11,8 +11,9 @@ from pydantic import ValidationError
 
 from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings
-from fitctl.config.reading import read_toml
+from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours import problems
+from fitctl.sequences.files import SUFFIXES, read_document
 from fitctl.sequences.steps import AnyStep, Sequence, Step
 
 STEPS: dict[str, type[Step]] = {
@@ -31,19 +32,25 @@ def find_sequence(name: Path) -> Path:
     """The file of a sequence: as given, or a shipped one by its bare name."""
     if name.exists() or name.parent != Path() or name.suffix:
         return name
-    shipped = shipped_folder() / f"{name}.toml"
-    return shipped if shipped.exists() else name
+    return next((path for path in shipped_sequences() if path.stem == str(name)), name)
 
 
-def load_sequence(path: Path, rig: Rig) -> Sequence:
+def shipped_sequences() -> list[Path]:
+    """The files of the shipped sequences, by name."""
+    return sorted(path for path in shipped_folder().iterdir() if path.suffix in SUFFIXES)
+
+
+def load_sequence(path: Path, rig: Rig, overrides: Iterable[str] = ()) -> Sequence:
     """Read a sequence file and check it for a rig, without the instrument.
+
+    `overrides` are ``steps.2.key=value`` texts, or ``steps.hold.key=value`` for every step of that name.
 
     Raises
     ------
     ConfigError
         One line for each mistake: file, step, key, what is allowed.
     """
-    sequence = read_sequence(path)
+    sequence = read_sequence(path, overrides)
     wrong = [
         f"{path}: step {number} ({step.step}): {problem}"
         for number, step in enumerate(sequence.steps, start=1)
@@ -54,17 +61,36 @@ def load_sequence(path: Path, rig: Rig) -> Sequence:
     return sequence
 
 
-def read_sequence(path: Path) -> Sequence:
-    """Read a sequence file, for whatever rig.
+def read_sequence(path: Path, overrides: Iterable[str] = ()) -> Sequence:
+    """Read a sequence file, for whatever rig; `overrides` as :func:`load_sequence`.
 
     Raises
     ------
     ConfigError
         One line for each mistake.
     """
-    names = ", ".join(sorted(file.stem for file in shipped_folder().glob("*.toml")))
-    document = read_toml(path, f"no such sequence file; shipped are {names}")
+    names = ", ".join(file.stem for file in shipped_sequences())
+    document = read_document(path, f"no such sequence file; shipped are {names}")
+    for override in overrides:
+        _override(document, override)
     return sequence_from_document(document, str(path))
+
+
+def _override(document: Mapping[str, Any], text: str) -> None:
+    parts, value = parse_override(text, "steps.2.duration_s=60.0")
+    listed = document.get("steps")
+    steps = {
+        str(number): step
+        for number, step in enumerate(listed if isinstance(listed, list) else [], start=1)
+        if isinstance(step, dict)
+    }
+    meant = [s for number, s in steps.items() if parts[1:2] in ([number], [s.get("step")])]
+    if len(parts) != 3 or not meant:
+        have = ", ".join(f"{number} ({step.get('step')})" for number, step in steps.items())
+        msg = f"--set {text}: expected steps.NUMBER.key=value or steps.NAME.key=value; there are {have}"
+        raise ConfigError(msg)
+    for step in meant:
+        step[parts[2]] = value
 
 
 def sequence_from_document(document: Mapping[str, Any], origin: str) -> Sequence:

@@ -2,14 +2,12 @@
 
 from typing import Literal, get_args, get_origin
 
+from documents import table
+
 from fitctl.sequences.reading import STEPS
 from fitctl.sequences.steps import Step
 
 COMMON = set(Step.model_fields)
-
-
-def table(head, rows):
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
 def default(field):

@@ -5,7 +5,7 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.sequences.links import SimulatedLink
-from fitctl.sequences.reading import load_sequence, shipped_folder
+from fitctl.sequences.reading import load_sequence, shipped_sequences
 from fitctl.sequences.runner import run_sequence
 from fitctl.supervisor.messages import Hold, SequenceControl, Stop
 
@@ -14,9 +14,7 @@ HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
 RIG = load_rig(default_rig_path())
 
 
-@pytest.mark.parametrize(
-    "path", sorted(shipped_folder().glob("*.toml")), ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", shipped_sequences(), ids=lambda path: path.stem)
 def test_every_shipped_sequence_runs_to_its_end(path):
     sequence = load_sequence(path, RIG)
     assert sequence.name == path.stem
@@ -198,7 +196,7 @@ def test_attempts_of_a_run_are_recorded_once_each(rig):
     records = []
     link = SimulatedLink(rig, 0)
     link._simulation._also = records.append
-    sequence = load_sequence(shipped_folder() / "acquire.toml", rig)
+    sequence = load_sequence(shipped_sequences() / "acquire.toml", rig)
 
     attempts = run_sequence(link, rig, sequence)
 

@@ -1,6 +1,7 @@
 """docs/sequences.md is true: its tables, its file and its programs."""
 
 import tomllib
+from pathlib import Path
 
 import pytest
 from documents import between, blocks
@@ -8,6 +9,7 @@ from step_tables import common_keys, step_keys
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.sequences.behaviours import problems
+from fitctl.sequences.files import parse_yaml
 from fitctl.sequences.reading import sequence_from_document
 
 
@@ -22,9 +24,11 @@ def test_the_tables_are_those_of_the_steps():
     assert between("sequences.md", "sequence-steps") == step_keys()
 
 
-@pytest.mark.parametrize("block", shown("TOML"), ids=str)
+@pytest.mark.parametrize("block", [*shown("TOML"), *shown("yaml")], ids=str)
 def test_a_sequence_that_is_shown_is_well(block):
-    sequence = sequence_from_document(tomllib.loads(block.text), str(block))
+    yaml = block.language == "yaml"
+    document = parse_yaml(block.text, Path(str(block))) if yaml else tomllib.loads(block.text)
+    sequence = sequence_from_document(document, str(block))
 
     rig = load_rig(default_rig_path())
     assert [problem for step in sequence.steps for problem in problems(step, rig)] == []

@@ -1,6 +1,7 @@
 """Sequence files: every mistake is one line that says where."""
 
 import tomllib
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -8,11 +9,12 @@ from hypothesis import strategies as st
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.sequences.behaviours import BEHAVIOURS
+from fitctl.sequences.files import parse_yaml
 from fitctl.sequences.reading import (
     STEPS,
     load_sequence,
     sequence_from_document,
-    shipped_folder,
+    shipped_sequences,
 )
 
 RIG = load_rig(default_rig_path())
@@ -85,6 +87,117 @@ def test_what_is_no_sequence_is_refused(tmp_path, text, said):
     assert any(said in line for line in mistakes(tmp_path, text))
 
 
+YAML_HEAD = "schema_version: 1\nname: tried\ndescription: Of a test.\n"
+WRITTEN = {
+    ".toml": HEAD + 'steps = [{ step = "wait", duration_s = 5.0 }]',
+    ".yaml": YAML_HEAD + "steps:\n  - step: wait\n    duration_s: 5.0\n",
+    ".yml": YAML_HEAD + "steps: [{step: wait, duration_s: 5}]",
+}
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_toml_and_yaml_say_the_same(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_text(WRITTEN[suffix])
+
+    (step,) = load_sequence(path, RIG).steps
+
+    assert (step.step, step.duration_s) == ("wait", 5.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "steps: [{step: wait\n",
+            "not YAML: expected ',' or '}', but got '<stream end>' (at line 5",
+        ),
+        ("steps: 1\nsteps: 2\n", 'found duplicate key "steps" with value "2"'),
+        ("steps:\n\t- step: off\n", "not YAML: found character '\\t'"),
+        (
+            "steps: [{step: off, loop: !!python/object:os.system x}]",
+            "not YAML: could not determine",
+        ),
+        ("steps: " + "[" * 5000, "not YAML: "),
+        ("steps: [{step: off, loop: no}]", "loop 'no': rig fit-mock has right"),
+        ("steps: [{step: wait, duration_s: 12:30}]", "must be a valid number (is '12:30')"),
+        ("steps: [{step: wait, duration_s: yes}]", "must be a valid number (is 'yes')"),
+        ("steps: [{step: off, 1: 2}]", "step 1"),
+        ("steps: &a [*a]", "step 1"),
+        ("steps: \x01", "not YAML: "),
+    ],
+)
+def test_a_mistake_in_yaml_is_one_line_that_says_where(tmp_path, text, said):
+    path = tmp_path / "a.yaml"
+    path.write_text(YAML_HEAD + text)
+
+    with pytest.raises(ConfigError) as caught:
+        load_sequence(path, RIG)
+
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(f"{path}: ")
+    assert said in line
+
+
+@pytest.mark.parametrize("text", ["", "- 1", "no", "42"])
+def test_yaml_without_keys_is_no_sequence(tmp_path, text):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+
+    with pytest.raises(ConfigError, match="must have keys, such as schema_version: 1"):
+        load_sequence(path, RIG)
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_yaml_or_one_line(text):
+    said = "a.yaml: not YAML: nothing"
+    try:
+        parse_yaml(text, Path("a.yaml"))
+    except ConfigError as error:
+        said = str(error)
+
+    assert said.startswith("a.yaml: not YAML: ")
+    assert len(said.splitlines()) == 1
+
+
+def changed(tmp_path, *overrides):
+    path = tmp_path / "a.toml"
+    path.write_text(
+        HEAD + 'steps = [{ step = "acquire" }, { step = "hold", duration_s = 5.0 },'
+        ' { step = "hold", duration_s = 6.0 }]'
+    )
+    return load_sequence(path, RIG, overrides)
+
+
+@pytest.mark.parametrize(
+    ("override", "durations"),
+    [
+        ("steps.2.duration_s=60", [60.0, 6.0]),
+        ("steps.3.duration_s=60.0", [5.0, 60.0]),
+        ("steps.hold.duration_s=60.0", [60.0, 60.0]),
+    ],
+)
+def test_a_steps_keys_are_set_by_its_number_or_its_name(tmp_path, override, durations):
+    assert [step.duration_s for step in changed(tmp_path, override).steps[1:]] == durations
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("steps.4.duration_s=1.0", "there are 1 (acquire), 2 (hold), 3 (hold)"),
+        ("steps.jog.jog_px=1.0", "expected steps.NUMBER.key=value or steps.NAME.key=value"),
+        ("steps.2=1.0", "expected steps.NUMBER.key=value"),
+        ("steps.2.duration=1.0", "duration: unknown key; did you mean duration_s?"),
+        ("steps.2.duration_s", "expected key.path=value, for example steps.2.duration_s=60.0"),
+    ],
+)
+def test_a_step_that_is_not_there_cannot_be_changed(tmp_path, override, said):
+    with pytest.raises(ConfigError) as caught:
+        changed(tmp_path, override)
+
+    assert said in str(caught.value)
+
+
 def test_where_a_rig_has_two_loops_each_step_names_its_own(tmp_path):
     document = tomllib.loads(default_rig_path().read_text())
     two = RIG.model_copy(update={"loops": {"left": RIG.loops["right"], **RIG.loops}})
@@ -101,7 +214,7 @@ def test_where_a_rig_has_two_loops_each_step_names_its_own(tmp_path):
 def test_shipped_sequences_are_well_for_every_shipped_rig(rig):
     settings = load_rig(rig)
 
-    assert [load_sequence(path, settings).name for path in shipped_folder().glob("*.toml")]
+    assert [load_sequence(path, settings).name for path in shipped_sequences()]
 
 
 def test_every_step_has_a_behaviour():
