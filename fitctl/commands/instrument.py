@@ -51,12 +51,20 @@ COMMANDS: dict[str, Callable[..., messages.AnyCommand]] = {
 class WithValues(NamedTuple):
     """A command that needs values, and their names in the order in which they are given."""
 
-    make: type[messages.SetTarget | messages.SetController | messages.Reset]
+    make: type[
+        messages.SetTarget
+        | messages.Jog
+        | messages.SetBiasOffset
+        | messages.SetController
+        | messages.Reset
+    ]
     fields: tuple[str, ...]
 
 
 WITH_VALUES = {
     "target": WithValues(messages.SetTarget, ("az_px", "el_px")),
+    "jog": WithValues(messages.Jog, ("az_sky_arcsec", "el_sky_arcsec")),
+    "bias-offset": WithValues(messages.SetBiasOffset, ("az_urad", "el_urad")),
     "controller": WithValues(messages.SetController, ("name",)),
     "reset": WithValues(messages.Reset, ("name",)),
 }

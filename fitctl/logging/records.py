@@ -6,6 +6,7 @@ A field's unit is in its name; a value that does not exist at a tick is NaN.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import msgspec
@@ -68,6 +69,9 @@ class Tick(Record, frozen=True, kw_only=True):
     siderostat_az_sky_arcsec: float
     siderostat_el_sky_arcsec: float
     search_progress: float
+    # Of `compute_s`: measuring the star, and deciding; what is left is writing to the D/A.
+    sense_s: float = math.nan
+    decide_s: float = math.nan
 
 
 class FrameRecord(Record, frozen=True, kw_only=True):

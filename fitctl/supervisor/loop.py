@@ -130,7 +130,7 @@ class StellarLoop:
         self.interlocks = Interlocks(rig.interlocks, places(rig, name))
         self._laws: dict[Mode, Callable[[Seen], None]] = {
             Mode.OFF: self._rest,
-            Mode.STANDBY: self._rest,
+            Mode.STANDBY: self._stand_by,
             Mode.ACQUISITION: self._search,
             Mode.COARSE: self._pull_in,
             Mode.VERNIER: self._hold_star,
@@ -145,11 +145,13 @@ class StellarLoop:
         started_s = self._clock.now_s()
         self._note_injections()
         seen = self._sense(frame)
+        sensed_s = self._clock.now_s()
         self._judge(frame, seen.star)
         self._judge_interlocks(frame, seen.star)
         self._move(frame, seen)
+        decided_s = self._clock.now_s()
         self._write()
-        tick = self._record(frame, seen, started_s, frames_lost)
+        tick = self._record(frame, seen, frames_lost, (started_s, sensed_s, decided_s))
         self.measured.of_tick(tick.compute_s, tick.time_s)
         return tick
 
@@ -320,12 +322,16 @@ class StellarLoop:
         """Mirror back to its bias; the siderostat is held or stopped by its servo."""
         self.stages.mirror_to_bias()
 
+    def _stand_by(self, _seen: Seen) -> None:
+        """Both stages rest where the operator has put them."""
+        self.stages.mirror_to_rest()
+
     def _search(self, _seen: Seen) -> None:
-        self.stages.mirror_to_bias()
+        self.stages.mirror_to_rest()
         self.stages.siderostat_to(self.search.advance(self._period_s))
 
     def _pull_in(self, seen: Seen) -> None:
-        self.stages.mirror_to_bias()
+        self.stages.mirror_to_rest()
         command_px = self._prefilter.step(self.target_px)
         if seen.star is not None:
             error_px = _position(seen.star) - command_px
@@ -442,9 +448,19 @@ class StellarLoop:
 
     # ------------------------------------------------------------ records
 
-    def _record(self, frame: Frame | None, seen: Seen, started_s: float, frames_lost: int) -> Tick:
-        """What this tick was: names, times and numbers as they are logged."""
+    def _record(
+        self,
+        frame: Frame | None,
+        seen: Seen,
+        frames_lost: int,
+        times_s: tuple[float, float, float],
+    ) -> Tick:
+        """What this tick was: names, times and numbers as they are logged.
+
+        `times_s` are when it was started, when the star was measured, and when it was decided what to do.
+        """
         done_s = self._clock.now_s()
+        started_s, sensed_s, decided_s = times_s
         star, stages = seen.star, self.stages
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
         star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
@@ -489,6 +505,8 @@ class StellarLoop:
             siderostat_az_sky_arcsec=motor_az_rad * sky_arcsec_per_rad,
             siderostat_el_sky_arcsec=motor_el_rad * sky_arcsec_per_rad,
             search_progress=self.search.progress if self.mode is Mode.ACQUISITION else math.nan,
+            sense_s=sensed_s - started_s,
+            decide_s=decided_s - sensed_s,
         )
 
     def _near_edge(self, star: Star) -> bool:
