@@ -80,6 +80,9 @@ class Tick(Record, frozen=True, kw_only=True):
     encoder_read_s: float = math.nan
     encoder_az_rad: float = math.nan
     encoder_el_rad: float = math.nan
+    # Of `compute_s`: measuring the star, and deciding; what is left is writing to the D/A.
+    sense_s: float = math.nan
+    decide_s: float = math.nan
 
 
 class FrameRecord(Record, frozen=True, kw_only=True):

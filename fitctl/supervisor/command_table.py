@@ -76,6 +76,8 @@ COMMANDS = (
     CommandRow(messages.Recover, "the instrument", "recover", "r", "Recover"),
     CommandRow(messages.Off, "the instrument", "off", "o", "Off"),
     CommandRow(messages.SetTarget, "the instrument", "target"),
+    CommandRow(messages.Jog, "the instrument", "jog"),
+    CommandRow(messages.SetBiasOffset, "the instrument", "bias-offset"),
     CommandRow(messages.SetController, "the instrument", "controller"),
     CommandRow(messages.Reset, "the instrument", "reset"),
     CommandRow(messages.Status, "any key", "status", logged=False),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fitctl.config import QUANTITIES, Action, Interlock
-from fitctl.supervisor.messages import TrippedInterlock
+from fitctl.supervisor.messages import TrippedInterlock, Watched
 
 Reading = tuple[float, float, str]
 """A value, when it was measured, in s, and what there is to say about it, if it is an error's."""
@@ -168,6 +168,27 @@ class Interlocks:
         for rule in self._rules.values():
             rule.begin(now_s)
         self._sum_up()
+
+    def watched(self, now_s: float, readings: Mapping[str, Reading]) -> list[Watched]:
+        """Every row beside its quantity as last measured; may be asked from any thread."""
+        judged = set(map(id, self._judged))
+        rows = []
+        for rule in self._rules.values():
+            value, time_s, _ = readings.get(rule.quantity, (math.nan, math.nan, ""))
+            rows.append(
+                Watched(
+                    name=rule.name,
+                    quantity=rule.quantity,
+                    value=value,
+                    age_s=now_s - time_s,
+                    low=rule.row.low,
+                    high=rule.row.high,
+                    stale_s=rule.row.stale_s,
+                    action=rule.row.action,
+                    judged=id(rule) in judged,
+                )
+            )
+        return rows
 
     def _enter(self, mode: str, now_s: float) -> None:
         for rule in self._rules.values():

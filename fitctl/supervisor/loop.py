@@ -140,7 +140,7 @@ class StellarLoop:
         self.interlocks = Interlocks(rig.interlocks, places(rig, name))
         self._laws: dict[Mode, Callable[[Seen], None]] = {
             Mode.OFF: self._rest,
-            Mode.STANDBY: self._rest,
+            Mode.STANDBY: self._stand_by,
             Mode.ACQUISITION: self._search,
             Mode.COARSE: self._pull_in,
             Mode.VERNIER: self._hold_star,
@@ -156,11 +156,13 @@ class StellarLoop:
         started_s = self._clock.now_s()
         self._note_injections()
         seen = self._sense(frame, servo, started_s)
+        sensed_s = self._clock.now_s()
         self._judge(frame, seen)
         self._judge_interlocks(frame, seen)
         self._move(frame, seen)
+        decided_s = self._clock.now_s()
         self._write()
-        tick = self._record(frame, seen, frames_lost)
+        tick = self._record(frame, seen, frames_lost, (sensed_s, decided_s))
         self.measured.of_tick(tick.compute_s, tick.time_s)
         return tick
 
@@ -342,12 +344,16 @@ class StellarLoop:
         """Mirror back to its bias; the siderostat is held or stopped by its servo."""
         self.stages.mirror_to_bias()
 
+    def _stand_by(self, _seen: Seen) -> None:
+        """Both stages rest where the operator has put them."""
+        self.stages.mirror_to_rest()
+
     def _search(self, _seen: Seen) -> None:
-        self.stages.mirror_to_bias()
+        self.stages.mirror_to_rest()
         self.stages.siderostat_to(self.search.advance(self._period_s))
 
     def _pull_in(self, seen: Seen) -> None:
-        self.stages.mirror_to_bias()
+        self.stages.mirror_to_rest()
         command_px = self._prefilter.step(self.target_px)
         if seen.star is not None:
             error_px = _position(seen.star) - command_px
@@ -474,9 +480,15 @@ class StellarLoop:
 
     # ------------------------------------------------------------ records
 
-    def _record(self, frame: Frame | None, seen: Seen, frames_lost: int) -> Tick:
-        """What this tick was: names, times and numbers as they are logged."""
+    def _record(
+        self, frame: Frame | None, seen: Seen, frames_lost: int, times_s: tuple[float, float]
+    ) -> Tick:
+        """What this tick was: names, times and numbers as they are logged.
+
+        `times_s` are when the star was measured, and when it was decided what to do.
+        """
         done_s = self._clock.now_s()
+        sensed_s, decided_s = times_s
         star, stages, servo = seen.star, self.stages, seen.servo
         read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or _NO_READING
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
@@ -529,6 +541,8 @@ class StellarLoop:
             encoder_read_s=read_s,
             encoder_az_rad=encoder_az_rad,
             encoder_el_rad=encoder_el_rad,
+            sense_s=sensed_s - seen.now_s,
+            decide_s=decided_s - sensed_s,
         )
 
     def _near_edge(self, star: Star) -> bool:

@@ -67,6 +67,20 @@ class SetTarget(Command, frozen=True, kw_only=True):
     el_px: float
 
 
+class Jog(Command, frozen=True, kw_only=True):
+    """In STANDBY: move the siderostat from where it is held, by angles on the sky."""
+
+    az_sky_arcsec: float
+    el_sky_arcsec: float
+
+
+class SetBiasOffset(Command, frozen=True, kw_only=True):
+    """In STANDBY: how far from its bias the mirror rests, until it is powered up anew or made safe."""
+
+    az_urad: float
+    el_urad: float
+
+
 class SetController(Command, frozen=True, kw_only=True):
     """Work with another design; in VERNIER the mirror goes on where it is. Files cannot be named here."""
 
@@ -140,6 +154,8 @@ AnyCommand = (
     | Recover
     | Off
     | SetTarget
+    | Jog
+    | SetBiasOffset
     | SetController
     | Reset
     | Experiment
@@ -185,6 +201,29 @@ class TrippedInterlock(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
+class Watched(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of the table of interlocks beside what is measured; NaN where nothing was."""
+
+    name: str
+    quantity: str
+    value: float
+    age_s: float
+    low: float | None
+    high: float | None
+    stale_s: float | None
+    action: Action
+    judged: bool
+
+
+class LoopLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """How far a loop's stages go, and what its search does, from the rig file."""
+
+    fsm_range_rad: float
+    siderostat_travel_sky_arcsec: float
+    search_radius_sky_arcsec: float
+    spiral_pitch_sky_arcsec: float
+
+
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it."""
 
@@ -197,6 +236,10 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     controller: str = ""
     last_change: ModeChange | None = None
     interlocks: list[TrippedInterlock] = []
+    limits: LoopLimits | None = None
+    watched: list[Watched] = []
+    bias_offset_urad: tuple[float, float] = (0.0, 0.0)
+    search_centre_sky_arcsec: tuple[float, float] | None = None
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):

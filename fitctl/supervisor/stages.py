@@ -45,6 +45,8 @@ class Stages:
         Of the siderostat's travel: the wanted set-point before it was limited.
     travel_rad : float
         Of the motors, each way from the encoders' zero.
+    bias_offset_rad : array, shape (2,)
+        How far from its bias the mirror rests.
     injector : Injector
         Writes the D/A in this one's stead while an experiment runs.
     """
@@ -57,6 +59,8 @@ class Stages:
         self.ready = False
         self.stack_v = np.full(3, loop.fsm.bias_v)
         self.mirror_rad = np.zeros(2)
+        self.bias_offset_rad = np.zeros(2)
+        self._rest_v = self.stack_v
         self.setpoint_rad = np.zeros(2)
         self.written_s = clock.now_s()
         self.round_trip_s = 0.0
@@ -76,6 +80,7 @@ class Stages:
         self._clock = clock
         self._mirror = Mirror(loop.fsm)
         self._most_slew_v = loop.fsm.slew_v_per_s * rig.camera.period_s
+        self._motor_sky_arcsec_per_rad = scale.motor_sky_arcsec_per_rad
         self.travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
         shortest_s = min(rig.camera.period_s, self.injector.period_s)
         self._lowest_v, self._highest_v = self.stack_v.copy(), self.stack_v.copy()
@@ -103,6 +108,7 @@ class Stages:
 
     def start_from(self, stack_v: Floats) -> None:
         """Take the D/A's outputs, shape (3,), as found."""
+        self.rest_off_bias(np.zeros(2))
         self._mirror.assume(stack_v)
         self.stack_v = self._mirror.stack_v
         self.mirror_rad = self._mirror.angles_rad
@@ -121,9 +127,26 @@ class Stages:
             self.mirror_rad, hysteresis_inverse=hysteresis_inverse
         )
 
+    def rest_off_bias(self, offset_rad: Floats) -> None:
+        """From now on the mirror rests this far from its bias, shape (2,), within its diamond."""
+        self.bias_offset_rad = saturate_diamond(offset_rad, self._fsm.range_rad)
+        # Without one, the bias itself; with one, the angle that was asked for, from where the mirror is now.
+        self._rest_v = self._mirror.volts_for(
+            self.bias_offset_rad, hysteresis_inverse=bool(self.bias_offset_rad.any())
+        )
+
+    def mirror_to_rest(self) -> None:
+        """One frame's way back to where it rests."""
+        self._go_to_v(self._rest_v)
+
     def mirror_to_bias(self) -> None:
-        """One frame's way back to the bias."""
-        left_v = self._fsm.bias_v - self.stack_v
+        """One frame's way back to the bias; an offset from it is forgotten."""
+        if self.bias_offset_rad.any():
+            self.rest_off_bias(np.zeros(2))
+        self._go_to_v(self._rest_v)
+
+    def _go_to_v(self, rest_v: Floats) -> None:
+        left_v = rest_v - self.stack_v
         self.stack_v = self.stack_v + np.clip(left_v, -self._most_slew_v, self._most_slew_v)
         self.mirror_rad = self._mirror.angles_rad
 
@@ -172,6 +195,10 @@ class Stages:
         """The servo holds the siderostat where it is."""
         self.setpoint_rad = self._servo.setpoint_rad
         self.asked_fraction = 0.0
+
+    def jog(self, step_sky_arcsec: Floats) -> None:
+        """Move the set-point by an angle on the sky, shape (2,)."""
+        self.siderostat_to(self.setpoint_rad + step_sky_arcsec / self._motor_sky_arcsec_per_rad)
 
     def siderostat_to(self, setpoint_rad: Floats) -> None:
         """Move the set-point, shape (2,), no farther than its travel."""

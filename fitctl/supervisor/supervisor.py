@@ -37,18 +37,21 @@ from fitctl.logging.records import (
 from fitctl.supervisor.command_table import ROWS, command_record
 from fitctl.supervisor.drives import refused_drives
 from fitctl.supervisor.health import camera_health, loop_health
+from fitctl.supervisor.jogging import move_by_hand
 from fitctl.supervisor.loop import StellarLoop
 from fitctl.supervisor.messages import (
     Acquire,
     AnyCommand,
     Experiment,
     Hold,
+    Jog,
     Off,
     Recover,
     Reply,
     Reset,
     SequenceControl,
     SequenceReport,
+    SetBiasOffset,
     SetController,
     SetTarget,
     Shutdown,
@@ -308,6 +311,8 @@ class Supervisor:
         match command:
             case SetTarget():
                 reply = self._set_target(command, names)
+            case Jog() | SetBiasOffset():
+                reply = self._move_by_hand(command, names)
             case SetController():
                 reply = self._set_controller(command, names)
             case Reset():
@@ -334,6 +339,8 @@ class Supervisor:
             self._open(usable, trigger)
         elif trigger is Trigger.OFF:
             moving = [name for name in usable if not self._at_bias(name)]
+            for name in moving:
+                self.loops[name].stages.mirror_to_bias()  # where it rested off its bias
             if moving:
                 return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
             self._turn_off(usable)
@@ -356,6 +363,10 @@ class Supervisor:
         for name in names:
             self.loops[name].target_px = wanted
         return Reply(accepted=True)
+
+    def _move_by_hand(self, command: Jog | SetBiasOffset, names: list[str]) -> Reply:
+        why_not = move_by_hand(self.rig, [self.loops[name] for name in names], command)
+        return _refusal(why_not) if why_not else Reply(accepted=True)
 
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
         for name in names:

@@ -21,9 +21,8 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.model.optics import scales
-from fitctl.supervisor.messages import LoopState, Telemetry
-from fitctl.supervisor.modes import usable_commands
+from fitctl.supervisor.loop_state import loop_state
+from fitctl.supervisor.messages import Telemetry
 from fitctl.supervisor.supervisor import Supervisor
 
 _BUFFERED_TICKS = 2000
@@ -101,20 +100,7 @@ class TelemetryBuffer:
             wall_minus_monotonic_s=state.wall_minus_monotonic_s,
             rig_name=supervisor.rig.name,
             pid=state.pid,
-            loops=[
-                LoopState(
-                    name=name,
-                    mode=loop.mode.name,
-                    since_s=loop.mode_since_s,
-                    requirement_px=loop.settings.requirement_px,
-                    sky_arcsec_per_px=scales(supervisor.rig, loop.settings).sky_arcsec_per_px,
-                    usable_commands=[t.name.capitalize() for t in usable_commands(loop.mode)],
-                    controller=loop.controller,
-                    last_change=loop.last_change,
-                    interlocks=list(loop.interlocks.tripped),
-                )
-                for name, loop in supervisor.loops.items()
-            ],
+            loops=[loop_state(supervisor.rig, loop, now_s) for loop in supervisor.loops.values()],
             ticks=self._ticks.drain(),
             events=self._events.drain(),
             mode_changes=self._changes.drain(),

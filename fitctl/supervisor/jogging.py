@@ -1,0 +1,67 @@
+"""An operator moves the stages by hand, in STANDBY."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.model.optics import scales
+from fitctl.supervisor.loop import StellarLoop
+from fitctl.supervisor.messages import Jog, SetBiasOffset
+from fitctl.supervisor.modes import Mode
+
+Floats = NDArray[np.float64]
+
+
+def move_by_hand(rig: Rig, loops: list[StellarLoop], command: Jog | SetBiasOffset) -> str:
+    """Move the siderostats or the mirrors of `loops`, all of them or none.
+
+    Returns
+    -------
+    str
+        Why none was moved, and what to do; empty where all were.
+    """
+    for loop in loops:
+        if loop.mode is not Mode.STANDBY:
+            return (
+                f"stages are moved by hand only in STANDBY (is {loop.mode.name}); while a star is held, "
+                "move the target"
+            )
+    if isinstance(command, Jog):
+        step_sky_arcsec = np.array([command.az_sky_arcsec, command.el_sky_arcsec])
+        why_not = next(filter(None, (_beyond(rig, loop, step_sky_arcsec) for loop in loops)), "")
+        for loop in () if why_not else loops:
+            loop.stages.jog(step_sky_arcsec)
+        return why_not
+    offset_rad = 1e-6 * np.array([command.az_urad, command.el_urad])
+    why_not = next(filter(None, (_off_the_diamond(loop, offset_rad) for loop in loops)), "")
+    for loop in () if why_not else loops:
+        loop.stages.rest_off_bias(offset_rad)
+    return why_not
+
+
+def _beyond(rig: Rig, loop: StellarLoop, step_sky_arcsec: Floats) -> str:
+    """A slip of the finger must not lead far from the star, nor to the end of the travel."""
+    scale = scales(rig, loop.settings)
+    most_arcsec = min(rig.camera.width_px, rig.camera.height_px) * scale.sky_arcsec_per_px
+    if not np.abs(step_sky_arcsec).max() <= most_arcsec:  # not-a-number too
+        return f"a jog is at most a field of view, {most_arcsec:.1f} arcsec on the sky"
+    stages = loop.stages
+    goes_rad = stages.setpoint_rad + step_sky_arcsec / scale.motor_sky_arcsec_per_rad
+    if np.abs(goes_rad).max() > stages.travel_rad:
+        travel_arcsec = loop.settings.siderostat.travel_sky_arcsec
+        return (
+            f"siderostat {loop.name} would leave its travel of ±{travel_arcsec:g} arcsec on the sky; "
+            "jog the other way"
+        )
+    return ""
+
+
+def _off_the_diamond(loop: StellarLoop, offset_rad: Floats) -> str:
+    range_rad = loop.settings.fsm.range_rad
+    if not np.abs(offset_rad).sum() <= range_rad:
+        return (
+            f"|az| + |el| of a bias offset must be within the mirror's {1e6 * range_rad:.1f} urad"
+        )
+    return ""
