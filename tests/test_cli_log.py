@@ -15,6 +15,7 @@ from log_samples import (
     SETTINGS,
     SMALL_CHUNKS,
     contents,
+    files_end_at,
     frame,
     one_of_each,
     tick,
@@ -193,6 +194,29 @@ def test_nothing_exported_is_overwritten(log, whole):
     status, _, error = log("export", whole, "--format", "csv", "--topic", "/fit/events")
     assert status == 2
     assert "fit.events.csv: exists already; give another folder with --out" in error
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_an_export_that_fails_leaves_no_part_of_it(log, whole, kind):
+    pytest.importorskip("pyarrow.parquet")
+    out = whole.with_name("tables")
+    out.mkdir()
+    (out / f"fit.events.{kind}").write_text("somebody's own")  # the log's other topics come first
+    status, _, error = log("export", whole, "--format", kind, "--out", out)
+    assert (status, "exists already" in error) == (2, True)
+    assert [path.name for path in out.iterdir()] == [f"fit.events.{kind}"]
+    assert (out / f"fit.events.{kind}").read_text() == "somebody's own"
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_an_export_onto_a_full_disk_leaves_no_part_of_it(log, whole, kind):
+    pytest.importorskip("pyarrow.parquet")
+    narrow, out = whole.with_name("narrow.mcap"), whole.with_name("tables")
+    log("cut", whole, "--from", "8", "--out", narrow)
+    with files_end_at(1000):
+        status, _, error = log("export", narrow, "--format", kind, "--out", out)
+    assert (status, f"{out}: cannot be written: " in error) == (2, True), error
+    assert list(out.iterdir()) == []
 
 
 def test_parquet_without_pyarrow_says_what_to_do(log, whole, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,8 +19,14 @@ from fitctl.commands.instrument import FAILED, interrupt
 from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, Rig
 from fitctl.identify.errors import IdentifyError
-from fitctl.identify.experiments import EXPERIMENTS, Finding, response_on_mock_bench
+from fitctl.identify.experiments import (
+    EXPERIMENTS,
+    Finding,
+    Identification,
+    response_on_mock_bench,
+)
 from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
+from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
 from fitctl.processes import ended_by_signals
 from fitctl.supervisor.client import Client
@@ -131,15 +138,25 @@ def _found(
         rig.mock_parts()
         with demos.instrument(rig_path, overrides, source.seed) as running:
             _hold_a_star(running, loop_name)
-            path = on_rig(running.client, rig, loop_name, what, drives, progress)
-            return experiment.from_log(rig, loop_name, path)
+            paths = on_rig(running.client, rig, loop_name, what, drives, progress)
+            return _from_logs(experiment, rig, loop_name, paths)
     client = Client(service_folder(rig))
     try:
         insist_on_vernier(client, loop_name)
-        path = on_rig(client, rig, loop_name, what, drives, progress)
+        paths = on_rig(client, rig, loop_name, what, drives, progress)
     finally:
         client.close()
-    return experiment.from_log(rig, loop_name, path)
+    return _from_logs(experiment, rig, loop_name, paths)
+
+
+def _from_logs(experiment: Identification, rig: Rig, loop_name: str, paths: list[Path]) -> Finding:
+    """From all logs that were written meanwhile: another may have begun within the experiment."""
+    if len(paths) == 1:
+        return experiment.from_log(rig, loop_name, paths[0])
+    with tempfile.TemporaryDirectory(prefix="fitctl-identify-") as folder:
+        whole = Path(folder) / "whole.mcap"
+        merge(paths, whole)
+        return experiment.from_log(rig, loop_name, whole)
 
 
 def _by_axis(progress: Progress) -> Callable[[str], None]:

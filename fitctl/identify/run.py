@@ -59,8 +59,8 @@ def on_simulation(
 
 def on_rig(
     client: Client, rig: Rig, loop_name: str, name: str, drives: list[Drive], on_progress: Progress
-) -> Path:
-    """Have a running supervisor carry an experiment out; the log that has it.
+) -> list[Path]:
+    """Have a running supervisor carry an experiment out; the logs that have it, in their order.
 
     Raises
     ------
@@ -70,27 +70,42 @@ def on_rig(
         If no supervisor answers.
     """
     _command(client, Experiment(loop=loop_name, name=name, drives=drives))
+    paths: dict[Path, None] = {}  # in the order in which they were begun
     try:
-        telemetry = _followed(client, loop_name, experiment_s(drives), on_progress)
+        telemetry = _followed(client, loop_name, experiment_s(drives), on_progress, paths)
     except KeyboardInterrupt:
         client.send(Hold(loop=loop_name))  # nobody waits for it any more
         raise
     change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
     _insist_on_end(_mode(telemetry, loop_name), change.reason if change else "")
-    if telemetry.recorder is None:
+    end_s = time.monotonic() + rig.logging.flush_s + _FLUSH_SLACK_S
+    while time.monotonic() < end_s:  # until the log's newest second is on disk
+        _hear(client, paths)
+    if not paths:
         msg = "the supervisor has no recorder, so there is no log to learn from; see its events"
         raise IdentifyError(msg)
-    time.sleep(rig.logging.flush_s + _FLUSH_SLACK_S)  # until the log's newest second is on disk
-    return Path(telemetry.recorder.path)
+    return list(paths)
+
+
+def _hear(client: Client, paths: dict[Path, None]) -> Telemetry | None:
+    """The next message; which log is written just now goes to `paths`."""
+    telemetry = client.receive(0.5)
+    if telemetry is not None and telemetry.recorder is not None:
+        paths[Path(telemetry.recorder.path)] = None
+    return telemetry
 
 
 def _followed(
-    client: Client, loop_name: str, duration_s: float, on_progress: Progress
+    client: Client,
+    loop_name: str,
+    duration_s: float,
+    on_progress: Progress,
+    paths: dict[Path, None],
 ) -> Telemetry:
     """Wait until the loop is out of its experiment; the message that says so."""
     start_s = heard_s = time.monotonic()
     while True:
-        telemetry = client.receive(0.5)
+        telemetry = _hear(client, paths)
         now_s = time.monotonic()
         if telemetry is None:
             if now_s - heard_s > _SILENCE_S:

@@ -50,27 +50,38 @@ def export(path: Path, folder: Path, kind: str, topics: list[str]) -> dict[Path,
     ------
     LogError
         If the log cannot be read, a file exists or cannot be written, or pyarrow is missing for Parquet.
+        No file is left then.
     """
-    begin = KINDS[kind]
     rows: dict[Path, int] = {}
-    writers: dict[str, Write] = {}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as stack:
-            for topic, columns in _blocks(path, topics, frames=kind != "csv"):
-                file = folder / f"{topic.strip('/').replace('/', '.')}.{kind}"
-                if topic not in writers:
-                    if file.exists():
-                        msg = f"{file}: exists already; give another folder with --out"
-                        raise LogError(msg)
-                    writers[topic] = begin(file, stack)
-                    rows[file] = 0
-                writers[topic](columns)
-                rows[file] += len(columns["sequence"])
-    except OSError as error:
-        msg = f"{folder}: cannot be written: {error.strerror or error}; make room, or give another --out"
-        raise LogError(msg) from error
+        _write_all(path, folder, kind, topics, rows)
+    except BaseException as error:
+        for file in rows:  # part of a log is not what was asked for
+            file.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            msg = f"{folder}: cannot be written: {error.strerror or error}; make room, or give another --out"
+            raise LogError(msg) from error
+        raise
     return rows
+
+
+def _write_all(
+    path: Path, folder: Path, kind: str, topics: list[str], rows: dict[Path, int]
+) -> None:
+    """Write, and keep count in `rows`, which has every file that was begun."""
+    writers: dict[str, Write] = {}
+    with ExitStack() as stack:
+        for topic, columns in _blocks(path, topics, frames=kind != "csv"):
+            file = folder / f"{topic.strip('/').replace('/', '.')}.{kind}"
+            if topic not in writers:
+                if file.exists():
+                    msg = f"{file}: exists already; give another folder with --out"
+                    raise LogError(msg)
+                rows[file] = 0
+                writers[topic] = KINDS[kind](file, stack)
+            writers[topic](columns)
+            rows[file] += len(columns["sequence"])
 
 
 def _blocks(path: Path, topics: list[str], *, frames: bool) -> Iterator[tuple[str, Columns]]:
@@ -133,7 +144,7 @@ def _npz(file: Path, stack: ExitStack) -> Write:
 
     def write(columns: Columns) -> None:
         if not blocks:
-            stack.callback(finish)
+            stack.push(lambda error, *_: finish() if error is None else None)
         blocks.append(columns)
 
     return write

@@ -8,6 +8,7 @@ import re
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 from fitctl.config import Logging
 from fitctl.logging.errors import LogError
@@ -90,11 +91,18 @@ def keep(path: Path, *, kept: bool) -> None:
         raise LogError(msg) from error
 
 
-def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> list[Path]:
+class Pruned(NamedTuple):
+    """What became of the logs that had had their time: gone, or why one is still there."""
+
+    deleted: list[Path]
+    refused: list[str]
+
+
+def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> Pruned:
     """Delete what is too old or too much of one rig's logs, the oldest first.
 
     Only files that a recorder named count and go. Of these, the ones in use and the ones that are kept
-    count, but stay.
+    count, but stay. One that cannot be deleted keeps none of the others.
 
     Parameters
     ----------
@@ -107,13 +115,7 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> list
 
     Returns
     -------
-    list of Path
-        What was deleted.
-
-    Raises
-    ------
-    LogError
-        If a file cannot be deleted, or not be asked whether it is in use.
+    Pruned
     """
     name = re.compile(re.escape(rig_name) + r"_\d{8}T\d{6}Z(_\d+)?\.mcap")
     logs = []
@@ -124,17 +126,21 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> list
                 logs.append((status.st_mtime, path, status.st_size))
     total_bytes = sum(size for *_, size in logs)
     oldest_s = (now - timedelta(days=settings.retain_days)).timestamp()
-    deleted = []
+    pruned = Pruned([], [])
     for written_s, path, size in sorted(logs):
         if written_s >= oldest_s and total_bytes <= settings.retain_bytes:
             break
-        if is_kept(path) or in_use(path):
-            continue
         try:
+            if is_kept(path) or in_use(path):
+                continue
             path.unlink(missing_ok=True)
+        except LogError as error:
+            pruned.refused.append(str(error))
         except OSError as error:
-            msg = f"{path}: is due for deletion, but cannot be deleted: {error.strerror}"
-            raise LogError(msg) from error
-        total_bytes -= size
-        deleted.append(path)
-    return deleted
+            pruned.refused.append(
+                f"{path}: is due for deletion, but cannot be deleted: {error.strerror}"
+            )
+        else:
+            total_bytes -= size
+            pruned.deleted.append(path)
+    return pruned

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import TracebackType
 
 from fitctl.config import Logging
-from fitctl.logging.errors import LogError
 from fitctl.logging.folder import new_log_path, prune
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.logging.writer import LogWriter
@@ -111,9 +110,6 @@ class RotatingLog:
         path = new_log_path(self._folder, self._rig_name, now)
         self._writer = LogWriter(path, self._settings)
         self._begun_s = time.monotonic()
-        try:
-            deleted = prune(self._folder, self._rig_name, self._settings, now)
-        except LogError as error:  # no reason to stop recording
-            self._notes.append(("warning", str(error)))
-        else:
-            self._notes += [("info", f"{log}: deleted, its time was over") for log in deleted]
+        pruned = prune(self._folder, self._rig_name, self._settings, now)
+        self._notes += [("warning", why) for why in pruned.refused]  # no reason to stop recording
+        self._notes += [("info", f"{log}: deleted, its time was over") for log in pruned.deleted]

@@ -13,10 +13,9 @@ from fitctl.figures.settling import settling
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, too_far
-from fitctl.sequences.view import Figures, StepFailed, View, columns
+from fitctl.sequences.view import Figures, Squares, StepFailed, View, columns
 from fitctl.supervisor.messages import SetTarget
 from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import rms
 
 Floats = NDArray[np.float64]
 AXES = ("az", "el")
@@ -38,32 +37,32 @@ def _hold_done(step: steps.Hold, view: View) -> Result | None:
     if view.mode is not Mode.VERNIER or view.loop.since_s > view.began_s:
         msg = f"the star was not held all the time: {view.why}"
         raise StepFailed(msg)
+    due = round(step.duration_s * view.rig.camera.frame_rate_hz)
+    if view.gone_s > step.settle_s:
+        view.squares.add(columns(view.looks)[: due - view.squares.frames, 3:5])
+    view.looks.clear()  # hours of them would fill the memory
     if view.gone_s < step.settle_s + step.duration_s:
         return None
-    table = columns(view.looks)
-    # A pause took frames out; what is judged are the last of those that are left.
-    due = round(step.duration_s * view.rig.camera.frame_rate_hz)
-    return _judged(step, view, table[-due:, 3:5], due)
+    return _judged(step, view, view.squares, due)
 
 
-def _judged(step: steps.Hold | steps.Visiting, view: View, errors_px: Floats, due: int) -> Result:
-    """RMS of each axis of the errors, shape (n, 2), against what is required; of `due` frames."""
-    seen = np.isfinite(errors_px).all(axis=1)
-    if np.count_nonzero(seen) < _LEAST_SEEN * due:
+def _judged(step: steps.Hold | steps.Visiting, view: View, squares: Squares, due: int) -> Result:
+    """RMS of each axis against what is required; of `due` frames."""
+    if squares.seen < _LEAST_SEEN * due:
         msg = (
-            f"the star was seen on {np.count_nonzero(seen)} of {due} frames; expected at least "
+            f"the star was seen on {squares.seen} of {due} frames; expected at least "
             f"{100 * _LEAST_SEEN:g} %"
         )
         raise StepFailed(msg)
     per_px = scales(view.rig, view.settings).sky_arcsec_per_px
-    rms_px = rms(errors_px[seen])
+    rms_px = squares.rms_px
     limit_px = step.rms_limit_px or view.settings.requirement_px
     figures: Figures = {}
     for axis, value_px in zip(AXES, rms_px.tolist(), strict=True):
         figures[f"rms_{axis}_px"] = value_px
         figures[f"rms_{axis}_sky_arcsec"] = value_px * per_px
     figures["limit_px"] = limit_px
-    figures["frames_seen"] = float(np.count_nonzero(seen))
+    figures["frames_seen"] = float(squares.seen)
     said = f"az {rms_px[0]:.4f}, el {rms_px[1]:.4f} px RMS; required {limit_px:g} px"
     if rms_px.max() > limit_px:
         raise StepFailed(said)
@@ -159,7 +158,8 @@ def _judge_visits(step: steps.Visiting, view: View, offsets: list[Offset]) -> Re
             settled_s.append(found.settled_s)
             overshoot_px.append(found.overshoot_px)
         steady.append(away_px[time_s[there] >= came_s + step.steady_after_s])
-    judged = _judged(step, view, np.concatenate(steady), due_each * len(offsets))
+    view.squares.add(np.concatenate(steady))
+    judged = _judged(step, view, view.squares, due_each * len(offsets))
     figures = judged.figures | {
         "settled_s": float(np.max(settled_s)),
         "overshoot_px": float(np.max(overshoot_px)),

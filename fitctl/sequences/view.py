@@ -26,6 +26,35 @@ class SequenceError(Exception):
         self.attempt = attempt
 
 
+@dataclass
+class Squares:
+    """Errors of frames, added up: a long step need not remember them.
+
+    Attributes
+    ----------
+    frames, seen : int
+        All that were taken, and those with a star.
+    sum_px2 : array, shape (2,)
+        Of the squares of these errors az, el.
+    """
+
+    frames: int = 0
+    seen: int = 0
+    sum_px2: Floats = field(default_factory=lambda: np.zeros(2))
+
+    def add(self, errors_px: Floats) -> None:
+        """Take errors, shape (n, 2), NaN without a star."""
+        seen = errors_px[np.isfinite(errors_px).all(axis=1)]
+        self.frames += len(errors_px)
+        self.seen += len(seen)
+        self.sum_px2 += np.sum(seen**2, axis=0)
+
+    @property
+    def rms_px(self) -> Floats:
+        """Root of their mean, shape (2,); of one frame at the least."""
+        return np.asarray(np.sqrt(self.sum_px2 / self.seen))
+
+
 class StepFailed(Exception):
     """The attempt has failed; another may succeed."""
 
@@ -58,6 +87,8 @@ class View:
         For the step's own use: times of what it did.
     frames : list of FrameRecord
         For the step's own use too: those that it keeps.
+    squares : Squares
+        And this: what it adds up.
     errors : list of str
         Error events of the supervisor since the attempt's first command.
     fresh_s : float
@@ -74,6 +105,7 @@ class View:
     looks: list[Look] = field(default_factory=list)
     marks: list[float] = field(default_factory=list)
     frames: list[FrameRecord] = field(default_factory=list)
+    squares: Squares = field(default_factory=Squares)
     errors: list[str] = field(default_factory=list)
 
     @property

@@ -10,6 +10,7 @@ import math
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
@@ -144,7 +145,7 @@ def local_executor() -> Iterator[tuple[Executor, int]]:
     # A server forks the workers before any thread is there that a fork would leave behind.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
-    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_ctrl_c)
+    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_as_a_worker)
     try:
         yield executor, workers
     except BaseException:
@@ -156,9 +157,18 @@ def local_executor() -> Iterator[tuple[Executor, int]]:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _leave_ctrl_c() -> None:
-    """Ctrl-C is for the parent, who then ends its workers."""
+def _as_a_worker() -> None:
+    """Ctrl-C is for the parent, who then ends its workers; should it be killed, they end by themselves."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, name="parent-watch", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """The server that forked us lives as long as we do; it is the parent who started it that counts."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 @contextmanager

@@ -43,6 +43,9 @@ from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.traces import Traces
 
 RECEIVE_TIMEOUT_S = 0.2
+UNDRAWN_MESSAGES = (
+    20  # a terminal that takes nothing holds the screen up; more telemetry then waits in the link
+)
 EXIT_WAIT_S = 2.5
 KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 UNREADABLE_NOTICE_S = 10.0  # at most one notice in this time
@@ -131,6 +134,7 @@ class ConsoleApp(App[None]):
         self.clock = clock
         self.state = ConsoleState(clock())
         self._ended = threading.Event()
+        self._room = threading.Semaphore(UNDRAWN_MESSAGES)
         self._reader = threading.Thread(target=self._read, name="console-reader", daemon=True)
         self._senders: set[threading.Thread] = set()
 
@@ -184,6 +188,9 @@ class ConsoleApp(App[None]):
     def _read(self) -> None:
         notice_due_s = -math.inf
         while not self._ended.is_set():
+            if not self._room.acquire(timeout=RECEIVE_TIMEOUT_S):
+                continue
+            telemetry = None
             try:
                 telemetry = self.link.receive(RECEIVE_TIMEOUT_S)
             except (ConnectionError, msgspec.MsgspecError, UnicodeDecodeError) as error:
@@ -191,12 +198,14 @@ class ConsoleApp(App[None]):
                     notice_due_s = self.clock() + UNREADABLE_NOTICE_S
                     self.post_message(Unreadable(str(error)))
                 self._ended.wait(UNREADABLE_PAUSE_S)
-                continue
-            if telemetry is not None and not self._ended.is_set():
+            if telemetry is None:
+                self._room.release()
+            elif not self._ended.is_set():
                 self.post_message(Received(telemetry))
 
     def on_received(self, message: Received) -> None:
         """Remember; draw at once only what must not wait."""
+        self._room.release()
         before = self.state.loop.state.mode if self.state.loop else ""
         was_stale = self.state.stale
         self.state.accept(message.telemetry, self.clock())

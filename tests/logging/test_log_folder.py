@@ -3,6 +3,7 @@
 import os
 import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -116,7 +117,7 @@ def test_the_oldest_go_until_the_rest_fits_but_never_one_in_use_or_kept(
             safe.add(path)
         paths.append((age, path, path.stat().st_size))
     try:
-        deleted = prune(folder, "bench", limits(retain_bytes, retain_days), NOW)
+        deleted = prune(folder, "bench", limits(retain_bytes, retain_days), NOW).deleted
         left = [(age, path, size) for age, path, size in paths if path.exists()]
     finally:
         for stream in streams:
@@ -151,7 +152,7 @@ def test_only_what_a_recorder_of_this_rig_named_is_deleted(tmp_path):
         aged(tmp_path, name_of(1), 400, 10),
         aged(tmp_path, "bench_20261101T000001Z_2.mcap", 399, 10),
     ]
-    assert prune(tmp_path, "bench", SETTINGS, NOW) == mine
+    assert prune(tmp_path, "bench", SETTINGS, NOW).deleted == mine
     assert all(path.exists() for path in others)
 
 
@@ -159,9 +160,9 @@ def test_a_kept_log_stays_until_it_is_no_longer_kept(tmp_path):
     path = aged(tmp_path, name_of(1), 400, 10)
     keep(path, kept=True)
     assert is_kept(path)
-    assert prune(tmp_path, "bench", SETTINGS, NOW) == []
+    assert prune(tmp_path, "bench", SETTINGS, NOW).deleted == []
     keep(path, kept=False)
-    assert prune(tmp_path, "bench", SETTINGS, NOW) == [path]
+    assert prune(tmp_path, "bench", SETTINGS, NOW).deleted == [path]
 
 
 def test_a_log_that_is_not_there_cannot_be_kept(tmp_path):
@@ -190,6 +191,25 @@ def test_recording_goes_on_where_nothing_can_be_deleted(tmp_path, monkeypatch):
     assert severity == "warning"
     assert f"{old}: is due for deletion, but cannot be deleted" in text
     assert len(contents(log.path)) == 1
+
+
+def test_one_log_that_cannot_be_deleted_keeps_none_of_the_others(tmp_path, monkeypatch):
+    stuck, folder, gone = (tmp_path / name_of(day) for day in (1, 2, 3))
+    aged(tmp_path, stuck.name, 403, 10)
+    folder.mkdir()
+    aged(tmp_path, gone.name, 401, 10)
+    os.utime(folder, (0, 0))
+    unlink = Path.unlink
+
+    def refuse(path, **options):
+        if path == stuck:
+            raise PermissionError(1, "Operation not permitted")
+        unlink(path, **options)
+
+    monkeypatch.setattr("fitctl.logging.folder.Path.unlink", refuse)
+    pruned = prune(tmp_path, "bench", SETTINGS, NOW)
+    assert pruned.deleted == [gone]
+    assert [why.partition(": ")[0] for why in pruned.refused] == [str(folder), str(stuck)]
 
 
 def test_recording_goes_on_where_something_else_has_an_old_logs_name(tmp_path):

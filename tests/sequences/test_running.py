@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.sequences import pointing, view
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import load_sequence, shipped_sequences
 from fitctl.sequences.runner import run_sequence
@@ -124,6 +125,22 @@ def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
     assert run.link.mode() == "STANDBY"
     target = RIG.loops["right"].target_px
     assert run.link.target_px() == [target.az, target.el]
+
+
+def test_a_long_hold_remembers_no_more_frames_than_a_message_brings(tried, monkeypatch):
+    remembered = []
+
+    def columns(looks):
+        remembered.append(len(looks))
+        return view.columns(looks)
+
+    monkeypatch.setattr(pointing, "columns", columns)
+    run = tried()
+    run(ACQUIRE, {**HOLD, "duration_s": 30.0})
+
+    assert run.figures(1)["frames_seen"] == 1500
+    assert sum(remembered) >= 1500
+    assert max(remembered) < 10
 
 
 def test_a_pause_within_a_hold_is_not_judged_and_not_counted(tried):

@@ -10,6 +10,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
+import psutil
 import pytest
 
 from fitctl.cli import main
@@ -214,6 +215,27 @@ def test_an_interrupted_campaign_does_not_wait_for_its_runs():
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert time.monotonic() - begun_s < 30
+
+
+def test_a_campaign_whose_parent_is_killed_leaves_no_worker_behind():
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "fitctl", "simulate", "--runs", "100000", "--duration", "60"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    workers = []
+    try:
+        begun_s = time.monotonic()
+        # What multiprocessing itself starts are two; then come the workers.
+        while len(workers) < 3 and time.monotonic() < begun_s + 60:
+            workers = psutil.Process(parent.pid).children(recursive=True)
+            time.sleep(0.1)
+    finally:
+        parent.kill()
+        parent.wait()
+
+    assert len(workers) >= 3
+    assert psutil.wait_procs(workers, timeout=30)[1] == []
 
 
 def test_an_address_that_is_none_is_one_line_at_once():

@@ -57,5 +57,8 @@ def test_a_full_disk_is_an_event_losses_are_counted_and_the_star_is_held(rig):
     assert log_info(last).finished
     assert verify(last).problems == ()
     assert verify(last).lost >= lost
+    losses = [entry.message for entry in read_records(last, ["/fit/losses"])]
+    assert losses[-1].records_lost >= lost
+    assert losses[-1].records_offered > losses[0].records_offered > QUEUE_RECORDS
     texts = [entry.message.message for entry in read_records(last, ["/fit/events"])]
     assert any("records were lost on their way to the log" in text for text in texts)

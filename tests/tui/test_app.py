@@ -26,7 +26,7 @@ from fitctl.supervisor.messages import (
     Stop,
     TrippedInterlock,
 )
-from fitctl.tui.app import ConsoleApp
+from fitctl.tui.app import UNDRAWN_MESSAGES, ConsoleApp
 from fitctl.tui.screens import Reader
 from fitctl.tui.widgets.header import Header
 from tests.tui.fake import START_S, FakeLink, FakeSupervisor
@@ -366,3 +366,21 @@ def test_quitting_leaves_no_thread_and_closes_the_link():
 
     assert run(scenario).closed
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("console-")]
+
+
+def test_a_screen_that_is_held_up_leaves_telemetry_in_the_link():
+    """Where it is bounded; in the console's own memory it would grow for as long as the terminal waits."""
+
+    async def scenario(console, pilot, link):
+        link.deliver(FakeSupervisor().messages(300)[2:])
+        waiting, since_s = link.incoming.qsize(), time.monotonic()
+        while time.monotonic() < since_s + 0.5:  # the loop that draws stands still meanwhile
+            time.sleep(0.01)
+            if link.incoming.qsize() < waiting:
+                waiting, since_s = link.incoming.qsize(), time.monotonic()
+        assert waiting >= 298 - UNDRAWN_MESSAGES
+
+        await until(pilot, lambda: console.state.newest.sequence == 300)
+        assert console.state.missed == 0
+
+    run(scenario)

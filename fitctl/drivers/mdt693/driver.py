@@ -137,6 +137,15 @@ class Mdt693:
         self._check_limit("the voltage-limit switch", volts, self._piezo.limit_v)
         return volts
 
+    def ask_once(self) -> None:
+        """One question and its answer, unjudged: what a round trip takes.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout, DeviceProtocolError
+        """
+        self._ask(self._commands.limit)
+
     def close(self) -> None:
         """Let go of the port; safe to call twice and after a failure."""
         self._in_step = False

@@ -19,4 +19,4 @@ def probe_mdt693(piezo: Mdt693Device) -> Probe:
     """
     with closing(Mdt693(piezo)) as driver:
         identity = driver.open()
-        return Probe(identity, round_trip_s(driver.stack_volts))
+        return Probe(identity, round_trip_s(driver.ask_once))

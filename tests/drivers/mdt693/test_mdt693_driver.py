@@ -14,6 +14,7 @@ from fitctl.drivers.interface import (
     DeviceUnreachable,
 )
 from fitctl.drivers.mdt693.driver import Mdt693
+from fitctl.drivers.probe import round_trip_s
 
 A_301 = {"model": "MDT693A", "firmware": "3.01"}
 B_105 = {"model": "MDT693B", "firmware": "1.05", "prompt": "*"}
@@ -135,6 +136,14 @@ def test_one_wrong_answer_is_not_believed():
         opened(path, limit_v=100.5) as piezo,
     ):
         assert piezo.stack_volts()[0] == pytest.approx(25.8)
+
+
+def test_a_round_trip_is_one_question(start):
+    """Which a reading is not: three channels, each asked for twice."""
+    with start(reply_s=0.03).opened() as piezo:
+        one_s, reading_s = round_trip_s(piezo.ask_once), round_trip_s(piezo.stack_volts)
+        assert one_s >= 0.03
+        assert reading_s > 3 * one_s
 
 
 def test_a_device_without_a_serial_number_is_taken():
