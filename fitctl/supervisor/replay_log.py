@@ -107,7 +107,10 @@ def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
     with tempfile.TemporaryDirectory(prefix="fitctl-replay-") as folder:
         together = Path(folder) / paths[0].name
         merge(paths, together)
-        yield log_info(together)
+        try:
+            yield log_info(together)
+        except LogError as error:  # of files that the user knows
+            raise LogError(str(error).replace(str(together), ", ".join(map(str, paths)))) from None
 
 
 def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
