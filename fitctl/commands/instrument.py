@@ -205,9 +205,7 @@ def _pictures(rig: Rig, log: Path) -> Picture:
             camera.height_px,
             camera.period_s,
             camera.bias_dn,
-            lambda: typer.echo(
-                f"mocks: {log}: its frames are over; it is dark from here on", err=True
-            ),
+            lambda why: typer.echo(f"mocks: {why}; it is dark from here on", err=True),
         )
     except LogError as error:
         raise ConfigError(str(error)) from None

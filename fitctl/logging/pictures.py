@@ -37,7 +37,7 @@ class LoggedPictures:
         Of the frames that will be asked for.
     bias_dn : float
     on_end : callable
-        Called once, when the log's frames are over.
+        Called once with why, when the log's frames are over, or what follows cannot be read.
 
     Raises
     ------
@@ -52,7 +52,7 @@ class LoggedPictures:
         height_px: int,
         period_s: float,
         bias_dn: float,
-        on_end: Callable[[], None],
+        on_end: Callable[[str], None],
     ) -> None:
         if not log_info(path).counts.get(_TOPIC):
             msg = f"{path}: has no frames ({_TOPIC}) to show; name a log that a camera's frames went into"
@@ -74,13 +74,19 @@ class LoggedPictures:
             self._first_s = time_s
         due_ns = self._first_ns + (time_s - self._first_s) * 1e9 + self._half_period_ns
         while self._next is not None and self._next.exposed_ns <= due_ns:
-            self._shown = self._next
-            entry = next(self._entries, None)
-            self._next = None if entry is None else self._picture(entry)
-            if entry is None:
-                self._on_end()
+            self._shown, self._next = self._next, self._following()
         over = self._next is None and due_ns - self._shown.exposed_ns > 2 * self._half_period_ns
         return self._dark if over else self._shown.image
+
+    def _following(self) -> _Picture | None:
+        try:
+            entry = next(self._entries, None)
+            if entry is not None:
+                return self._picture(entry)
+            self._on_end(f"{self._path}: its frames are over")
+        except LogError as error:  # nobody waits for it but the one who looks
+            self._on_end(str(error))
+        return None
 
     def _picture(self, entry: LogMessage) -> _Picture:
         frame: Any = entry.message
