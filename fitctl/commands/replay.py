@@ -50,15 +50,9 @@ def run_replay(
         If the log, or the rig that it is to be replayed with, cannot be used.
     """
     try:
-        with whole_run(logs) as info, progress_line() as progress:
+        with whole_run(logs) as info:
             rig = _rig(info, rig_path, overrides, controller)
-            task = progress.add_task("replaying", total=info.duration_s)
-            result = replay(
-                rig,
-                read_steps(info, list(rig.loops)),
-                on_tick=lambda gone_s: progress.update(task, completed=gone_s),
-            )
-            progress.update(task, completed=info.duration_s)
+            result = _shown(info, rig)
     except LogError as error:
         raise ConfigError(str(error)) from None
     named = ", ".join(map(str, logs))
@@ -68,6 +62,19 @@ def run_replay(
         for line in _lines(named, info, rig, result):
             typer.echo(line)
     return 0 if result.same else DIFFERS
+
+
+def _shown(info: LogInfo, rig: Rig) -> ReplayResult:
+    """The replay, with its progress."""
+    with progress_line() as progress:
+        task = progress.add_task("replaying", total=info.duration_s)
+        result = replay(
+            rig,
+            read_steps(info, list(rig.loops)),
+            on_tick=lambda gone_s: progress.update(task, completed=gone_s),
+        )
+        progress.update(task, completed=info.duration_s)
+    return result
 
 
 def _rig(info: LogInfo, path: Path | None, overrides: Sequence[str], controller: str | None) -> Rig:
