@@ -27,7 +27,8 @@ def frames(log):
 
 
 def finished(rig):
-    """End the supervisor; its log."""
+    """End the supervisor, once there is a recorder to finish its log; the log."""
+    rig.follow(lambda telemetry: telemetry.recorder is not None)
     assert rig.client.send(Shutdown()).accepted
     assert rig.supervisor.wait(20) == 0
     (log,) = rig.folder.glob("*.mcap")
@@ -54,11 +55,10 @@ def test_a_supervisor_sees_a_logs_frames_in_place_of_the_camera(tmp_path):
     log = tmp_path / "shown.mcap"
     simulation = LoggedSimulation(load_rig(default_rig_path(), [SOON]), log)
     simulation.acquire()
-    simulation.run(30.0)
+    simulation.run(15.0)
     simulation.writer.close()
     with running(tmp_path / "seen", SOON, mocks=["--camera", log]) as rig:
         rig.to_vernier()  # by the light that the log has
-        rig.follow(lambda telemetry: telemetry.recorder is not None)
         its_log = finished(rig)
     shown, seen = frames(log), frames(its_log)
 
