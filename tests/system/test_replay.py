@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.reading import read_records
 from fitctl.supervisor.messages import SetTarget, Shutdown, Stop
@@ -51,6 +53,7 @@ def test_a_real_run_replayed_decides_the_same_to_the_last_bit(tmp_path):
     assert loop["frames_missing"] == result["records_lost"] == 0
 
 
+@pytest.mark.slow
 def test_a_supervisor_sees_a_logs_frames_in_place_of_the_camera(tmp_path):
     log = tmp_path / "shown.mcap"
     simulation = LoggedSimulation(load_rig(default_rig_path(), [SOON]), log)
