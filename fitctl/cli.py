@@ -123,6 +123,12 @@ def mocks(
             metavar="FILE", help="What goes wrong and when: a TOML file of [[fault]] tables."
         ),
     ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="What the camera shows: a log's frames, in place of the mock star."
+        ),
+    ] = None,
     parent_pid: ParentOption = None,
 ) -> None:
     """Serve the rig's mock devices on 127.0.0.1 until Ctrl-C, and print where they listen."""
@@ -132,7 +138,7 @@ def mocks(
     settings = rig_of(rig, overrides)
     if faults is not None:
         settings = with_script(settings, faults)
-    run_mocks(settings, seed, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
+    run_mocks(settings, seed, camera, as_json=as_json, free_ports=free_ports, parent_pid=parent_pid)
 
 
 @app.command()
@@ -340,6 +346,30 @@ def simulate(
         raise typer.Exit(run_simulation(settings, seed, duration, as_json=as_json))
     seeds = range(seed, seed + runs)
     raise typer.Exit(run_many(settings, seeds, duration, scheduler, as_json=as_json))
+
+
+@app.command()
+def replay(
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="All files of one run, from its first on."),
+    ],
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", metavar="FILE", help="Rig file; without it, the one in the log."),
+    ] = None,
+    overrides: SetOption = None,
+    controller: ControllerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Feed a log's frames through today's code, and tell where it decides otherwise.
+
+    Exit status 0 if every mode and every command is the same to the last bit, 1 if not, 2 if the log
+    cannot be replayed. A changed command changes no frames.
+    """
+    from fitctl.commands.replay import run_replay
+
+    raise typer.Exit(run_replay(logs, rig, overrides or [], controller, as_json=as_json))
 
 
 @app.command()

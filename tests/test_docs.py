@@ -62,7 +62,7 @@ def ours():
 def runnable(found):
     """Whether it ends by itself, soon, without hardware, terminal or supervisor."""
     match found.words[1:]:
-        case ["--help"] | ["check" | "log", *_] | [_, "--help"]:
+        case ["--help"] | ["check" | "log", *_] | [_, "--help"] | ["replay", _]:
             return True
         case ["simulate", *options] if "--duration" in options:
             return float(options[options.index("--duration") + 1]) <= LONGEST_RUN_S

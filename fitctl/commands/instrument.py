@@ -5,18 +5,20 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import typer
 import zmq
+from numpy.typing import NDArray
 
 from fitctl import demo as demos
 from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, LoopMocks, Rig
 from fitctl.logging.errors import LogError
+from fitctl.logging.pictures import LoggedPictures
 from fitctl.logging.records import RecorderStatus
 from fitctl.model.plant_constants import plant_constants
 from fitctl.processes import (
@@ -33,6 +35,7 @@ from fitctl.supervisor.messages import Telemetry
 
 FAILED = 1
 _REPORT_TIMEOUT_S = 0.5
+Picture = Callable[[float], NDArray[np.uint16]]
 _CONSOLE_END_S = 3.0
 
 
@@ -149,15 +152,37 @@ def _summary_text(name: str, result: dict[str, Any]) -> str:
 
 
 def run_mocks(
-    rig: Rig, seed: int, *, as_json: bool, free_ports: bool, parent_pid: int | None
+    rig: Rig,
+    seed: int,
+    camera_log: Path | None,
+    *,
+    as_json: bool,
+    free_ports: bool,
+    parent_pid: int | None,
 ) -> None:
-    """Serve the mock testbed until a signal comes."""
+    """Serve the mock testbed until a signal comes; its camera shows a log's frames, if there is one."""
     from fitctl.mocks.event_loop import run_on_time
 
+    picture = None if camera_log is None else _pictures(rig, camera_log)
     if free_ports:
         rig = _with_free_ports(rig)
     end_with_parent(parent_pid)
-    run_on_time(_serve_mocks(rig, seed, as_json=as_json, free_ports=free_ports))
+    run_on_time(_serve_mocks(rig, seed, picture, as_json=as_json, free_ports=free_ports))
+
+
+def _pictures(rig: Rig, log: Path) -> Picture:
+    camera = rig.true_camera
+    try:
+        return LoggedPictures(
+            log,
+            camera.width_px,
+            camera.height_px,
+            camera.period_s,
+            camera.bias_dn,
+            lambda why: typer.echo(f"mocks: {why}; it is dark from here on", err=True),
+        )
+    except LogError as error:
+        raise ConfigError(str(error)) from None
 
 
 def _with_free_ports(rig: Rig) -> Rig:
@@ -176,7 +201,9 @@ def _loop_with_free_ports(loop: LoopMocks) -> LoopMocks:
     return loop.model_copy(update=update)
 
 
-async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool, free_ports: bool) -> None:
+async def _serve_mocks(
+    rig: Rig, seed: int, picture: Picture | None, *, as_json: bool, free_ports: bool
+) -> None:
     from fitctl.mocks.faults import UnknownFault
     from fitctl.mocks.testbed import Testbed
 
@@ -185,7 +212,7 @@ async def _serve_mocks(rig: Rig, seed: int, *, as_json: bool, free_ports: bool) 
     for number in ENDING_SIGNALS:
         loop.add_signal_handler(number, ending.set)
     # The bench has its own port where it can: there `fitctl fault` finds the mocks of a demo.
-    testbed = Testbed(rig, seed, bench_at_any_port=free_ports)
+    testbed = Testbed(rig, seed, bench_at_any_port=free_ports, picture=picture)
     try:
         endpoints = await testbed.start()
     except UnknownFault as error:

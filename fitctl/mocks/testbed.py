@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -118,9 +118,19 @@ class Testbed:
         Of everything random in the plants.
     bench_at_any_port : bool
         Where the bench's own port is taken.
+    picture : callable, optional
+        What the camera sees in place of the plants' spots: ``picture(mid_exposure_s)``, the uint16 image,
+        shape (height_px, width_px), of that host monotonic time.
     """
 
-    def __init__(self, rig: Rig, seed: int, *, bench_at_any_port: bool = False) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        seed: int,
+        *,
+        bench_at_any_port: bool = False,
+        picture: Callable[[float], NDArray[np.uint16]] | None = None,
+    ) -> None:
         truth, mocks = rig.mock_parts()
         started_s = time.monotonic()
         self._plants = {
@@ -142,7 +152,7 @@ class Testbed:
         self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
         self._exposures = 0
         self._camera = GigeCameraMock(
-            rig.true_camera, mocks.camera, self._render, port=mocks.gvcp_port
+            rig.true_camera, mocks.camera, picture or self._render, port=mocks.gvcp_port
         )
         self._fault_plan = mocks.faults
         devices = {"camera": self._camera.faults}

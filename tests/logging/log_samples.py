@@ -75,11 +75,10 @@ def one_of_each():
     ]  # fmt: skip
 
 
-def frame(number):
+def frame(number, **values):
     noise = np.random.default_rng(number).integers(0, 65536, 1600, dtype="<u2")
-    return filled(
-        FrameRecord, number=number, camera="cam", width_px=40, height_px=40, data=noise.tobytes()
-    )
+    known = {"number": number, "camera": "cam", "width_px": 40, "height_px": 40}
+    return filled(FrameRecord, **known | {"data": noise.tobytes()} | values)
 
 
 def write_log(path, records, log_settings=SETTINGS, start_s=WALL_S):

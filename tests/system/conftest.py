@@ -134,12 +134,12 @@ class Rig:
 
 
 @contextmanager
-def running(folder, *settings, file=None):
-    """Mock testbed and supervisor of a rig, with some values replaced."""
+def running(folder, *settings, file=None, mocks=()):
+    """Mock testbed and supervisor of a rig, with some values replaced; `mocks` are options of the testbed."""
     rig = Rig(folder, file)
     rig.common += [part for setting in settings for part in ("--set", setting)]
     try:
-        rig.start_mocks("--free-ports")
+        rig.start_mocks("--free-ports", *mocks)
         rig.start_supervisor()
         yield rig
     finally:

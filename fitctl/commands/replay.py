@@ -1,0 +1,180 @@
+"""`fitctl replay`: a log through today's code, and where it decides otherwise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from fitctl import demo as demos
+from fitctl.commands.progress import progress_line
+from fitctl.config import ConfigError, Rig, load_rig, rig_from_json
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import design_json
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import LogInfo
+from fitctl.supervisor.replay import replay
+from fitctl.supervisor.replay_log import read_steps, whole_run
+from fitctl.supervisor.replay_result import LoopReplay, ReplayResult
+
+DIFFERS = 1
+_ROWS = {
+    "star_px": ("star's place", "px"),
+    "mirror_rad": ("mirror", "rad"),
+    "stacks_v": ("D/A voltages", "V"),
+    "siderostat_setpoint_rad": ("siderostat set-point", "rad"),
+}
+_OPEN_LOOP = (
+    "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
+    "on from where\nthe log sent them; modes and the controllers' own state go on from today's"
+)
+
+
+def run_replay(
+    logs: Sequence[Path],
+    rig_path: Path | None,
+    overrides: Sequence[str],
+    controller: str | None,
+    *,
+    as_json: bool,
+) -> int:
+    """Replay a run and print how it went; returns the exit status.
+
+    Raises
+    ------
+    ConfigError
+        If the log, or the rig that it is to be replayed with, cannot be used.
+    """
+    try:
+        with whole_run(logs) as info:
+            rig = _rig(info, rig_path, overrides, controller)
+            result = _shown(info, rig)
+    except LogError as error:
+        raise ConfigError(str(error)) from None
+    named = ", ".join(map(str, logs))
+    if as_json:
+        typer.echo(demos.to_json(_document(named, info, rig, result)))
+    else:
+        for line in _lines(named, info, rig, result):
+            typer.echo(line)
+    return 0 if result.same else DIFFERS
+
+
+def _shown(info: LogInfo, rig: Rig) -> ReplayResult:
+    """The replay, with its progress."""
+    with progress_line() as progress:
+        task = progress.add_task("replaying", total=info.duration_s)
+        result = replay(
+            rig,
+            read_steps(info, list(rig.loops)),
+            on_tick=lambda gone_s: progress.update(task, completed=gone_s),
+        )
+        progress.update(task, completed=info.duration_s)
+    return result
+
+
+def _rig(info: LogInfo, path: Path | None, overrides: Sequence[str], controller: str | None) -> Rig:
+    """The log's rig or the one of a file, with values replaced; its loops and frames must be the log's."""
+    in_log = info.metadata.get("rig", {}).get("json")
+    if in_log is None:
+        msg = f"{info.path}: has no rig file in it; name a log that fitctl recorded"
+        raise ConfigError(msg)
+    origin = f"the rig in {info.path}"
+
+    def read(changes: Sequence[str]) -> Rig:
+        return load_rig(path, changes) if path else rig_from_json(in_log, origin, changes)
+
+    rig = read(overrides)
+    if controller is not None:
+        chosen = [f"loops.{name}.vernier.controller={controller}" for name in rig.loops]
+        rig = read([*overrides, *chosen])
+    then = json.loads(in_log)
+    needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
+    given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)
+    if given != needed:
+        msg = (
+            f"replay: loops, camera.width_px and camera.height_px must be those of the log, {needed}, are "
+            f"{given}; replace other values, or none"
+        )
+        raise ConfigError(msg)
+    return rig
+
+
+def _from_start_s(info: LogInfo, time_s: float) -> float:
+    """Seconds after the log's first record, as `fitctl log cut` takes them, of a monotonic time."""
+    return time_s + float(info.metadata["clock"]["wall_minus_monotonic_s"]) - info.start_s
+
+
+def _document(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> dict[str, Any]:
+    loops = {}
+    for name, loop in result.loops.items():
+        loops[name] = document = asdict(loop)
+        differences = loop.differences.items()
+        document["differences"] = {
+            what: {
+                "ticks": difference.ticks,
+                "first_s": _from_start_s(info, difference.first_s),
+                "worst": difference.worst,
+                "rms": difference.rms,
+            }
+            for what, difference in differences
+        }
+        document["mode"]["first_s"] = _from_start_s(info, loop.mode.first_s)
+    span_s = result.end_s - result.start_s
+    return {
+        "log": named,
+        "rig": rig.name,
+        "same": result.same,
+        "span_s": span_s,
+        "speed_x": span_s / result.wall_s,
+        "records_lost": result.records_lost,
+        "refused": result.refused,
+        "loops": loops,
+    }
+
+
+def _lines(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> Iterator[str]:
+    span_s = result.end_s - result.start_s
+    yield f"{named}: {span_s:.1f} s of rig {rig.name}, replayed at {span_s / result.wall_s:.0f}x real time"
+    for name, loop in result.loops.items():
+        yield from _loop_lines(info, name, loop)
+    yield from (f"accepted then, refused today: {text}" for text in result.refused)
+    if result.records_lost:
+        yield f"{result.records_lost} records were lost on the way to the log; what follows them may differ"
+    if result.same:
+        yield "the same, to the last bit"
+        return
+    yield from _other_designs(info, rig)
+    yield _OPEN_LOOP
+
+
+def _loop_lines(info: LogInfo, name: str, loop: LoopReplay) -> Iterator[str]:
+    yield f"loop {name}: {loop.ticks} ticks"
+    if loop.frames_missing:
+        yield (
+            f"  {loop.frames_missing} frames are not in the log; their ticks were replayed without, "
+            "so what follows may differ"
+        )
+    yield f"  {'differs':<22}{'ticks':>8}{'first at':>12}{'worst':>16}{'rms':>16}"
+    mode = loop.mode
+    first = f"{_from_start_s(info, mode.first_s):>10.2f} s   {mode.then} then, {mode.now} now"
+    yield f"  {'mode':<22}{mode.ticks:>8}" + (first if mode.ticks else "")
+    for what, (title, unit) in _ROWS.items():
+        found = loop.differences[what]
+        first = f"{_from_start_s(info, found.first_s):>10.2f} s"
+        sizes = "".join(f"{f'{value:.3g} {unit}':>16}" for value in (found.worst, found.rms))
+        yield f"  {title:<22}{found.ticks:>8}" + (first + sizes if found.ticks else "")
+
+
+def _other_designs(info: LogInfo, rig: Rig) -> Iterator[str]:
+    """Where the controller to begin with is not that of the log."""
+    for name, text in info.metadata.get("designs", {}).items():
+        then, now = json.loads(text), json.loads(design_json(design_for(rig, name)))
+        if then["name"] != now["name"]:
+            yield f"loop {name} begins with controller {now['name']}, in the log with {then['name']}"
+        elif any(then[matrix] != now[matrix] for matrix in ("a", "b", "c", "d")):
+            yield f"loop {name}: today's design of {now['name']} is not the log's"

@@ -1,0 +1,87 @@
+"""`fitctl replay` as a stranger meets it."""
+
+import json
+
+import pytest
+
+from fitctl.cli import main
+from fitctl.config import default_rig_path, load_rig
+from tests.logged_simulation import LoggedSimulation
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    rig = load_rig(default_rig_path(), ["loops.right.coarse.reach_fraction=0.7"])
+    simulation = LoggedSimulation(rig, path)
+    simulation.acquire()
+    simulation.run(3.0)
+    simulation.writer.close()
+    return path
+
+
+@pytest.fixture
+def replay(capsys):
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["replay", *map(str, arguments)])
+        printed = capsys.readouterr()
+        return end.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+def test_ones_own_log_is_the_same_and_the_status_says_so(replay, log):
+    status, text, _ = replay(log)
+
+    first, loop, _, *rows, verdict = text.splitlines()
+    assert status == 0
+    assert first.startswith(f"{log}: 3.0 s of rig fit-mock, replayed at ")
+    assert loop == "loop right: 152 ticks"
+    assert [row.split()[-1] for row in rows] == ["0"] * 5
+    assert verdict == "the same, to the last bit"
+
+
+def test_another_controller_differs_and_the_table_says_where_and_that_it_is_open_loop(replay, log):
+    status, text, _ = replay(log, "--controller", "lqg-ltr")
+
+    rows = {line[2:24].strip(): line[24:].split() for line in text.splitlines()}
+    assert status == 1
+    assert rows["mode"] == rows["star's place"] == ["0"]
+    ticks, first_s, *_, worst, unit, rms, _ = rows["D/A voltages"]
+    assert (int(ticks) > 50, float(first_s) > 0.4, unit) == (True, True, "V")
+    assert float(worst) > float(rms) > 0
+    assert "loop right begins with controller lqg-ltr, in the log with eq20" in text
+    assert "open loop: whatever today's code commands, the frames are the log's" in text
+
+
+def test_json_says_the_same_for_programs(replay, log):
+    changed = "loops.right.coarse.reach_frames=40"
+    status, text, _ = replay(log, "--json", "--set", changed)
+    result = json.loads(text)
+    loop = result["loops"]["right"]
+
+    assert status == 1
+    assert result["same"] is False
+    assert (loop["mode"]["then"], loop["mode"]["now"]) == ("VERNIER", "COARSE")
+    assert loop["mode"]["ticks"] == 30
+    assert loop["differences"]["star_px"]["first_s"] is None
+
+
+UNUSABLE = {
+    "a file that is none": (["no-such.mcap"], "no-such.mcap: cannot be opened"),
+    "another camera": (["LOG", "--set", "camera.width_px=41"], "must be those of the log"),
+    "a wrong key": (["LOG", "--set", "camera.with_px=41"], "camera.with_px: unknown key"),
+    "a controller that is none": (["LOG", "--controller", "pid"], "controller"),
+    "a rig file that is none": (["LOG", "--rig", "no-such.toml"], "no-such.toml: no such rig file"),
+    "no log at all": (["LOG", str(default_rig_path())], "is not an MCAP log"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "said"), UNUSABLE.values(), ids=UNUSABLE.keys())
+def test_what_cannot_be_replayed_is_one_line_and_status_2(replay, log, arguments, said):
+    status, text, errors = replay(*(log if word == "LOG" else word for word in arguments))
+
+    (line,) = (line for line in errors.splitlines() if "replaying" not in line)
+    assert (status, text) == (2, "")
+    assert said in line
