@@ -21,6 +21,8 @@ from fitctl.config.devices import (
 from fitctl.config.interlocks import QUANTITIES, Action, Interlock, ResetBy
 from fitctl.config.loops import (
     CONTROLLERS,
+    LEAST_OVERLAP,
+    MOST_OVERLAP,
     AirPathModel,
     ControllerName,
     Logging,
@@ -45,6 +47,8 @@ __all__ = [
     "ARCSEC_PER_RAD",
     "CONTROLLERS",
     "HALF_WINDOW_PX",
+    "LEAST_OVERLAP",
+    "MOST_OVERLAP",
     "QUANTITIES",
     "Action",
     "AirPath",

@@ -50,9 +50,27 @@ class StepMethods(ABC, Generic[R_co]):
         """Devices on and ready, the stages held where they are."""
         return self._do(steps.Standby, limits)
 
-    def acquire(self, **limits: Unpack[Limits]) -> R_co:
+    def acquire(
+        self,
+        *,
+        search_radius_sky_arcsec: float | None = None,
+        radius_growth: float = 1.5,
+        max_offset_sky_arcsec: float | None = None,
+        field_overlap: float | None = None,
+        expected_az_sky_arcsec: float | None = None,
+        expected_el_sky_arcsec: float | None = None,
+        **limits: Unpack[Limits],
+    ) -> R_co:
         """Search for the star, pull it in, until it is held in VERNIER."""
-        return self._do(steps.Acquire, limits)
+        keys = {
+            "search_radius_sky_arcsec": search_radius_sky_arcsec,
+            "radius_growth": radius_growth,
+            "max_offset_sky_arcsec": max_offset_sky_arcsec,
+            "field_overlap": field_overlap,
+            "expected_az_sky_arcsec": expected_az_sky_arcsec,
+            "expected_el_sky_arcsec": expected_el_sky_arcsec,
+        }
+        return self._do(steps.Acquire, {**keys, **limits})
 
     def hold(
         self,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from fitctl.config.base import Count, Finite, NonNegative, Positive, Settings
-from fitctl.config.loops import ControllerName
+from fitctl.config.loops import ControllerName, FieldOverlap
 
 LONGEST_S = 86_400.0
 
@@ -24,6 +24,13 @@ OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, o
 RmsLimitPx = Annotated[
     Positive | None,
     Field(description="largest RMS of an axis; without it, the rig file's requirement_px"),
+]
+ExpectedSkyArcsec = Annotated[
+    Finite | None,
+    Field(
+        description="where the star is, from where the encoders read zero; without it, on the target or "
+        "where it was last"
+    ),
 ]
 
 
@@ -45,9 +52,32 @@ class Standby(Step):
 
 
 class Acquire(Step):
-    """Devices on, search for the star, pull it in, until it is held; one that is held stays so."""
+    """Devices on, search for the star, pull it in, until it is held; one that is held stays so.
+
+    Where it is expected somewhere, a star that is held is let go first.
+    """
 
     step: Literal["acquire"] = "acquire"
+    search_radius_sky_arcsec: Annotated[
+        Positive | None,
+        Field(description="of the first attempt; without it, the rig file's"),
+    ] = None
+    radius_growth: Annotated[
+        float, Field(ge=1, le=10, description="of the radius, from an attempt to the next")
+    ] = 1.5
+    max_offset_sky_arcsec: Annotated[
+        Positive | None,
+        Field(description="no search goes farther; without it, the radius does not grow"),
+    ] = None
+    field_overlap: Annotated[
+        FieldOverlap | None,
+        Field(
+            description="of the field, between turns: more is a finer and slower search; without it, the "
+            "rig file's"
+        ),
+    ] = None
+    expected_az_sky_arcsec: ExpectedSkyArcsec = None
+    expected_el_sky_arcsec: ExpectedSkyArcsec = None
     timeout_s: TimeoutS = 120.0
     attempts: Attempts = 2
 

@@ -60,6 +60,8 @@ class View:
         For the step's own use too: those that it keeps.
     errors : list of str
         Error events of the supervisor since the attempt's first command.
+    attempt : int
+        Which one it is, from 1.
     fresh_s : float
         Telemetry from before tells nothing about the last command.
     """
@@ -69,6 +71,7 @@ class View:
     loop_name: str
     telemetry: Telemetry
     began_s: float
+    attempt: int = 1
     paused_s: float = 0.0
     fresh_s: float = 0.0
     looks: list[Look] = field(default_factory=list)

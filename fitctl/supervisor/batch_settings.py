@@ -25,6 +25,7 @@ from fitctl.model.scene import FULL_WELL_DN
 from fitctl.supervisor.batch_interlocks import acting_interlocks
 from fitctl.supervisor.injector import PERIOD_S
 from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.search import NEAR
 from fitctl.supervisor.servo import FOLLOWING_S, HISTORY_S
 from fitctl.supervisor.stages import HISTORY_S as MIRROR_HISTORY_S
 
@@ -60,6 +61,7 @@ RUN = np.dtype(
         ("sighted_s", "f8"),
         ("sighting_frames", "i8"),
         ("sighting_rad", "f8", (2,)),
+        ("spiral_there", "i8"),
         ("spiral_angle", "f8"),
         ("spiral_centre_rad", "f8", (2,)),
         # StarEstimator, Prefilter, Mirror, Pair
@@ -215,6 +217,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         "spiral_speed_px_s": plan.speed_px_s,
         "spiral_acceleration_px_s2": plan.acceleration_px_s2,
         "spiral_radius_px": plan.radius_px,
+        "spiral_near_px": NEAR * plan.field_radius_px,
         "writes": math.ceil(MIRROR_HISTORY_S / min(camera.period_s, PERIOD_S)),
         "states": len(design.a),
         # Rows are those of outputs, then of states; columns of inputs, then of states.

@@ -175,6 +175,8 @@ class StellarLoop:
         return Seen(self._find(frame, mirror_rad, motor_rad), mirror_rad, motor_rad)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
+            return None  # what is seen on the way is another star
         if self.mode in FOLLOWING and self._findings.lost == 0:
             predicted = self._estimator.predict_px(motor_rad, mirror_rad)
             star = self._sensor.measure(frame.image, *predicted.tolist())
@@ -310,7 +312,7 @@ class StellarLoop:
             self._start_pair()
 
     def _start_search(self) -> None:
-        """About where the star is expected: on the target, or where it was last seen."""
+        """As asked; else about where the star is expected: on the target, or where it was last seen."""
         self._estimator.expect(self.target_px, self.servo.position_rad, np.zeros(2))
         self.search.begin()
 
@@ -320,9 +322,9 @@ class StellarLoop:
         """Mirror back to its bias; the siderostat is held or stopped by its servo."""
         self.stages.mirror_to_bias()
 
-    def _search(self, _seen: Seen) -> None:
+    def _search(self, seen: Seen) -> None:
         self.stages.mirror_to_bias()
-        self.stages.siderostat_to(self.search.advance(self._period_s))
+        self.stages.siderostat_to(self.search.advance(self._period_s, seen.motor_rad))
 
     def _pull_in(self, seen: Seen) -> None:
         self.stages.mirror_to_bias()

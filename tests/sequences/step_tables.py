@@ -35,7 +35,7 @@ def step_keys():
     for name, kind in STEPS.items():
         fields = kind.model_fields
         limits = f"{fields['timeout_s'].default:g} s, {fields['attempts'].default}"
-        rows.append([f"**`{name}`**", limits, kind.__doc__.strip()])
+        rows.append([f"**`{name}`**", limits, " ".join(kind.__doc__.split())])
         rows += [
             [f"`{key}`", default(field), meaning(field)]
             for key, field in fields.items()
