@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 import typer
 
 from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption, rig_of
@@ -148,6 +147,7 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
     """Run, show progress, then print what every attempt gave; returns the exit status."""
     from fitctl.commands.instrument import interrupt
     from fitctl.commands.progress import progress_line
+    from fitctl.commands.sequence_text import as_json_text, attempts_text, where
     from fitctl.processes import ended_by_signals
     from fitctl.sequences.runner import run_sequence
     from fitctl.sequences.view import SequenceError
@@ -161,8 +161,12 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
             newest = status.last_attempt
             if newest is not None and newest not in attempts[-1:]:
                 attempts.append(newest)
-            done = sum(attempt.outcome == "done" for attempt in attempts)
-            progress.update(task, completed=done, description=_where(status))
+            done = {each.step_number for each in attempts if each.outcome == "done"}
+            progress.update(
+                task,
+                completed=len(done - {status.step_number}) + (status.state == "done"),
+                description=where(status),
+            )
 
         try:
             run_sequence(link, rig, sequence, show)
@@ -172,38 +176,10 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
         finally:
             progress.stop()
             if as_json:
-                typer.echo(_json(sequence.name, failure, attempts))
+                typer.echo(as_json_text(sequence.name, failure, attempts))
             elif attempts:
-                typer.echo(_table(attempts))
+                typer.echo(attempts_text(attempts))
     if failure:
         typer.echo(f"sequence {sequence.name}: {failure}", err=True)
         return FAILED
     return 0
-
-
-def _where(status: SequenceStatus) -> str:
-    again = f", attempt {status.attempt}" if status.attempt > 1 else ""
-    state = "" if status.state == "running" else f" {status.state}"
-    return f"{status.name}{state} {status.step_number}/{status.steps} {status.step}{again}"
-
-
-def _table(attempts: list[SequenceAttempt]) -> str:
-    """One line for each attempt; its times are the instrument's."""
-    head = f"{'step':>4}  {'':<11}  {'try':>3}  {'outcome':<9}  {'s':>7}"
-    lines = [
-        f"{each.step_number:>4}  {each.step:<11}  {each.attempt:>3}  {each.outcome:<9}  "
-        f"{each.ended_s - each.began_s:>7.1f}  {each.message}".rstrip()
-        for each in attempts
-    ]
-    return "\n".join([head, *lines])
-
-
-def _json(name: str, failure: str, attempts: list[SequenceAttempt]) -> str:
-    told = [
-        msgspec.to_builtins(each) | {"figures": msgspec.Raw(each.figures_json.encode())}
-        for each in attempts
-    ]
-    for each in told:
-        del each["figures_json"]
-    document = {"sequence": name, "failure": failure, "attempts": told}
-    return msgspec.json.encode(document).decode()

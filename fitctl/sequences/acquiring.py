@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_spiral
+from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, let_go
 from fitctl.sequences.view import StepFailed, View
@@ -72,7 +75,32 @@ def _done(step: steps.Acquire, view: View) -> Result | None:
     view.insist_on(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
     if view.mode is not Mode.VERNIER:
         return None
-    return Result({"acquired_s": view.gone_s}, f"held after {view.gone_s:.1f} s")
+    az, el = _place(view)
+    return Result(
+        {"acquired_s": view.gone_s, "found_az_sky_arcsec": az, "found_el_sky_arcsec": el},
+        f"held after {view.gone_s:.1f} s",
+    )
+
+
+def _place(view: View) -> tuple[float, float]:
+    """Where the star is on the sky, in arcsec from where the encoders read zero; nan if it was not seen."""
+    seen = [look for look in view.looks if math.isfinite(look.star_az_px)]
+    if not seen:
+        return math.nan, math.nan
+    scale, target, look = scales(view.rig, view.settings), view.settings.target_px, seen[-1]
+    beside_px = (
+        look.star_az_px - target.az - scale.mirror_px_per_rad * look.mirror_az_rad,
+        look.star_el_px - target.el - scale.mirror_px_per_rad * look.mirror_el_rad,
+    )
+    turned_px = (
+        scale.motor_px_per_rad * look.motor_az_rad,
+        scale.motor_px_per_rad * look.motor_el_rad,
+    )
+    az, el = (
+        (beside - turned) * scale.sky_arcsec_per_px
+        for beside, turned in zip(beside_px, turned_px, strict=True)
+    )
+    return az, el
 
 
 ACQUIRE = {

@@ -19,6 +19,17 @@ TimeoutS = Annotated[
     Field(gt=0, le=LONGEST_S, description="the most that is waited beyond the step's own time"),
 ]
 Attempts = Annotated[int, Field(ge=1, le=20, description="how often it is tried in all")]
+SearchRadius = Annotated[
+    Positive | None, Field(description="of the first attempt; without it, the rig file's")
+]
+RadiusGrowth = Annotated[
+    float, Field(ge=1, le=10, description="of the radius, from an attempt to the next")
+]
+LargestOffset = Annotated[
+    Positive | None,
+    Field(description="no search goes farther; without it, the radius does not grow"),
+]
+SettleS = Annotated[NonNegative, Field(le=600, description="before, not judged")]
 DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
 OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
 RmsLimitPx = Annotated[
@@ -58,17 +69,9 @@ class Acquire(Step):
     """
 
     step: Literal["acquire"] = "acquire"
-    search_radius_sky_arcsec: Annotated[
-        Positive | None,
-        Field(description="of the first attempt; without it, the rig file's"),
-    ] = None
-    radius_growth: Annotated[
-        float, Field(ge=1, le=10, description="of the radius, from an attempt to the next")
-    ] = 1.5
-    max_offset_sky_arcsec: Annotated[
-        Positive | None,
-        Field(description="no search goes farther; without it, the radius does not grow"),
-    ] = None
+    search_radius_sky_arcsec: SearchRadius = None
+    radius_growth: RadiusGrowth = 1.5
+    max_offset_sky_arcsec: LargestOffset = None
     field_overlap: Annotated[
         FieldOverlap | None,
         Field(
@@ -87,9 +90,47 @@ class Hold(Step):
 
     step: Literal["hold"] = "hold"
     duration_s: Annotated[DurationS, Field(description="how long is judged")]
-    settle_s: Annotated[NonNegative, Field(le=600, description="before, not judged")] = 10.0
+    settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     timeout_s: TimeoutS = 60.0
+
+
+class Star(Settings):
+    """A star of a list: where it is expected, from where the encoders read zero."""
+
+    name: Annotated[str, Field(min_length=1, max_length=60)]
+    az_sky_arcsec: Finite
+    el_sky_arcsec: Finite
+    duration_s: DurationS | None = None
+
+
+class Stars(Step):
+    """A list of stars, one after the other: acquire each where it is expected, hold it and judge it."""
+
+    step: Literal["stars"] = "stars"
+    stars: Annotated[
+        list[Star] | None,
+        Field(
+            min_length=1,
+            max_length=1000,
+            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and, of its own, `duration_s`",
+        ),
+    ] = None
+    file: Annotated[
+        str, Field(description="TOML, YAML or CSV with the stars, beside the sequence's own file")
+    ] = ""
+    duration_s: Annotated[DurationS, Field(description="how long each is judged")] = 30.0
+    settle_s: SettleS = 10.0
+    rms_limit_px: RmsLimitPx = None
+    search_radius_sky_arcsec: SearchRadius = None
+    radius_growth: RadiusGrowth = 1.5
+    max_offset_sky_arcsec: LargestOffset = None
+    on_failure: Annotated[
+        Literal["skip", "stop"],
+        Field(description="what follows a star that is not found or not held well"),
+    ] = "skip"
+    least_held: Annotated[Count, Field(description="with fewer, the step has failed")] = 1
+    timeout_s: TimeoutS = 120.0
 
 
 class Moving(Step):
@@ -216,6 +257,7 @@ AnyStep = (
     Standby
     | Acquire
     | Hold
+    | Stars
     | Target
     | Jog
     | Raster

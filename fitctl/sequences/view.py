@@ -40,6 +40,8 @@ class Look(NamedTuple):
     error_el_px: float
     motor_az_rad: float
     motor_el_rad: float
+    mirror_az_rad: float
+    mirror_el_rad: float
 
 
 @dataclass
@@ -175,9 +177,11 @@ def _look(tick: Tick) -> Look:
         tick.error_el_px,
         tick.siderostat_az_rad,
         tick.siderostat_el_rad,
+        tick.fsm_az_rad,
+        tick.fsm_el_rad,
     )
 
 
 def columns(looks: list[Look]) -> Floats:
-    """Looks as an array, shape (n, 7)."""
+    """Looks as an array, shape (n, 9)."""
     return np.array(looks, dtype=np.float64).reshape(-1, len(Look._fields))

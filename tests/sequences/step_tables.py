@@ -13,7 +13,9 @@ COMMON = set(Step.model_fields)
 def default(field):
     if field.is_required():
         return "required"
-    return "" if field.default in {None, ""} else f"{field.default:g}"
+    if field.default in {None, ""}:
+        return ""
+    return f"{field.default:g}" if isinstance(field.default, int | float) else f"`{field.default}`"
 
 
 def meaning(field):

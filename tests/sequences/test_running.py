@@ -14,14 +14,16 @@ from fitctl.supervisor.messages import Acquire, Hold, SequenceControl, Stop
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
 RIG = load_rig(default_rig_path())
+SKIES = {"stars": load_rig(default_rig_path().parent / "star-field.toml")}
 
 
 @pytest.mark.parametrize("path", shipped_sequences(), ids=lambda path: path.stem)
 def test_every_shipped_sequence_runs_to_its_end(path):
-    sequence = load_sequence(path, RIG)
+    rig = SKIES.get(path.stem, RIG)
+    sequence = load_sequence(path, rig)
     assert sequence.name == path.stem
 
-    attempts = run_sequence(SimulatedLink(RIG, 0), RIG, sequence)
+    attempts = run_sequence(SimulatedLink(rig, 0), rig, sequence)
 
     last = {attempt.step_number: attempt.outcome for attempt in attempts}
     assert list(last.values()) == ["done"] * len(sequence.steps)
