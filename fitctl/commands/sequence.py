@@ -37,6 +37,14 @@ StepSetOption = Annotated[
         "steps.hold.duration_s=60 for every hold; may be repeated.",
     ),
 ]
+OutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER",
+        help="Where calibrations are written: fragments for the rig file's include list.",
+    ),
+]
 
 
 def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Rig, Sequence]:
@@ -72,15 +80,19 @@ def dry_run(
     overrides: StepSetOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
+    out: OutOption = None,
 ) -> None:
-    """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave."""
+    """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave.
+
+    What it measures of the simulated rig is written only where --out says.
+    """
     from fitctl.sequences.links import SimulatedLink
 
     settings, sequence = _load(file, rig, overrides)
     settings.mock_parts()
     begun = time.perf_counter()
     link = SimulatedLink(settings, seed)
-    status = _run(settings, sequence, link, as_json=as_json)
+    status = _run(settings, sequence, link, out, as_json=as_json)
     if not as_json:
         typer.echo(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")
     raise typer.Exit(status)
@@ -92,6 +104,7 @@ def run(
     rig: RigOption = None,
     overrides: StepSetOption = None,
     as_json: JsonOption = False,
+    out: OutOption = Path(),
 ) -> None:
     """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
     from fitctl.supervisor.client import Client
@@ -100,7 +113,7 @@ def run(
     settings, sequence = _load(file, rig, overrides)
     client = Client(service_folder(settings))
     try:
-        status = _run(settings, sequence, client, as_json=as_json)
+        status = _run(settings, sequence, client, out, as_json=as_json)
     finally:
         client.close()
     raise typer.Exit(status)
@@ -143,15 +156,18 @@ def _steer(
     raise typer.Exit(0 if reply.accepted else FAILED)
 
 
-def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
-    """Run, show progress, then print what every attempt gave; returns the exit status."""
+def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json: bool) -> int:
+    """Run, show progress, print what every attempt gave, write calibrations; returns the exit status."""
     from fitctl.commands.instrument import interrupt
     from fitctl.commands.progress import progress_line
     from fitctl.commands.sequence_text import as_json_text, attempts_text, where
     from fitctl.processes import ended_by_signals
-    from fitctl.sequences.runner import run_sequence
+    from fitctl.sequences.calibration import CALIBRATING, insist_on_folder, write_calibration
+    from fitctl.sequences.runner import Runner, run_steps
     from fitctl.sequences.view import SequenceError
 
+    if out is not None and any(step.step in CALIBRATING for step in sequence.steps):
+        insist_on_folder(out)
     attempts: list[SequenceAttempt] = []
     failure = "interrupted"
     with ended_by_signals(interrupt), progress_line() as progress:
@@ -168,8 +184,9 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
                 description=where(status),
             )
 
+        runner = Runner(link, rig, sequence.name, len(sequence.steps), show)
         try:
-            run_sequence(link, rig, sequence, show)
+            run_steps(runner, sequence.steps)
             failure = ""
         except (SequenceError, ConnectionError) as error:
             failure = str(error)
@@ -179,6 +196,10 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
                 typer.echo(as_json_text(sequence.name, failure, attempts))
             elif attempts:
                 typer.echo(attempts_text(attempts))
+    if out is not None:
+        for calibration in runner.calibrations:
+            path = write_calibration(calibration, rig, out)
+            typer.echo(f"written: {path} (name it in the rig file's include list)", err=as_json)
     if failure:
         typer.echo(f"sequence {sequence.name}: {failure}", err=True)
         return FAILED

@@ -39,7 +39,7 @@ from fitctl.config.mocks import (
     LoopMocks,
     Mdt693Mock,
 )
-from fitctl.config.plant import AirPath, Hysteresis, Spot
+from fitctl.config.plant import AirPath, HotPixel, Hysteresis, Spot
 from fitctl.config.reading import lay_over, load_rig, rig_from_document
 from fitctl.config.rig import Rig, default_rig_path
 
@@ -66,6 +66,7 @@ __all__ = [
     "Fault",
     "Fsm",
     "GigeMock",
+    "HotPixel",
     "Hysteresis",
     "Interlock",
     "Logging",

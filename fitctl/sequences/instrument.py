@@ -17,6 +17,7 @@ import msgspec
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.logging.records import SequenceAttempt
 from fitctl.sequences import steps
+from fitctl.sequences.calibration import write_calibration
 from fitctl.sequences.links import Link, SimulatedLink
 from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import find_sequence, load_sequence
@@ -121,6 +122,17 @@ class Instrument(StepMethods[Figures]):
     def attempts(self) -> list[SequenceAttempt]:
         """Every attempt of the newest step or file, as the log has them."""
         return [] if self._runner is None else list(self._runner.attempts)
+
+    def write_calibrations(self, folder: Path | str) -> list[Path]:
+        """Write what the newest step or file has measured for the rig file; the fragments' paths.
+
+        Raises
+        ------
+        ConfigError
+            If that cannot be done.
+        """
+        measured = [] if self._runner is None else self._runner.calibrations
+        return [write_calibration(each, self.rig, Path(folder)) for each in measured]
 
     def send(self, command: AnyCommand) -> Reply:
         """Give one command of :mod:`fitctl.supervisor.messages`."""

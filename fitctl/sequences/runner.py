@@ -10,7 +10,7 @@ import msgspec
 
 from fitctl.config import Rig
 from fitctl.logging.records import SequenceAttempt
-from fitctl.sequences.behaviour import Behaviour, Result
+from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
 from fitctl.sequences.links import Link
@@ -54,6 +54,7 @@ class Runner:
         on_status: Callable[[SequenceStatus], None] = lambda _status: None,
     ) -> None:
         self.attempts: list[SequenceAttempt] = []
+        self.calibrations: list[Calibration] = []
         self.contact = Contact(link, rig, name, steps, on_status)
         self._link = link
         self._rig = rig
@@ -148,6 +149,8 @@ class Runner:
                     behaviour.stop(step, view)
                 self._note("stopped", str(stopped) or "interrupted", {}, began_s)
             raise
+        if result.calibration is not None:
+            self.calibrations.append(result.calibration)
         return self._note("done", result.message, result.figures, began_s)
 
     def _work(self, step: Step, behaviour: Behaviour, view: View) -> Result:

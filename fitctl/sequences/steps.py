@@ -228,6 +228,9 @@ class PlateScale(Moving):
     max_residual_px: Annotated[
         Positive, Field(description="largest RMS that the fit may leave unexplained")
     ] = 0.5
+    max_rotation_deg: Annotated[
+        Positive, Field(le=45, description="a stage turned farther than this is refused")
+    ] = 10.0
 
 
 class Dark(Step):

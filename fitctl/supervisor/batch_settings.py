@@ -130,7 +130,7 @@ WORK = np.dtype(
 
 
 class TooLargeForBatchError(Exception):
-    """The rig has more of something than the records hold, or an interlock that may act."""
+    """The rig has more of something than the records hold, or something that a batch does not know."""
 
 
 def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArray[np.void]:
@@ -146,6 +146,9 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         raise TooLargeForBatchError(msg)
     loop, camera = rig.loops[loop_name], rig.true_camera
     truth, _ = rig.mock_parts()
+    if truth.hot_pixels or camera.dark_file is not None:
+        msg = "pixels differ, and a batch takes all for alike"
+        raise TooLargeForBatchError(msg)
     plant = truth.loops[loop_name]
     fsm, siderostat, acquisition = loop.fsm, loop.siderostat, loop.acquisition
     scale, plan = scales(rig, loop), plan_spiral(rig, loop_name)
