@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import tomli_w
 import typer
 
 from fitctl import demo as demos
@@ -25,6 +24,7 @@ from fitctl.identify.experiments import (
     Identification,
     response_on_mock_bench,
 )
+from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
@@ -84,7 +84,7 @@ def identify(
             finding = _found(rig, rig_path, overrides, what, loop_name, source, progress)
         # The plot first: it shows why, where there is nothing to write for the rig.
         _write(plot_path, lambda: finding.plot(plot_path))
-        text = _fragment_text(rig, what, finding)
+        text = fragment_text(f"fitctl identify {what}", rig, finding.lines(), finding.fragment())
     except LogError as error:
         raise ConfigError(str(error)) from None
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
@@ -178,13 +178,6 @@ def _hold_a_star(running: demos.Instrument, loop_name: str) -> None:
         if since_s is None and time.monotonic() > deadline_s:
             msg = f"the mock star was not held within {_MOCK_VERNIER_S:g} s; modes {modes}"
             raise IdentifyError(msg)
-
-
-def _fragment_text(rig: Rig, what: str, finding: Finding) -> str:
-    when = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
-    said = "".join(f"# {line}\n" for line in finding.lines())
-    head = f"# Written by `fitctl identify {what}` for rig {rig.name}, {when}.\n{said}\n"
-    return head + tomli_w.dumps(finding.fragment())
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 import typer
 
 from fitctl.commands.options import (
@@ -45,6 +44,14 @@ StepSetOption = Annotated[
         "steps.hold.duration_s=60 for every hold; may be repeated.",
     ),
 ]
+OutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER",
+        help="Where calibrations are written: fragments for the rig file's include list.",
+    ),
+]
 
 
 def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Rig, Sequence]:
@@ -80,15 +87,19 @@ def dry_run(
     overrides: StepSetOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
+    out: OutOption = None,
 ) -> None:
-    """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave."""
+    """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave.
+
+    What it measures of the simulated rig is written only where --out says.
+    """
     from fitctl.sequences.links import SimulatedLink
 
     settings, sequence = _load(file, rig, overrides)
     settings.mock_parts()
     begun = time.perf_counter()
     link = SimulatedLink(settings, seed)
-    status = _run(settings, sequence, link, as_json=as_json)
+    status = _run(settings, sequence, link, out, as_json=as_json)
     if not as_json:
         typer.echo(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")
     raise typer.Exit(status)
@@ -101,6 +112,7 @@ def run(
     overrides: StepSetOption = None,
     remote: RemoteOption = None,
     as_json: JsonOption = False,
+    out: OutOption = Path(),
 ) -> None:
     """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
     from fitctl.supervisor.client import Client
@@ -110,7 +122,7 @@ def run(
     settings, sequence = _load(file, rig, overrides)
     client = Client(service_folder(settings) if remote is None else read_key_of(settings, remote))
     try:
-        status = _run(settings, sequence, client, as_json=as_json)
+        status = _run(settings, sequence, client, out, as_json=as_json)
     finally:
         client.close()
     raise typer.Exit(status)
@@ -155,14 +167,18 @@ def _steer(
     raise typer.Exit(0 if reply.accepted else FAILED)
 
 
-def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
-    """Run, show progress, then print what every attempt gave; returns the exit status."""
+def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json: bool) -> int:
+    """Run, show progress, print what every attempt gave, write calibrations; returns the exit status."""
     from fitctl.commands.instrument import interrupt
     from fitctl.commands.progress import progress_line
+    from fitctl.commands.sequence_text import as_json_text, attempts_text, where
     from fitctl.processes import ended_by_signals
-    from fitctl.sequences.runner import run_sequence
+    from fitctl.sequences.calibration import CALIBRATING, insist_on_folder, write_calibration
+    from fitctl.sequences.runner import Runner, run_steps
     from fitctl.sequences.view import SequenceError
 
+    if out is not None and any(step.step in CALIBRATING for step in sequence.steps):
+        insist_on_folder(out)
     attempts: list[SequenceAttempt] = []
     failure = "interrupted"
     with ended_by_signals(interrupt), progress_line() as progress:
@@ -172,49 +188,30 @@ def _run(rig: Rig, sequence: Sequence, link: Link, *, as_json: bool) -> int:
             newest = status.last_attempt
             if newest is not None and newest not in attempts[-1:]:
                 attempts.append(newest)
-            done = sum(attempt.outcome == "done" for attempt in attempts)
-            progress.update(task, completed=done, description=_where(status))
+            done = {each.step_number for each in attempts if each.outcome == "done"}
+            progress.update(
+                task,
+                completed=len(done - {status.step_number}) + (status.state == "done"),
+                description=where(status),
+            )
 
+        runner = Runner(link, rig, sequence.name, len(sequence.steps), show)
         try:
-            run_sequence(link, rig, sequence, show)
+            run_steps(runner, sequence.steps)
             failure = ""
         except (SequenceError, ConnectionError) as error:
             failure = str(error)
         finally:
             progress.stop()
             if as_json:
-                typer.echo(_json(sequence.name, failure, attempts))
+                typer.echo(as_json_text(sequence.name, failure, attempts))
             elif attempts:
-                typer.echo(_table(attempts))
+                typer.echo(attempts_text(attempts))
+    if out is not None:
+        for calibration in runner.calibrations:
+            path = write_calibration(calibration, rig, out)
+            typer.echo(f"written: {path} (name it in the rig file's include list)", err=as_json)
     if failure:
         typer.echo(f"sequence {sequence.name}: {failure}", err=True)
         return FAILED
     return 0
-
-
-def _where(status: SequenceStatus) -> str:
-    again = f", attempt {status.attempt}" if status.attempt > 1 else ""
-    state = "" if status.state == "running" else f" {status.state}"
-    return f"{status.name}{state} {status.step_number}/{status.steps} {status.step}{again}"
-
-
-def _table(attempts: list[SequenceAttempt]) -> str:
-    """One line for each attempt; its times are the instrument's."""
-    head = f"{'step':>4}  {'':<11}  {'try':>3}  {'outcome':<9}  {'s':>7}"
-    lines = [
-        f"{each.step_number:>4}  {each.step:<11}  {each.attempt:>3}  {each.outcome:<9}  "
-        f"{each.ended_s - each.began_s:>7.1f}  {each.message}".rstrip()
-        for each in attempts
-    ]
-    return "\n".join([head, *lines])
-
-
-def _json(name: str, failure: str, attempts: list[SequenceAttempt]) -> str:
-    told = [
-        msgspec.to_builtins(each) | {"figures": msgspec.Raw(each.figures_json.encode())}
-        for each in attempts
-    ]
-    for each in told:
-        del each["figures_json"]
-    document = {"sequence": name, "failure": failure, "attempts": told}
-    return msgspec.json.encode(document).decode()

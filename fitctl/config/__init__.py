@@ -21,6 +21,8 @@ from fitctl.config.devices import (
 from fitctl.config.interlocks import QUANTITIES, Action, Interlock, ResetBy
 from fitctl.config.loops import (
     CONTROLLERS,
+    LEAST_OVERLAP,
+    MOST_OVERLAP,
     AirPathModel,
     ControllerName,
     Logging,
@@ -37,7 +39,7 @@ from fitctl.config.mocks import (
     LoopMocks,
     Mdt693Mock,
 )
-from fitctl.config.plant import AirPath, Hysteresis, Spot
+from fitctl.config.plant import AirPath, HotPixel, Hysteresis, Spot
 from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_json
 from fitctl.config.rig import Rig, default_rig_path
 
@@ -45,6 +47,8 @@ __all__ = [
     "ARCSEC_PER_RAD",
     "CONTROLLERS",
     "HALF_WINDOW_PX",
+    "LEAST_OVERLAP",
+    "MOST_OVERLAP",
     "QUANTITIES",
     "Action",
     "AirPath",
@@ -62,6 +66,7 @@ __all__ = [
     "Fault",
     "Fsm",
     "GigeMock",
+    "HotPixel",
     "Hysteresis",
     "Interlock",
     "Logging",

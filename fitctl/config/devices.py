@@ -49,6 +49,7 @@ class Camera(Settings):
     frame_delay_s: NonNegative
     bias_dn: NonNegative
     pixel_noise_dn: Positive
+    dark_file: str | None = None
     device: GigeDevice
 
     @property

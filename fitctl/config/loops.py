@@ -21,6 +21,8 @@ from fitctl.config.devices import AnySiderostat, Fsm
 
 ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
 CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
+LEAST_OVERLAP, MOST_OVERLAP = 0.05, 0.6
+FieldOverlap = Annotated[float, Field(ge=LEAST_OVERLAP, le=MOST_OVERLAP)]
 
 
 class Acquisition(Settings):
@@ -30,7 +32,7 @@ class Acquisition(Settings):
     detection_sigma: Annotated[float, Field(ge=3, le=100)]
     found_frames: Count
     lost_frames: Count
-    field_overlap: Annotated[float, Field(ge=0.05, le=0.6)]
+    field_overlap: FieldOverlap
     settle_s: NonNegative
     confirm_timeout_s: Positive
 

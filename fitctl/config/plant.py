@@ -46,6 +46,14 @@ class Spot(Settings):
     diameter_px: Positive
 
 
+class HotPixel(Settings):
+    """A pixel that reads more than the others, light or no light."""
+
+    az_px: Annotated[int, Field(ge=0)]
+    el_px: Annotated[int, Field(ge=0)]
+    dn: Positive
+
+
 class LoopPlant(Settings):
     """What one loop's hardware truly is; nothing but mocks and simulation reads it."""
 
@@ -66,6 +74,7 @@ class PlantTruth(Settings):
         None  # where the truth is not what camera.frame_delay_s says
     )
     history_s: Annotated[float, Field(ge=1, le=3600)]
+    hot_pixels: tuple[HotPixel, ...] = Field(default=(), strict=False)
     loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
 
     @model_validator(mode="after")

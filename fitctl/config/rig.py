@@ -56,6 +56,10 @@ class Rig(Settings):
                     "the camera's delay and two frames"
                 )
                 raise ValueError(msg)
+        for pixel in self.plant.hot_pixels if self.plant else []:
+            if pixel.az_px >= self.camera.width_px or pixel.el_px >= self.camera.height_px:
+                msg = f"plant.hot_pixels: az {pixel.az_px}, el {pixel.el_px} px is not on the frame"
+                raise ValueError(msg)
         for section, part in (("plant", self.plant), ("mocks", self.mocks)):
             if part is not None and set(part.loops) != set(self.loops):
                 msg = f"{section}.loops must name the same loops as loops: {', '.join(self.loops)}"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop
+from fitctl.controllers.dark import Dark
 
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 # Eq. 7's three sums over a window, row by row: light, and its moments along azimuth and elevation.
@@ -30,7 +32,7 @@ class Star(NamedTuple):
     az_px, el_px : float
         Centre of gravity, global pixel coordinates.
     flux_dn : float
-        Sum over the window, bias subtracted.
+        Sum over the window, dark subtracted.
     window_az_px, window_el_px : int
         Centre of the 7x7 window.
     """
@@ -53,8 +55,7 @@ class StarSensor:
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
-        self._bias_dn = camera.bias_dn
-        self._window_bias_dn = camera.bias_dn * _LEVER_PX.size**2
+        self._dark = Dark(camera)
         self._threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_low_dn = loop.flux_range.low * loop.star_flux_dn
         self._flux_high_dn = loop.flux_range.high * loop.star_flux_dn
@@ -68,11 +69,10 @@ class StarSensor:
 
     def find(self, image: NDArray[np.uint16]) -> Star | None:
         """Look over the whole frame, brightest spot first; None when this loop's star is not there."""
-        search = image.astype(np.float64)
+        search = self._dark.light(image, 0, 0, *image.shape)
         for _ in range(MAX_CANDIDATES):
             el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
-            peak_dn = search[el_px, az_px] - self._bias_dn
-            if peak_dn < self._threshold_dn:
+            if search[el_px, az_px] < self._threshold_dn:
                 return None
             candidate = self._centroid(image, az_px, el_px)
             if candidate is not None:
@@ -84,7 +84,7 @@ class StarSensor:
             search[
                 max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
                 max(0, az_px - HALF_WINDOW_PX) : az_px + HALF_WINDOW_PX + 1,
-            ] = 0.0
+            ] = -math.inf
         return None
 
     def _centroid(
@@ -93,14 +93,10 @@ class StarSensor:
         """Eq. 7; None where there is no light, or one pixel has most of it."""
         az = min(max(round(window_az_px), HALF_WINDOW_PX), self._largest_az_px)
         el = min(max(round(window_el_px), HALF_WINDOW_PX), self._largest_el_px)
-        window = image[
-            el - HALF_WINDOW_PX : el + HALF_WINDOW_PX + 1,
-            az - HALF_WINDOW_PX : az + HALF_WINDOW_PX + 1,
-        ].astype(np.float64)
-        light_dn, az_moment, el_moment = _SUMS.dot(window.ravel()).tolist()
-        flux_dn = light_dn - self._window_bias_dn  # the bias has no moment about the middle
-        peak_dn = float(window.max()) - self._bias_dn
-        if flux_dn <= 0 or peak_dn > LARGEST_PEAK * flux_dn:
+        side = _LEVER_PX.size
+        light_dn = self._dark.light(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
+        flux_dn, az_moment, el_moment = _SUMS.dot(light_dn.ravel()).tolist()
+        if flux_dn <= 0 or float(light_dn.max()) > LARGEST_PEAK * flux_dn:
             return None
         return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
 

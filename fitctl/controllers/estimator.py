@@ -37,6 +37,11 @@ class StarEstimator:
             self.assume(star_px, motor_rad, mirror_rad)
         self._expected = True
 
+    def place(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
+        """Expect another star, at `star_px`; as :meth:`assume`."""
+        self.assume(star_px, motor_rad, mirror_rad)
+        self.known, self._expected = False, True
+
     def assume(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
         """Take the star to be at `star_px` with the stages as given; all shapes (2,)."""
         self._origin_px = star_px - self._stages_px(motor_rad, mirror_rad)

@@ -44,9 +44,20 @@ class SpiralPlan:
     radius_px: float
     field_radius_px: float
 
+    @property
+    def duration_s(self) -> float:
+        """About how long it takes, but for its slower middle: the area over what is covered in a second."""
+        return math.pi * self.radius_px**2 / (self.pitch_px * self.speed_px_s)
 
-def plan_spiral(rig: Rig, loop_name: str) -> SpiralPlan:
-    """The spiral that misses no star within the rig's search radius.
+
+def plan_spiral(
+    rig: Rig,
+    loop_name: str,
+    *,
+    radius_sky_arcsec: float | None = None,
+    field_overlap: float | None = None,
+) -> SpiralPlan:
+    """The spiral that misses no star within the search radius; this and the overlap are the rig's unless given.
 
     Its pitch follows from the field of view, its speed from the frame rate, the motors and the blur of
     a spot: not more than one window half in one exposure.
@@ -56,7 +67,8 @@ def plan_spiral(rig: Rig, loop_name: str) -> SpiralPlan:
     camera, acquisition = rig.camera, loop.acquisition
     # The 7x7 window must fit, and its centre may be half a pixel off the spot's.
     field_px = min(camera.width_px, camera.height_px) / 2 - HALF_WINDOW_PX - 1.0
-    reach_px = field_px * (1 - acquisition.field_overlap)
+    overlap = acquisition.field_overlap if field_overlap is None else field_overlap
+    reach_px = field_px * (1 - overlap)
     looks = acquisition.found_frames + _LOOKS_BEYOND_FOUND
     speed_px_s = min(
         math.sqrt(2) * reach_px / looks * camera.frame_rate_hz,
@@ -64,13 +76,15 @@ def plan_spiral(rig: Rig, loop_name: str) -> SpiralPlan:
         0.5 * loop.siderostat.velocity_limit_rad_s * scale.motor_px_per_rad,
     )
     pitch_px = math.sqrt(2) * reach_px
+    if radius_sky_arcsec is None:
+        radius_sky_arcsec = acquisition.search_radius_sky_arcsec
     return SpiralPlan(
         pitch_px=pitch_px,
         speed_px_s=speed_px_s,
         acceleration_px_s2=0.25
         * loop.siderostat.acceleration_limit_rad_s2
         * scale.motor_px_per_rad,
-        radius_px=acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px + pitch_px / 2,
+        radius_px=radius_sky_arcsec / scale.sky_arcsec_per_px + pitch_px / 2,
         field_radius_px=field_px,
     )
 

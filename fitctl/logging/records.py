@@ -243,7 +243,10 @@ class Losses(Record, frozen=True, kw_only=True):
 
 
 class SequenceAttempt(Record, frozen=True, kw_only=True):
-    """One attempt at one step of a sequence, when it ended; figures as JSON, units in their names."""
+    """One attempt at one step of a sequence, when it ended; figures as JSON, units in their names.
+
+    ``star`` is the one of a list that the step was for.
+    """
 
     sequence_name: str
     step_number: int
@@ -255,6 +258,7 @@ class SequenceAttempt(Record, frozen=True, kw_only=True):
     outcome: Literal["done", "failed", "timed out", "stopped"]
     message: str
     figures_json: str
+    star: str = ""
 
 
 AnyRecord = (

@@ -147,7 +147,9 @@ class Testbed:
             for name, live in self._plants.items()
         }
         self._scene = Scene(
-            rig.camera, [spot for name in rig.loops for spot in truth.loops[name].spots]
+            rig.camera,
+            [spot for name in rig.loops for spot in truth.loops[name].spots],
+            truth.hot_pixels,
         )
         self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
         self._exposures = 0

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Camera, Spot
+from fitctl.config import Camera, HotPixel, Spot
 from fitctl.model.compiled import kernels
 from fitctl.model.light import light_below, light_table
 from fitctl.model.pixel_noise import pixel_normals, quantiles
@@ -25,9 +25,13 @@ class Scene:
     camera : Camera
     spots : sequence of Spot
         Their order is that of the positions given to :meth:`expected`.
+    hot_pixels : sequence of HotPixel
+        They read so much more on every frame.
     """
 
-    def __init__(self, camera: Camera, spots: Sequence[Spot]) -> None:
+    def __init__(
+        self, camera: Camera, spots: Sequence[Spot], hot_pixels: Sequence[HotPixel] = ()
+    ) -> None:
         self._shape = (camera.height_px, camera.width_px)
         self._bias_dn = camera.bias_dn
         self._noise_dn = camera.pixel_noise_dn
@@ -38,6 +42,7 @@ class Scene:
         self._down, self._across = np.empty(self._shape[0]), np.empty(self._shape[1])
         self._edges_x: Floats = np.arange(camera.width_px + 1.0) - 0.5
         self._edges_y: Floats = np.arange(camera.height_px + 1.0) - 0.5
+        self._hot = [(pixel.el_px, pixel.az_px, pixel.dn) for pixel in hot_pixels]
 
     def expected(self, positions_px: Floats) -> Floats:
         """Noiseless frame, shape (..., height, width), of spots at (..., spots, 2) in (az, el)."""
@@ -73,13 +78,18 @@ class Scene:
             self._down,
             self._across,
         )
-        return self._light_dn.astype(np.uint16)
+        return self._with_hot_pixels(self._light_dn)
 
     def frame_reference(self, positions_px: Floats, key: int, number: int) -> NDArray[np.uint16]:
         """:meth:`frame` in NumPy; the compiled one is held to this."""
         noise = pixel_normals(key, number, math.prod(self._shape)).reshape(self._shape)
         noisy = self.expected(positions_px) + self._noise_dn * noise
-        return np.clip(np.rint(noisy), 0, FULL_WELL_DN).astype(np.uint16)
+        return self._with_hot_pixels(np.clip(np.rint(noisy), 0, FULL_WELL_DN))
+
+    def _with_hot_pixels(self, read_dn: Floats) -> NDArray[np.uint16]:
+        for row, column, dn in self._hot:
+            read_dn[row, column] = min(round(read_dn[row, column] + dn), FULL_WELL_DN)
+        return read_dn.astype(np.uint16)
 
     def _pixel_fractions(self, edges: Floats, centre_px: Floats) -> Floats:
         """Part of a spot's light that falls on each column (or row), shape (..., spots, pixels)."""

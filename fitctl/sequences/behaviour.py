@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from numpy.typing import NDArray
+
 from fitctl.config import Rig
 from fitctl.model.optics import scales
 from fitctl.sequences.steps import Moving
@@ -14,11 +16,33 @@ from fitctl.supervisor.messages import Hold
 from fitctl.supervisor.modes import Mode
 
 
+class Calibration(NamedTuple):
+    """What a step has measured that a rig file can say.
+
+    Attributes
+    ----------
+    name : str
+        What it is, as a part of file names.
+    lines : list of str
+        For people.
+    fragment : dict
+        What to lay over the rig file.
+    arrays : dict
+        Arrays that the fragment names, by their file names.
+    """
+
+    name: str
+    lines: list[str]
+    fragment: dict[str, Any]
+    arrays: dict[str, NDArray[Any]]
+
+
 class Result(NamedTuple):
-    """What a step that is done has measured, and that in words."""
+    """What a step that is done has measured, that in words, and what of it is for the rig file."""
 
     figures: Figures
     message: str
+    calibration: Calibration | None = None
 
 
 class Behaviour(NamedTuple):

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from fitctl.config import Rig
+from fitctl.sequences.acquiring import ACQUIRE
 from fitctl.sequences.behaviour import Behaviour
 from fitctl.sequences.dark import DARK
 from fitctl.sequences.open_loop import OPEN_LOOP
 from fitctl.sequences.plain import PLAIN
 from fitctl.sequences.plate_scale import PLATE_SCALE
 from fitctl.sequences.pointing import POINTING
+from fitctl.sequences.stars import STARS
 from fitctl.sequences.steps import Step
 
-BEHAVIOURS: dict[str, Behaviour] = PLAIN | POINTING | OPEN_LOOP | PLATE_SCALE | DARK
+BEHAVIOURS: dict[str, Behaviour] = (
+    PLAIN | ACQUIRE | POINTING | OPEN_LOOP | PLATE_SCALE | DARK | STARS
+)
 
 
 def problems(step: Step, rig: Rig) -> list[str]:

@@ -93,7 +93,9 @@ class Contact:
         telemetry = self._receive()
         while telemetry.time_s < since_s:
             telemetry = self._receive()
-        view = View(self._link, self._rig, loop_name, telemetry, began_s=telemetry.time_s)
+        view = View(
+            self._link, self._rig, loop_name, telemetry, telemetry.time_s, self.status.attempt
+        )
         self._obey(view)
         return view
 

@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 from fitctl.config import Rig
 from fitctl.logging.records import FrameRecord
 from fitctl.sequences import steps
-from fitctl.sequences.behaviour import Behaviour, Result
+from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.view import Figures, StepFailed, View
 from fitctl.supervisor.modes import Mode
 
 Floats = NDArray[np.float64]
 _BRIGHT_NOISES = 5.0  # above the bias, and a pixel is bright
+_TOLD = 20  # bad pixels that are named
+_NOISE_RANGE = (1 / 3, 3.0)  # of the median: a pixel that is stuck, or restless, is bad
 
 
 def stack_of(frames: list[FrameRecord]) -> Floats:
@@ -46,6 +48,32 @@ def measure_dark(stack: Floats) -> Figures:
     }
 
 
+def dark_frame(stack: Floats) -> Floats:
+    """What each pixel reads without light, shape (rows, columns), from dark frames; NaN where it is bad.
+
+    Bad is a pixel with much more noise than the others, or much less, as one that is stuck or saturated. One
+    that is only bright is good: what it reads too much is subtracted, which is better than to guess it from
+    its neighbours.
+    """
+    noise_dn = stack.std(axis=0, ddof=1)
+    low, high = (part * np.median(noise_dn) for part in _NOISE_RANGE)
+    return np.where((noise_dn < low) | (noise_dn > high), np.nan, stack.mean(axis=0))
+
+
+def _calibration(rig: Rig, figures: Figures, dark_dn: Floats, said: str) -> Calibration:
+    name = f"{rig.name}-dark.npy"
+    camera = {
+        "bias_dn": round(figures["bias_dn"], 2),
+        "pixel_noise_dn": round(figures["noise_dn"], 2),
+        "dark_file": name,
+    }
+    bad = [f"az {column}, el {row}" for row, column in np.argwhere(np.isnan(dark_dn))]
+    more = f"; and {len(bad) - _TOLD} more" if len(bad) > _TOLD else ""
+    told = "; ".join(bad[:_TOLD]) or "none"
+    lines = [said, f"bad pixels, which are filled in from their neighbours: {told}{more}"]
+    return Calibration("dark", lines, {"camera": camera}, {name: dark_dn.astype(np.float32)})
+
+
 def _done(step: steps.Dark, view: View) -> Result | None:
     view.insist_on(Mode.STANDBY)
     if any(np.isfinite(look.star_az_px) for look in view.looks):
@@ -57,7 +85,8 @@ def _done(step: steps.Dark, view: View) -> Result | None:
         view.frames.append(newest)
     if len(view.frames) < step.frames:
         return None
-    figures, camera = measure_dark(stack_of(view.frames)), view.rig.camera
+    stack, camera = stack_of(view.frames), view.rig.camera
+    figures = measure_dark(stack)
     said = (
         f"bias {figures['bias_dn']:.1f} DN (rig file {camera.bias_dn:g}), noise {figures['noise_dn']:.1f} DN "
         f"(rig file {camera.pixel_noise_dn:g}), {figures['bright_pixels']:.0f} bright pixels"
@@ -65,7 +94,7 @@ def _done(step: steps.Dark, view: View) -> Result | None:
     if figures["bright_pixels"] > step.max_bright_pixels:
         msg = f"{said}; max_bright_pixels is {step.max_bright_pixels}: is there light?"
         raise StepFailed(msg)
-    return Result(figures, said)
+    return Result(figures, said, _calibration(view.rig, figures, dark_frame(stack), said))
 
 
 def _own_s(step: steps.Dark, rig: Rig, _loop_name: str) -> float:

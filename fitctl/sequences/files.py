@@ -1,7 +1,8 @@
-"""What people write for sequences: TOML and YAML, as dictionaries."""
+"""What people write for sequences: TOML, YAML and, for lists of stars, CSV, as dictionaries."""
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -51,3 +52,58 @@ def parse_yaml(text: str, path: Path) -> Any:
         said = str(error).splitlines()[0]
     msg = f"{path}: not YAML: {said}"
     raise ConfigError(msg)
+
+
+def read_table(path: Path, key: str, missing: str) -> list[tuple[str, Any]]:
+    """A list of tables, each with where it is in the file: the lines of a CSV, or what `key` says.
+
+    A CSV names its columns in its first line; lines that begin with # are left out.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`read_document`, or if there is no such list.
+    """
+    if path.suffix == ".csv":
+        return _parse_csv(read_text(path, missing), path)
+    rows = read_document(path, missing).get(key)
+    if not isinstance(rows, list):
+        msg = f"{path}: {key}: must be a list of tables, [[{key}]] in TOML"
+        raise ConfigError(msg)
+    return [(f"{path}: {key} {number}", row) for number, row in enumerate(rows, start=1)]
+
+
+def _parse_csv(text: str, path: Path) -> list[tuple[str, Any]]:
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    reader = csv.reader([line for _, line in lines], skipinitialspace=True, strict=True)
+    try:
+        rows = list(zip([number for number, _ in lines], reader, strict=True))
+    except (csv.Error, ValueError) as error:  # also a quoted text over several lines
+        msg = f"{path}: not CSV: {error}"
+        raise ConfigError(msg) from None
+    if not rows:
+        msg = f"{path}: is empty; its first line must name the columns"
+        raise ConfigError(msg)
+    (_, names), *rest = rows
+    for number, row in rest:
+        if len(row) != len(names):
+            msg = f"{path}: line {number}: {len(row)} values for {len(names)} columns"
+            raise ConfigError(msg)
+    return [
+        (
+            f"{path}: line {number}",
+            {name: _number(text) for name, text in zip(names, row, strict=True) if text.strip()},
+        )
+        for number, row in rest
+    ]
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()

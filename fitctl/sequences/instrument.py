@@ -15,7 +15,9 @@ from typing import TypeVar
 import msgspec
 
 from fitctl.config import Rig, default_rig_path, load_rig
+from fitctl.logging.records import SequenceAttempt
 from fitctl.sequences import steps
+from fitctl.sequences.calibration import write_calibration
 from fitctl.sequences.links import Link, SimulatedLink
 from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import find_sequence, load_sequence
@@ -120,6 +122,22 @@ class Instrument(StepMethods[Figures]):
         self._runner = Runner(self._link, self.rig, sequence.name, len(sequence.steps))
         return _figures(self._runner, sequence.steps)
 
+    @property
+    def attempts(self) -> list[SequenceAttempt]:
+        """Every attempt of the newest step or file, as the log has them."""
+        return [] if self._runner is None else list(self._runner.attempts)
+
+    def write_calibrations(self, folder: Path | str) -> list[Path]:
+        """Write what the newest step or file has measured for the rig file; the fragments' paths.
+
+        Raises
+        ------
+        ConfigError
+            If that cannot be done.
+        """
+        measured = [] if self._runner is None else self._runner.calibrations
+        return [write_calibration(each, self.rig, Path(folder)) for each in measured]
+
     def send(self, command: AnyCommand) -> Reply:
         """Give one command of :mod:`fitctl.supervisor.messages`."""
         return self._link.send(command)
@@ -153,9 +171,11 @@ def _where(rig: Rig, folder: Path | str | None, remote: Path | str | None) -> Pa
 
 def _figures(runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
     """Run steps; the figures of each, NaN where a value could not be had."""
-    done = [attempt for attempt in run_steps(runner, todo) if attempt.outcome == "done"]
+    # The last attempt at a step is the one that was done.
+    last = {attempt.step_number: attempt for attempt in run_steps(runner, todo)}
     found = [
-        msgspec.json.decode(attempt.figures_json, type=dict[str, float | None]) for attempt in done
+        msgspec.json.decode(each.figures_json, type=dict[str, float | None])
+        for each in last.values()
     ]
     return [{k: float("nan") if v is None else v for k, v in each.items()} for each in found]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Generic, Literal, TypedDict, TypeVar, Unpack
 
 from fitctl.config import ControllerName
@@ -50,9 +50,27 @@ class StepMethods(ABC, Generic[R_co]):
         """Devices on and ready, the stages held where they are."""
         return self._do(steps.Standby, limits)
 
-    def acquire(self, **limits: Unpack[Limits]) -> R_co:
+    def acquire(
+        self,
+        *,
+        search_radius_sky_arcsec: float | None = None,
+        radius_growth: float = 1.5,
+        max_offset_sky_arcsec: float | None = None,
+        field_overlap: float | None = None,
+        expected_az_sky_arcsec: float | None = None,
+        expected_el_sky_arcsec: float | None = None,
+        **limits: Unpack[Limits],
+    ) -> R_co:
         """Search for the star, pull it in, until it is held in VERNIER."""
-        return self._do(steps.Acquire, limits)
+        keys = {
+            "search_radius_sky_arcsec": search_radius_sky_arcsec,
+            "radius_growth": radius_growth,
+            "max_offset_sky_arcsec": max_offset_sky_arcsec,
+            "field_overlap": field_overlap,
+            "expected_az_sky_arcsec": expected_az_sky_arcsec,
+            "expected_el_sky_arcsec": expected_el_sky_arcsec,
+        }
+        return self._do(steps.Acquire, {**keys, **limits})
 
     def hold(
         self,
@@ -65,6 +83,36 @@ class StepMethods(ABC, Generic[R_co]):
         """Hold the star for a time and judge each axis against the requirement."""
         keys = {"duration_s": duration_s, "settle_s": settle_s, "rms_limit_px": rms_limit_px}
         return self._do(steps.Hold, {**keys, **limits})
+
+    def stars(
+        self,
+        stars: Sequence[steps.Star | Mapping[str, Any]] | None = None,
+        *,
+        file: str = "",
+        duration_s: float = 30.0,
+        settle_s: float = 10.0,
+        rms_limit_px: float | None = None,
+        search_radius_sky_arcsec: float | None = None,
+        radius_growth: float = 1.5,
+        max_offset_sky_arcsec: float | None = None,
+        on_failure: Literal["skip", "stop"] = "skip",
+        least_held: int = 1,
+        **limits: Unpack[Limits],
+    ) -> R_co:
+        """Go through a list of stars, or a file of them: acquire, hold and judge each."""
+        keys = {
+            "stars": stars if stars is None else list(stars),
+            "file": file,
+            "duration_s": duration_s,
+            "settle_s": settle_s,
+            "rms_limit_px": rms_limit_px,
+            "search_radius_sky_arcsec": search_radius_sky_arcsec,
+            "radius_growth": radius_growth,
+            "max_offset_sky_arcsec": max_offset_sky_arcsec,
+            "on_failure": on_failure,
+            "least_held": least_held,
+        }
+        return self._do(steps.Stars, {**keys, **limits})
 
     def target(
         self, offset_az_px: float, offset_el_px: float, **limits: Unpack[VisitLimits]
@@ -127,6 +175,7 @@ class StepMethods(ABC, Generic[R_co]):
         duration_s: float = 20.0,
         max_error: float = 0.02,
         max_residual_px: float = 0.5,
+        max_rotation_deg: float = 10.0,
         **limits: Unpack[MotionLimits],
     ) -> R_co:
         """Drive both stages, open loop, and solve how each moves the star."""
@@ -135,6 +184,7 @@ class StepMethods(ABC, Generic[R_co]):
             "duration_s": duration_s,
             "max_error": max_error,
             "max_residual_px": max_residual_px,
+            "max_rotation_deg": max_rotation_deg,
         }
         return self._do(steps.PlateScale, {**keys, **limits})
 

@@ -1,4 +1,4 @@
-"""Steps that are a command and the mode that it leads to: standby, acquire, controller, wait, off."""
+"""Steps that are a command and the mode that it leads to: standby, controller, wait, off."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from fitctl.config import Rig
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import POWERED, Behaviour, Result, let_go
 from fitctl.sequences.view import StepFailed, View
-from fitctl.supervisor.messages import Acquire, Hold, Off, SetController, Standby
+from fitctl.supervisor.messages import Hold, Off, SetController, Standby
 from fitctl.supervisor.modes import Mode
 
 
@@ -21,32 +21,6 @@ def _standby_done(_step: steps.Standby, view: View) -> Result | None:
     if view.errors:
         raise StepFailed(view.errors[0])
     return Result({}, "") if view.mode is Mode.STANDBY else None
-
-
-def _run_acquire(_step: steps.Acquire, view: View) -> None:
-    if view.mode is Mode.OFF:
-        view.command(Standby(loop=view.loop_name))
-    elif view.mode is Mode.STANDBY:
-        _search(view)
-
-
-def _search(view: View) -> None:
-    view.command(Acquire(loop=view.loop_name))
-    view.marks.append(view.fresh_s)
-
-
-def _acquire_done(_step: steps.Acquire, view: View) -> Result | None:
-    if view.errors:
-        raise StepFailed(view.errors[0])
-    if view.mode is Mode.STANDBY and not view.marks:
-        _search(view)  # the devices are on now
-        return None
-    if view.mode is Mode.OFF:
-        return None
-    view.insist_on(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
-    if view.mode is not Mode.VERNIER:
-        return None
-    return Result({"acquired_s": view.gone_s}, f"held after {view.gone_s:.1f} s")
 
 
 def _run_controller(step: steps.Controller, view: View) -> None:
@@ -76,12 +50,6 @@ def _wait_s(step: steps.Wait, _rig: Rig, _loop_name: str) -> float:
 
 PLAIN = {
     "standby": Behaviour(POWERED | {Mode.OFF}, _standby_done, _run_standby),
-    "acquire": Behaviour(
-        frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER}),
-        _acquire_done,
-        _run_acquire,
-        let_go,
-    ),
     "controller": Behaviour(POWERED | {Mode.OFF}, _controller_done, _run_controller),
     "wait": Behaviour(POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True),
     "off": Behaviour(POWERED | {Mode.OFF}, _off_done, let_go),

@@ -17,7 +17,7 @@ from fitctl.config import Rig
 from fitctl.model.drives import FSM, SIDEROSTAT, Drive
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
-from fitctl.sequences.behaviour import Result
+from fitctl.sequences.behaviour import Calibration, Result
 from fitctl.sequences.open_loop import open_loop, watched
 from fitctl.sequences.view import Figures, StepFailed, View
 
@@ -163,7 +163,19 @@ def refusal(fit: PlateScaleFit, step: steps.PlateScale) -> str:
             )
         if np.linalg.svd(matrix, compute_uv=False)[-1] < _LEAST_GAIN:
             return f"{name}: does not move the star along both axes; look at its wiring and its amplifiers"
+        turned_deg, mirrored = math.degrees(rotation_rad(matrix)), np.linalg.det(matrix) < 0
+        if abs(turned_deg) > step.max_rotation_deg or mirrored:
+            return (
+                f"{name}: turned by {turned_deg:+.1f} deg{', and mirrored' if mirrored else ''}; "
+                f"max_rotation_deg is {step.max_rotation_deg:g}; look at its wiring and the camera's mount"
+            )
     return ""
+
+
+def rotation_rad(matrix: Floats) -> float:
+    """By how much a matrix, shape (2, 2), turns from azimuth towards elevation."""
+    (az_az, az_el), (el_az, el_el) = matrix.tolist()
+    return math.atan2(el_az - az_el, az_az + el_el)
 
 
 def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
@@ -193,7 +205,25 @@ def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
             f"{found[f'{name}_rotation_deg']:+.2f} deg"
         )
     figures["residual_px"] = fit.residual_px
-    return Result(figures, "; ".join(said))
+    return Result(figures, "; ".join(said), _calibration(view, figures, said))
+
+
+def _calibration(view: View, figures: Figures, said: list[str]) -> Calibration:
+    """Both scales, into the keys that stand for a stage alone; no key of a rig file holds a rotation."""
+    fsm, siderostat = view.settings.fsm, view.settings.siderostat
+    ball_screw = siderostat.ball_screw_m_per_rad * figures["siderostat_scale"]
+    found: dict[str, dict[str, float]] = {"siderostat": {"ball_screw_m_per_rad": ball_screw}}
+    lines = [*said, "the siderostat's scale is taken into ball_screw_m_per_rad"]
+    if fsm.hysteresis is None:
+        found["fsm"] = {"beam_per_mirror": fsm.beam_per_mirror * figures["fsm_scale"]}
+        lines.append("the mirror's scale is taken into beam_per_mirror")
+    else:
+        lines.append(
+            "the mirror's scale is left alone: identify fsm.hysteresis anew where it is off"
+        )
+    lines.append("rotations are not corrected: each degree takes one from the loop's phase margin")
+    fragment = {"loops": {view.loop_name: found}}
+    return Calibration(f"{view.loop_name}-plate-scale", lines, fragment, {})
 
 
 def _in_figures(name: str, matrix: Floats, deviation: Floats, px_per_rad: float) -> Figures:
@@ -205,7 +235,7 @@ def _in_figures(name: str, matrix: Floats, deviation: Floats, px_per_rad: float)
         f"{name}_el_px_per_el_rad": el_el,
         f"{name}_scale": math.sqrt(abs(float(np.linalg.det(matrix)))),
         f"{name}_scale_sd": float(deviation.max()),
-        f"{name}_rotation_deg": math.degrees(math.atan2(el_az - az_el, az_az + el_el)),
+        f"{name}_rotation_deg": math.degrees(rotation_rad(matrix)),
     }
 
 

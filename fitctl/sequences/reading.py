@@ -13,8 +13,8 @@ from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings
 from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours import problems
-from fitctl.sequences.files import SUFFIXES, read_document
-from fitctl.sequences.steps import AnyStep, Sequence, Step
+from fitctl.sequences.files import SUFFIXES, read_document, read_table
+from fitctl.sequences.steps import AnyStep, Sequence, Star, Stars, Step
 
 STEPS: dict[str, type[Step]] = {
     kind.model_fields["step"].default: kind for kind in get_args(AnyStep)
@@ -73,6 +73,10 @@ def read_sequence(path: Path, overrides: Iterable[str] = ()) -> Sequence:
     document = read_document(path, f"no such sequence file; shipped are {names}")
     for override in overrides:
         _override(document, override)
+    steps = document.get("steps")
+    for step in steps if isinstance(steps, list) else []:
+        if isinstance(step, dict) and step.get("step") == "stars":
+            step.update(_stars_of_file(step, path.parent))
     return sequence_from_document(document, str(path))
 
 
@@ -116,12 +120,43 @@ def make_step(kind: type[Step], keys: Mapping[str, Any]) -> Step:
     ConfigError
         One line for each mistake.
     """
+    more = _stars_of_file(keys, Path()) if kind is Stars else {}
     try:
-        return kind.model_validate(keys)
+        return kind.model_validate({**keys, **more})
     except ValidationError as error:
         name = kind.model_fields["step"].default
         lines = [_told(name, kind, _key(each["loc"]), each) for each in error.errors()]
         raise ConfigError("\n".join(lines)) from None
+
+
+def _stars_of_file(keys: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The stars of the file that a step names, if it names one and has no others."""
+    file = keys.get("file")
+    if not isinstance(file, str) or not file or keys.get("stars") is not None:
+        return {}
+    return {"stars": [star.model_dump() for star in read_stars(folder / file)]}
+
+
+def read_stars(path: Path) -> list[Star]:
+    """Read a list of stars: TOML or YAML with ``stars``, or CSV with a line for each.
+
+    Raises
+    ------
+    ConfigError
+        One line for each mistake: file, star or line, key.
+    """
+    stars, wrong = [], []
+    for where, row in read_table(path, "stars", "no such list of stars"):
+        named = row
+        if isinstance(row, dict) and isinstance(row.get("name"), float):
+            named = row | {"name": f"{row['name']:g}"}  # a star that is called by a number
+        try:
+            stars.append(Star.model_validate(named))
+        except ValidationError as error:
+            wrong += [_told(where, Star, _key(each["loc"]), each) for each in error.errors()]
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+    return stars
 
 
 def _place(origin: str, place: tuple[Any, ...]) -> tuple[str, type[Settings], str]:

@@ -10,11 +10,12 @@ import msgspec
 
 from fitctl.config import Rig
 from fitctl.logging.records import SequenceAttempt
-from fitctl.sequences.behaviour import Behaviour, Result
+from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
 from fitctl.sequences.links import Link
-from fitctl.sequences.steps import Sequence, Step
+from fitctl.sequences.stars import judge, star_results, steps_of
+from fitctl.sequences.steps import Sequence, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 from fitctl.supervisor.messages import Hold, SequenceStatus
 from fitctl.supervisor.modes import Mode
@@ -53,10 +54,12 @@ class Runner:
         on_status: Callable[[SequenceStatus], None] = lambda _status: None,
     ) -> None:
         self.attempts: list[SequenceAttempt] = []
+        self.calibrations: list[Calibration] = []
         self.contact = Contact(link, rig, name, steps, on_status)
         self._link = link
         self._rig = rig
         self._loops: set[str] = set()
+        self._star = ""  # of a list, that the step is for
 
     def hold_stages(self) -> None:
         """Stop tracking with every loop that had a step; one that does not track refuses, and may."""
@@ -81,17 +84,46 @@ class Runner:
             raise SequenceError(msg)
         loop_name = loop_of(step, self._rig)
         self._loops.add(loop_name)
+        if isinstance(step, Stars):
+            return self._run_stars(step, loop_name, number)
+        return self._try(step, loop_name, number)
+
+    def _run_stars(self, step: Stars, loop_name: str, number: int) -> SequenceAttempt:
+        """Each star's steps, one star after the other; one that fails is skipped, if the step says so."""
+        began_s, first = self._link.now_s(), len(self.attempts)
+        for star in step.stars or []:
+            try:
+                for each in steps_of(step, star):
+                    self._try(each, loop_name, number, star.name)
+            except SequenceError:
+                if step.on_failure == "stop":
+                    raise
+        self._tell(step.step, loop_name, number, 1, "")
+        try:
+            result = judge(step, star_results(self.attempts[first:]))
+        except StepFailed as failure:
+            record = self._note("failed", str(failure), {}, began_s)
+            msg = f"step {number} ({step.step}) failed: {failure}"
+            raise SequenceError(msg, record) from None
+        return self._note("done", result.message, result.figures, began_s)
+
+    def _tell(self, step: str, loop_name: str, number: int, attempt: int, star: str) -> None:
+        self._star = star
+        self.contact.report(
+            state="running", step_number=number, step=step, loop=loop_name, attempt=attempt,
+            message=star,
+        )  # fmt: skip
+
+    def _try(self, step: Step, loop_name: str, number: int, star: str = "") -> SequenceAttempt:
         for attempt in range(1, step.attempts + 1):
-            self.contact.report(
-                state="running", step_number=number, step=step.step, loop=loop_name, attempt=attempt,
-                message="",
-            )  # fmt: skip
+            self._tell(step.step, loop_name, number, attempt, star)
             record = self._attempt(step, loop_name)
             if record.outcome == "done":
                 return record
             if attempt < step.attempts:
                 self._rest(loop_name)
-        msg = f"step {number} ({step.step}) {record.outcome}: {record.message}"
+        what = f"{step.step}, star {star}" if star else step.step
+        msg = f"step {number} ({what}) {record.outcome}: {record.message}"
         raise SequenceError(msg, record)
 
     # ------------------------------------------------------------ one attempt
@@ -117,6 +149,8 @@ class Runner:
                     behaviour.stop(step, view)
                 self._note("stopped", str(stopped) or "interrupted", {}, began_s)
             raise
+        if result.calibration is not None:
+            self.calibrations.append(result.calibration)
         return self._note("done", result.message, result.figures, began_s)
 
     def _work(self, step: Step, behaviour: Behaviour, view: View) -> Result:
@@ -177,6 +211,7 @@ class Runner:
             outcome=outcome,
             message=message[:MESSAGE_CHARS],
             figures_json=msgspec.json.encode(figures).decode(),
+            star=self._star,
         )
         self.attempts.append(record)
         self.contact.report(last_attempt=record)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from fitctl.config.base import Count, Finite, NonNegative, Positive, Settings
-from fitctl.config.loops import ControllerName
+from fitctl.config.loops import ControllerName, FieldOverlap
 
 LONGEST_S = 86_400.0
 
@@ -19,11 +19,29 @@ TimeoutS = Annotated[
     Field(gt=0, le=LONGEST_S, description="the most that is waited beyond the step's own time"),
 ]
 Attempts = Annotated[int, Field(ge=1, le=20, description="how often it is tried in all")]
+SearchRadius = Annotated[
+    Positive | None, Field(description="of the first attempt; without it, the rig file's")
+]
+RadiusGrowth = Annotated[
+    float, Field(ge=1, le=10, description="of the radius, from an attempt to the next")
+]
+LargestOffset = Annotated[
+    Positive | None,
+    Field(description="no search goes farther; without it, the radius does not grow"),
+]
+SettleS = Annotated[NonNegative, Field(le=600, description="before, not judged")]
 DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
 OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
 RmsLimitPx = Annotated[
     Positive | None,
     Field(description="largest RMS of an axis; without it, the rig file's requirement_px"),
+]
+ExpectedSkyArcsec = Annotated[
+    Finite | None,
+    Field(
+        description="where the star is, from where the encoders read zero; without it, on the target or "
+        "where it was last"
+    ),
 ]
 
 
@@ -45,9 +63,24 @@ class Standby(Step):
 
 
 class Acquire(Step):
-    """Devices on, search for the star, pull it in, until it is held; one that is held stays so."""
+    """Devices on, search for the star, pull it in, until it is held; one that is held stays so.
+
+    Where it is expected somewhere, a star that is held is let go first.
+    """
 
     step: Literal["acquire"] = "acquire"
+    search_radius_sky_arcsec: SearchRadius = None
+    radius_growth: RadiusGrowth = 1.5
+    max_offset_sky_arcsec: LargestOffset = None
+    field_overlap: Annotated[
+        FieldOverlap | None,
+        Field(
+            description="of the field, between turns: more is a finer and slower search; without it, the "
+            "rig file's"
+        ),
+    ] = None
+    expected_az_sky_arcsec: ExpectedSkyArcsec = None
+    expected_el_sky_arcsec: ExpectedSkyArcsec = None
     timeout_s: TimeoutS = 120.0
     attempts: Attempts = 2
 
@@ -57,9 +90,47 @@ class Hold(Step):
 
     step: Literal["hold"] = "hold"
     duration_s: Annotated[DurationS, Field(description="how long is judged")]
-    settle_s: Annotated[NonNegative, Field(le=600, description="before, not judged")] = 10.0
+    settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     timeout_s: TimeoutS = 60.0
+
+
+class Star(Settings):
+    """A star of a list: where it is expected, from where the encoders read zero."""
+
+    name: Annotated[str, Field(min_length=1, max_length=60)]
+    az_sky_arcsec: Finite
+    el_sky_arcsec: Finite
+    duration_s: DurationS | None = None
+
+
+class Stars(Step):
+    """A list of stars, one after the other: acquire each where it is expected, hold it and judge it."""
+
+    step: Literal["stars"] = "stars"
+    stars: Annotated[
+        list[Star] | None,
+        Field(
+            min_length=1,
+            max_length=1000,
+            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and, of its own, `duration_s`",
+        ),
+    ] = None
+    file: Annotated[
+        str, Field(description="TOML, YAML or CSV with the stars, beside the sequence's own file")
+    ] = ""
+    duration_s: Annotated[DurationS, Field(description="how long each is judged")] = 30.0
+    settle_s: SettleS = 10.0
+    rms_limit_px: RmsLimitPx = None
+    search_radius_sky_arcsec: SearchRadius = None
+    radius_growth: RadiusGrowth = 1.5
+    max_offset_sky_arcsec: LargestOffset = None
+    on_failure: Annotated[
+        Literal["skip", "stop"],
+        Field(description="what follows a star that is not found or not held well"),
+    ] = "skip"
+    least_held: Annotated[Count, Field(description="with fewer, the step has failed")] = 1
+    timeout_s: TimeoutS = 120.0
 
 
 class Moving(Step):
@@ -157,6 +228,9 @@ class PlateScale(Moving):
     max_residual_px: Annotated[
         Positive, Field(description="largest RMS that the fit may leave unexplained")
     ] = 0.5
+    max_rotation_deg: Annotated[
+        Positive, Field(le=45, description="a stage turned farther than this is refused")
+    ] = 10.0
 
 
 class Dark(Step):
@@ -186,6 +260,7 @@ AnyStep = (
     Standby
     | Acquire
     | Hold
+    | Stars
     | Target
     | Jog
     | Raster

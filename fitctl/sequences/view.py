@@ -69,6 +69,8 @@ class Look(NamedTuple):
     error_el_px: float
     motor_az_rad: float
     motor_el_rad: float
+    mirror_az_rad: float
+    mirror_el_rad: float
 
 
 @dataclass
@@ -91,6 +93,8 @@ class View:
         And this: what it adds up.
     errors : list of str
         Error events of the supervisor since the attempt's first command.
+    attempt : int
+        Which one it is, from 1.
     fresh_s : float
         Telemetry from before tells nothing about the last command.
     """
@@ -100,6 +104,7 @@ class View:
     loop_name: str
     telemetry: Telemetry
     began_s: float
+    attempt: int = 1
     paused_s: float = 0.0
     fresh_s: float = 0.0
     looks: list[Look] = field(default_factory=list)
@@ -204,9 +209,11 @@ def _look(tick: Tick) -> Look:
         tick.error_el_px,
         tick.siderostat_az_rad,
         tick.siderostat_el_rad,
+        tick.fsm_az_rad,
+        tick.fsm_el_rad,
     )
 
 
 def columns(looks: list[Look]) -> Floats:
-    """Looks as an array, shape (n, 7)."""
+    """Looks as an array, shape (n, 9)."""
     return np.array(looks, dtype=np.float64).reshape(-1, len(Look._fields))

@@ -47,6 +47,7 @@ from fitctl.supervisor.batch_kernel_steps import (
     prefilter_step,
     siderostat_to,
     spiral_advance,
+    spiral_is_there,
     stages_px,
     window_about,
 )
@@ -100,6 +101,8 @@ def sense(s: Any, r: Any, w: Any) -> int:
     Negative: the number of a spot that might matter, and needs more air first.
     """
     r.star_visible = 0
+    if r.mode == ACQUISITION and not spiral_is_there(s, r):
+        return _SEEN
     if (r.mode in (COARSE, VERNIER)) and r.lost == 0:
         az = window_about(r.star_origin_px[0] + stages_px(s, r, 0), s.largest_az_px)
         el = window_about(r.star_origin_px[1] + stages_px(s, r, 1), s.largest_el_px)

@@ -36,7 +36,7 @@ def start_search(s: Any, r: Any) -> None:
             r.star_origin_px[axis] = s.target_px[axis] - moved_px
         left_px = s.middle_px[axis] - r.star_origin_px[axis]
         r.spiral_centre_rad[axis] = left_px / s.motor_px_per_rad
-    r.spiral_angle = 0.0
+    r.spiral_there, r.spiral_angle = 0, 0.0
     r.sighted = 0
 
 

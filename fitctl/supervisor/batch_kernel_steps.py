@@ -279,8 +279,24 @@ def angular_rate(s: Any, angle: float) -> float:
 
 
 @jit
+def spiral_is_there(s: Any, r: Any) -> bool:
+    """``Search.is_there``."""
+    if not r.spiral_there:
+        away_rad = 0.0
+        for axis in range(2):
+            middle_rad = limited(r.spiral_centre_rad[axis], s.travel_rad)
+            away_rad = max(away_rad, abs(r.motor_rad[axis] - middle_rad))
+        r.spiral_there = away_rad * s.motor_px_per_rad <= s.spiral_near_px
+    return bool(r.spiral_there)
+
+
+@jit
 def spiral_advance(s: Any, r: Any) -> None:
-    """``Spiral.advance`` by one frame, and the siderostat with it."""
+    """``Search.advance`` by one frame, and the siderostat with it."""
+    if not spiral_is_there(s, r):
+        siderostat_to(s, r, 0, r.spiral_centre_rad[0])
+        siderostat_to(s, r, 1, r.spiral_centre_rad[1])
+        return
     ahead = r.spiral_angle + angular_rate(s, r.spiral_angle) * s.period_s
     r.spiral_angle += angular_rate(s, ahead) * s.period_s
     radius_px = s.spiral_growth_px * r.spiral_angle

@@ -25,6 +25,7 @@ from fitctl.model.scene import FULL_WELL_DN
 from fitctl.supervisor.batch_interlocks import acting_interlocks
 from fitctl.supervisor.injector import PERIOD_S
 from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.search import NEAR
 from fitctl.supervisor.servo import FOLLOWING_S, HISTORY_S
 from fitctl.supervisor.stages import HISTORY_S as MIRROR_HISTORY_S
 
@@ -60,6 +61,7 @@ RUN = np.dtype(
         ("sighted_s", "f8"),
         ("sighting_frames", "i8"),
         ("sighting_rad", "f8", (2,)),
+        ("spiral_there", "i8"),
         ("spiral_angle", "f8"),
         ("spiral_centre_rad", "f8", (2,)),
         # StarEstimator, Prefilter, Mirror, Pair
@@ -128,7 +130,7 @@ WORK = np.dtype(
 
 
 class TooLargeForBatchError(Exception):
-    """The rig has more of something than the records hold, or an interlock that may act."""
+    """The rig has more of something than the records hold, or something that a batch does not know."""
 
 
 def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArray[np.void]:
@@ -144,6 +146,9 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         raise TooLargeForBatchError(msg)
     loop, camera = rig.loops[loop_name], rig.true_camera
     truth, _ = rig.mock_parts()
+    if truth.hot_pixels or camera.dark_file is not None:
+        msg = "pixels differ, and a batch takes all for alike"
+        raise TooLargeForBatchError(msg)
     plant = truth.loops[loop_name]
     fsm, siderostat, acquisition = loop.fsm, loop.siderostat, loop.acquisition
     scale, plan = scales(rig, loop), plan_spiral(rig, loop_name)
@@ -215,6 +220,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         "spiral_speed_px_s": plan.speed_px_s,
         "spiral_acceleration_px_s2": plan.acceleration_px_s2,
         "spiral_radius_px": plan.radius_px,
+        "spiral_near_px": NEAR * plan.field_radius_px,
         "writes": math.ceil(MIRROR_HISTORY_S / min(camera.period_s, PERIOD_S)),
         "states": len(design.a),
         # Rows are those of outputs, then of states; columns of inputs, then of states.

@@ -189,6 +189,8 @@ class StellarLoop:
         return Seen(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
+            return None  # what is seen on the way is another star
         if self.mode in FOLLOWING and self._findings.lost == 0:
             predicted = self._estimator.predict_px(motor_rad, mirror_rad)
             star = self._sensor.measure(frame.image, *predicted.tolist())
@@ -334,7 +336,7 @@ class StellarLoop:
             self._start_pair(motor_rad)
 
     def _start_search(self, motor_rad: Floats) -> None:
-        """About where the star is expected: on the target, or where it was last seen."""
+        """As asked; else about where the star is expected: on the target, or where it was last seen."""
         self._estimator.expect(self.target_px, motor_rad, np.zeros(2))
         self.search.begin()
 
@@ -348,9 +350,9 @@ class StellarLoop:
         """Both stages rest where the operator has put them."""
         self.stages.mirror_to_rest()
 
-    def _search(self, _seen: Seen) -> None:
+    def _search(self, seen: Seen) -> None:
         self.stages.mirror_to_rest()
-        self.stages.siderostat_to(self.search.advance(self._period_s))
+        self.stages.siderostat_to(self.search.advance(self._period_s, seen.motor_rad))
 
     def _pull_in(self, seen: Seen) -> None:
         self.stages.mirror_to_rest()

@@ -41,7 +41,20 @@ class Standby(Command, frozen=True, kw_only=True):
 
 
 class Acquire(Command, frozen=True, kw_only=True):
-    """Search for the star, pull it in, hold it."""
+    """Search for the star, pull it in, hold it; what is given stands in place of the rig file's, this once.
+
+    Attributes
+    ----------
+    search_radius_sky_arcsec, field_overlap : float, optional
+        As the rig file's.
+    expected_az_sky_arcsec, expected_el_sky_arcsec : float, optional
+        Where the star is, from where the encoders read zero; without it, on the target or where it was last.
+    """
+
+    search_radius_sky_arcsec: float | None = None
+    field_overlap: float | None = None
+    expected_az_sky_arcsec: float | None = None
+    expected_el_sky_arcsec: float | None = None
 
 
 class Hold(Command, frozen=True, kw_only=True):

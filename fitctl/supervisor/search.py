@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Rig
+from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
 from fitctl.controllers.centroid import Star
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.model.optics import scales
+from fitctl.supervisor.messages import Acquire
 from fitctl.supervisor.modes import Trigger
 
 Floats = NDArray[np.float64]
+NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
 
 
 class Finding(NamedTuple):
@@ -55,10 +59,18 @@ class Search:
         self.centre_rad = np.zeros(2)
         self._settings = loop.acquisition
         self._estimator = estimator
+        self._target_px = np.array([loop.target_px.az, loop.target_px.el])
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
-        self._motor_px_per_rad = scales(rig, loop).motor_px_per_rad
-        self._plan = plan_spiral(rig, loop_name)
+        scale = scales(rig, loop)
+        self._sky_arcsec_per_px = scale.sky_arcsec_per_px
+        self._motor_px_per_rad = scale.motor_px_per_rad
+        self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        self._plan_spiral = partial(plan_spiral, rig, loop_name)
+        self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
+        self._plan = self._plan_spiral()
         self._spiral = Spiral(self._plan)
+        self._there = False
+        self._asked = Acquire()
         self._sighting: _Sighting | None = None
 
     @property
@@ -66,11 +78,39 @@ class Search:
         """Part of the searched area, 0 to 1."""
         return self._spiral.progress
 
+    def ask(self, asked: Acquire) -> None:
+        """Make the next search, and no other, as a command asks that was not refused."""
+        self._asked = asked
+
     def begin(self) -> None:
-        """A new spiral, about where the star is expected now."""
+        """A new spiral, about where the star is expected now, or as asked."""
+        asked, self._asked = self._asked, Acquire()
+        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
+            offset = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
+            place_px = self._target_px + offset / self._sky_arcsec_per_px
+            self._estimator.place(place_px, np.zeros(2), np.zeros(2))
+        self._radius_sky_arcsec = (
+            asked.search_radius_sky_arcsec or self._settings.search_radius_sky_arcsec
+        )
+        self._plan = self._plan_spiral(
+            radius_sky_arcsec=self._radius_sky_arcsec, field_overlap=asked.field_overlap
+        )
         self.centre_rad = self._star_in_the_middle_rad()
         self._spiral = Spiral(self._plan)
+        self._there = False
         self._sighting = None
+
+    def is_there(self, motor_rad: Floats) -> bool:
+        """Whether the siderostat, which was at `motor_rad`, has come near the spiral's middle.
+
+        On its way from another star it would see that one, and a spiral that had begun would have passed
+        the middle by.
+        """
+        if not self._there:
+            middle_rad = np.clip(self.centre_rad, -self._travel_rad, self._travel_rad)
+            away_px = float(np.abs(motor_rad - middle_rad).max()) * self._motor_px_per_rad
+            self._there = away_px <= NEAR * self._plan.field_radius_px
+        return self._there
 
     def judge(self, star: Star | None, now_s: float) -> Finding | None:
         """What a frame exposed at `now_s` showed, if it is anything to tell."""
@@ -81,7 +121,7 @@ class Search:
             elif self._spiral.exhausted:
                 return Finding(
                     Trigger.SEARCH_EXHAUSTED,
-                    f"no star within {settings.search_radius_sky_arcsec:g} arcsec of the start; "
+                    f"no star within {self._radius_sky_arcsec:g} arcsec of the start; "
                     "check shutter and pointing, then acquire again",
                 )
             return None
@@ -94,12 +134,41 @@ class Search:
             return Finding(None, "a sighting was not confirmed; the search goes on")
         return None
 
-    def advance(self, duration_s: float) -> Floats:
+    def advance(self, duration_s: float, motor_rad: Floats) -> Floats:
         """Go on for `duration_s`, or wait where something was seen; motor set-point, shape (2,)."""
         if self._sighting is not None:
             return self._sighting.motor_rad
+        if not self.is_there(motor_rad):
+            return self.centre_rad
         return self.centre_rad + self._spiral.advance(duration_s) / self._motor_px_per_rad
 
     def _star_in_the_middle_rad(self) -> Floats:
         """With the star in the middle of the field, the search sees farthest."""
         return self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
+
+
+def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
+    """Why a search cannot be made as asked, or nothing."""
+    loop = rig.loops[loop_name]
+    expected = [asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec]
+    given = [place for place in expected if place is not None]
+    if len(given) == 1:
+        return "expected_az_sky_arcsec and expected_el_sky_arcsec belong together"
+    radius, overlap = asked.search_radius_sky_arcsec, asked.field_overlap
+    if radius is not None and not 0 < radius < math.inf:
+        return f"search_radius_sky_arcsec must be above 0 (is {radius:g})"
+    if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
+        return f"field_overlap must lie in {LEAST_OVERLAP:g} to {MOST_OVERLAP:g} (is {overlap:g})"
+    if radius is None and not given:
+        return ""
+    radius = radius or loop.acquisition.search_radius_sky_arcsec
+    travel = loop.siderostat.travel_sky_arcsec
+    for place in given or [0.0]:
+        reach = abs(place) + radius
+        # Written so that what is no number is refused too.
+        if not reach <= travel:
+            return (
+                f"the search would reach {reach:g} arcsec from where the encoders read zero; "
+                f"travel_sky_arcsec of loops.{loop_name}.siderostat is {travel:g}"
+            )
+    return ""

@@ -147,7 +147,9 @@ class SimulatedCamera:
         self._clock = clock
         self._plants = plants
         self._scene = Scene(
-            rig.camera, [spot for name in plants for spot in truth.loops[name].spots]
+            rig.camera,
+            [spot for name in plants for spot in truth.loops[name].spots],
+            truth.hot_pixels,
         )
         self._pixel_key = next(iter(plants.values())).pixel_keys[0]
         self._exposures = 0  # never starts again, as the frames' numbers do: noise must not repeat

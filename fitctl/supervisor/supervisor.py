@@ -61,6 +61,7 @@ from fitctl.supervisor.messages import (
 from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices, told
+from fitctl.supervisor.search import refused_search
 from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.servo import Periodic, SiderostatServo
 from fitctl.supervisor.timing import TimingBook
@@ -315,6 +316,8 @@ class Supervisor:
                 reply = self._move_by_hand(command, names)
             case SetController():
                 reply = self._set_controller(command, names)
+            case Acquire() if why_not := self._refused_search(command, names):
+                reply = _refusal(f"acquire: {why_not}")
             case Reset():
                 reply = self._reset(command, names)
             case Experiment():
@@ -324,12 +327,12 @@ class Supervisor:
             case SequenceControl():
                 reply = self.sequences.control(command.action)
             case _ if type(command) in _COMMANDS:
-                reply = self._fire(_COMMANDS[type(command)], names)
+                reply = self._fire(_COMMANDS[type(command)], names, command)
             case _:
                 reply = _refusal(f"{type(command).__name__} is not for the supervisor")
         return reply
 
-    def _fire(self, trigger: Trigger, names: list[str]) -> Reply:
+    def _fire(self, trigger: Trigger, names: list[str], command: AnyCommand) -> Reply:
         usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
         if not usable:
             return _refusal(self._why_not(trigger, names))
@@ -348,6 +351,8 @@ class Supervisor:
             if trigger is Trigger.STOP:
                 self._abandoned |= self._opening & set(usable)
             for name in usable:
+                if isinstance(command, Acquire):
+                    self.loops[name].search.ask(command)
                 self.loops[name].fire(trigger, "operator")
         return Reply(accepted=True)
 
@@ -375,6 +380,9 @@ class Supervisor:
             self._designs.append(Job(future, partial(self._designed, name, command.name)))
         self._finish_jobs()
         return Reply(accepted=True, text="designing; an event tells when it is at work")
+
+    def _refused_search(self, command: Acquire, names: list[str]) -> str:
+        return next(filter(None, (refused_search(self.rig, name, command) for name in names)), "")
 
     def _reset(self, command: Reset, names: list[str]) -> Reply:
         why_not = [self.loops[name].reset_interlock(command.name) for name in names]

@@ -13,7 +13,9 @@ COMMON = set(Step.model_fields)
 def default(field):
     if field.is_required():
         return "required"
-    return "" if field.default in {None, ""} else f"{field.default:g}"
+    if field.default in {None, ""}:
+        return ""
+    return f"{field.default:g}" if isinstance(field.default, int | float) else f"`{field.default}`"
 
 
 def meaning(field):
@@ -35,7 +37,7 @@ def step_keys():
     for name, kind in STEPS.items():
         fields = kind.model_fields
         limits = f"{fields['timeout_s'].default:g} s, {fields['attempts'].default}"
-        rows.append([f"**`{name}`**", limits, kind.__doc__.strip()])
+        rows.append([f"**`{name}`**", limits, " ".join(kind.__doc__.split())])
         rows += [
             [f"`{key}`", default(field), meaning(field)]
             for key, field in fields.items()

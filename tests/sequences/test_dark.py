@@ -1,11 +1,21 @@
 """Dark frames: bias and noise that are known come back; light is refused."""
 
+import tomllib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fitctl import Instrument
+from fitctl.config import default_rig_path, load_rig
 from fitctl.sequences.dark import measure_dark
+from fitctl.supervisor.batch import Batch
+from fitctl.supervisor.batch_settings import TooLargeForBatchError
+from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import Simulation
+
+NEAR = ["plant.loops.right.star_offset_sky_arcsec_max=5.0"]
 
 
 @settings(max_examples=25)
@@ -56,3 +66,49 @@ def test_a_star_on_the_frame_is_no_dark_frame(tried):
 
     assert run.outcomes() == ["done", "failed"]
     assert "a star is on the frame" in run.error
+
+
+HOT = "plant.hot_pixels=[{az_px=22, el_px=20, dn=3000.0}, {az_px=30, el_px=9, dn=65000.0}]"
+
+
+def offset_px(*overrides):
+    """How far from its target the star is truly held."""
+    rig = load_rig(default_rig_path(), [*NEAR, *overrides])
+    simulation = Simulation(rig, 4, history_s=60.0)
+    simulation.acquire()
+    simulation.run(50.0)
+    true_px = simulation.plants["right"].history_px(25.0, 50.0)[:, 0, 0]
+    assert simulation.supervisor.loops["right"].mode is Mode.VERNIER
+    return true_px.mean(axis=0) - simulation.supervisor.loops["right"].target_px
+
+
+def test_a_dark_frame_that_was_measured_is_used_and_the_star_is_held_in_its_place(tmp_path):
+    aside = load_rig(default_rig_path(), [HOT])
+    with Instrument(aside, simulate=True, seed=1) as instrument:
+        instrument.standby()
+        figures = instrument.dark(60)
+        (fragment,) = instrument.write_calibrations(tmp_path)
+
+    assert figures["bright_pixels"] == 2
+    text = fragment.read_text()
+    assert "bad pixels, which are filled in from their neighbours: az 30, el 9" in text
+    camera = tomllib.loads(text)["camera"]
+    assert camera["dark_file"] == "fit-mock-dark.npy"
+    assert camera["bias_dn"] == pytest.approx(1000.0, abs=1.0)
+
+    # Beside a rig file, the fragment's file is found from wherever fitctl is run.
+    rig_file = tmp_path / "rig.toml"
+    rig_file.write_text(f'include = ["{fragment.name}"]\nbase = "{default_rig_path()}"\n')
+    dark_file = load_rig(rig_file).camera.dark_file
+    assert dark_file == str(tmp_path / "fit-mock-dark.npy")
+
+    clean = offset_px()
+    assert np.linalg.norm(offset_px(HOT) - clean) > 0.15
+    assert np.linalg.norm(offset_px(HOT, f"camera.dark_file={dark_file}") - clean) < 0.01
+
+
+def test_a_batch_leaves_pixels_that_differ_to_the_simulation(tmp_path):
+    np.save(tmp_path / "dark.npy", np.full((40, 40), 1000.0))
+    for override in (HOT, f"camera.dark_file={tmp_path / 'dark.npy'}"):
+        with pytest.raises(TooLargeForBatchError, match="pixels differ"):
+            Batch(load_rig(default_rig_path(), [override]))

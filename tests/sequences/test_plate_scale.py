@@ -1,10 +1,13 @@
 """Plate scale: matrices that are known come back, and what cannot be believed is refused."""
 
+import tomllib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fitctl import Instrument
 from fitctl.config import default_rig_path, load_rig
 from fitctl.sequences.plate_scale import (
     fit_plate_scale,
@@ -60,7 +63,8 @@ def test_matrices_that_are_known_come_back(
 
     fit = fit_plate_scale(TIME_S, star_px, swings)
 
-    assert refusal(fit, STEP) == ""
+    anyhow = STEP.model_copy(update={"max_rotation_deg": 180.0})
+    assert refusal(fit, anyhow) == ""
     np.testing.assert_allclose(fit.mirror, mirror, atol=0.01)
     np.testing.assert_allclose(fit.siderostat, siderostat, atol=0.01)
 
@@ -125,3 +129,51 @@ def test_a_rig_file_that_is_wrong_is_found_out(tried, scale):
     assert found["siderostat_scale"] == pytest.approx(scale, rel=0.02)
     assert found["fsm_scale"] == pytest.approx(1.0, rel=0.02)
     assert abs(found["siderostat_rotation_deg"]) < 1.0
+
+
+def test_the_scales_that_are_measured_correct_the_rig_file(tmp_path):
+    loop = RIG.loops["right"]
+    fsm = loop.fsm.model_copy(update={"hysteresis": None})
+    rig = RIG.model_copy(update={"loops": {"right": loop.model_copy(update={"fsm": fsm})}})
+    with Instrument(rig, simulate=True, seed=1) as instrument:
+        truth = instrument._link._simulation.plants["right"].constants.packed
+        truth["mirror_px_per_rad"] *= 0.93
+        truth["motor_px_per_rad"] *= 1.06
+        instrument.acquire()
+        instrument.wait(10.0)
+        instrument.plate_scale(attempts=2)
+        (path,) = instrument.write_calibrations(tmp_path)
+
+    found = tomllib.loads(path.read_text())["loops"]["right"]
+    assert path.name == "fit-mock-right-plate-scale.toml"
+    # The stacks' own gain at this swing is within a few percent of stack_scale_m_per_v.
+    assert found["fsm"]["beam_per_mirror"] == pytest.approx(0.93 * fsm.beam_per_mirror, rel=0.05)
+    assert found["siderostat"]["ball_screw_m_per_rad"] == pytest.approx(
+        1.06 * loop.siderostat.ball_screw_m_per_rad, rel=0.01
+    )
+
+
+def test_a_known_hysteresis_is_not_corrected_by_a_scale():
+    with Instrument(RIG, simulate=True, seed=1) as instrument:
+        instrument.acquire()
+        instrument.plate_scale(attempts=2)
+        (calibration,) = instrument._runner.calibrations
+
+    assert list(calibration.fragment["loops"]["right"]) == ["siderostat"]
+    assert "identify fsm.hysteresis anew" in "\n".join(calibration.lines)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]), "turned by +11.5 deg;"),
+        (np.diag([1.0, -1.0]), "and mirrored; max_rotation_deg is 10"),
+    ],
+)  # fmt: skip
+def test_a_stage_that_is_turned_too_far_or_mirrored_is_refused(matrix, said):
+    swings, star_px = star_of(np.eye(2), matrix)
+
+    fit = fit_plate_scale(TIME_S, star_px, swings)
+
+    assert "siderostat: " in refusal(fit, STEP)
+    assert said in refusal(fit, STEP)

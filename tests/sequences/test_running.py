@@ -1,28 +1,33 @@
 """How a sequence runs: attempts, time limits, pauses, and every way to end one."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.sequences import pointing, view
 from fitctl.sequences.links import SimulatedLink
-from fitctl.sequences.reading import load_sequence, shipped_sequences
+from fitctl.sequences.reading import find_sequence, load_sequence, shipped_sequences
 from fitctl.sequences.runner import run_sequence
-from fitctl.supervisor.messages import Hold, SequenceControl, Stop
+from fitctl.supervisor.messages import Acquire, Hold, SequenceControl, Stop
 
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
 RIG = load_rig(default_rig_path())
+SKIES = {"stars": load_rig(default_rig_path().parent / "star-field.toml")}
 
 
 @pytest.mark.parametrize("path", shipped_sequences(), ids=lambda path: path.stem)
 def test_every_shipped_sequence_runs_to_its_end(path):
-    sequence = load_sequence(path, RIG)
+    rig = SKIES.get(path.stem, RIG)
+    sequence = load_sequence(path, rig)
     assert sequence.name == path.stem
 
-    attempts = run_sequence(SimulatedLink(RIG, 0), RIG, sequence)
+    attempts = run_sequence(SimulatedLink(rig, 0), rig, sequence)
 
-    assert [attempt.outcome for attempt in attempts] == ["done"] * len(sequence.steps)
+    last = {attempt.step_number: attempt.outcome for attempt in attempts}
+    assert list(last.values()) == ["done"] * len(sequence.steps)
 
 
 def test_a_held_star_is_judged_against_the_requirement(tried):
@@ -52,13 +57,60 @@ def test_a_search_that_finds_nothing_is_tried_again(tried):
     assert run.states[-1] == "failed"
 
 
+ELSEWHERE = {"expected_az_sky_arcsec": 200.0, "expected_el_sky_arcsec": 0.0}
+GROWING = {"search_radius_sky_arcsec": 40.0, "radius_growth": 2.0, "max_offset_sky_arcsec": 170.0}
+
+
+def searches(run):
+    asked = [command for command in run.link.commands if isinstance(command, Acquire)]
+    return [command.search_radius_sky_arcsec for command in asked]
+
+
+def test_each_attempt_searches_wider_about_the_same_place(tried):
+    run = tried()
+
+    run({**ACQUIRE, **ELSEWHERE, **GROWING, "attempts": 5})
+
+    assert run.outcomes() == ["failed", "failed", "done"]
+    assert searches(run) == [40.0, 80.0, 160.0]
+    assert "no star within 80 arcsec" in run.attempts[1].message
+
+
+def test_no_attempt_searches_beyond_the_largest_offset(tried):
+    run = tried()
+    nowhere = {**ELSEWHERE, "expected_az_sky_arcsec": -900.0}
+
+    run({**ACQUIRE, **nowhere, **GROWING, "attempts": 4})
+
+    assert run.outcomes() == ["failed"] * 4
+    assert searches(run) == [40.0, 80.0, 160.0, 170.0]
+
+
+def test_without_a_largest_offset_every_attempt_is_the_rig_files(tried):
+    run = tried("plant.loops.right.star_offset_sky_arcsec_max=5000.0")
+
+    run({**ACQUIRE, "attempts": 2})
+
+    assert searches(run) == [None, None]
+
+
+def test_a_star_that_is_held_is_let_go_for_one_that_is_expected_elsewhere(tried):
+    run = tried()
+
+    run(ACQUIRE, {**ACQUIRE, **ELSEWHERE, "attempts": 1, "search_radius_sky_arcsec": 20.0})
+
+    assert run.outcomes() == ["done", "failed"]
+    assert "no star within 20 arcsec" in run.error
+
+
 def test_a_step_that_takes_too_long_is_stopped_and_the_stages_are_held(tried):
     run = tried("plant.loops.right.star_offset_sky_arcsec_max=200.0")
 
     run({**ACQUIRE, "timeout_s": 1.0, "attempts": 1})
 
     assert run.outcomes() == ["timed out"]
-    assert run.attempts[0].ended_s - run.attempts[0].began_s < 2.0
+    taken_s = run.attempts[0].ended_s - run.attempts[0].began_s
+    assert taken_s == pytest.approx(8.2, abs=0.5)  # the search itself takes 7.2 s
     assert run.link.mode() == "STANDBY"
 
 
@@ -213,7 +265,7 @@ def test_attempts_of_a_run_are_recorded_once_each(rig):
     records = []
     link = SimulatedLink(rig, 0)
     link._simulation._also = records.append
-    sequence = load_sequence(shipped_sequences() / "acquire.toml", rig)
+    sequence = load_sequence(find_sequence(Path("acquire")), rig)
 
     attempts = run_sequence(link, rig, sequence)
 

@@ -47,6 +47,16 @@ def mistakes(tmp_path, text, rig=RIG):
             'step = "acquire", loop = "left"',
             "step 1 (acquire): loop 'left': rig fit-mock has right",
         ),
+        (
+            'step = "acquire", field_overlap = 0.7',
+            "field_overlap: must be less than or equal to 0.6",
+        ),
+        ('step = "acquire", search_radius_sky_arcsec = 1300.0', "would reach 1300 arcsec"),
+        ('step = "acquire", expected_az_sky_arcsec = 3.0', "belong together"),
+        (
+            'step = "acquire", max_offset_sky_arcsec = 9.0, search_radius_sky_arcsec = 10.0',
+            "search_radius_sky_arcsec passes max_offset_sky_arcsec, 9",
+        ),
         ('step = "jog", jog_px = 4.0', "would go 5.66 px from its target; max_offset_px is 5"),
         ('step = "jog", max_offset_sky_arcsec = 1.0', "max_offset_sky_arcsec is 1"),
         ('step = "jog", jog_px = 30.0, max_offset_px = 100.0', "a place is off the frame"),

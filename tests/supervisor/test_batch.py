@@ -80,6 +80,7 @@ def test_every_design_makes_the_same_run_from_the_search_to_the_held_star(contro
             id="flight rate",
         ),
         pytest.param(["loops.right.siderostat.travel_sky_arcsec=60.0"], id="end of travel"),
+        pytest.param(["loops.right.target_px={az=35.0, el=5.0}"], id="far from the field's middle"),
         pytest.param(
             [
                 "plant.loops.right.spots=[{name='pointing', offset_px={az=0.0, el=0.0}, "

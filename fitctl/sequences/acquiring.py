@@ -1,0 +1,115 @@
+"""The step that searches for a star: wider from attempt to attempt, about where the star is expected."""
+
+from __future__ import annotations
+
+import math
+
+from fitctl.config import Rig
+from fitctl.controllers.spiral import plan_spiral
+from fitctl.model.optics import scales
+from fitctl.sequences import steps
+from fitctl.sequences.behaviour import Behaviour, Result, let_go
+from fitctl.sequences.view import StepFailed, View
+from fitctl.supervisor.messages import Acquire, Hold, Standby
+from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.search import refused_search
+
+
+def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Acquire:
+    """The command that makes an attempt's search, the first of which is 1."""
+    radius = step.search_radius_sky_arcsec
+    if step.max_offset_sky_arcsec is not None:
+        first = radius or rig.loops[loop_name].acquisition.search_radius_sky_arcsec
+        radius = min(first * step.radius_growth ** (attempt - 1), step.max_offset_sky_arcsec)
+    return Acquire(
+        loop=loop_name,
+        search_radius_sky_arcsec=radius,
+        field_overlap=step.field_overlap,
+        expected_az_sky_arcsec=step.expected_az_sky_arcsec,
+        expected_el_sky_arcsec=step.expected_el_sky_arcsec,
+    )
+
+
+def _check(step: steps.Acquire, rig: Rig, loop_name: str) -> list[str]:
+    widest = search_of(step, rig, loop_name, step.attempts)
+    first = search_of(step, rig, loop_name, 1)
+    given = step.search_radius_sky_arcsec
+    if given is not None and given != first.search_radius_sky_arcsec:
+        return [
+            f"search_radius_sky_arcsec passes max_offset_sky_arcsec, {step.max_offset_sky_arcsec:g}"
+        ]
+    why_not = refused_search(rig, loop_name, widest)
+    return [why_not] if why_not else []
+
+
+def _own_s(step: steps.Acquire, rig: Rig, loop_name: str) -> float:
+    widest = search_of(step, rig, loop_name, step.attempts)
+    return plan_spiral(
+        rig,
+        loop_name,
+        radius_sky_arcsec=widest.search_radius_sky_arcsec,
+        field_overlap=widest.field_overlap,
+    ).duration_s
+
+
+def _run(step: steps.Acquire, view: View) -> None:
+    if step.expected_az_sky_arcsec is not None and view.tracking:
+        view.command(Hold(loop=view.loop_name))  # another star, or the same anew
+    if view.mode is Mode.OFF:
+        view.command(Standby(loop=view.loop_name))
+
+
+def _search(step: steps.Acquire, view: View) -> None:
+    view.command(search_of(step, view.rig, view.loop_name, view.attempt))
+    view.marks.append(view.fresh_s)
+
+
+def _done(step: steps.Acquire, view: View) -> Result | None:
+    if view.errors:
+        raise StepFailed(view.errors[0])
+    if view.mode is Mode.STANDBY and not view.marks:
+        _search(step, view)  # the devices are on, and no star is held
+        return None
+    if view.mode is Mode.OFF:
+        return None
+    view.insist_on(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
+    if view.mode is not Mode.VERNIER:
+        return None
+    az, el = _place(view)
+    return Result(
+        {"acquired_s": view.gone_s, "found_az_sky_arcsec": az, "found_el_sky_arcsec": el},
+        f"held after {view.gone_s:.1f} s",
+    )
+
+
+def _place(view: View) -> tuple[float, float]:
+    """Where the star is on the sky, in arcsec from where the encoders read zero; nan if it was not seen."""
+    seen = [look for look in view.looks if math.isfinite(look.star_az_px)]
+    if not seen:
+        return math.nan, math.nan
+    scale, target, look = scales(view.rig, view.settings), view.settings.target_px, seen[-1]
+    beside_px = (
+        look.star_az_px - target.az - scale.mirror_px_per_rad * look.mirror_az_rad,
+        look.star_el_px - target.el - scale.mirror_px_per_rad * look.mirror_el_rad,
+    )
+    turned_px = (
+        scale.motor_px_per_rad * look.motor_az_rad,
+        scale.motor_px_per_rad * look.motor_el_rad,
+    )
+    az, el = (
+        (beside - turned) * scale.sky_arcsec_per_px
+        for beside, turned in zip(beside_px, turned_px, strict=True)
+    )
+    return az, el
+
+
+ACQUIRE = {
+    "acquire": Behaviour(
+        frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER}),
+        _done,
+        _run,
+        let_go,
+        _check,
+        _own_s,
+    )
+}
