@@ -15,6 +15,7 @@ from benchmarks.soak.logs import Audit
 from benchmarks.soak.run import BACK_WITHIN_S, Soak
 
 _UNITS = {"rss_mb": "memory, MB", "handles": "handles", "threads": "threads"}
+_TOLD = 8  # events of a strike that the loop did not come back from; all are in the JSON
 _RUN_INFO = 1  # the run's description is offered too; it is no message of a file, but its metadata
 
 
@@ -70,7 +71,8 @@ def markdown(found: dict[str, Any]) -> str:
     """A section for docs/reliability.md: tables, then what went wrong."""
     wrong = [found["ended"]] if found["ended"] else []
     wrong += [
-        f"{s['name']}: {s['back_s']:.0f} s; {'; '.join(s['told'])}" for s in found["not_back"]
+        f"{s['name']}: {s['back_s']:.0f} s; {'; '.join(s['told'][-_TOLD:])}"
+        for s in found["not_back"]
     ]
     wrong += [f"unstruck: {why}" for why in found["left_vernier_unstruck"]]
     wrong += found["logs"]["problems"]
@@ -88,9 +90,9 @@ def markdown(found: dict[str, Any]) -> str:
             ),
         ),
         _slowest(found["strikes"]),
-        *(f"- {line}" for line in wrong),
+        "\n".join(f"- {line}" for line in wrong),
     )
-    return "\n\n".join(tables)
+    return "\n\n".join(filter(None, tables))
 
 
 def _whole(found: dict[str, Any]) -> Iterable[tuple[str, str]]:

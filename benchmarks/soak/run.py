@@ -96,6 +96,8 @@ class Soak:
             over()
             ended_s = time.monotonic()
             back_s = self._come_back(strike.name)
+            if self._stop.is_set():
+                return
             told = self.course.told_since(at_s) if back_s > BACK_WITHIN_S else ()
             self.course.struck.append(
                 Struck(at_s - self.started_s, strike.name, ended_s - at_s, back_s, told)
@@ -113,7 +115,7 @@ class Soak:
             pass
 
     def _come_back(self, what: str) -> float:
-        """Recover and acquire until VERNIER lasts; the time that took, in s.
+        """Recover and acquire until VERNIER lasts, or the soak is ended; the time that took, in s.
 
         Raises
         ------
@@ -123,6 +125,8 @@ class Soak:
         began_s = asked_s = since_s = time.monotonic()
         while (now_s := time.monotonic()) < began_s + _GIVE_UP_S:
             self._follow(0.0)
+            if self._stop.is_set():
+                return now_s - began_s
             mode = self.course.mode
             if mode != "VERNIER":
                 since_s = now_s
