@@ -15,7 +15,7 @@ from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
 from fitctl.sequences.links import Link
 from fitctl.sequences.stars import judge, star_results, steps_of
-from fitctl.sequences.steps import Sequence, Stars, Step
+from fitctl.sequences.steps import Sequence, Standby, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 from fitctl.supervisor.messages import Hold, SequenceStatus
 from fitctl.supervisor.modes import Mode
@@ -91,6 +91,8 @@ class Runner:
     def _run_stars(self, step: Stars, loop_name: str, number: int) -> SequenceAttempt:
         """Each star's steps, one star after the other; one that fails is skipped, if the step says so."""
         began_s, first = self._link.now_s(), len(self.attempts)
+        # Devices that are not ready are no star's fault, and end the step.
+        self._try(Standby(loop=step.loop), loop_name, number)
         for star in step.stars or []:
             try:
                 for each in steps_of(step, star):

@@ -1,5 +1,7 @@
 """Lists of stars: each is acquired where it is expected, held and judged; one that is missing is skipped."""
 
+from concurrent.futures import Future
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from fitctl.sequences.reading import load_sequence, read_stars
 from fitctl.sequences.stars import star_results
 from fitctl.sequences.steps import Star
 from fitctl.sequences.view import SequenceError
+from fitctl.supervisor.supervisor import Job
 
 SKY = load_rig(default_rig_path().parent / "star-field.toml", ["supervisor.telemetry_hz=10.0"])
 QUICK = {"duration_s": 2.0, "settle_s": 3.0, "search_radius_sky_arcsec": 60.0}
@@ -50,7 +53,7 @@ def test_a_list_may_end_with_its_first_failure():
         ):
             instrument.stars([MISSING, ALPHA], on_failure="stop", **QUICK)
 
-        assert [attempt.star for attempt in instrument.attempts] == ["nobody"]
+        assert [attempt.star for attempt in instrument.attempts] == ["", "nobody"]
 
 
 def test_too_few_held_stars_fail_the_step():
@@ -61,7 +64,17 @@ def test_too_few_held_stars_fail_the_step():
             instrument.stars([MISSING], **QUICK)
 
         outcomes = [(attempt.step, attempt.outcome) for attempt in instrument.attempts]
-    assert outcomes == [("acquire", "failed"), ("stars", "failed")]
+    assert outcomes == [("standby", "done"), ("acquire", "failed"), ("stars", "failed")]
+
+
+def test_devices_that_are_not_ready_end_the_list_and_no_star_is_skipped(tried):
+    run = tried()
+    run.link._simulation.supervisor._job = Job(Future(), lambda _: None)  # that never ends
+
+    run({"step": "stars", "stars": [ALPHA, BETA], **QUICK})
+
+    assert [attempt.step for attempt in run.attempts] == ["standby", "standby"]
+    assert "devices are being opened or closed" in run.error
 
 
 FILES = {
