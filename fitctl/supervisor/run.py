@@ -31,6 +31,7 @@ from fitctl.supervisor.endpoints import (
     make_service_folder,
 )
 from fitctl.supervisor.machine import Machine
+from fitctl.supervisor.periodic import PeriodicThread
 from fitctl.supervisor.realtime import (
     become_realtime,
     collect_young,
@@ -38,7 +39,6 @@ from fitctl.supervisor.realtime import (
     quiet_interpreter,
 )
 from fitctl.supervisor.service import Service, ServiceState, TelemetryBuffer
-from fitctl.supervisor.servo import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
 
 _RECORDER_ERRORS = "recorder.err"
