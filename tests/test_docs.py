@@ -32,7 +32,7 @@ from documents import (
 from fitctl.cli import app
 from fitctl.commands.fault import kinds as fault_kinds
 from fitctl.config import default_rig_path, load_rig, rig_from_document
-from fitctl.logging.records import RecorderStatus
+from fitctl.logging.records import QuantityReading, RecorderStatus
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.logging.writer import LogWriter
 from fitctl.mocks.faults import WIRE_FAULTS
@@ -100,6 +100,8 @@ def sample_log(tmp_path_factory):
         now_s = simulation.clock.now_s()
         status = RecorderStatus(time_s=now_s, path=str(path), records=1, lost=0, bytes_written=1)
         log.write(status, log_time_s())
+        disk = QuantityReading(time_s=now_s, name="disk_free_bytes", value=1e12)
+        log.write(disk, log_time_s())
     return path
 
 

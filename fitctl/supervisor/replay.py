@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -107,14 +106,14 @@ class Replay:
                 self._post(command)
 
     def _post(self, told: Any) -> None:
-        arguments = msgspec.json.decode(told.values_json)
-        with suppress(msgspec.ValidationError):
-            self._supervisor.post(
-                msgspec.convert(arguments | {"type": told.command, "loop": told.loop}, AnyCommand),
-                lambda reply: self._answered(told.command, reply),
-            )
+        try:
+            arguments = msgspec.json.decode(told.values_json)
+            given = arguments | {"type": told.command, "loop": told.loop}
+            command = msgspec.convert(given, AnyCommand)
+        except msgspec.MsgspecError as error:
+            self._answered(told.command, Reply(accepted=False, text=f"not a command: {error}"))
             return
-        self._answered(told.command, Reply(accepted=False, text="no such command today"))
+        self._supervisor.post(command, lambda reply: self._answered(told.command, reply))
 
     def _answered(self, command: str, reply: Reply) -> None:
         if not reply.accepted:
@@ -140,9 +139,9 @@ class Replay:
                 values = (
                     tuple(stages.wanted_v.tolist())
                     if what == "stacks_v"
-                    else tuple(getattr(now, name) for name in fields)
+                    else tuple(getattr(now, part) for part in fields)
                 )
-                logged = tuple(getattr(then, name) for name in fields)
+                logged = tuple(getattr(then, part) for part in fields)
                 found.differences[what].add(then.time_s, logged, values)
         stages.follow()
         self._supervisor.loops[name].measured.of_tick(then.compute_s, then.time_s)

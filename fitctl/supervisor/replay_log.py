@@ -140,7 +140,8 @@ def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
             step.ticks[loop] = message
         elif kind is FrameRecord:
             numbers = {tick.number % 2**32 for tick in step.ticks.values()}
-            step.frame = message if sequence in numbers else None
+            whole = len(message.data) == message.step * message.height
+            step.frame = message if sequence in numbers and whole else None
         elif kind is LoopTiming:
             step.timing[loop] = message
         elif kind is RecorderStatus:

@@ -31,6 +31,7 @@ from fitctl.supervisor.endpoints import (
     make_service_folder,
 )
 from fitctl.supervisor.machine import Machine
+from fitctl.supervisor.periodic import PeriodicThread
 from fitctl.supervisor.realtime import (
     become_realtime,
     collect_young,
@@ -45,7 +46,6 @@ from fitctl.supervisor.service_manager import (
     status_line,
     tell_service_manager,
 )
-from fitctl.supervisor.servo import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 

@@ -59,11 +59,12 @@ from fitctl.supervisor.messages import (
     Stop,
 )
 from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
+from fitctl.supervisor.periodic import Periodic
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices, told
 from fitctl.supervisor.search import refused_search
 from fitctl.supervisor.sequence_board import SequenceBoard
-from fitctl.supervisor.servo import Periodic, SiderostatServo
+from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
 _CLOSE_TIMEOUT_S = 30.0

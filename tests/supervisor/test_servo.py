@@ -6,7 +6,8 @@ import pytest
 from fitctl.clock import VirtualClock
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceIdentity, DeviceTimeout, ServoReading
-from fitctl.supervisor.servo import PeriodicThread, SiderostatServo
+from fitctl.supervisor.periodic import PeriodicThread
+from fitctl.supervisor.servo import SiderostatServo
 
 
 class Amplifiers:
