@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer.exceptions import TyperException
@@ -16,6 +16,9 @@ from typer.exceptions import TyperException
 from fitctl.commands import log, sequence
 from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+
+if TYPE_CHECKING:
+    from fitctl.supervisor.client import Client
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
 # give, above all beside a loop that must not be late.
@@ -55,6 +58,13 @@ ParentOption = Annotated[
 
 def _rig(path: Path | None, overrides: list[str] | None) -> Rig:
     return load_rig(path or default_rig_path(), overrides or ())
+
+
+def _client(path: Path | None, overrides: list[str] | None) -> Client:
+    from fitctl.supervisor.client import Client
+    from fitctl.supervisor.endpoints import service_folder
+
+    return Client(service_folder(_rig(path, overrides)))
 
 
 def with_controller(
@@ -274,7 +284,7 @@ def status(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOpti
     """
     from fitctl.commands.status import run_status
 
-    raise typer.Exit(run_status(_rig(rig, overrides), as_json=as_json))
+    raise typer.Exit(run_status(_client(rig, overrides), as_json=as_json))
 
 
 @app.command()
@@ -291,7 +301,7 @@ def watch(
     """Print a line a second about the running instrument, and every event as it comes."""
     from fitctl.commands.watch import run_watch
 
-    raise typer.Exit(run_watch(_rig(rig, overrides), duration, as_json=as_json))
+    raise typer.Exit(run_watch(_client(rig, overrides), duration, as_json=as_json))
 
 
 @app.command()
