@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.exceptions import TyperException
 
-from fitctl.commands import log, sequence
-from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
+from fitctl.commands import completing, log, sequence
+from fitctl.commands.options import JsonOption, LoopOption, RigOption, SeedOption, SetOption
+from fitctl.commands.welcome import welcome
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ ControllerOption = Annotated[
         "--controller",
         metavar="NAME",
         help="eq20, lqg-ltr, minimum-variance, fslq, or a saved file.",
+        autocompletion=completing.controllers,
     ),
 ]
 ParentOption = Annotated[
@@ -168,7 +170,11 @@ def discover(
 
 
 DeviceArgument = Annotated[
-    str, typer.Argument(help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.")
+    str,
+    typer.Argument(
+        help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.",
+        autocompletion=completing.devices,
+    ),
 ]
 PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has parts.")]
 
@@ -176,7 +182,10 @@ PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has
 @fault.command("set")
 def fault_set(
     device: DeviceArgument,
-    kind: Annotated[str, typer.Argument(help="`fitctl fault kinds` lists them.")],
+    kind: Annotated[
+        str,
+        typer.Argument(help="`fitctl fault kinds` lists them.", autocompletion=completing.faults),
+    ],
     value: Annotated[float | None, typer.Argument(help="In the kind's unit.")] = None,
     part: PartOption = "",
     for_s: Annotated[
@@ -196,7 +205,9 @@ def fault_set(
 
 @fault.command("clear")
 def fault_clear(
-    device: Annotated[str, typer.Argument(help="Without it, all devices.")] = "",
+    device: Annotated[
+        str, typer.Argument(help="Without it, all devices.", autocompletion=completing.devices)
+    ] = "",
     kind: Annotated[str, typer.Argument(help="Without it, all kinds.")] = "",
     part: PartOption = "",
     rig: RigOption = None,
@@ -268,7 +279,10 @@ def send(
     ] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name; without it, all.")] = "",
+    loop: Annotated[
+        str,
+        typer.Option(help="One loop by name; without it, all.", autocompletion=completing.loops),
+    ] = "",
 ) -> None:
     """Give one command to the running supervisor of a rig."""
     from fitctl.commands.instrument import send_command
@@ -340,7 +354,7 @@ def identify(
     what: Annotated[str, typer.Argument(help="hysteresis, backlash, response, airpath or delay.")],
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    loop: LoopOption = "right",
     log: Annotated[
         Path | None, typer.Option(help="Learn from this log (or bench file) of an earlier run.")
     ] = None,
@@ -389,7 +403,7 @@ def design(
     ],
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    loop: LoopOption = "right",
     as_json: JsonOption = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw Fig. 9 (vernier), PNG or SVG.")
@@ -417,7 +431,7 @@ def figures(
     ],
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    loop: LoopOption = "right",
     seed: SeedOption = 0,
     quick: Annotated[
         bool, typer.Option("--quick", help="Few and short runs: to see how it looks.")
@@ -432,6 +446,47 @@ def figures(
 
     settings = _rig(rig, overrides)
     raise typer.Exit(run_figures(settings, loop, seed, out, quick=quick))
+
+
+_DEVICE_SAID = "KIND:ADDRESS"
+
+
+@app.command()
+def init(
+    file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("my-rig.toml"),
+    name: Annotated[str | None, typer.Option(help="Of the rig; by default the file's.")] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar=_DEVICE_SAID, help="gige:ADDRESS, aravis:ADDRESS or mock.")
+    ] = None,
+    siderostat: Annotated[
+        str | None,
+        typer.Option(
+            metavar=_DEVICE_SAID,
+            help="cia402:INTERFACE:CHANNEL, ensemble:PORT, bal_analog:HOST or mock.",
+        ),
+    ] = None,
+    dac: Annotated[
+        str | None, typer.Option(metavar=_DEVICE_SAID, help="tcp:HOST, rtu:PORT or mock.")
+    ] = None,
+    mdt693: Annotated[
+        str | None, typer.Option(metavar=_DEVICE_SAID, help="mdt693:PORT or mock.")
+    ] = None,
+    mocks: Annotated[
+        bool, typer.Option("--mocks", help="Ask nothing: what is not said is a mock.")
+    ] = False,
+    ask_devices: Annotated[
+        bool, typer.Option("--doctor/--no-doctor", help="Ask the devices at the end.")
+    ] = True,
+) -> None:
+    """Write a rig file of your own: asks what hardware is there, or is told by options.
+
+    Nothing is overwritten. At the end the devices are asked who they are, as `fitctl doctor` does; the exit
+    status is 1 if one disagrees.
+    """
+    from fitctl.commands.init import run_init
+
+    said = {"camera": camera, "siderostat": siderostat, "dac": dac, "mdt693": mdt693}
+    raise typer.Exit(run_init(file, name, said, mocks=mocks, ask_devices=ask_devices))
 
 
 @app.command()
@@ -467,7 +522,10 @@ def metrics(
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
-    given = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    given = sys.argv[1:] if arguments is None else arguments
+    if not given and "_FITCTL_COMPLETE" not in os.environ:
+        typer.echo(welcome(Path.cwd()))
+        return
     try:
         status = app(given, prog_name="fitctl", standalone_mode=False)
     except ConfigError as error:

@@ -7,9 +7,16 @@ from typing import Annotated
 
 import typer
 
+from fitctl.commands import completing
+
 RigOption = Annotated[
     Path | None,
-    typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
+    typer.Option(
+        "--rig",
+        metavar="FILE",
+        help="Rig file; without it, the shipped fit-mock.toml.",
+        autocompletion=completing.rigs,
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -21,3 +28,6 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+LoopOption = Annotated[
+    str, typer.Option("--loop", help="One loop by name.", autocompletion=completing.loops)
+]

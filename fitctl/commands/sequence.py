@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 import typer
 
+from fitctl.commands import completing
 from fitctl.commands.options import JsonOption, RigOption, SeedOption, SetOption
 from fitctl.config import Rig, default_rig_path, load_rig
 
@@ -26,7 +27,12 @@ app = typer.Typer(
 )
 
 SequenceArgument = Annotated[
-    Path, typer.Argument(metavar="FILE", help="A TOML file, or the name of a shipped sequence.")
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="A TOML file, or the name of a shipped sequence.",
+        autocompletion=completing.sequences,
+    ),
 ]
 
 

@@ -47,7 +47,7 @@ def newest_telemetry(client: Client) -> Telemetry:
     client.send(messages.Status())  # who is not there is told sooner, and by name
     telemetry = client.receive(REPLY_TIMEOUT_S)
     if telemetry is None:
-        msg = f"the supervisor answers, but has sent no telemetry within {REPLY_TIMEOUT_S:g} s; look at its output"
+        msg = f"the supervisor answers, but sends no telemetry ({REPLY_TIMEOUT_S:g} s); see its output"
         raise ConnectionError(msg)
     return telemetry
 
