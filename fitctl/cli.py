@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.exceptions import TyperException
 
-from fitctl.commands import completing, log, sequence
+from fitctl.commands import completing, faulting, init, log, sequence
 from fitctl.commands.options import JsonOption, LoopOption, RigOption, SeedOption, SetOption
 from fitctl.commands.welcome import welcome
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
@@ -36,8 +36,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-fault = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
-app.add_typer(fault, name="fault")
+app.add_typer(faulting.app, name="fault")
 app.add_typer(log.app, name="log")
 app.add_typer(sequence.app, name="sequence")
 
@@ -167,74 +166,6 @@ def discover(
     from fitctl.commands.doctor import run_discover
 
     run_discover(broadcast, wait_s, as_json=as_json)
-
-
-DeviceArgument = Annotated[
-    str,
-    typer.Argument(
-        help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.",
-        autocompletion=completing.devices,
-    ),
-]
-PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has parts.")]
-
-
-@fault.command("set")
-def fault_set(
-    device: DeviceArgument,
-    kind: Annotated[
-        str,
-        typer.Argument(help="`fitctl fault kinds` lists them.", autocompletion=completing.faults),
-    ],
-    value: Annotated[float | None, typer.Argument(help="In the kind's unit.")] = None,
-    part: PartOption = "",
-    for_s: Annotated[
-        float | None, typer.Option("--for", metavar="SECONDS", help="Without it, until cleared.")
-    ] = None,
-    probability: Annotated[float, typer.Option(help="That it hits, each time.")] = 1.0,
-    rig: RigOption = None,
-    overrides: SetOption = None,
-) -> None:
-    """Begin a fault."""
-    from fitctl.commands.fault import change_faults
-    from fitctl.mocks.bench import SetFault
-
-    wanted = SetFault(device, kind, part, value, for_s, probability)
-    change_faults(_rig(rig, overrides), wanted)
-
-
-@fault.command("clear")
-def fault_clear(
-    device: Annotated[
-        str, typer.Argument(help="Without it, all devices.", autocompletion=completing.devices)
-    ] = "",
-    kind: Annotated[str, typer.Argument(help="Without it, all kinds.")] = "",
-    part: PartOption = "",
-    rig: RigOption = None,
-    overrides: SetOption = None,
-) -> None:
-    """End faults."""
-    from fitctl.commands.fault import change_faults
-    from fitctl.mocks.bench import ClearFaults
-
-    change_faults(_rig(rig, overrides), ClearFaults(device, kind, part))
-
-
-@fault.command("now")
-def fault_now(rig: RigOption = None, overrides: SetOption = None) -> None:
-    """Print what is wrong now."""
-    from fitctl.commands.fault import change_faults
-    from fitctl.mocks.bench import ListFaults
-
-    change_faults(_rig(rig, overrides), ListFaults())
-
-
-@fault.command("kinds")
-def fault_kinds() -> None:
-    """Print what can go wrong with each device."""
-    from fitctl.commands.fault import list_kinds
-
-    list_kinds()
 
 
 @app.command()
@@ -448,45 +379,7 @@ def figures(
     raise typer.Exit(run_figures(settings, loop, seed, out, quick=quick))
 
 
-_DEVICE_SAID = "KIND:ADDRESS"
-
-
-@app.command()
-def init(
-    file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("my-rig.toml"),
-    name: Annotated[str | None, typer.Option(help="Of the rig; by default the file's.")] = None,
-    camera: Annotated[
-        str | None, typer.Option(metavar=_DEVICE_SAID, help="gige:ADDRESS, aravis:ADDRESS or mock.")
-    ] = None,
-    siderostat: Annotated[
-        str | None,
-        typer.Option(
-            metavar=_DEVICE_SAID,
-            help="cia402:INTERFACE:CHANNEL, ensemble:PORT, bal_analog:HOST or mock.",
-        ),
-    ] = None,
-    dac: Annotated[
-        str | None, typer.Option(metavar=_DEVICE_SAID, help="tcp:HOST, rtu:PORT or mock.")
-    ] = None,
-    mdt693: Annotated[
-        str | None, typer.Option(metavar=_DEVICE_SAID, help="mdt693:PORT or mock.")
-    ] = None,
-    mocks: Annotated[
-        bool, typer.Option("--mocks", help="Ask nothing: what is not said is a mock.")
-    ] = False,
-    ask_devices: Annotated[
-        bool, typer.Option("--doctor/--no-doctor", help="Ask the devices at the end.")
-    ] = True,
-) -> None:
-    """Write a rig file of your own: asks what hardware is there, or is told by options.
-
-    Nothing is overwritten. At the end the devices are asked who they are, as `fitctl doctor` does; the exit
-    status is 1 if one disagrees.
-    """
-    from fitctl.commands.init import run_init
-
-    said = {"camera": camera, "siderostat": siderostat, "dac": dac, "mdt693": mdt693}
-    raise typer.Exit(run_init(file, name, said, mocks=mocks, ask_devices=ask_devices))
+app.command()(init.init)
 
 
 @app.command()

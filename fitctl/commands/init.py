@@ -6,6 +6,7 @@ import sys
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -19,6 +20,42 @@ TITLES = {
     "dac": "D/A converter of the mirror",
     "mdt693": "MDT693 piezo amplifier",
 }
+_DEVICE_SAID = "KIND:ADDRESS"
+
+
+def init(
+    file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("my-rig.toml"),
+    name: Annotated[str | None, typer.Option(help="Of the rig; by default the file's.")] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar=_DEVICE_SAID, help="gige:ADDRESS, aravis:ADDRESS or mock.")
+    ] = None,
+    siderostat: Annotated[
+        str | None,
+        typer.Option(
+            metavar=_DEVICE_SAID,
+            help="cia402:INTERFACE:CHANNEL, ensemble:PORT, bal_analog:HOST or mock.",
+        ),
+    ] = None,
+    dac: Annotated[
+        str | None, typer.Option(metavar=_DEVICE_SAID, help="tcp:HOST, rtu:PORT or mock.")
+    ] = None,
+    mdt693: Annotated[
+        str | None, typer.Option(metavar=_DEVICE_SAID, help="mdt693:PORT or mock.")
+    ] = None,
+    mocks: Annotated[
+        bool, typer.Option("--mocks", help="Ask nothing: what is not said is a mock.")
+    ] = False,
+    ask_devices: Annotated[
+        bool, typer.Option("--doctor/--no-doctor", help="Ask the devices at the end.")
+    ] = True,
+) -> None:
+    """Write a rig file of your own: asks what hardware is there, or is told by options.
+
+    Nothing is overwritten. At the end the devices are asked who they are, as `fitctl doctor` does; the exit
+    status is 1 if one disagrees.
+    """
+    said = {"camera": camera, "siderostat": siderostat, "dac": dac, "mdt693": mdt693}
+    raise typer.Exit(run_init(file, name, said, mocks=mocks, ask_devices=ask_devices))
 
 
 def run_init(
