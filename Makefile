@@ -10,7 +10,7 @@ FUZZ_S ?= 120
 SOAK_S ?= 3600
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-sim soak fuzz lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -82,6 +82,17 @@ bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN serv
 	$(BIN)/python -m benchmarks.can
 	$(BIN)/python -m benchmarks.gvsp
 
+docs: $(READY)  ## The documentation as a site, dist/docs/index.html
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/docs.lock
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "dist/docs/index.html"
+
+dist: $(READY)  ## Wheel and sdist, into dist/
+	$(BIN)/python -m hatchling build -d dist
+
+dist-test: $(READY)  ## Wheel and sdist, installed into a fresh environment and run there
+	$(BIN)/pytest -m dist tests/dist $(ARGS)
+
 LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
     --custom-compile-command "make lock" --quiet
 
@@ -89,6 +100,7 @@ lock: $(READY)  ## Resolve the requirements anew (needs uv)
 	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --group dev $(LOCK) -o requirements/dev.lock
 	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
+	uv pip compile --group docs $(LOCK) --constraint requirements/dev.lock -o requirements/docs.lock
 	uv pip compile --group bench $(LOCK) --constraint requirements/dev.lock -o requirements/bench.lock
 
 clean:  ## Remove .venv and caches

@@ -14,15 +14,17 @@ import typer
 from typer.core import TyperCommand
 from typer.exceptions import TyperException
 
-from fitctl.commands import keys, log, sequence
+from fitctl.commands import completing, faulting, init, keys, log, sequence
 from fitctl.commands.options import (
     JsonOption,
+    LoopOption,
     RemoteOption,
     RigOption,
     SeedOption,
     SetOption,
     rig_of,
 )
+from fitctl.commands.welcome import welcome
 from fitctl.config import ConfigError, default_rig_path
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
@@ -40,8 +42,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-fault = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
-app.add_typer(fault, name="fault")
+app.add_typer(faulting.app, name="fault")
 app.add_typer(log.app, name="log")
 app.add_typer(sequence.app, name="sequence")
 app.add_typer(keys.app, name="keys")
@@ -52,6 +53,7 @@ ControllerOption = Annotated[
         "--controller",
         metavar="NAME",
         help="eq20, lqg-ltr, minimum-variance, fslq, or a saved file.",
+        autocompletion=completing.controllers,
     ),
 ]
 ParentOption = Annotated[
@@ -168,65 +170,6 @@ def discover(
     run_discover(broadcast, wait_s, as_json=as_json)
 
 
-DeviceArgument = Annotated[
-    str, typer.Argument(help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.")
-]
-PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has parts.")]
-
-
-@fault.command("set")
-def fault_set(
-    device: DeviceArgument,
-    kind: Annotated[str, typer.Argument(help="`fitctl fault kinds` lists them.")],
-    value: Annotated[float | None, typer.Argument(help="In the kind's unit.")] = None,
-    part: PartOption = "",
-    for_s: Annotated[
-        float | None, typer.Option("--for", metavar="SECONDS", help="Without it, until cleared.")
-    ] = None,
-    probability: Annotated[float, typer.Option(help="That it hits, each time.")] = 1.0,
-    rig: RigOption = None,
-    overrides: SetOption = None,
-) -> None:
-    """Begin a fault."""
-    from fitctl.commands.fault import change_faults
-    from fitctl.mocks.bench import SetFault
-
-    wanted = SetFault(device, kind, part, value, for_s, probability)
-    change_faults(rig_of(rig, overrides), wanted)
-
-
-@fault.command("clear")
-def fault_clear(
-    device: Annotated[str, typer.Argument(help="Without it, all devices.")] = "",
-    kind: Annotated[str, typer.Argument(help="Without it, all kinds.")] = "",
-    part: PartOption = "",
-    rig: RigOption = None,
-    overrides: SetOption = None,
-) -> None:
-    """End faults."""
-    from fitctl.commands.fault import change_faults
-    from fitctl.mocks.bench import ClearFaults
-
-    change_faults(rig_of(rig, overrides), ClearFaults(device, kind, part))
-
-
-@fault.command("now")
-def fault_now(rig: RigOption = None, overrides: SetOption = None) -> None:
-    """Print what is wrong now."""
-    from fitctl.commands.fault import change_faults
-    from fitctl.mocks.bench import ListFaults
-
-    change_faults(rig_of(rig, overrides), ListFaults())
-
-
-@fault.command("kinds")
-def fault_kinds() -> None:
-    """Print what can go wrong with each device."""
-    from fitctl.commands.fault import list_kinds
-
-    list_kinds()
-
-
 @app.command()
 def run(
     rig: RigOption = None,
@@ -275,7 +218,10 @@ def send(
     rig: RigOption = None,
     overrides: SetOption = None,
     remote: RemoteOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name; without it, all.")] = "",
+    loop: Annotated[
+        str,
+        typer.Option(help="One loop by name; without it, all.", autocompletion=completing.loops),
+    ] = "",
 ) -> None:
     """Give one command to the running supervisor of a rig."""
     from fitctl.commands.connecting import connect
@@ -290,20 +236,27 @@ def send(
 
 
 @app.command()
-def status(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+def status(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    remote: RemoteOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Say how the running instrument of a rig is.
 
     Exit status 0 if all is well, 1 if something is not, 3 if no supervisor answers.
     """
+    from fitctl.commands.connecting import connect
     from fitctl.commands.status import run_status
 
-    raise typer.Exit(run_status(rig_of(rig, overrides), as_json=as_json))
+    raise typer.Exit(run_status(connect(rig, overrides, remote), as_json=as_json))
 
 
 @app.command()
 def watch(
     rig: RigOption = None,
     overrides: SetOption = None,
+    remote: RemoteOption = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Each line is one JSON object; `kind` says what of.")
     ] = False,
@@ -312,9 +265,10 @@ def watch(
     ] = None,
 ) -> None:
     """Print a line a second about the running instrument, and every event as it comes."""
+    from fitctl.commands.connecting import connect
     from fitctl.commands.watch import run_watch
 
-    raise typer.Exit(run_watch(rig_of(rig, overrides), duration, as_json=as_json))
+    raise typer.Exit(run_watch(connect(rig, overrides, remote), duration, as_json=as_json))
 
 
 @app.command()
@@ -377,7 +331,7 @@ def identify(
     what: Annotated[str, typer.Argument(help="hysteresis, backlash, response, airpath or delay.")],
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    loop: LoopOption = "right",
     log: Annotated[
         Path | None, typer.Option(help="Learn from this log (or bench file) of an earlier run.")
     ] = None,
@@ -426,7 +380,7 @@ def design(
     ],
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    loop: LoopOption = "right",
     as_json: JsonOption = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw Fig. 9 (vernier), PNG or SVG.")
@@ -454,7 +408,7 @@ def figures(
     ],
     rig: RigOption = None,
     overrides: SetOption = None,
-    loop: Annotated[str, typer.Option(help="One loop by name.")] = "right",
+    loop: LoopOption = "right",
     seed: SeedOption = 0,
     quick: Annotated[
         bool, typer.Option("--quick", help="Few and short runs: to see how it looks.")
@@ -469,6 +423,9 @@ def figures(
 
     settings = rig_of(rig, overrides)
     raise typer.Exit(run_figures(settings, loop, seed, out, quick=quick))
+
+
+app.command()(init.init)
 
 
 @app.command()
@@ -504,7 +461,10 @@ def metrics(
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
-    given = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    given = sys.argv[1:] if arguments is None else arguments
+    if not given and "_FITCTL_COMPLETE" not in os.environ:
+        typer.echo(welcome(Path.cwd()))
+        return
     try:
         status = app(given, prog_name="fitctl", standalone_mode=False)
     except ConfigError as error:

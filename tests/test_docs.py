@@ -49,7 +49,20 @@ from tests.tui.fake import FakeSupervisor
 MAKE_TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 CLI = typer.main.get_command(app)
 # Programs that are not ours: that they are called is all that is checked, or that they are installed.
-OUTSIDE = {"git", "cd", "cp", "sudo", "uv", "pip", "python3", "export", "source", "ssh", "tmux"}
+OUTSIDE = {
+    "git",
+    "cd",
+    "cp",
+    "sudo",
+    "uv",
+    "pip",
+    "pipx",
+    "python3",
+    "export",
+    "source",
+    "ssh",
+    "tmux",
+}
 INSTALLED = {"rerun", "pymcap-cli", "pytest", "python", "ruff", "mypy"}
 LONGEST_RUN_S = 60.0  # of virtual time
 NEARBY_PX = np.array([30.0, -10.0])  # a star that is found and held within 20 s

@@ -7,11 +7,17 @@ from typing import Annotated
 
 import typer
 
+from fitctl.commands import completing
 from fitctl.config import Rig, default_rig_path, load_rig
 
 RigOption = Annotated[
     Path | None,
-    typer.Option("--rig", metavar="FILE", help="Rig file; without it, the shipped fit-mock.toml."),
+    typer.Option(
+        "--rig",
+        metavar="FILE",
+        help="Rig file; without it, the shipped fit-mock.toml.",
+        autocompletion=completing.rigs,
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -29,6 +35,9 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+LoopOption = Annotated[
+    str, typer.Option("--loop", help="One loop by name.", autocompletion=completing.loops)
+]
 
 
 def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:

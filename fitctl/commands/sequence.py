@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from fitctl.commands import completing
 from fitctl.commands.options import (
     JsonOption,
     RemoteOption,
@@ -33,7 +34,11 @@ app = typer.Typer(
 
 SequenceArgument = Annotated[
     Path,
-    typer.Argument(metavar="FILE", help="A TOML or YAML file, or the name of a shipped sequence."),
+    typer.Argument(
+        metavar="FILE",
+        help="A TOML or YAML file, or the name of a shipped sequence.",
+        autocompletion=completing.sequences,
+    ),
 ]
 StepSetOption = Annotated[
     list[str] | None,

@@ -8,9 +8,8 @@ from typing import Any
 import msgspec
 import typer
 
-from fitctl.config import Rig
+from fitctl.supervisor import messages
 from fitctl.supervisor.client import REPLY_TIMEOUT_S, Client
-from fitctl.supervisor.endpoints import service_folder
 from fitctl.supervisor.messages import Telemetry
 from fitctl.supervisor.troubles import records_lost, troubles
 
@@ -20,19 +19,15 @@ NO_SUPERVISOR = 3
 _STREAMS = ("frame", "events", "mode_changes")  # `fitctl watch` and the log have them
 
 
-def run_status(rig: Rig, *, as_json: bool) -> int:
+def run_status(client: Client, *, as_json: bool) -> int:
     """Print how the instrument is; returns the exit status: `WELL`, `NOT_WELL` or `NO_SUPERVISOR`."""
-    client = Client(service_folder(rig))
     try:
-        telemetry = client.receive(REPLY_TIMEOUT_S)
+        telemetry = newest_telemetry(client)
     except ConnectionError as error:
         typer.echo(f"status: {error}", err=True)
         return NO_SUPERVISOR
     finally:
         client.close()
-    if telemetry is None:
-        typer.echo(f"status: {nobody_answers(rig)}", err=True)
-        return NO_SUPERVISOR
     found = troubles(telemetry)
     if as_json:
         typer.echo(msgspec.json.encode(status_document(telemetry, found)).decode())
@@ -41,12 +36,20 @@ def run_status(rig: Rig, *, as_json: bool) -> int:
     return NOT_WELL if found else WELL
 
 
-def nobody_answers(rig: Rig) -> str:
-    """That no supervisor is there, and what to do."""
-    return (
-        f"no supervisor of {rig.name} at {service_folder(rig)}: nothing came within "
-        f"{REPLY_TIMEOUT_S:g} s; start one with: fitctl run"
-    )
+def newest_telemetry(client: Client) -> Telemetry:
+    """One message.
+
+    Raises
+    ------
+    ConnectionError
+        If nobody answers, or no telemetry comes.
+    """
+    client.send(messages.Status())  # who is not there is told sooner, and by name
+    telemetry = client.receive(REPLY_TIMEOUT_S)
+    if telemetry is None:
+        msg = f"the supervisor answers, but sends no telemetry ({REPLY_TIMEOUT_S:g} s); see its output"
+        raise ConnectionError(msg)
+    return telemetry
 
 
 def utc(telemetry: Telemetry, time_s: float) -> str:
@@ -91,6 +94,9 @@ def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
     if running is not None:
         told = f"{running.name} {running.state}, step {running.step_number} of {running.steps}"
         lines.append(_line("sequence", f"{told} ({running.step})"))
+    commander = getattr(telemetry, "commander", "")
+    if commander:
+        lines.append(_line("commander", commander))
     lines.append(_line("supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"))
     return lines
 

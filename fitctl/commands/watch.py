@@ -11,18 +11,17 @@ from datetime import UTC, datetime
 
 import msgspec
 
-from fitctl.commands.status import NO_SUPERVISOR, nobody_answers, utc
-from fitctl.config import Rig
+from fitctl.commands.status import NO_SUPERVISOR, utc
 from fitctl.logging.records import Severity
 from fitctl.processes import ended_by_signals
 from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import service_folder
 from fitctl.supervisor.messages import LoopState, Telemetry
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.tally import Tally, add_ticks
 
 _LINE_S = 1.0
 _POLL_S = 0.2
+_SILENCE = "nothing is heard of a supervisor; if none is running: fitctl run"
 
 
 class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
@@ -71,17 +70,16 @@ class _Ended(Exception):
     """Ctrl-C or another signal: the ordinary end."""
 
 
-def run_watch(rig: Rig, duration_s: float | None, *, as_json: bool) -> int:
+def run_watch(client: Client, duration_s: float | None, *, as_json: bool) -> int:
     """Print lines until Ctrl-C, for `duration_s` at the most; returns the exit status.
 
     It is `NO_SUPERVISOR` where nobody was heard at all.
     """
-    client = Client(service_folder(rig))
     text = _json if as_json else _text
     heard = False
     try:
         with ended_by_signals(_end):
-            for entry in entries(client.receive, duration_s, nobody_answers(rig)):
+            for entry in entries(client.receive, duration_s):
                 heard = heard or not isinstance(entry, Silence)
                 print(text(entry), flush=True)
     except _Ended:
@@ -99,9 +97,9 @@ def _end() -> None:
 
 
 def entries(
-    receive: Callable[[float], Telemetry | None], duration_s: float | None, silence: str
+    receive: Callable[[float], Telemetry | None], duration_s: float | None
 ) -> Iterator[Entry]:
-    """What `receive` brings, a second at a time, and every event as it comes.
+    """What `receive` brings, a second at a time, and every event as it comes; silence once a second.
 
     Parameters
     ----------
@@ -109,14 +107,12 @@ def entries(
         Waits at most so many seconds for the next message; ConnectionError for one that cannot be read.
     duration_s : float or None
         By this machine's clock; None goes on for ever.
-    silence : str
-        Said once a second while nothing comes.
     """
     begun_s = heard_s = time.monotonic()
     due_s = math.inf
     tallies: dict[str, Tally] = {}
     while duration_s is None or time.monotonic() - begun_s < duration_s:
-        why = silence
+        why = _SILENCE
         try:
             telemetry = receive(_POLL_S)
         except ConnectionError as error:

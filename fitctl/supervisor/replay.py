@@ -44,7 +44,8 @@ from fitctl.supervisor.replay_log import LoggedStep
 from fitctl.supervisor.replay_result import COMPARED, LoopReplay, ReplayResult
 from fitctl.supervisor.supervisor import Supervisor
 
-_OF_PROGRAMS = {"SequenceControl"}  # leads to commands of its own, which are in the log as well
+# Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well.
+_OF_PEOPLE = {"SequenceControl", "TakeOver"}
 
 
 class Replay:
@@ -102,7 +103,7 @@ class Replay:
         for reading in step.of(PiezoReading):
             supervisor.piezos[reading.loop].take(_piezo_answer(reading))
         for command in step.of(CommandRecord):
-            if command.accepted and command.command not in _OF_PROGRAMS:
+            if command.accepted and command.command not in _OF_PEOPLE:
                 self._post(command)
 
     def _post(self, told: Any) -> None:

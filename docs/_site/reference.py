@@ -1,0 +1,233 @@
+"""The pages of the site that are made from the code: commands, rig keys, messages, topics, Python."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, get_args
+
+import msgspec
+import tomlkit
+import typer
+from tomlkit.items import AoT, Item, Table
+from typer.cli import get_docs_for_click
+
+from fitctl.cli import app
+from fitctl.config import Rig, default_rig_path
+from fitctl.logging.schemas import MESSAGES, TOPICS
+from fitctl.supervisor.messages import AnyCommand
+
+LOOP = "right"
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """A table in Markdown; a bar within a cell is written so that it ends none."""
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *cells))
+
+
+# ---------------------------------------------------------------- the command line
+
+
+def command_line() -> str:
+    """Every command that is not hidden, with its options."""
+    group = copy.copy(typer.main.get_command(app))
+    group.commands = {name: c for name, c in group.commands.items() if not c.hidden}
+    text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="fitctl")
+    return text.replace("# `fitctl`\n", "# Command line\n", 1)
+
+
+# ---------------------------------------------------------------- the rig file
+
+
+def rig_keys() -> str:
+    """Every key of the shipped rig file, section by section: its value, what is allowed, what it is."""
+    schema = Rig.model_json_schema()
+    document = tomlkit.parse(default_rig_path().read_text(encoding="utf-8"))
+    parts = [
+        "# Rig keys",
+        "Every key of a rig file, with its value in the shipped `fit-mock.toml` and what is allowed. A table "
+        "that is named optional may be left out; `plant` and `mocks` are for mocks and simulation alone. The "
+        "other siderostats have keys of their own: [Ensemble](../devices/ensemble.md), [analogue "
+        "amplifiers](../devices/bal-analog.md).",
+    ]
+    for section, rows in sections(document, "", schema, schema):
+        head = ["key", "shipped", "allowed", "what it is"]
+        parts += [f"## {section or 'The rig'}", table(head, rows)]
+    return "\n\n".join(parts)
+
+
+def sections(
+    at: Any, prefix: str, schema: dict[str, Any], root: dict[str, Any]
+) -> Iterator[tuple[str, list[list[str]]]]:
+    """The tables of a TOML document, each with a row for each of its keys."""
+    rows, below = [], []
+    required = schema.get("required", ())
+    for key, value in at.items():
+        inner = _property(schema, str(key), root)
+        name = f"{prefix.removesuffix(' (optional)')}.{key}".lstrip(".")
+        if isinstance(value, AoT):
+            below.append((value[0], f"{name}[]", _resolved(inner["items"], value[0], root)))
+        elif isinstance(value, Table):
+            optional = "" if key in required or "properties" not in schema else " (optional)"
+            below.append((value, f"{name}{optional}", _resolved(inner, value, root)))
+        else:
+            rows.append(
+                [f"`{key}`", _shown(at.item(key)), allowed(inner, root), _comment(at.item(key))]
+            )
+    if rows:
+        yield prefix, rows
+    for inner_table, name, inner in below:
+        yield from sections(inner_table, name, inner, root)
+
+
+def _property(schema: dict[str, Any], key: str, root: dict[str, Any]) -> dict[str, Any]:
+    found = schema.get("properties", {}).get(key) or schema["additionalProperties"]
+    return _resolved(found, None, root)
+
+
+def _resolved(schema: dict[str, Any], value: Any, root: dict[str, Any]) -> dict[str, Any]:
+    """A schema without references: what ``X | None`` is of, and which of several devices `value` is."""
+    while True:
+        if "discriminator" in schema:
+            if value is None:
+                return schema
+            schema = {"$ref": schema["discriminator"]["mapping"][value["driver"]]}
+        elif "$ref" in schema:
+            schema = root["$defs"][schema["$ref"].removeprefix("#/$defs/")]
+        elif "anyOf" in schema:
+            (schema, *_) = [each for each in schema["anyOf"] if each.get("type") != "null"]
+        else:
+            return schema
+
+
+_BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+
+
+def allowed(schema: dict[str, Any], root: dict[str, Any]) -> str:
+    """What a value may be, in words."""
+    if "enum" in schema or "const" in schema:
+        choices = schema.get("enum", [schema.get("const")])
+        return ", ".join(f"`{msgspec.json.encode(choice).decode()}`" for choice in choices)
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in _BOUNDS.items() if key in schema]
+    if schema.get("type") == "array":
+        of = allowed(_resolved(schema["items"], None, root), root)
+        count = schema.get("minItems") if schema.get("minItems") == schema.get("maxItems") else None
+        return f"list of {f'{count} × ' if count else ''}{of}"
+    if schema.get("type") == "object":
+        inner = schema.get("properties", {})
+        return f"table of {', '.join(f'`{key}`' for key in inner)}"
+    names = {
+        "integer": "whole number",
+        "number": "number",
+        "string": "text",
+        "boolean": "true, false",
+    }
+    return " ".join([names[schema["type"]], ", ".join(bounds)]).strip()
+
+
+def _shown(value: Item) -> str:
+    text = re.sub(r"\s+", " ", value.as_string()).strip()
+    return f"`{text}`" if len(text) <= 40 else "see the file"
+
+
+def _comment(item: Item) -> str:
+    return item.trivia.comment.removeprefix("#").strip()
+
+
+# ---------------------------------------------------------------- what travels, what is logged
+
+
+def commands() -> str:
+    """Every command of the service's schema, with its fields."""
+    parts = [
+        "# Commands of the service",
+        "What a client may send to a supervisor: msgpack, made by `msgspec` from the structs of "
+        "`fitctl.supervisor.messages`. Each has `version` and `loop` (empty for all loops). Unknown fields are "
+        "refused. `fitctl send` and the console give those that people need.",
+    ]
+    for kind in sorted(get_args(AnyCommand), key=lambda kind: kind.__name__):
+        parts += [f"## {kind.__name__}", _plain(kind)]
+        fields = [
+            field for field in msgspec.structs.fields(kind) if field.name not in {"version", "loop"}
+        ]
+        if fields:
+            rows = [[f"`{field.name}`", f"`{_type_name(field.type)}`"] for field in fields]
+            parts.append(table(["field", "type"], rows))
+    return "\n\n".join(parts)
+
+
+def topics() -> str:
+    """Every topic of a log, with the type of each field."""
+    parts = [
+        "# Topics of a log",
+        "Messages are protobuf, with their schema in the file; foxglove's are as Foxglove defines them. Units "
+        "are in the names. Frames of reference and how to read a log: [logs](../logs.md).",
+    ]
+    for kind, topic in TOPICS.items():
+        message = MESSAGES[kind].DESCRIPTOR
+        rows = [
+            [f"`{field.name}`", _wire_type(field), str(field.number)] for field in message.fields
+        ]
+        parts += [
+            f"## {topic.format(loop=LOOP)}",
+            f"`{message.full_name}`. {_plain(kind)}",
+            table(["field", "type", "number"], rows),
+        ]
+    return "\n\n".join(parts)
+
+
+def _wire_type(field: Any) -> str:
+    if field.message_type is not None:
+        return field.message_type.full_name
+    names = {getattr(field, name): name for name in dir(field) if name.startswith("TYPE_")}
+    return names[field.type].removeprefix("TYPE_").lower()
+
+
+def _type_name(kind: Any) -> str:
+    return kind.__name__ if inspect.isclass(kind) else str(kind).replace("typing.", "")
+
+
+def _plain(kind: type) -> str:
+    """A docstring's first paragraph, without its roles."""
+    first = inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0]
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", first).replace("``", "`").replace("\n", " ")
+
+
+# ---------------------------------------------------------------- Python
+
+PYTHON = """# Python
+
+What scripts import. [Sequences](../sequences.md) shows how they are used, and [logs](../logs.md) how logs
+are read.
+
+## Instrument
+
+::: fitctl.Instrument
+
+## AsyncInstrument
+
+::: fitctl.AsyncInstrument
+
+## Reading logs
+
+::: fitctl.logging.reading
+
+## Rig files
+
+::: fitctl.config.load_rig
+
+## Simulation
+
+::: fitctl.supervisor.simulate.Simulation
+"""
+
+PAGES: dict[str, Callable[[], str]] = {
+    "reference/command-line.md": command_line,
+    "reference/rig-keys.md": rig_keys,
+    "reference/commands.md": commands,
+    "reference/topics.md": topics,
+    "reference/python.md": lambda: PYTHON,
+}

@@ -1,0 +1,121 @@
+"""The site of docs/: its references are complete, and every page has a place. `make docs` makes the rest."""
+
+import importlib.util
+import re
+import tomllib
+from pkgutil import resolve_name
+from typing import get_args
+
+import pytest
+import yaml
+from documents import ROOT, blocks
+
+import fitctl
+from fitctl.cli import app
+from fitctl.config import default_rig_path
+from fitctl.logging.schemas import MESSAGES, TOPICS
+from fitctl.supervisor.messages import AnyCommand
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """The module that makes the pages."""
+    path = ROOT / "docs" / "_site" / "reference.py"
+    spec = importlib.util.spec_from_file_location("site_reference", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_command_line_has_every_command_and_no_hidden_one(reference):
+    titles = set(re.findall(r"^## `fitctl (\S+)`", reference.command_line(), re.MULTILINE))
+
+    commands = app.registered_commands
+    names = {command.name or command.callback.__name__: command.hidden for command in commands}
+    groups = {group.name for group in app.registered_groups}
+    assert titles == {name for name, hidden in names.items() if not hidden} | groups
+
+
+def test_every_key_of_the_shipped_rig_has_a_row_with_what_is_allowed(reference):
+    page = reference.rig_keys()
+    sections = re.split(r"^## (\S+).*\n", page, flags=re.MULTILINE)[1:]
+    found = {}
+    for name, text in zip(sections[::2], sections[1::2], strict=True):
+        found[name] = re.findall(r"^\| `(\w+)` \| .+ \| (.+?) \| ", text, re.MULTILINE)
+
+    for name, keys in flat(tomllib.loads(default_rig_path().read_text()), ""):
+        assert [key for key, _ in found[name]] == keys, name
+    assert all(allowed.strip() for rows in found.values() for _, allowed in rows)
+
+
+def flat(table, prefix):
+    """Names of the tables of a document, each with the keys that are no tables."""
+    keys, below = [], []
+    for key, value in table.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            below.append((value[0], f"{prefix}{key}[]"))
+        elif isinstance(value, dict) and key not in {"target_px", "flux_range", "offset_px"}:
+            below.append((value, f"{prefix}{key}"))
+        else:
+            keys.append(key)
+    if keys:
+        yield prefix.removesuffix(".") or "The", keys
+    for inner, name in below:
+        yield from flat(inner, f"{name}.")
+
+
+@pytest.mark.parametrize(
+    ("schema", "words"),
+    [
+        ({"type": "number", "exclusiveMinimum": 0, "maximum": 60}, "number > 0, ≤ 60"),
+        ({"enum": ["a", 5]}, '`"a"`, `5`'),
+        ({"type": "array", "items": {"type": "integer"}}, "list of whole number"),
+        (
+            {"type": "array", "minItems": 3, "maxItems": 3, "items": {"type": "string"}},
+            "list of 3 × text",
+        ),
+        ({"type": "boolean"}, "true, false"),
+    ],
+)
+def test_what_is_allowed_is_said_in_words(reference, schema, words):
+    assert reference.allowed(schema, {}) == words
+
+
+def test_every_command_and_every_topic_has_a_section(reference):
+    titles = re.findall(r"^## (\S+)$", reference.commands(), re.MULTILINE)
+    assert titles == sorted(kind.__name__ for kind in get_args(AnyCommand))
+
+    page = reference.topics()
+    for kind, topic in TOPICS.items():
+        section = page.split(f"## {topic.format(loop='right')}\n")[1].split("\n## ")[0]
+        for field in MESSAGES[kind].DESCRIPTOR.fields:
+            assert f"| `{field.name}` |" in section
+
+
+def test_what_python_documents_exists(reference):
+    for name in re.findall(r"^::: ([\w.]+)$", reference.PYTHON, re.MULTILINE):
+        assert resolve_name(name)
+
+
+def test_every_page_has_its_place_in_the_site_and_every_place_a_page(reference):
+    nav = (ROOT / "mkdocs.yml").read_text().split("\nnav:\n")[1]
+    placed = re.findall(r"- (?:[^:\n]+: )?(\S+\.md)$", nav, re.MULTILINE)
+    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    pages = {page for page in pages if not page.startswith("decisions/0")}
+
+    assert len(placed) == len(set(placed))
+    assert set(placed) == pages | set(reference.PAGES) | {"CHANGELOG.md", "CONTRIBUTING.md"}
+
+
+@pytest.mark.parametrize("block", blocks("yaml"), ids=str)
+def test_yaml_that_the_documents_show_is_yaml(block):
+    assert yaml.safe_load(block.text)
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+    assert citation["version"] == project["version"] == fitctl.__version__
+    assert citation["license"] == project["license"]
+    assert citation["authors"] == project["authors"]
