@@ -1,89 +1,32 @@
 """The supervisor's door: what is answered, what is refused, and to whom it is open."""
 
-import os
 import stat
-import threading
-import time
 
 import msgspec
 import pytest
-import zmq
+from served import Served, until
 
-from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.logging.records import RecorderStatus
+from fitctl.model.drives import Drive
 from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, make_service_folder, service_folder
+from fitctl.supervisor.endpoints import make_service_folder, service_folder
 from fitctl.supervisor.messages import (
+    MAX_COMMAND_BYTES,
     Acquire,
+    Experiment,
     RecorderReport,
-    Reply,
     SetTarget,
     Standby,
     Status,
     Stop,
 )
-from fitctl.supervisor.service import Service
-from fitctl.supervisor.simulate import Simulation
-from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
-
-
-class Served:
-    """A simulated instrument behind a real service, stepped by a thread."""
-
-    def __init__(self, rig, folder):
-        self.folder = folder
-        self.buffer = TelemetryBuffer()
-        self.simulation = Simulation(rig, 0, star_offset_px=(9.0, 4.0), record=self.buffer.add)
-        state = ServiceState(
-            pid=os.getpid(), wall_minus_monotonic_s=0.0, scheduling="", records_lost=lambda: 7
-        )
-        self.service = Service(
-            self.simulation.supervisor, self.buffer, folder, state, MonotonicClock()
-        )
-        self.ending = threading.Event()
-        self.stepper = threading.Thread(target=self.step)
-        self.client = Client(folder)
-
-    def step(self):
-        while not self.ending.wait(0.002):
-            self.simulation.supervisor.step()
-
-    def close(self):
-        self.client.close()
-        self.ending.set()
-        self.stepper.join()
-        self.service.stop()
-
-    def follow(self, reached, limit_s=10.0):
-        end_s = time.monotonic() + limit_s
-        while time.monotonic() < end_s:
-            telemetry = self.client.receive(0.5)
-            if telemetry is not None and reached(telemetry):
-                return telemetry
-        raise AssertionError("not reached")
-
-    def raw(self, *parts):
-        """Send what no client of ours would; returns the reply, or None."""
-        context = zmq.Context()
-        try:
-            with context.socket(zmq.DEALER) as socket:
-                socket.setsockopt(zmq.LINGER, 0)
-                socket.connect(f"ipc://{self.folder / COMMAND_SOCKET}")
-                socket.send_multipart(parts)
-                if not socket.poll(500):
-                    return None
-                return msgspec.msgpack.decode(socket.recv_multipart()[1], type=Reply)
-        finally:
-            context.term()
 
 
 @pytest.fixture
 def served(tmp_path):
-    rig = load_rig(default_rig_path(), [f"service.folder={tmp_path / 's'}"])
-    served = Served(rig, make_service_folder(rig))
-    served.service.start()
-    served.stepper.start()
+    served = Served(tmp_path)
+    served.start()
     yield served
     served.close()
 
@@ -156,6 +99,21 @@ def test_messages_of_a_wrong_shape_or_size_do_not_disturb_the_service(served):
     assert served.client.send(Status()).text == "right OFF"
 
 
+def test_a_command_of_too_many_parts_is_thrown_away_whole(served):
+    assert served.raw(b"tag", *[b"part"] * 1000) is None
+
+    assert served.client.send(Status()).text == "right OFF"
+
+
+def test_a_command_that_is_too_long_is_refused_before_it_is_sent(served):
+    drive = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=1.0, duration_s=2.0)
+
+    reply = served.client.send(Experiment(name="long", drives=[drive] * 100))
+
+    assert not reply.accepted
+    assert f"a command may take {MAX_COMMAND_BYTES}" in reply.text
+
+
 def test_a_nonsense_target_is_refused(served):
     assert not served.client.send(SetTarget(az_px=float("nan"), el_px=10.0)).accepted
     assert not served.client.send(SetTarget(az_px=1e9, el_px=10.0)).accepted
@@ -209,3 +167,33 @@ def test_without_a_supervisor_a_command_says_so_in_time(tmp_path):
     with pytest.raises(ConnectionError, match="fitctl run"):
         client.send(Status(), timeout_s=0.2)
     client.close()
+
+
+def test_who_sends_too_much_is_told_so_and_counted(tmp_path):
+    served = Served(tmp_path, "service.commands_per_s=5.0")
+    served.start()
+    try:
+        replies = [served.client.send(Status()) for _ in range(50)]
+        until(lambda: any("over the rate limit" in told for told in served.events()))
+    finally:
+        served.close()
+
+    refused = [reply for reply in replies if not reply.accepted]
+    assert refused
+    assert all("more than 5 commands a second" in reply.text for reply in refused)
+    told = [int(told.split()[1]) for told in served.events() if "over the rate limit" in told]
+    assert sum(told) <= len(refused)
+
+
+def test_a_stop_is_never_one_too_many(tmp_path):
+    served = Served(tmp_path, "service.commands_per_s=5.0")
+    served.start()
+    try:
+        while served.client.send(Status()).accepted:
+            pass
+        stops = [served.client.send(Stop()) for _ in range(20)]
+    finally:
+        served.close()
+
+    assert all(reply.accepted for reply in stops)
+    assert served.simulation.supervisor.loops["right"].mode.name == "SAFE"
