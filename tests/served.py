@@ -43,7 +43,7 @@ def rig_in(folder, *settings):
 class Served:
     """Stepped by a thread; with `tcp` it has keys too."""
 
-    def __init__(self, folder, *settings, tcp=False):
+    def __init__(self, folder, *settings, tcp=False, clock=None):
         tcp_settings = ["service.tcp_address=127.0.0.1"] if tcp else []
         self.rig = rig_in(folder, *tcp_settings, *settings)
         self.keys = folder
@@ -55,7 +55,7 @@ class Served:
             pid=os.getpid(), wall_minus_monotonic_s=0.0, scheduling="", records_lost=lambda: 7
         )
         self.service = Service(
-            self.simulation.supervisor, self.buffer, self.folder, state, MonotonicClock()
+            self.simulation.supervisor, self.buffer, self.folder, state, clock or MonotonicClock()
         )
         self.ending = threading.Event()
         self.stepper = threading.Thread(target=self.step)

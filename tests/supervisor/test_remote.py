@@ -40,7 +40,7 @@ def free(request):
 def test_a_commander_elsewhere_commands_and_sees_what_the_owner_sees(served):
     anna = served.person("anna")
 
-    reply = anna.send(Standby())
+    reply = anna.send(Standby(), timeout_s=20.0)  # imports much, once
     assert reply.accepted, reply.text
 
     telemetry = served.follow(lambda t: t.commander == "anna", client=anna)
