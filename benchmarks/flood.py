@@ -110,7 +110,7 @@ def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: f
     offered, sent = json.loads(process.communicate()[0]) if process else (0, 0)
     ticks = [tick for tick in course.ticks["right"] if tick.time_s >= begun_s]
     timing = [timing for timing in course.timing.values() if timing.time_s >= begun_s]
-    return Window([tick for tick in ticks if tick.mode == "VERNIER"], timing, offered, sent)
+    return Window([tick for tick in ticks if tick.number >= 0], timing, offered, sent)
 
 
 def spread(values: list[float], unit: float) -> str:
@@ -128,17 +128,19 @@ def main() -> None:
     options = parser.parse_args()
     windows = measure(options)
     print(
-        "\n| flood | offered a second | sent a second | compute ms | exposure to command ms | servo late ms |"
+        "\n| flood | offered a second | sent a second | ticks in VERNIER % | compute ms "
+        "| exposure to command ms | servo late ms |"
     )
-    print("| --- | --- | --- | --- | --- | --- |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for kind, seen in windows.items():
         lasted_s = options.rounds * (options.duration + 2 * SETTLING_S)
         servo = [timing.servo_late_median_s for timing in seen.timing]
         worst = max(timing.servo_late_worst_s for timing in seen.timing)
         print(
             f"| {FLOODS[kind]} | {seen.offered / lasted_s:.0f} | {seen.sent / lasted_s:.0f} "
+            f"| {100 * float(np.mean([tick.mode == 'VERNIER' for tick in seen.ticks])):.0f} "
             f"| {spread([tick.compute_s for tick in seen.ticks], 1e3)} "
-            f"| {spread([t.time_s - t.mid_exposure_s for t in seen.ticks if t.number >= 0], 1e3)} "
+            f"| {spread([t.time_s - t.mid_exposure_s for t in seen.ticks], 1e3)} "
             f"| {1e3 * float(np.median(servo)):.2f} / {1e3 * worst:.2f} |"
         )
 

@@ -66,14 +66,17 @@ def strangers(context: zmq.Context, key_file: Path) -> Iterator[bool]:
     knocking: list[zmq.Socket] = []
     public, secret = zmq.curve_keypair()
     while True:
-        stranger = context.socket(zmq.DEALER)
-        stranger.setsockopt(zmq.LINGER, 0)
+        if len(knocking) > 100:
+            knocking.pop(0).close(linger=0)
+        try:
+            stranger = context.socket(zmq.DEALER)
+        except zmq.ZMQError:  # closing takes longer than opening
+            yield False
+            continue
         keyed(stranger, key_file)
         stranger.curve_publickey, stranger.curve_secretkey = public, secret
         stranger.connect(command_port(key_file))
         knocking.append(stranger)
-        if len(knocking) > 500:
-            knocking.pop(0).close()
         yield True
 
 
