@@ -186,6 +186,7 @@ class KeyedDoor:
         self._pair = server_pair(rig)
         self._signature: object = None
         self._allowed: dict[str, AllowedKey] = {}
+        self._gone: list[str] = []
         self._context = zmq.Context()
         # ZAP, RFC 27: libzmq asks here whether a key may come in. Polled with the rest: unlike pyzmq's
         # authenticator thread, it takes no more of the interpreter than its share when many knock.
@@ -193,6 +194,7 @@ class KeyedDoor:
         self.zap.bind("inproc://zeromq.zap.01")
         router = self._keyed(router_socket(self._context))
         self.door = Door(router, None, self._whose)
+        self._look()
         try:
             self._bind(router, rig.service.command_port)
             self._publish_again()
@@ -203,7 +205,6 @@ class KeyedDoor:
                 f"{rig.service.telemetry_port}, cannot be listened at: {error}; choose others"
             )
             raise ConfigError(msg) from None
-        self.refresh()
 
     def admit(self, handshakes: int) -> None:
         """Answer at most so many who knock."""
@@ -215,6 +216,8 @@ class KeyedDoor:
             key = ""
             if len(asked) == _ZAP_FRAMES and asked[5] == b"CURVE" and len(asked[6]) == 32:
                 key = z85.encode(asked[6]).decode()
+            if key not in self._allowed:
+                self._look()  # it may be quite new; libzmq's clients do not ask twice
             known = key in self._allowed
             status = (b"200", b"OK") if known else (b"400", b"this key is not allowed")
             user = key.encode() if known else b""
@@ -228,9 +231,20 @@ class KeyedDoor:
         if self.door.publisher is None:
             with suppress(zmq.ZMQError):  # the port is being let go of; the next look will do
                 self._publish_again()
+        self._look()
+        gone, self._gone = self._gone, []
+        return gone
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self.door.close()
+        self.zap.close(linger=0)
+        self._context.term()
+
+    def _look(self) -> None:
         signature = keys_signature(self._rig)
         if signature == self._signature:
-            return []
+            return
         self._signature = signature
         before, (self._allowed, problems) = self._allowed, allowed_keys(self._rig)
         for problem in problems:
@@ -239,13 +253,7 @@ class KeyedDoor:
         if gone and self.door.publisher is not None:
             self.door.publisher.close(linger=0)
             self.door.publisher = None
-        return gone
-
-    def close(self) -> None:
-        """Let go of everything."""
-        self.door.close()
-        self.zap.close(linger=0)
-        self._context.term()
+        self._gone += gone
 
     def _whose(self, frame: zmq.Frame) -> Sender | None:
         key = self._allowed.get(_property(frame, "User-Id"))

@@ -105,8 +105,8 @@ def new_key(rig: Rig, name: str, role: Role, host: str, out: Path) -> RemoteKey:
     host = host or service.tcp_address
     if not host or (_is_address(host) and ip_address(host).is_unspecified):
         msg = (
-            "keys: no address for the client to reach this machine at; give --host, or set "
-            f"service.tcp_address to one (is {service.tcp_address!r})"
+            f"keys: a client cannot reach this machine at {host!r}; give its name or address with --host, "
+            "or set service.tcp_address to one"
         )
         raise ConfigError(msg)
     pair = _new_pair()

@@ -1,99 +1,41 @@
 """The supervisor's door: what is answered, what is refused, and to whom it is open."""
 
-import os
 import stat
 import threading
-import time
 
 import msgspec
 import pytest
-import zmq
+from served import Served, until
 
-from fitctl.clock import MonotonicClock
+from fitctl.clock import VirtualClock
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.logging.records import Event, RecorderStatus
+from fitctl.model.drives import Drive
 from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, make_service_folder, service_folder
+from fitctl.supervisor.endpoints import make_service_folder, service_folder
 from fitctl.supervisor.messages import (
+    MAX_COMMAND_BYTES,
     Acquire,
+    Experiment,
     RecorderReport,
-    Reply,
     SetTarget,
     Standby,
     Status,
     Stop,
 )
-from fitctl.supervisor.service import Service
-from fitctl.supervisor.simulate import Simulation
-from fitctl.supervisor.telemetry import CountingBuffer, ServiceState, TelemetryBuffer
-
-
-class Served:
-    """A simulated instrument behind a real service, stepped by a thread."""
-
-    def __init__(self, rig, folder):
-        self.folder = folder
-        self.buffer = TelemetryBuffer()
-        self.simulation = Simulation(rig, 0, star_offset_px=(9.0, 4.0), record=self.buffer.add)
-        state = ServiceState(
-            pid=os.getpid(),
-            wall_minus_monotonic_s=0.0,
-            scheduling="",
-            records_lost=lambda: 7,
-            records_offered=lambda: 1000,
-        )
-        self.service = Service(
-            self.simulation.supervisor, self.buffer, folder, state, MonotonicClock()
-        )
-        self.ending = threading.Event()
-        self.stepper = threading.Thread(target=self.step)
-        self.client = Client(folder)
-
-    def step(self):
-        while not self.ending.wait(0.002):
-            self.simulation.supervisor.step()
-
-    def close(self):
-        self.client.close()
-        self.ending.set()
-        self.stepper.join()
-        self.service.stop()
-
-    def follow(self, reached, limit_s=10.0):
-        end_s = time.monotonic() + limit_s
-        while time.monotonic() < end_s:
-            telemetry = self.client.receive(0.5)
-            if telemetry is not None and reached(telemetry):
-                return telemetry
-        raise AssertionError("not reached")
-
-    def raw(self, *parts):
-        """Send what no client of ours would; returns the reply, or None."""
-        context = zmq.Context()
-        try:
-            with context.socket(zmq.DEALER) as socket:
-                socket.setsockopt(zmq.LINGER, 0)
-                socket.connect(f"ipc://{self.folder / COMMAND_SOCKET}")
-                socket.send_multipart(parts)
-                if not socket.poll(500):
-                    return None
-                return msgspec.msgpack.decode(socket.recv_multipart()[1], type=Reply)
-        finally:
-            context.term()
+from fitctl.supervisor.telemetry import CountingBuffer
 
 
 @pytest.fixture
 def served(tmp_path):
-    rig = load_rig(default_rig_path(), [f"service.folder={tmp_path / 's'}"])
-    served = Served(rig, make_service_folder(rig))
-    served.service.start()
-    served.stepper.start()
+    served = Served(tmp_path)
+    served.start()
     yield served
     served.close()
 
 
 def test_commands_lead_through_the_modes_and_telemetry_shows_it(served):
-    assert served.client.send(Standby()).accepted
+    assert served.client.send(Standby(), timeout_s=20.0).accepted  # imports much, once
     assert served.client.send(Acquire()).accepted
     telemetry = served.follow(lambda t: t.loops[0].mode == "VERNIER")
 
@@ -158,6 +100,21 @@ def test_messages_of_a_wrong_shape_or_size_do_not_disturb_the_service(served):
     assert served.raw(b"tag", b"x" * 1_000_000) is None
 
     assert served.client.send(Status()).text == "right OFF"
+
+
+def test_a_command_of_too_many_parts_is_thrown_away_whole(served):
+    assert served.raw(b"tag", *[b"part"] * 1000) is None
+
+    assert served.client.send(Status()).text == "right OFF"
+
+
+def test_a_command_that_is_too_long_is_refused_before_it_is_sent(served):
+    drive = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=1.0, duration_s=2.0)
+
+    reply = served.client.send(Experiment(name="long", drives=[drive] * 100))
+
+    assert not reply.accepted
+    assert f"a command may take {MAX_COMMAND_BYTES}" in reply.text
 
 
 def test_a_nonsense_target_is_refused(served):
@@ -265,3 +222,32 @@ def test_a_reply_to_somebody_who_has_gone_is_counted(served):
         if seen[-1].losses.replies_unsent:
             return
     raise AssertionError("never counted")
+
+
+@pytest.fixture
+def slow_clock(tmp_path):
+    """At most five commands a second, and a second that the test itself makes pass."""
+    served = Served(tmp_path, "service.commands_per_s=5.0", clock=VirtualClock())
+    served.start()
+    yield served
+    served.close()
+
+
+def test_who_sends_too_much_is_told_so_and_counted(slow_clock):
+    replies = [slow_clock.client.send(Status()) for _ in range(20)]
+
+    assert [reply.accepted for reply in replies] == [True] * 5 + [False] * 15
+    assert all("more than 5 commands a second" in reply.text for reply in replies[5:])
+    slow_clock.service._clock.sleep_until(10.0)
+    until(lambda: any("15 messages, over the rate limit" in e for e in slow_clock.events()))
+    assert slow_clock.client.send(Status()).accepted
+
+
+def test_a_stop_is_never_one_too_many(slow_clock):
+    while slow_clock.client.send(Status()).accepted:
+        pass
+
+    stops = [slow_clock.client.send(Stop()) for _ in range(20)]
+
+    assert all(reply.accepted for reply in stops)
+    assert slow_clock.simulation.supervisor.loops["right"].mode.name == "SAFE"

@@ -28,6 +28,7 @@ from fitctl.supervisor.messages import (
     AnyCommand,
     LoopState,
     Reply,
+    Status,
     Telemetry,
     TrippedInterlock,
 )
@@ -319,11 +320,15 @@ def _events() -> list[Event]:
 
 
 class FakeLink:
-    """Delivers what a test puts in, keeps what was sent, and answers as the test says."""
+    """Delivers what a test puts in, keeps what was sent, and answers as the test says.
+
+    What the console sends of its own accord, to keep the instrument, is only counted.
+    """
 
     def __init__(self, answer: Callable[[AnyCommand], Reply] | None = None) -> None:
         self.incoming: queue.Queue[Telemetry] = queue.Queue()
         self.sent: list[AnyCommand] = []
+        self.kept = 0
         self.closed = False
         self._answer = answer or (lambda _command: Reply(accepted=True))
 
@@ -338,7 +343,10 @@ class FakeLink:
             return None
 
     def send(self, command: AnyCommand) -> Reply:
-        self.sent.append(command)
+        if isinstance(command, Status):
+            self.kept += 1
+        else:
+            self.sent.append(command)
         return self._answer(command)
 
     def close(self) -> None:

@@ -24,8 +24,10 @@ from fitctl.supervisor.messages import (
     SetTarget,
     Standby,
     Stop,
+    TakeOver,
     TrippedInterlock,
 )
+from fitctl.tui import app as console_app
 from fitctl.tui.app import UNDRAWN_MESSAGES, ConsoleApp
 from fitctl.tui.screens import Reader
 from fitctl.tui.widgets.header import Header
@@ -384,3 +386,34 @@ def test_a_screen_that_is_held_up_leaves_telemetry_in_the_link():
         assert console.state.missed == 0
 
     run(scenario)
+
+
+def test_who_has_the_instrument_is_in_the_header():
+    async def scenario(app, pilot, link):
+        assert " by " not in header_text(app)
+        message = FakeSupervisor().messages(3)[-1]
+        link.deliver([msgspec.structs.replace(message, commander="anna")])
+        await until(pilot, lambda: "by anna" in header_text(app))
+
+    run(scenario)
+
+
+def test_taking_over_is_in_the_palette_and_its_answer_is_shown():
+    answer = Reply(accepted=True, text="owner has the instrument, taken over from anna")
+
+    async def scenario(app, pilot, link):
+        command = next(c for c in app.get_system_commands(app.screen) if c.title == "Take over")
+        command.callback()
+        await until(pilot, lambda: "taken over from anna" in notifications(app))
+
+    assert run(scenario, link=FakeLink(lambda _: answer)).sent == [TakeOver(loop="right")]
+
+
+def test_an_open_console_keeps_the_instrument_and_never_complains_of_it(monkeypatch):
+    monkeypatch.setattr(console_app, "KEEP_S", 0.05)
+
+    async def scenario(app, pilot, link):
+        await until(pilot, lambda: link.kept > 2)
+        assert notifications(app) == ""
+
+    assert not run(scenario, link=FakeLink(lambda _: Reply(accepted=False, text="no"))).sent

@@ -1,0 +1,128 @@
+"""Coverage-guided fuzzing of the service: any payload from anybody, up to the supervisor and back.
+
+The first byte chooses who sends: somebody on this machine, a commander's key, a viewer's, or a revoked one.
+The second chooses one of the commands, the third a place in it, and the rest is written over what is there;
+or the rest is all. Only ZeroMQ is left out: see ``tests/supervisor/test_service_garbage.py``. The instrument is
+simulated and lives on from one input to the next, so that commands meet it in every mode.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.logging.records import RecorderStatus
+from fitctl.model.drives import Drive
+from fitctl.supervisor.admission import Sender
+from fitctl.supervisor.command_table import COMMANDS
+from fitctl.supervisor.doors import Parcel
+from fitctl.supervisor.messages import (
+    RecorderReport,
+    Reply,
+    SequenceStatus,
+    SetController,
+    Shutdown,
+    Status,
+    decode_command,
+)
+from fitctl.supervisor.service import Service, Waiting
+from fitctl.supervisor.simulate import Simulation
+from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
+
+_SENDERS = (
+    Sender("owner@here", "process 1", "commander", is_local=True),
+    Sender("anna", "10.0.0.1", "commander", is_local=False),
+    Sender("bob", "10.0.0.2", "viewer", is_local=False),
+    None,
+)
+_SLOW = SetController | Shutdown  # a design takes seconds; after a shutdown nothing is obeyed
+_STATUS = SequenceStatus(run="a", name="night", state="running", steps=3)
+_DRIVE = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=1.0, duration_s=2.0)
+_VALUES = {
+    "az_px": 21.5,
+    "el_px": 19.0,
+    "name": "flux_low",
+    "drives": [_DRIVE],
+    "action": "pause",
+    "status": _STATUS,
+}
+_RECORDER = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_written=9)
+_COMMANDS = [
+    msgspec.msgpack.encode(
+        {"type": row.name, "loop": "right"}
+        | {name: _RECORDER if row.make is RecorderReport else _VALUES[name] for name in row.values}
+    )
+    for row in COMMANDS
+]
+
+
+class _Door:
+    """Keeps replies."""
+
+    def __init__(self) -> None:
+        self.replies: list[Reply] = []
+
+    def answer(self, identity: bytes, tag: bytes, payload: bytes) -> None:
+        self.replies.append(msgspec.msgpack.decode(payload, type=Reply))
+
+
+def _service() -> tuple[Service, Simulation]:
+    rig = load_rig(default_rig_path(), ["service.commands_per_s=1000.0"])
+    buffer = TelemetryBuffer()
+    simulation = Simulation(
+        rig, 0, star_offset_px=np.array([3.0, 1.0]), record=buffer.add, history_s=1.0
+    )
+    state = ServiceState(
+        pid=os.getpid(),
+        wall_minus_monotonic_s=0.0,
+        scheduling="",
+        records_lost=lambda: 0,
+        records_offered=lambda: 0,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        service = Service(simulation.supervisor, buffer, Path(folder), state, simulation.clock)
+    return service, simulation
+
+
+_SERVICE, _SIMULATION = _service()
+
+
+def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
+    """Every payload is answered once, a stop at the latest with the next step; who may not, does not."""
+    sender, payload = _SENDERS[data[0] % len(_SENDERS)] if data else None, _payload(data[1:])
+    if isinstance(decode_command(payload), _SLOW):
+        return
+    door = _Door()
+    _SERVICE._receive(Waiting(door, Parcel(b"identity", b"tag", payload, sender)))  # type: ignore[arg-type]
+    _SIMULATION.supervisor.step()
+    _SIMULATION.ticks.clear()
+    _SERVICE._send_replies()
+    if len(door.replies) != 1:
+        raise AssertionError(f"{payload!r} has {len(door.replies)} replies")
+    may = sender is not None and (
+        sender.role == "commander" or isinstance(decode_command(payload), Status)
+    )
+    if door.replies[0].accepted and not may:
+        raise AssertionError(f"{payload!r} of {sender} was accepted")
+    for name, loop in _SIMULATION.supervisor.loops.items():
+        place_rad = _SIMULATION.supervisor.servos[name].setpoint_rad
+        if not (np.isfinite(place_rad).all() and np.isfinite(loop.target_px).all()):
+            raise AssertionError(f"{payload!r} makes {place_rad} rad, {loop.target_px} px")
+
+
+def _payload(data: bytes) -> bytes:
+    if len(data) < 2 or data[0] >= len(_COMMANDS):
+        return data[1:]
+    command, place = _COMMANDS[data[0]], data[1]
+    return command[:place] + data[2:] + command[place + len(data) - 2 :]
+
+
+if __name__ == "__main__":
+    from harness import fuzz
+
+    fuzz(TestOneInput)
