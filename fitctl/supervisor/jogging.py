@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,7 @@ from fitctl.supervisor.modes import Mode
 Floats = NDArray[np.float64]
 
 
-def move_by_hand(rig: Rig, loops: list[StellarLoop], command: Jog | SetBiasOffset) -> str:
+def move_by_hand(rig: Rig, loops: Sequence[StellarLoop], command: Jog | SetBiasOffset) -> str:
     """Move the siderostats or the mirrors of `loops`, all of them or none.
 
     Returns

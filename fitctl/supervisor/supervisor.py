@@ -14,8 +14,6 @@ from concurrent.futures import Executor, Future
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
-
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
@@ -35,34 +33,27 @@ from fitctl.logging.records import (
     Severity,
 )
 from fitctl.supervisor.command_table import ROWS, command_record
-from fitctl.supervisor.drives import refused_drives
 from fitctl.supervisor.health import camera_health, loop_health
-from fitctl.supervisor.jogging import move_by_hand
 from fitctl.supervisor.loop import StellarLoop
+from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
 from fitctl.supervisor.messages import (
     Acquire,
     AnyCommand,
-    Experiment,
     Hold,
-    Jog,
     Off,
     Recover,
     Reply,
-    Reset,
     SequenceControl,
     SequenceReport,
-    SetBiasOffset,
     SetController,
-    SetTarget,
     Shutdown,
     Standby,
     Stop,
 )
-from fitctl.supervisor.modes import Mode, Trigger, transition, usable_commands
+from fitctl.supervisor.modes import Mode, Trigger, usable_commands
 from fitctl.supervisor.periodic import Periodic
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices, told
-from fitctl.supervisor.search import refused_search
 from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.timing import TimingBook
@@ -310,30 +301,29 @@ class Supervisor:
             return Reply(accepted=True, text="shutting down")
         if self.shutdown_wanted and not isinstance(command, Stop):
             return _refusal("shutting down")
+        return self._obey_for(command, names)
+
+    def _obey_for(self, command: AnyCommand, names: list[str]) -> Reply:
+        loops = [self.loops[name] for name in names]
         match command:
-            case SetTarget():
-                reply = self._set_target(command, names)
-            case Jog() | SetBiasOffset():
-                reply = self._move_by_hand(command, names)
             case SetController():
-                reply = self._set_controller(command, names)
-            case Acquire() if why_not := self._refused_search(command, names):
-                reply = _refusal(f"acquire: {why_not}")
-            case Reset():
-                reply = self._reset(command, names)
-            case Experiment():
-                reply = self._start_experiment(command, names)
+                return self._set_controller(command, names)
             case SequenceReport():
-                reply = self.sequences.report(command.status)
+                return self.sequences.report(command.status)
             case SequenceControl():
-                reply = self.sequences.control(command.action)
+                return self.sequences.control(command.action)
+            case _ if type(command) in LOOP_COMMANDS:
+                why_not = LOOP_COMMANDS[type(command)](self.rig, loops, command)
+                return _refusal(why_not) if why_not else Reply(accepted=True)
             case _ if type(command) in _COMMANDS:
-                reply = self._fire(_COMMANDS[type(command)], names, command)
-            case _:
-                reply = _refusal(f"{type(command).__name__} is not for the supervisor")
-        return reply
+                return self._fire(_COMMANDS[type(command)], names, command)
+        return _refusal(f"{type(command).__name__} is not for the supervisor")
 
     def _fire(self, trigger: Trigger, names: list[str], command: AnyCommand) -> Reply:
+        if isinstance(command, Acquire):
+            why_not = why_no_search(self.rig, [self.loops[name] for name in names], command)
+            if why_not:
+                return _refusal(why_not)
         usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
         if not usable:
             return _refusal(self._why_not(trigger, names))
@@ -362,18 +352,6 @@ class Supervisor:
         can = ", ".join(t.name.lower() for t in usable_commands(mode))
         return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
 
-    def _set_target(self, command: SetTarget, names: list[str]) -> Reply:
-        if not self.rig.camera.window_fits(command.az_px, command.el_px):
-            return _refusal(f"target {self.rig.camera.window_range_text}")
-        wanted = np.array([command.az_px, command.el_px])
-        for name in names:
-            self.loops[name].target_px = wanted
-        return Reply(accepted=True)
-
-    def _move_by_hand(self, command: Jog | SetBiasOffset, names: list[str]) -> Reply:
-        why_not = move_by_hand(self.rig, [self.loops[name] for name in names], command)
-        return _refusal(why_not) if why_not else Reply(accepted=True)
-
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
         for name in names:
             # A design takes longer than a tick.
@@ -382,33 +360,12 @@ class Supervisor:
         self._finish_jobs()
         return Reply(accepted=True, text="designing; an event tells when it is at work")
 
-    def _refused_search(self, command: Acquire, names: list[str]) -> str:
-        return next(filter(None, (refused_search(self.rig, name, command) for name in names)), "")
-
-    def _reset(self, command: Reset, names: list[str]) -> Reply:
-        why_not = [self.loops[name].reset_interlock(command.name) for name in names]
-        return Reply(accepted=True) if "" in why_not else _refusal(why_not[0])
-
     def _designed(self, name: str, controller: str, future: Future) -> None:
         error = future.exception()
         if error is None:
             self.loops[name].use(future.result())
         else:
             self._event("error", name, f"no design {controller}: {told(error)}")
-
-    def _start_experiment(self, command: Experiment, names: list[str]) -> Reply:
-        if len(names) != 1:
-            return _refusal(f"an experiment is on one loop; name it: {', '.join(names)}")
-        loop = self.loops[names[0]]
-        if transition(loop.mode, Trigger.EXPERIMENT) is None:
-            return _refusal(
-                f"experiment means nothing in {loop.mode.name}; it needs a star in COARSE or VERNIER"
-            )
-        why_not = refused_drives(self.rig, loop.name, command.drives)
-        if why_not:
-            return _refusal(f"experiment: {why_not}")
-        loop.start_experiment(command.name, command.drives)
-        return Reply(accepted=True)
 
     # ------------------------------------------------------------ device work
 
