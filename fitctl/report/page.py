@@ -1,0 +1,144 @@
+"""From findings to a page: which tables and plots stand where."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from fitctl.report import frequency, tables, timeline
+from fitctl.report.drawing import Plot, inline_svg, style, time_axis
+from fitctl.report.findings import Findings, LoopFindings
+from fitctl.report.residual import Word
+from fitctl.report.tables import Table
+
+SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
+JUDGED = (
+    "Judged is VERNIER, from 10 s after it began and 2 s after the target last moved, on frames with a star. The "
+    "error is the measured one: the camera's noise is in it. The interval knows that neighbouring frames are alike "
+    "(batch means). Met: all of both axes' intervals is within the requirement. Not met: all of one is above. Else, "
+    "or without enough data: not known."
+)
+
+
+class Card(NamedTuple):
+    """The verdict on one loop.
+
+    Attributes
+    ----------
+    title : str
+    word : Word
+    why : str
+    tables : list of Table
+    """
+
+    title: str
+    word: Word
+    why: str
+    tables: list[Table]
+
+
+class Section(NamedTuple):
+    """A part of a page.
+
+    Attributes
+    ----------
+    title : str
+    plots : list of Plot
+    tables : list of Table
+    text : str
+    fold : str
+        Long text that is opened on demand.
+    """
+
+    title: str
+    plots: list[Plot]
+    tables: list[Table]
+    text: str = ""
+    fold: str = ""
+
+    @property
+    def anchor(self) -> str:
+        """For links."""
+        return re.sub(r"\W+", "-", self.title.lower())
+
+
+def card(loop: LoopFindings) -> Card:
+    """Verdict, residual and key figures of a loop."""
+    title = f"Loop {loop.name}: {loop.requirement_px:g} px RMS on each axis"
+    its_tables = [tables.residual(loop), tables.key_figures(loop)]
+    return Card(title, loop.verdict.word, loop.verdict.why, its_tables)
+
+
+def sections(findings: Findings) -> list[Section]:
+    """All of a run's report. Draws its plots: call it within :func:`fitctl.report.drawing.style`."""
+    run = findings.run
+    time = time_axis(run.duration_s, tables.utc(run, form="%H:%M:%S UTC"))
+    found: list[Section] = []
+    for loop in findings.loops.values():
+        if not len(loop.ticks["time_s"]):
+            text = "No tick of this loop is in the log, so there is nothing to draw."
+            found.append(Section(f"Loop {loop.name}", [], [], text))
+            continue
+        plots = [
+            timeline.timeline(findings, loop, time),
+            timeline.traces(loop, time),
+            frequency.spectra(loop),
+            frequency.rejection(loop),
+            timeline.mirror(loop, time),
+            timeline.siderostat(findings, loop, time),
+            frequency.hysteresis(loop),
+            timeline.timing(findings, loop, time),
+        ]
+        why = "; ".join(one.why for one in loop.rejections if one.why)
+        text = f"The design's own figures are not known: {why}." if why else ""
+        found.append(
+            Section(f"Loop {loop.name}", plots, [tables.rejected(loop), tables.timings(loop)], text)
+        )
+    recorded = [tables.losses(findings), tables.files(run)]
+    told = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
+    rig = run.rig
+    designs = {
+        loop: json.loads(text).get("parameters") for loop, text in run.metadata.get("designs", {}).items()
+    }
+    return [
+        *found,
+        Section("Events", [], told),
+        Section("Losses and files", [], recorded),
+        Section("Devices", [], [tables.devices(findings)]),
+        Section(
+            "Configuration and versions",
+            [],
+            [tables.versions(findings)],
+            f"Rig {rig.name}: {rig.description}",
+            json.dumps({"rig": rig.model_dump(mode="json"), "designs": designs}, indent=1),
+        ),
+    ]
+
+
+def render(title: str, facts: Sequence[str], cards: list[Card], parts: list[Section]) -> str:
+    """The page: one file, nothing from elsewhere."""
+    import matplotlib
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    pages = Environment(
+        loader=PackageLoader("fitctl.report"), autoescape=True, undefined=StrictUndefined
+    )
+    with matplotlib.rc_context(style()):
+        drawings: dict[str, Any] = {
+            plot.name: inline_svg(plot.figure, plot.name, plot.title)
+            for part in parts
+            for plot in part.plots
+        }
+    return pages.get_template("page.html.j2").render(
+        title=title,
+        facts=facts,
+        cards=cards,
+        sections=parts,
+        drawings=drawings,
+        signs=SIGNS,
+        judged=JUDGED,
+        version=importlib.metadata.version("fitctl"),
+    )
