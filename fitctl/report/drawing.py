@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.figures.plate import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure, save
+from fitctl.figures.plate import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.floating]
 
 INK, GRID, FAINT = "#20262e", "#d5d9de", "#8a929c"
 AZ, EL = BLUE, VERMILION
+COLORS = {"az": AZ, "el": EL}
 SERIES = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 # On the page these are the style sheet's, which has a light and a dark one of each.
 VARIABLES = {
@@ -33,8 +38,9 @@ VARIABLES = {
     PURPLE: "purple",
     SKY: "sky",
 }
+_DPI = 120
 BINS = 900  # of a trace: about as many as a page shows
-_STYLE = {
+_STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9.0,
     "axes.edgecolor": FAINT,
@@ -92,17 +98,21 @@ def time_axis(duration_s: float, start: str) -> TimeAxis:
     return TimeAxis(3600.0, f"h after {start}")
 
 
-def style() -> dict[str, object]:
-    """For ``matplotlib.rc_context`` around drawing and writing."""
-    return dict(_STYLE)
+@contextmanager
+def styled() -> Iterator[None]:
+    """Within, figures are made and written as reports have them."""
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE):
+        yield
 
 
 def panels(
-    rows: int, height_in: float, columns: int = 1, *, share_x: bool = True
+    rows: int, height_in: float, columns: int = 1, heights: Sequence[float] | None = None
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of a page's width and its axes, row by row."""
+    """A figure of a page's width and its axes, row by row; one column shares its x axis."""
     figure = new_figure(9.0, height_in)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=share_x and columns == 1)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=columns == 1, height_ratios=heights)
     return figure, list(axes.ravel())
 
 
@@ -125,7 +135,9 @@ def envelope(time_s: Floats, values: Floats, bins: int = BINS) -> tuple[Floats, 
     return (edges_s[:-1] + edges_s[1:]) / 2, low, high
 
 
-def trace(axes: Axes, time: TimeAxis, series: tuple[Floats, Floats], color: str, label: str) -> None:
+def trace(
+    axes: Axes, time: TimeAxis, series: tuple[Floats, Floats], color: str, label: str
+) -> None:
     """A series against time, as a band where there is more of it than a page can show."""
     time_s, values = series
     if len(time_s) == 0:
@@ -136,37 +148,53 @@ def trace(axes: Axes, time: TimeAxis, series: tuple[Floats, Floats], color: str,
         return
     # Bands meet where the next begins, or every second pixel would be empty.
     axes.fill_between(
-        at_s / time.s_per_unit, low, high, color=color, alpha=0.55, linewidth=0.4, label=label
+        at_s / time.s_per_unit, low, high, color=color, alpha=0.6, linewidth=0.9, label=label
     )
 
 
-def inline_svg(figure: Figure, name: str, title: str) -> str:
-    """A figure as SVG to stand within a page: its colours the page's, its names its own."""
-    import matplotlib
-
-    text = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": name}):
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
-    svg = text.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'\bid="', f'id="{name}-', svg)
-    svg = re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", svg)
-    for color, variable in VARIABLES.items():
-        svg = re.sub(f"{color}\\b", f"var(--{variable})", svg, flags=re.IGNORECASE)
-    # The style sheet sets the width; the view box keeps the shape.
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
-    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
-    label = title.replace("&", "&amp;").replace('"', "&quot;")
-    return svg.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
+def span(axes: Sequence[Axes], time: TimeAxis, duration_s: float) -> None:
+    """All of the run, no more: times of several plots then stand below each other."""
+    for one in axes:
+        one.set_xlim(0, max(duration_s, 1e-3) / time.s_per_unit)
 
 
-def save_plot(plot: Plot, folder: Path) -> None:
-    """PNG and SVG of a plot, as they are printed: on white.
+def decimal(axis: Axis, *, dense: bool = False) -> None:
+    """Plain numbers on a logarithmic axis; at 1, 2 and 5 where it is short."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if dense else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def draw(plot: Plot, folder: Path) -> str:
+    """Write a plot as PNG and SVG, on white as they are printed; returns it as SVG to stand within a page.
 
     Raises
     ------
     OSError
         If they cannot be written.
     """
-    save(plot.figure, folder, plot.name)
+    import matplotlib
+
+    with matplotlib.rc_context({"svg.hashsalt": plot.name}):
+        plot.figure.savefig(folder / f"{plot.name}.png", dpi=_DPI, metadata={"Software": None})
+        plot.figure.set_layout_engine("none")  # it is laid out: once is slow enough
+        text = io.StringIO()
+        plot.figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
+    svg = text.getvalue()
+    on_white = re.sub(r"(<svg[^>]*>)", r'\1<rect width="100%" height="100%" fill="#ffffff"/>', svg)
+    (folder / f"{plot.name}.svg").write_text(on_white, encoding="utf-8")
+    return within_page(svg[svg.index("<svg") :], plot.name, plot.title)
+
+
+def within_page(svg: str, name: str, title: str) -> str:
+    """An SVG whose colours are the page's, whose names are its own, and whose width the style sheet sets."""
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", svg)
+    for color, variable in VARIABLES.items():
+        svg = re.sub(f"{color}\\b", f"var(--{variable})", svg, flags=re.IGNORECASE)
+    for size in ("width", "height"):
+        svg = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", svg, count=1)
+    return svg.replace("<svg", f'<svg role="img" aria-label={quoteattr(title)}', 1)

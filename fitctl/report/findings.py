@@ -20,6 +20,7 @@ from fitctl.report.stages import Stacks, Stages, stacks, stages
 from fitctl.supervisor.modes import Mode
 
 AXES = ("az", "el")
+_TIMES = ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s")
 
 
 @dataclass(frozen=True)
@@ -124,10 +125,7 @@ def _mode_s(ticks: Columns, period_s: float) -> dict[str, float]:
     """By the ticks; where none came for long, nobody knows."""
     lasted_s = np.minimum(np.diff(ticks["time_s"], append=np.nan), 1.0)
     lasted_s[-1:] = period_s
-    spent = {
-        mode.name: float(lasted_s[ticks["mode_number"] == mode].sum())
-        for mode in Mode
-    }
+    spent = {mode.name: float(lasted_s[ticks["mode_number"] == mode].sum()) for mode in Mode}
     return {mode: seconds for mode, seconds in spent.items() if seconds > 0}
 
 
@@ -149,7 +147,12 @@ def _timing(ticks: Columns, timing: Columns) -> dict[str, float]:
         for name in ("servo_late_worst_s", "worst_stall_s")
     }
     if not frames.any():
-        return dict.fromkeys(("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s"), math.nan) | worst
+        return (
+            dict.fromkeys(
+                ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s"), math.nan
+            )
+            | worst
+        )
     return {
         "age_median_s": float(np.median(age_s)),
         "age_worst_s": float(age_s.max()),

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fitctl.report.drawing import AZ, EL, FAINT, GREEN, INK, SERIES, Plot, panels
+from fitctl.figures.plate import GREEN
+from fitctl.report.drawing import AZ, EL, FAINT, INK, SERIES, Plot, decimal, panels
 from fitctl.report.findings import AXES, LoopFindings
 
-_POINTS = 2500  # of a path in the plane
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_POINTS = 900  # of a path in the plane
 
 
 def spectra(loop: LoopFindings) -> Plot:
@@ -21,9 +26,13 @@ def spectra(loop: LoopFindings) -> Plot:
         frequency_hz = found.spectra.frequency_hz[shown]
         for what, line in (("disturbance", "--"), ("error", "-")):
             power = getattr(found.spectra, what)[shown]
-            density.loglog(frequency_hz, power, line, color=color, label=f"{what}, {found.controller}")
+            density.loglog(
+                frequency_hz, power, line, color=color, label=f"{what}, {found.controller}"
+            )
             total = np.sqrt(np.cumsum(power) * frequency_hz[0])
-            sums.semilogx(frequency_hz, total, line, color=color, label=f"{what}, {found.controller}")
+            sums.semilogx(
+                frequency_hz, total, line, color=color, label=f"{what}, {found.controller}"
+            )
     sums.axhline(loop.requirement_px, color=INK, linestyle=":", label="requirement")
     density.set_title("Power spectral density")
     density.set_ylabel("px²/Hz")
@@ -32,14 +41,16 @@ def spectra(loop: LoopFindings) -> Plot:
     sums.set_yscale("log")
     for axes in (density, sums):
         axes.set_xlabel("Hz")
+        decimal(axes.xaxis)
+        decimal(axes.yaxis)
     if loop.rejections:
         density.legend(loc="lower left")
     else:
         _nothing(density)
     caption = (
-        "Mean of both axes, Welch's method, segments of 8 s. Dashed: the disturbance, which is the open loop rebuilt "
-        "from the log, the error less where both stages had moved the star at mid-exposure. Solid: the error that "
-        "was left. Both hold the camera's noise."
+        "Mean of both axes, Welch's method, segments of 8 s. Dashed: the disturbance, which is the open loop "
+        "rebuilt from the log, the error less where both stages had moved the star at mid-exposure. Solid: "
+        "the error that was left. Both hold the camera's noise."
     )
     return Plot(f"{loop.name}-psd", "Before and after", caption, figure)
 
@@ -64,6 +75,8 @@ def rejection(loop: LoopFindings) -> Plot:
             )
     axes.axhline(1.0, color=FAINT, linewidth=0.9)
     axes.set_xlabel("Hz")
+    decimal(axes.xaxis, dense=True)
+    decimal(axes.yaxis, dense=True)
     axes.set_ylabel("disturbance over error")
     axes.set_title("Disturbance rejection: above 1 the loop helps, below it makes worse")
     if loop.rejections:
@@ -71,8 +84,8 @@ def rejection(loop: LoopFindings) -> Plot:
     else:
         _nothing(axes)
     caption = (
-        "Root of the ratio of both spectra, over the sensitivity of the linear sampled loop of the logged design. "
-        "Eq. 20 knows nothing of the stacks' hysteresis, which takes from its gain."
+        "Root of the ratio of both spectra, beside the sensitivity of the linear sampled loop of the logged "
+        "design. Eq. 20 knows nothing of the stacks' hysteresis, which takes from its gain."
     )
     return Plot(f"{loop.name}-rejection", "Rejection against the design", caption, figure)
 
@@ -82,6 +95,7 @@ def hysteresis(loop: LoopFindings) -> Plot:
     figure, (*commands, stack) = panels(1, 3.6, 3)
     for number, (axis, axes) in enumerate(zip(AXES, commands, strict=True)):
         dwells = loop.stages.gaps[number].dwells if loop.stages.gaps else []
+        middle_px = float(np.mean([dwell.command_px for dwell in dwells])) if dwells else 0.0
         for direction, sign, color, label in (
             (1, "^", AZ, "came from below"),
             (-1, "v", EL, "came from above"),
@@ -90,7 +104,7 @@ def hysteresis(loop: LoopFindings) -> Plot:
             its = [dwell for dwell in dwells if dwell.direction == direction]
             axes.plot(
                 [dwell.target_px for dwell in its],
-                [dwell.command_px for dwell in its],
+                [dwell.command_px - middle_px for dwell in its],
                 sign,
                 color=color,
                 markersize=5,
@@ -102,7 +116,7 @@ def hysteresis(loop: LoopFindings) -> Plot:
             _nothing(axes)
         axes.set_title(f"Command where it stood, {axis}")
         axes.set_xlabel("target (px)")
-        axes.set_ylabel("mirror and siderostat told (px)")
+        axes.set_ylabel("stages told, from their mean (px)")
     rows = loop.judged.rows
     if loop.stacks is not None and len(rows):
         some = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(int)]
@@ -126,22 +140,23 @@ def hysteresis(loop: LoopFindings) -> Plot:
 
 def _gap_text(loop: LoopFindings) -> str:
     told = [
-        f"{axis} {gap.px:+.3f} ± {gap.error_px:.3f} px" if not math.isnan(gap.error_px) else f"{axis} {gap.px:+.3f} px"
+        f"{axis} {gap.px:+.3f} px"
+        + ("" if math.isnan(gap.error_px) else f" (standard error {gap.error_px:.3f})")
         for axis, gap in zip(AXES, loop.stages.gaps, strict=False)
         if not math.isnan(gap.px)
     ]
     found = (
-        f"Difference of the commands at one place of the target, come from below less come from above: {', '.join(told)} "
-        "(one standard error)."
+        "Difference of the commands at one place of the target, come from below less come from above: "
+        f"{', '.join(told)}."
         if told
         else "The target did not come to one place from both sides, so the commands cannot show hysteresis."
     )
     return (
-        f"Left, middle: what both stages were told in the mean while the target stood; if it depends on where the "
-        f"target came from, that is hysteresis and backlash, within what the air adds. {found} Right: what their "
-        "model makes of the voltages; the width of each path is its hysteresis."
+        "Left, middle: what both stages were told in the mean while the target stood; if it depends on where "
+        f"the target came from, that is hysteresis and backlash, within what the air adds. {found} Right: what "
+        "their model makes of the voltages; the width of each path is its hysteresis."
     )
 
 
-def _nothing(axes: object) -> None:
-    axes.text(0.5, 0.5, "no data that count", transform=axes.transAxes, ha="center", color=FAINT)  # type: ignore[attr-defined]
+def _nothing(axes: Axes) -> None:
+    axes.text(0.5, 0.5, "no data that count", transform=axes.transAxes, ha="center", color=FAINT)

@@ -119,10 +119,8 @@ def gather(run: Run) -> Gathered:
         for topic, columns in column_blocks(log.path, list(places), _ROWS):
             place = places[topic]
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
-            if place[0] == "ticks":
-                columns = _small(columns, time_s, str(log.path))
-            columns["time_s"] = time_s
-            blocks[place].append(columns)
+            kept = _small(columns, time_s, str(log.path)) if place[0] == "ticks" else columns
+            blocks[place].append(kept | {"time_s": time_s})
     of_loops = {
         name: {loop: _in_order(_joined(blocks.pop((name, loop), []))) for loop in loops}
         for name in ("ticks", "timing", "piezo")

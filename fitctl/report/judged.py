@@ -69,13 +69,17 @@ def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
     counts = (since_s >= SETTLE_S) & (still_s >= TARGET_SETTLE_S)
     seen = rows[counts & ticks["star_visible"][rows]]
     seen_s = ticks["mid_exposure_s"][seen]
-    apart = (np.diff(seen_s) > LONGEST_GAP_S) | (np.diff(np.cumsum(begins)[np.searchsorted(rows, seen)]) > 0)
+    apart = (np.diff(seen_s) > LONGEST_GAP_S) | (
+        np.diff(np.cumsum(begins)[np.searchsorted(rows, seen)]) > 0
+    )
     pieces = np.split(seen, np.flatnonzero(apart) + 1) if len(seen) else []
     return Judged(
         pieces=[piece for piece in pieces if len(piece) > 1],
         vernier_s=len(rows) * period_s,
         judged_s=int(np.count_nonzero(counts)) * period_s,
-        star_fraction=len(seen) / max(1, int(np.count_nonzero(counts))) if counts.any() else float("nan"),
+        star_fraction=len(seen) / max(1, int(np.count_nonzero(counts)))
+        if counts.any()
+        else float("nan"),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from fitctl.report import tables
-from fitctl.report.drawing import save_plot, style
+from fitctl.report.drawing import draw, styled
 from fitctl.report.findings import Findings, LoopFindings
 from fitctl.report.page import Card, Section, card, render, sections
 
@@ -25,11 +25,9 @@ def make_report(findings: Findings, folder: Path) -> Path:
     OSError
         If something cannot be written.
     """
-    import matplotlib
-
     run = findings.run
     title = f"{run.rig.name}, {tables.utc(run)}" if run.start_ns else f"{run.name}: no records"
-    with matplotlib.rc_context(style()):
+    with styled():
         parts = sections(findings)
     facts = [f"{len(run.logs)} files" if len(run.logs) > 1 else run.logs[0].path.name]
     facts += [tables.seconds(run.duration_s), f"requirement {findings.word}"]
@@ -52,14 +50,10 @@ def write(
     OSError
         If something cannot be written.
     """
-    import matplotlib
-
+    with styled():
+        drawings = {plot.name: draw(plot, folder) for part in parts for plot in part.plots}
     page = folder / PAGE
-    page.write_text(render(title, facts, cards, parts), encoding="utf-8")
-    with matplotlib.rc_context(style()):
-        for part in parts:
-            for plot in part.plots:
-                save_plot(plot, folder)
+    page.write_text(render(title, facts, cards, parts, drawings), encoding="utf-8")
     (folder / "report.json").write_bytes(
         msgspec.json.format(msgspec.json.encode(figures), indent=2) + b"\n"
     )
@@ -104,7 +98,9 @@ def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
             {
                 "name": found.controller,
                 "judged_s": found.judged_s,
-                "design_residual_px": math.nan if found.predicted is None else found.predicted.residual_px,
+                "design_residual_px": math.nan
+                if found.predicted is None
+                else found.predicted.residual_px,
                 "bound_px": math.nan if found.predicted is None else found.predicted.bound_px,
                 "rejection": [
                     {"hz": at_hz, "measured": measured, "design": design}

@@ -5,21 +5,23 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import re
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-from fitctl.report import frequency, tables, timeline
-from fitctl.report.drawing import Plot, inline_svg, style, time_axis
+from fitctl.report import frequency, motion, tables, timeline
+from fitctl.report.drawing import Plot, time_axis
 from fitctl.report.findings import Findings, LoopFindings
+from fitctl.report.judged import TARGET_SETTLE_S
 from fitctl.report.residual import Word
 from fitctl.report.tables import Table
+from fitctl.supervisor.simulate import SETTLE_S
 
 SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
 JUDGED = (
-    "Judged is VERNIER, from 10 s after it began and 2 s after the target last moved, on frames with a star. The "
-    "error is the measured one: the camera's noise is in it. The interval knows that neighbouring frames are alike "
-    "(batch means). Met: all of both axes' intervals is within the requirement. Not met: all of one is above. Else, "
-    "or without enough data: not known."
+    f"Judged is VERNIER, from {SETTLE_S:g} s after it began and {TARGET_SETTLE_S:g} s after the target last "
+    "moved, on frames with a star. The error is the measured one: the camera's noise is in it. The interval "
+    "knows that neighbouring frames are alike (batch means). Met: all of both axes' intervals is within the "
+    "requirement. Not met: all of one is above. Else, or without enough data: not known."
 )
 
 
@@ -73,7 +75,7 @@ def card(loop: LoopFindings) -> Card:
 
 
 def sections(findings: Findings) -> list[Section]:
-    """All of a run's report. Draws its plots: call it within :func:`fitctl.report.drawing.style`."""
+    """All of a run's report. Draws its plots: call it within :func:`fitctl.report.drawing.styled`."""
     run = findings.run
     time = time_axis(run.duration_s, tables.utc(run, form="%H:%M:%S UTC"))
     found: list[Section] = []
@@ -84,13 +86,13 @@ def sections(findings: Findings) -> list[Section]:
             continue
         plots = [
             timeline.timeline(findings, loop, time),
-            timeline.traces(loop, time),
+            timeline.traces(findings, loop, time),
             frequency.spectra(loop),
             frequency.rejection(loop),
-            timeline.mirror(loop, time),
-            timeline.siderostat(findings, loop, time),
+            motion.mirror(findings, loop, time),
+            motion.siderostat(findings, loop, time),
             frequency.hysteresis(loop),
-            timeline.timing(findings, loop, time),
+            motion.timing(findings, loop, time),
         ]
         why = "; ".join(one.why for one in loop.rejections if one.why)
         text = f"The design's own figures are not known: {why}." if why else ""
@@ -101,7 +103,8 @@ def sections(findings: Findings) -> list[Section]:
     told = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
     rig = run.rig
     designs = {
-        loop: json.loads(text).get("parameters") for loop, text in run.metadata.get("designs", {}).items()
+        loop: json.loads(text).get("parameters")
+        for loop, text in run.metadata.get("designs", {}).items()
     }
     return [
         *found,
@@ -118,20 +121,19 @@ def sections(findings: Findings) -> list[Section]:
     ]
 
 
-def render(title: str, facts: Sequence[str], cards: list[Card], parts: list[Section]) -> str:
-    """The page: one file, nothing from elsewhere."""
-    import matplotlib
+def render(
+    title: str,
+    facts: Sequence[str],
+    cards: list[Card],
+    parts: list[Section],
+    drawings: Mapping[str, str],
+) -> str:
+    """The page: one file, nothing from elsewhere; `drawings` are its plots as SVG by name."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     pages = Environment(
         loader=PackageLoader("fitctl.report"), autoescape=True, undefined=StrictUndefined
     )
-    with matplotlib.rc_context(style()):
-        drawings: dict[str, Any] = {
-            plot.name: inline_svg(plot.figure, plot.name, plot.title)
-            for part in parts
-            for plot in part.plots
-        }
     return pages.get_template("page.html.j2").render(
         title=title,
         facts=facts,

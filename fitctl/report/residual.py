@@ -88,15 +88,13 @@ def rms_estimate(pieces: Sequence[Floats], period_s: float) -> Estimate:
     if len(means) < LEAST_BLOCKS or independent < _LEAST_INDEPENDENT or not means.mean() > 0:
         return Estimate(rms_px, math.nan, math.nan, independent, block_s)
     spread = float(means.std(ddof=1) / means.mean()) / math.sqrt(independent)
-    half = float(t.ppf((1 + CONFIDENCE) / 2, independent - 1)) * spread / 2  # ln RMS is half of ln square
-    return Estimate(
-        rms_px, rms_px * math.exp(-half), rms_px * math.exp(half), independent, block_s
-    )
+    half = (
+        float(t.ppf((1 + CONFIDENCE) / 2, independent - 1)) * spread / 2
+    )  # ln RMS is half of ln square
+    return Estimate(rms_px, rms_px * math.exp(-half), rms_px * math.exp(half), independent, block_s)
 
 
-def _block_means(
-    pieces: Sequence[Floats], block_s: float, period_s: float
-) -> tuple[Floats, float]:
+def _block_means(pieces: Sequence[Floats], block_s: float, period_s: float) -> tuple[Floats, float]:
     """Means of whole blocks, and by how much neighbours in one piece correlate."""
     frames = max(1, round(block_s / period_s))
     of_pieces = [
@@ -122,7 +120,9 @@ def verdict(
         return Verdict("not met", f"{' and '.join(above)}: all of the interval is above it")
     if star_fraction < LEAST_STAR_FRACTION:
         missing = 100 * (1 - star_fraction)
-        return Verdict("not known", f"the star is missing on {missing:.1f} % of the frames that count")
+        return Verdict(
+            "not known", f"the star is missing on {missing:.1f} % of the frames that count"
+        )
     few = [axis for axis, found in axes.items() if not found.known]
     if few:
         return Verdict(

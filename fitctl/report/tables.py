@@ -42,7 +42,7 @@ def seconds(value: float) -> str:
     """A length of time for people."""
     if math.isnan(value):
         return UNKNOWN
-    if value < 120:  # noqa: PLR2004
+    if value < 120:
         return f"{value:.1f} s"
     hours, rest = divmod(round(value), 3600)
     minutes, left = divmod(rest, 60)
@@ -63,7 +63,14 @@ def residual(loop: LoopFindings) -> Table:
     """What the verdict is of."""
     return Table(
         "Measured error about the target, RMS, with 95 % confidence",
-        ["axis", "px", "interval, px", "arcsec on the sky", "of the requirement", "independent blocks"],
+        [
+            "axis",
+            "px",
+            "interval, px",
+            "arcsec on the sky",
+            "of the requirement",
+            "independent blocks",
+        ],
         [
             [
                 axis,
@@ -86,7 +93,10 @@ def key_figures(loop: LoopFindings) -> Table:
         ["time in VERNIER", seconds(judged.vernier_s)],
         ["of it judged", f"{seconds(judged.judged_s)} in {len(judged.pieces)} pieces"],
         ["star seen in it", number(share, ".2f", "% of the frames")],
-        ["mirror's range", f"{number(moved.range_mean, '.1%')} mean, {number(moved.range_worst, '.1%')} worst"],
+        [
+            "mirror's range",
+            f"{number(moved.range_mean, '.1%')} mean, {number(moved.range_worst, '.1%')} worst",
+        ],
         ["mirror saturated", number(moved.saturated_fraction, ".2%")],
         ["piston (Eq. 4), RMS", number(moved.piston_rms_m, ".1f", "nm", 1e9)],
     ]
@@ -97,7 +107,12 @@ def key_figures(loop: LoopFindings) -> Table:
         ]
         for axis, px in zip(AXES, moved.motor_moved_px, strict=True)
     ]
-    rows.append(["modes", ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks"])
+    rows.append(
+        [
+            "modes",
+            ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks",
+        ]
+    )
     return Table("In the part that is judged", ["what", "how much"], rows)
 
 
@@ -109,10 +124,14 @@ def rejected(loop: LoopFindings) -> Table:
     rows = []
     for found in loop.rejections:
         predicted = found.predicted
-        least, left = (math.nan,) * 2 if predicted is None else (predicted.bound_px, predicted.residual_px)
+        least, left = (
+            (math.nan,) * 2 if predicted is None else (predicted.bound_px, predicted.residual_px)
+        )
         row = [found.controller, seconds(found.judged_s)]
         row += [number(least, ".4f", "px"), number(left, ".4f", "px")]
-        row += [f"{measured:.2f} / {number(design, '.2f')}" for _, measured, design in found.table()]
+        row += [
+            f"{measured:.2f} / {number(design, '.2f')}" for _, measured, design in found.table()
+        ]
         rows.append(row)
     return Table("Disturbance rejection: measured / design", head, rows)
 
@@ -120,13 +139,16 @@ def rejected(loop: LoopFindings) -> Table:
 def timings(loop: LoopFindings) -> Table:
     """Milliseconds."""
     found = loop.timing
-    rows = [
-        ["frame's age when used", found["age_median_s"], found["age_worst_s"]],
-        ["tick, from frame to command", found["compute_median_s"], found["compute_worst_s"]],
-        ["servo's wake-up late", math.nan, found["servo_late_worst_s"]],
-        ["the machine stood still", math.nan, found["worst_stall_s"]],
+    rows = {
+        "frame's age when used": (found["age_median_s"], found["age_worst_s"]),
+        "tick, from frame to command": (found["compute_median_s"], found["compute_worst_s"]),
+        "servo's wake-up late": (math.nan, found["servo_late_worst_s"]),
+        "the machine stood still": (math.nan, found["worst_stall_s"]),
+    }
+    texts = [
+        [what, *(number(value, ".3f", "ms", 1e3) for value in values)]
+        for what, values in rows.items()
     ]
-    texts = [[str(what), *(number(value, ".3f", "ms", 1e3) for value in values)] for what, *values in rows]
     return Table("Timing", ["what", "median", "worst"], texts)
 
 
@@ -145,7 +167,9 @@ def losses(findings: Findings) -> Table:
     caption = f"Losses. Records lost on the way to the log: {UNKNOWN if lost is None else lost}."
     if unfinished:
         caption += f" Not finished, so that its end may be missing: {', '.join(unfinished)}."
-    return Table(caption, ["loop", "frames", "frames lost", "late ticks", "stalls of the machine"], rows)
+    return Table(
+        caption, ["loop", "frames", "frames lost", "late ticks", "stalls of the machine"], rows
+    )
 
 
 def events(findings: Findings) -> Table:
@@ -153,7 +177,9 @@ def events(findings: Findings) -> Table:
     told = findings.gathered.events
     shown = sorted(told, key=lambda event: -event["level"])[:MOST_ROWS]
     shown.sort(key=lambda event: event["time_s"])
-    caption = "Events" if len(shown) == len(told) else f"Events: {len(shown)} of {len(told)}, the gravest"
+    caption = (
+        "Events" if len(shown) == len(told) else f"Events: {len(shown)} of {len(told)}, the gravest"
+    )
     rows = [
         [
             utc(findings.run, event["time_s"], "%H:%M:%S"),
@@ -180,7 +206,9 @@ def modes(findings: Findings) -> Table:
         ]
         for change in changes[:MOST_ROWS]
     ]
-    caption = "Changes of mode" + (f": the first {MOST_ROWS} of {len(changes)}" if len(changes) > MOST_ROWS else "")
+    caption = "Changes of mode" + (
+        f": the first {MOST_ROWS} of {len(changes)}" if len(changes) > MOST_ROWS else ""
+    )
     return Table(caption, ["UTC", "after start", "loop", "change", "why"], rows)
 
 
@@ -198,7 +226,9 @@ def devices(findings: Findings) -> Table:
         for row in findings.gathered.health[:MOST_ROWS]
     ]
     return Table(
-        "Devices: each change of state", ["device", "UTC", "state", "identity", "endpoint", "detail"], rows
+        "Devices: each change of state",
+        ["device", "UTC", "state", "identity", "endpoint", "detail"],
+        rows,
     )
 
 
@@ -215,9 +245,7 @@ def attempts(findings: Findings) -> Table:
         ]
         for row in findings.gathered.attempts[:MOST_ROWS]
     ]
-    return Table(
-        "Steps of sequences", ["step", "loop", "attempt", "took", "outcome", "told"], rows
-    )
+    return Table("Steps of sequences", ["step", "loop", "attempt", "took", "outcome", "told"], rows)
 
 
 def versions(findings: Findings) -> Table:
