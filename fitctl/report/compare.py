@@ -42,7 +42,7 @@ def make_comparison(nights: Sequence[Findings], folder: Path) -> Path:
             )
             for name in loops
         ]
-    parts.insert(0, Section("Nights", [], [_nights(letters, nights)]))
+    parts.insert(0, Section("Verdicts", [], [_nights(letters, nights)]))
     figures = {
         "nights": [
             {"letter": letter, **plain(night)}
@@ -114,22 +114,22 @@ def _at_1_hz(loop: LoopFindings) -> str:
 
 def _spectra(name: str, nights: list[Night]) -> Plot:
     figure, (density, rejection) = panels(1, 3.8, 2)
-    for index, (letter, loop) in enumerate(nights):
+    its = [(letter, one) for letter, loop in nights for one in loop.rejections]
+    for index, (letter, one) in enumerate(its):
         color = SERIES[index % len(SERIES)]
-        for one in loop.rejections:
-            shown = one.spectra.frequency_hz > 0
-            frequency_hz = one.spectra.frequency_hz[shown]
-            label = f"{letter}, {one.controller}"
-            density.loglog(frequency_hz, one.spectra.disturbance[shown], "--", color=color)
-            density.loglog(frequency_hz, one.spectra.error[shown], color=color, label=label)
-            rejection.loglog(frequency_hz, one.measured[shown], color=color, label=label)
+        shown = one.spectra.frequency_hz > 0
+        frequency_hz = one.spectra.frequency_hz[shown]
+        label = f"{letter}, {one.controller}"
+        density.loglog(frequency_hz, one.spectra.disturbance[shown], "--", color=color)
+        density.loglog(frequency_hz, one.spectra.error[shown], color=color, label=label)
+        rejection.loglog(frequency_hz, one.measured[shown], color=color, label=label)
     density.set_title("Power spectral density: error, and disturbance (dashed)")
     density.set_ylabel("px²/Hz")
     rejection.set_title("Disturbance rejection, measured")
     rejection.set_ylabel("disturbance over error")
     for axes in (density, rejection):
         axes.set_xlabel("Hz")
-        if any(loop.rejections for _, loop in nights):
+        if its:
             decimal(axes.xaxis)
             decimal(axes.yaxis)
             axes.legend(loc="best")

@@ -159,9 +159,11 @@ def span(axes: Sequence[Axes], time: TimeAxis, duration_s: float) -> None:
 
 
 def decimal(axis: Axis, *, dense: bool = False) -> None:
-    """Plain numbers on a logarithmic axis; at 1, 2 and 5 where it is short."""
+    """Plain numbers on a logarithmic axis; at 1, 2 and 5 where it is short. Without data an axis is none."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+    if axis.get_scale() != "log":
+        return
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if dense else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -150,9 +150,10 @@ def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
     figure: Any = plotext.figure
     figure.clear()
     figure.plot_size(columns, max(lines - 2, _LEAST_LINES * len(grouped)))
-    figure.subplots(len(grouped), 1)
+    if len(grouped) > 1:
+        figure.subplots(len(grouped), 1)
     for row, (unit, its) in enumerate(grouped.items(), start=1):
-        panel = figure.subplot(row, 1)
+        panel = figure.subplot(row, 1) if len(grouped) > 1 else figure
         panel.theme("simple" if colours else "colorless")
         for one in its:
             at_s, low, high = envelope(one.time_s, one.values, _TERMINAL_BINS)

@@ -91,7 +91,7 @@ def key_figures(loop: LoopFindings) -> Table:
     share = 100 * judged.star_fraction
     rows = [
         ["time in VERNIER", seconds(judged.vernier_s)],
-        ["of it judged", f"{seconds(judged.judged_s)} in {len(judged.pieces)} pieces"],
+        ["of it judged", f"{seconds(judged.judged_s)}; pieces: {len(judged.pieces)}"],
         ["star seen in it", number(share, ".2f", "% of the frames")],
         [
             "mirror's range",
