@@ -86,9 +86,8 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     at_s, rms = running_rms(loop)
     for axis in AXES:
         marker = "o" if len(at_s) < 60 else ""
-        residual.plot(
-            at_s / time.s_per_unit, rms[axis], color=COLORS[axis], label=axis, marker=marker
-        )
+        at = at_s / time.s_per_unit
+        residual.plot(at, rms[axis], marker, ls="-", ms=3, color=COLORS[axis], label=axis)
     residual.axhline(
         loop.requirement_px,
         color=INK,
