@@ -12,7 +12,7 @@ from fitctl.report.findings import find
 from fitctl.report.make import make_report
 from fitctl.report.run import find_run
 
-SIZE = "1000,1180"
+SIZE = "1000,1320"
 
 
 def main() -> None:

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _POINTS = 900  # of a path in the plane
+_NO_DATA = "no data that count"
+_DIRECTIONS = (
+    (1, "^", AZ, "came from below"),
+    (-1, "v", EL, "came from above"),
+    (0, "o", FAINT, "did not move"),
+)
 
 
 def spectra(loop: LoopFindings) -> Plot:
@@ -95,12 +101,9 @@ def hysteresis(loop: LoopFindings) -> Plot:
     figure, (*commands, stack) = panels(1, 3.6, 3)
     for number, (axis, axes) in enumerate(zip(AXES, commands, strict=True)):
         dwells = loop.stages.gaps[number].dwells if loop.stages.gaps else []
+        moved = any(dwell.direction for dwell in dwells)
         middle_px = float(np.mean([dwell.command_px for dwell in dwells])) if dwells else 0.0
-        for direction, sign, color, label in (
-            (1, "^", AZ, "came from below"),
-            (-1, "v", EL, "came from above"),
-            (0, "o", FAINT, "did not move"),
-        ):
+        for direction, sign, color, label in _DIRECTIONS if moved else ():
             its = [dwell for dwell in dwells if dwell.direction == direction]
             axes.plot(
                 [dwell.target_px for dwell in its],
@@ -110,10 +113,10 @@ def hysteresis(loop: LoopFindings) -> Plot:
                 markersize=5,
                 label=label,
             )
-        if dwells:
+        if moved:
             axes.legend(loc="best")
         else:
-            _nothing(axes)
+            _nothing(axes, "the target did not move" if dwells else _NO_DATA)
         axes.set_title(f"Command where it stood, {axis}")
         axes.set_xlabel("target (px)")
         axes.set_ylabel("stages told, from their mean (px)")
@@ -158,5 +161,5 @@ def _gap_text(loop: LoopFindings) -> str:
     )
 
 
-def _nothing(axes: Axes) -> None:
-    axes.text(0.5, 0.5, "no data that count", transform=axes.transAxes, ha="center", color=FAINT)
+def _nothing(axes: Axes, why: str = _NO_DATA) -> None:
+    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", color=FAINT)

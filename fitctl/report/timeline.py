@@ -86,8 +86,8 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     at_s, rms = running_rms(loop)
     for axis in AXES:
         marker = "o" if len(at_s) < 60 else ""
-        at = at_s / time.s_per_unit
-        residual.plot(at, rms[axis], marker, ls="-", ms=3, color=COLORS[axis], label=axis)
+        shown = at_s / time.s_per_unit
+        residual.plot(shown, rms[axis], marker, ls="-", ms=3, color=COLORS[axis], label=axis)
     residual.axhline(
         loop.requirement_px,
         color=INK,
