@@ -52,7 +52,7 @@ class Format(StrEnum):
 
 
 @contextmanager
-def _one_line() -> Iterator[None]:
+def one_line() -> Iterator[None]:
     """What is wrong with a log is for the operator, in one line."""
     from fitctl.logging.errors import LogError
 
@@ -71,7 +71,7 @@ def info(
     from fitctl.logging.folder import in_use, is_kept
     from fitctl.logging.reading import log_info
 
-    with _one_line():
+    with one_line():
         found, kept, recording = log_info(log), is_kept(log), in_use(log)
     if as_json:
         typer.echo(json.dumps(_info_document(found, kept=kept, recording=recording)))
@@ -110,7 +110,7 @@ def verify(logs: LogsArgument) -> None:
 
     problems = 0
     for log in logs:
-        with _one_line():
+        with one_line():
             verdict = verify(log)
         problems += len(verdict.problems)
         typer.echo(
@@ -129,7 +129,7 @@ def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption 
     from fitctl.logging.folder import in_use
     from fitctl.logging.verifying import verify
 
-    with _one_line():
+    with one_line():
         if in_use(log):
             msg = f"{log}: is being recorded just now; there is nothing to mend"
             raise ConfigError(msg)
@@ -162,10 +162,10 @@ def cut(
     from fitctl.logging.copying import cut
     from fitctl.logging.reading import log_info
 
-    with _one_line():
+    with one_line():
         found = log_info(log)
-        from_ns = _time_ns("--from", from_, found)
-        to_ns = 2**63 if to is None else _time_ns("--to", to, found)
+        from_ns = time_ns("--from", from_, found)
+        to_ns = 2**63 if to is None else time_ns("--to", to, found)
         if to_ns <= from_ns:
             msg = f"cut: --to {to} is not after --from {from_}"
             raise ConfigError(msg)
@@ -184,7 +184,7 @@ def merge(
     """Join logs by time, such as those of one night, or what a crash tore in two."""
     from fitctl.logging.copying import merge
 
-    with _one_line():
+    with one_line():
         records, doubles = merge(logs, out, overwrite=overwrite)
     also = f"; {doubles} were in two logs" if doubles else ""
     typer.echo(f"{out}: {records} records of {len(logs)} logs{also}")
@@ -205,7 +205,7 @@ def export(
     from fitctl.logging.reading import log_info
 
     folder = out or log.with_name(f"{log.stem}_{format_}")
-    with _one_line():
+    with one_line():
         files = export(log, folder, format_.value, _topics(log_info(log), topic))
     for file, rows in sorted(files.items()):
         typer.echo(f"{file}: {rows} rows")
@@ -222,7 +222,7 @@ def keep(
     """Mark logs, so that the recorder never deletes them; the mark is an empty file LOG.keep beside each."""
     from fitctl.logging.folder import keep
 
-    with _one_line():
+    with one_line():
         for log in logs:
             keep(log, kept=not undo)
             typer.echo(f"{log}: {'no longer kept' if undo else 'kept'}")
@@ -248,7 +248,7 @@ def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:
     ]
 
 
-def _time_ns(option: str, text: str, found: LogInfo) -> int:
+def time_ns(option: str, text: str, found: LogInfo) -> int:
     """Nanoseconds since 1970, of seconds after the log's start or of a UTC time.
 
     Raises

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
-from fitctl.config import Rig
+from fitctl.config import Fsm, Rig
 from fitctl.controllers.mirror import Mirror
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.records import Tick
-from fitctl.model.optics import scales
+from fitctl.model.optics import mirror_angles, scales
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.simulate import SETTLE_S
 
@@ -77,23 +77,46 @@ def rebuilt(rig: Rig, loop_name: str, ticks: Ticks) -> Rebuilt:
     IdentifyError
         If there is no such stretch, or the star is missing on too many of its frames.
     """
+    inside = _last_vernier(ticks)
+    exposed_s = ticks["mid_exposure_s"][inside]
+    error_px = _pair(ticks, "error_{}_px")[inside]
+    return Rebuilt(exposed_s, error_px, error_px - stages_px(rig, loop_name, ticks)[inside])
+
+
+def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
+    """Where both stages had moved the star at each tick's mid-exposure, px, shape (ticks, 2).
+
+    Mirror and siderostat as :func:`rebuilt` has them; NaN for a tick without a frame.
+
+    Parameters
+    ----------
+    ticks : mapping of str to array
+        All ticks of a log in their order: the stacks remember.
+    """
     loop = rig.loops[loop_name]
     scale = scales(rig, loop)
-    inside = _last_vernier(ticks)
-    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)])
-    mirror = Mirror(loop.fsm)
-    mirror.assume(volts[0])
+    angles_rad = _mirror_angles_rad(loop.fsm, ticks)
+    # A command acts from its tick's end until the next.
+    exposed_s = ticks["mid_exposure_s"]
+    in_force = np.searchsorted(ticks["time_s"], exposed_s, side="right") - 1
+    mirror_px = scale.mirror_px_per_rad * angles_rad[np.maximum(in_force, 0)]
+    motor_px = scale.motor_px_per_rad * _pair(ticks, "siderostat_{}_rad")
+    return np.where(np.isnan(exposed_s)[:, None], np.nan, mirror_px + motor_px)
+
+
+def _mirror_angles_rad(fsm: Fsm, ticks: Ticks) -> Floats:
+    """After each tick's command, shape (ticks, 2)."""
+    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
+    if fsm.hysteresis is None:
+        return mirror_angles(volts, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
+    mirror = Mirror(fsm)
+    if len(volts):
+        mirror.assume(volts[0])
     angles_rad = np.empty((len(volts), 2))
     for row, stack_v in enumerate(volts):
         mirror.written(stack_v)
         angles_rad[row] = mirror.angles_rad
-    # A command acts from its tick's end until the next.
-    exposed_s = ticks["mid_exposure_s"][inside]
-    in_force = np.searchsorted(ticks["time_s"], exposed_s, side="right") - 1
-    stages_px = scale.mirror_px_per_rad * angles_rad[in_force]
-    stages_px += scale.motor_px_per_rad * _pair(ticks, "siderostat_{}_rad")[inside]
-    error_px = _pair(ticks, "error_{}_px")[inside]
-    return Rebuilt(exposed_s, error_px, error_px - stages_px)
+    return angles_rad
 
 
 def _last_vernier(ticks: Ticks) -> NDArray[np.intp]:

@@ -74,7 +74,16 @@ def load_design(
     ConfigError
         One line: the file, what differs, what was expected, and what to do.
     """
-    document = _document(path)
+    return design_of(_document(path), path, rig_basis, makers)
+
+
+def design_of(
+    document: Mapping[str, Any],
+    path: Path,
+    rig_basis: Basis,
+    makers: Mapping[str, Callable[[Basis], Design]],
+) -> Design:
+    """A design from what a file of `path` has of it; as :func:`load_design`, also in what it raises."""
     wanted: dict[str, Any] = {
         "format": FORMAT,
         "inputs": list(INPUTS),

@@ -1,0 +1,160 @@
+"""Nights side by side: the same figures in columns, the same curves in one plot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fitctl.report import tables
+from fitctl.report.drawing import INK, SERIES, Plot, decimal, panels, styled
+from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.make import plain, write
+from fitctl.report.page import SIGNS, Section
+from fitctl.report.residual import Estimate
+from fitctl.report.tables import Table, number, seconds
+from fitctl.report.timeline import WINDOW_S, running_rms
+from fitctl.supervisor.modes import Mode
+
+Night = tuple[str, LoopFindings]
+
+
+def make_comparison(nights: Sequence[Findings], folder: Path) -> Path:
+    """Write a comparison of runs into a folder that exists; returns the page.
+
+    Raises
+    ------
+    OSError
+        If something cannot be written.
+    """
+    letters = [chr(ord("A") + number) for number in range(len(nights))]
+    loops = dict.fromkeys(name for night in nights for name in night.loops)
+    with styled():
+        parts = [
+            _loop(
+                name,
+                [
+                    (letter, night.loops[name])
+                    for letter, night in zip(letters, nights, strict=True)
+                    if name in night.loops
+                ],
+            )
+            for name in loops
+        ]
+    parts.insert(0, Section("Verdicts", [], [_nights(letters, nights)]))
+    figures = {
+        "nights": [
+            {"letter": letter, **plain(night)}
+            for letter, night in zip(letters, nights, strict=True)
+        ]
+    }
+    facts = [f"{letter}: {night.run.name}" for letter, night in zip(letters, nights, strict=True)]
+    return write(folder, "Nights side by side", facts, [], parts, figures)
+
+
+def _nights(letters: Sequence[str], nights: Sequence[Findings]) -> Table:
+    rows = [
+        [
+            letter,
+            night.run.name,
+            night.run.rig.name,
+            tables.utc(night.run),
+            seconds(night.run.duration_s),
+            night.run.metadata.get("versions", {}).get("fitctl", tables.UNKNOWN),
+            f"{SIGNS[night.word]} {night.word}",
+            tables.UNKNOWN if night.gathered.lost is None else str(night.gathered.lost),
+        ]
+        for letter, night in zip(letters, nights, strict=True)
+    ]
+    head = ["night", "log", "rig", "begins", "lasts", "fitctl", "requirement", "records lost"]
+    return Table("Nights", head, rows)
+
+
+def _loop(name: str, nights: list[Night]) -> Section:
+    return Section(
+        f"Loop {name}", [_spectra(name, nights), _residuals(name, nights)], [_figures(nights)]
+    )
+
+
+def _figures(nights: list[Night]) -> Table:
+    """What was measured, a row each."""
+    kinds: dict[str, Callable[[LoopFindings], str]] = {
+        "requirement": lambda loop: f"{SIGNS[loop.verdict.word]} {loop.verdict.word}",
+        "RMS az, px (95 %)": lambda loop: _rms(loop.residual["az"]),
+        "RMS el, px (95 %)": lambda loop: _rms(loop.residual["el"]),
+        "controllers": lambda loop: (
+            ", ".join(one.controller for one in loop.rejections) or tables.UNKNOWN
+        ),
+        "rejection at 1 Hz": _at_1_hz,
+        "time in VERNIER": lambda loop: seconds(loop.judged.vernier_s),
+        "of it judged": lambda loop: seconds(loop.judged.judged_s),
+        "star seen": lambda loop: number(loop.judged.star_fraction, ".2%"),
+        "mirror's range, mean": lambda loop: number(loop.stages.range_mean, ".1%"),
+        "mirror's range, worst": lambda loop: number(loop.stages.range_worst, ".1%"),
+        "piston, RMS": lambda loop: number(loop.stages.piston_rms_m, ".1f", "nm", 1e9),
+        "frames": lambda loop: str(loop.counts["frames"]),
+        "frames lost": lambda loop: str(loop.counts["frames_lost"]),
+        "late ticks": lambda loop: str(loop.counts["late_ticks"]),
+        "frame's age, median": lambda loop: number(loop.timing["age_median_s"], ".2f", "ms", 1e3),
+        "tick, worst": lambda loop: number(loop.timing["compute_worst_s"], ".2f", "ms", 1e3),
+    }
+    rows = [[what, *(tell(loop) for _, loop in nights)] for what, tell in kinds.items()]
+    return Table("Measured", ["what", *(letter for letter, _ in nights)], rows)
+
+
+def _rms(found: Estimate) -> str:
+    return f"{number(found.rms_px, '.4f')} ({tables.interval(found)})"
+
+
+def _at_1_hz(loop: LoopFindings) -> str:
+    measured = [of for one in loop.rejections for at_hz, of, _ in one.table() if at_hz == 1.0]
+    return ", ".join(f"{of:.2f}" for of in measured) or tables.UNKNOWN
+
+
+def _spectra(name: str, nights: list[Night]) -> Plot:
+    figure, (density, rejection) = panels(1, 3.8, 2)
+    its = [(letter, one) for letter, loop in nights for one in loop.rejections]
+    for index, (letter, one) in enumerate(its):
+        color = SERIES[index % len(SERIES)]
+        shown = one.spectra.frequency_hz > 0
+        frequency_hz = one.spectra.frequency_hz[shown]
+        label = f"{letter}, {one.controller}"
+        density.loglog(frequency_hz, one.spectra.disturbance[shown], "--", color=color)
+        density.loglog(frequency_hz, one.spectra.error[shown], color=color, label=label)
+        rejection.loglog(frequency_hz, one.measured[shown], color=color, label=label)
+    density.set_title("Power spectral density: error, and disturbance (dashed)")
+    density.set_ylabel("px²/Hz")
+    rejection.set_title("Disturbance rejection, measured")
+    rejection.set_ylabel("disturbance over error")
+    for axes in (density, rejection):
+        axes.set_xlabel("Hz")
+        if its:
+            decimal(axes.xaxis)
+            decimal(axes.yaxis)
+            axes.legend(loc="best")
+    caption = "Mean of both axes. The disturbance is the open loop, rebuilt from the log."
+    return Plot(f"{name}-spectra", "Spectra", caption, figure)
+
+
+def _residuals(name: str, nights: list[Night]) -> Plot:
+    figure, axes = panels(2, 4.4)
+    for index, (letter, loop) in enumerate(nights):
+        at_s, rms = running_rms(loop)
+        held = np.flatnonzero(loop.ticks["mode_number"] == Mode.VERNIER)
+        if len(held):
+            after_min = (at_s - loop.ticks["time_s"][held[0]]) / 60
+            for one, axis in zip(axes, AXES, strict=True):
+                one.plot(after_min, rms[axis], color=SERIES[index % len(SERIES)], label=letter)
+    for one, axis in zip(axes, AXES, strict=True):
+        requirement_px = min(loop.requirement_px for _, loop in nights)
+        one.axhline(requirement_px, color=INK, linestyle="--", linewidth=0.9)
+        one.set_yscale("log")
+        decimal(one.yaxis, dense=True)
+        one.set_ylabel("px")
+        one.set_title(f"RMS of the measured error in VERNIER, {axis}, {WINDOW_S:g} s at a time")
+    if axes[0].lines[1:]:
+        axes[0].legend(ncols=len(nights), loc="best")
+    axes[-1].set_xlabel("min after VERNIER first began")
+    caption = "Dashed: the requirement. Steps and hand-over are in it."
+    return Plot(f"{name}-residuals", "Residual over the night", caption, figure)

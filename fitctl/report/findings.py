@@ -1,0 +1,162 @@
+"""Everything that a report says of a run, before it is drawn or written."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fitctl.config import Rig
+from fitctl.logging.reading import Columns
+from fitctl.model.optics import scales
+from fitctl.report.gather import Gathered, gather
+from fitctl.report.judged import Judged, judge_by
+from fitctl.report.rejection import Rejection, rejections
+from fitctl.report.residual import Estimate, Verdict, Word, night_verdict, rms_estimate, verdict
+from fitctl.report.run import Run
+from fitctl.report.stages import Stacks, Stages, stacks, stages
+from fitctl.supervisor.modes import Mode
+
+AXES = ("az", "el")
+_TIMES = ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s")
+
+
+@dataclass(frozen=True)
+class LoopFindings:
+    """One loop.
+
+    Attributes
+    ----------
+    name : str
+    ticks : dict of str to array
+        See :class:`fitctl.report.gather.Gathered`.
+    requirement_px, sky_arcsec_per_px : float
+    judged : Judged
+    residual : dict of str to Estimate
+        By axis.
+    verdict : Verdict
+    mode_s : dict of str to float
+        Seconds in each mode that there was.
+    rejections : list of Rejection
+    stacks : Stacks or None
+    stages : Stages
+    counts : dict of str to int
+        Frames, late ticks, frames lost, stalls.
+    timing : dict of str to float
+        Medians and worsts, seconds; nan where nothing tells.
+    """
+
+    name: str
+    ticks: Columns
+    requirement_px: float
+    sky_arcsec_per_px: float
+    judged: Judged
+    residual: dict[str, Estimate]
+    verdict: Verdict
+    mode_s: dict[str, float]
+    rejections: list[Rejection]
+    stacks: Stacks | None
+    stages: Stages
+    counts: dict[str, int]
+    timing: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """A run, judged."""
+
+    gathered: Gathered
+    loops: dict[str, LoopFindings]
+
+    @property
+    def run(self) -> Run:
+        """Its files and its rig."""
+        return self.gathered.run
+
+    @property
+    def word(self) -> Word:
+        """The verdict on all loops together."""
+        return night_verdict([loop.verdict.word for loop in self.loops.values()])
+
+
+def find(run: Run) -> Findings:
+    """Read and judge a run.
+
+    Raises
+    ------
+    LogError
+        If it cannot be read.
+    """
+    gathered = gather(run)
+    return Findings(gathered, {name: _loop(gathered, name) for name in run.rig.loops})
+
+
+def _loop(gathered: Gathered, name: str) -> LoopFindings:
+    rig: Rig = gathered.run.rig
+    ticks, settings = gathered.ticks[name], rig.loops[name]
+    judged = judge_by(ticks, rig.camera.period_s, settings.requirement_px)
+    residual = {
+        axis: rms_estimate(
+            [ticks[f"error_{axis}_px"][piece] for piece in judged.pieces], rig.camera.period_s
+        )
+        for axis in AXES
+    }
+    found = stacks(rig, name, ticks)
+    return LoopFindings(
+        name=name,
+        ticks=ticks,
+        requirement_px=settings.requirement_px,
+        sky_arcsec_per_px=scales(rig, settings).sky_arcsec_per_px,
+        judged=judged,
+        residual=residual,
+        verdict=verdict(residual, settings.requirement_px, judged.judged_s, judged.star_fraction),
+        mode_s=_mode_s(ticks, rig.camera.period_s),
+        rejections=rejections(gathered, name, judged),
+        stacks=found,
+        stages=stages(rig, name, ticks, judged.pieces, found),
+        counts=_counts(ticks, gathered.timing[name]),
+        timing=_timing(ticks, gathered.timing[name]),
+    )
+
+
+def _mode_s(ticks: Columns, period_s: float) -> dict[str, float]:
+    """By the ticks; where none came for long, nobody knows."""
+    lasted_s = np.minimum(np.diff(ticks["time_s"], append=np.nan), 1.0)
+    lasted_s[-1:] = period_s
+    spent = {mode.name: float(lasted_s[ticks["mode_number"] == mode].sum()) for mode in Mode}
+    return {mode: seconds for mode, seconds in spent.items() if seconds > 0}
+
+
+def _counts(ticks: Columns, timing: Columns) -> dict[str, int]:
+    stalls: Any = timing.get("stalls", np.zeros(0))
+    return {
+        "frames": int(np.count_nonzero(ticks["number"] >= 0)),
+        "late_ticks": int(ticks["late"].sum()),
+        "frames_lost": int(ticks["frames_lost"].sum()),
+        "stalls": int(stalls.sum()),
+    }
+
+
+def _timing(ticks: Columns, timing: Columns) -> dict[str, float]:
+    frames = ticks["number"] >= 0
+    age_s, compute_s = ticks["frame_age_s"][frames], ticks["compute_s"][frames]
+    worst = {
+        name: float(timing[name].max()) if len(timing.get(name, ())) else math.nan
+        for name in ("servo_late_worst_s", "worst_stall_s")
+    }
+    if not frames.any():
+        return (
+            dict.fromkeys(
+                ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s"), math.nan
+            )
+            | worst
+        )
+    return {
+        "age_median_s": float(np.median(age_s)),
+        "age_worst_s": float(age_s.max()),
+        "compute_median_s": float(np.median(compute_s)),
+        "compute_worst_s": float(compute_s.max()),
+        **worst,
+    }

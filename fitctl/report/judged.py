@@ -1,0 +1,110 @@
+"""Which frames of a loop a residual is judged by, and the pieces that are whole."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.logging.reading import Columns
+from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import SETTLE_S
+
+TARGET_SETTLE_S = 2.0
+LONGEST_GAP_S = 0.5
+"""Frames missing for longer end a piece; shorter gaps are bridged, linearly, for spectra alone."""
+_TARGET_MOVES = 0.5  # requirements a second: slower is no motion
+
+
+class Judged(NamedTuple):
+    """The part of a run by which a loop is judged.
+
+    Attributes
+    ----------
+    pieces : list of array of int
+        Rows of ticks with a frame and a star, piece by piece, nothing longer than `LONGEST_GAP_S`
+        missing within one.
+    vernier_s : float
+        All time in VERNIER.
+    judged_s : float
+        Of it, what counts.
+    star_fraction : float
+        Part of the frames that count in which the star was measured; nan without any.
+    """
+
+    pieces: list[NDArray[np.intp]]
+    vernier_s: float
+    judged_s: float
+    star_fraction: float
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """Of all pieces."""
+        return np.concatenate([np.empty(0, np.intp), *self.pieces])
+
+
+def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
+    """Choose the frames: VERNIER, from `SETTLE_S` after it began and `TARGET_SETTLE_S` after the target moved.
+
+    Parameters
+    ----------
+    ticks : dict of str to array, shape (ticks,)
+        As :class:`fitctl.report.gather.Gathered` has them.
+    period_s : float
+        Of frames.
+    requirement_px : float
+        The target moves if it would pass half of this in a second.
+    """
+    rows = np.flatnonzero((ticks["mode_number"] == Mode.VERNIER) & (ticks["number"] >= 0))
+    if len(rows) == 0:
+        return Judged([], 0.0, 0.0, float("nan"))
+    time_s = ticks["time_s"][rows]
+    # A stretch ends where another mode came between, or nothing for long.
+    begins = np.ones(len(rows), bool)
+    left = np.cumsum(ticks["mode_number"] != Mode.VERNIER)[rows]
+    begins[1:] = (np.diff(left) > 0) | (np.diff(time_s) > LONGEST_GAP_S)
+    since_s = time_s - _last(time_s, begins)
+    still_s = time_s - _last(time_s, _moves(ticks, rows, begins, requirement_px) | begins)
+    counts = (since_s >= SETTLE_S) & (still_s >= TARGET_SETTLE_S)
+    seen = rows[counts & ticks["star_visible"][rows]]
+    seen_s = ticks["mid_exposure_s"][seen]
+    apart = (np.diff(seen_s) > LONGEST_GAP_S) | (
+        np.diff(np.cumsum(begins)[np.searchsorted(rows, seen)]) > 0
+    )
+    pieces = np.split(seen, np.flatnonzero(apart) + 1) if len(seen) else []
+    return Judged(
+        pieces=[piece for piece in pieces if len(piece) > 1],
+        vernier_s=len(rows) * period_s,
+        judged_s=int(np.count_nonzero(counts)) * period_s,
+        star_fraction=len(seen) / max(1, int(np.count_nonzero(counts)))
+        if counts.any()
+        else float("nan"),
+    )
+
+
+def _last(time_s: NDArray[np.float64], marked: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """When it was marked last, at each time; the first counts as marked."""
+    index = np.where(marked, np.arange(len(time_s)), 0)
+    return time_s[np.maximum.accumulate(index)]
+
+
+def _moves(
+    ticks: Columns, rows: NDArray[np.intp], begins: NDArray[np.bool_], requirement_px: float
+) -> NDArray[np.bool_]:
+    """Whether the target is on its way, at each of some rows."""
+    target_px = np.column_stack([ticks[f"target_{axis}_px"][rows] for axis in ("az", "el")])
+    step_px = np.abs(np.diff(target_px, axis=0, prepend=target_px[:1])).max(axis=1)
+    step_s = np.diff(ticks["time_s"][rows], prepend=ticks["time_s"][rows[0]] - 1.0)
+    return (step_px > _TARGET_MOVES * requirement_px * np.maximum(step_s, 1e-6)) & ~begins
+
+
+def regular(
+    time_s: NDArray[np.float64], values: NDArray[np.floating], period_s: float
+) -> NDArray[np.float64]:
+    """Values, shape (frames, n), once a period: what is missing is bridged by straight lines."""
+    frames = 1 + round((time_s[-1] - time_s[0]) / period_s)
+    if frames == len(time_s):
+        return np.asarray(values, dtype=float)
+    grid_s = np.linspace(time_s[0], time_s[-1], frames)
+    return np.column_stack([np.interp(grid_s, time_s, column) for column in values.T])

@@ -1,0 +1,112 @@
+"""Making a report: a folder with one page, its plots and its figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fitctl.report import tables
+from fitctl.report.drawing import draw, styled
+from fitctl.report.findings import Findings, LoopFindings
+from fitctl.report.page import Card, Section, card, render, sections
+
+PAGE = "report.html"
+
+
+def make_report(findings: Findings, folder: Path) -> Path:
+    """Write a run's report into a folder that exists; returns the page.
+
+    Raises
+    ------
+    OSError
+        If something cannot be written.
+    """
+    run = findings.run
+    title = f"{run.rig.name}, {tables.utc(run)}" if run.start_ns else f"{run.name}: no records"
+    with styled():
+        parts = sections(findings)
+    facts = [f"{len(run.logs)} files" if len(run.logs) > 1 else run.logs[0].path.name]
+    facts += [tables.seconds(run.duration_s), f"requirement {findings.word}"]
+    cards = [card(loop) for loop in findings.loops.values()]
+    return write(folder, title, facts, cards, parts, plain(findings))
+
+
+def write(
+    folder: Path,
+    title: str,
+    facts: Sequence[str],
+    cards: list[Card],
+    parts: list[Section],
+    figures: dict[str, Any],
+) -> Path:
+    """Page, plots and ``report.json``; returns the page.
+
+    Raises
+    ------
+    OSError
+        If something cannot be written.
+    """
+    with styled():
+        drawings = {plot.name: draw(plot, folder) for part in parts for plot in part.plots}
+    page = folder / PAGE
+    page.write_text(render(title, facts, cards, parts, drawings), encoding="utf-8")
+    (folder / "report.json").write_bytes(
+        msgspec.json.format(msgspec.json.encode(figures), indent=2) + b"\n"
+    )
+    return page
+
+
+def plain(findings: Findings) -> dict[str, Any]:
+    """A run's figures for programs; what is not known is null."""
+    run = findings.run
+    return {
+        "rig": run.rig.name,
+        "logs": [str(log.path) for log in run.logs],
+        "start_s": run.start_ns / 1e9,
+        "duration_s": run.duration_s,
+        "verdict": findings.word,
+        "records_lost": findings.gathered.lost,
+        "loops": {name: _plain_loop(loop) for name, loop in findings.loops.items()},
+    }
+
+
+def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
+    moved = loop.stages
+    return {
+        "verdict": loop.verdict.word,
+        "why": loop.verdict.why,
+        "requirement_px": loop.requirement_px,
+        "sky_arcsec_per_px": loop.sky_arcsec_per_px,
+        "residual": {axis: found._asdict() for axis, found in loop.residual.items()},
+        "vernier_s": loop.judged.vernier_s,
+        "judged_s": loop.judged.judged_s,
+        "star_fraction": loop.judged.star_fraction,
+        "mode_s": loop.mode_s,
+        "counts": loop.counts,
+        "timing": loop.timing,
+        "fsm_range_mean": moved.range_mean,
+        "fsm_range_worst": moved.range_worst,
+        "fsm_saturated_fraction": moved.saturated_fraction,
+        "piston_rms_m": moved.piston_rms_m,
+        "siderostat_moved_px": moved.motor_moved_px.tolist(),
+        "command_gap_px": [gap.px for gap in moved.gaps],
+        "controllers": [
+            {
+                "name": found.controller,
+                "judged_s": found.judged_s,
+                "design_residual_px": math.nan
+                if found.predicted is None
+                else found.predicted.residual_px,
+                "bound_px": math.nan if found.predicted is None else found.predicted.bound_px,
+                "rejection": [
+                    {"hz": at_hz, "measured": measured, "design": design}
+                    for at_hz, measured, design in found.table()
+                ],
+            }
+            for found in loop.rejections
+        ],
+    }

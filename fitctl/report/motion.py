@@ -1,0 +1,156 @@
+"""Plots of what the stages did, and when the loop did it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.figures.plate import GREEN, PURPLE, SKY
+from fitctl.report.drawing import (
+    AZ,
+    COLORS,
+    EL,
+    INK,
+    Plot,
+    TimeAxis,
+    decimal,
+    envelope,
+    panels,
+    span,
+    trace,
+)
+from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.stages import motion_px
+from fitctl.supervisor.modes import Mode
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = NDArray[np.floating]
+
+
+def mirror(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+    """How much of its range the mirror uses, and its piston."""
+    ticks = loop.ticks
+    ready = ticks["mode_number"] >= Mode.COARSE
+    figure, (fraction, piston) = panels(2, 3.8)
+    trace(
+        fraction,
+        time,
+        (ticks["time_s"][ready], 100 * ticks["fsm_range_fraction"][ready]),
+        AZ,
+        "range",
+    )
+    fraction.axhline(100.0, color=INK, linestyle="--", linewidth=0.9)
+    fraction.set_ylim(0, 105)
+    fraction.set_ylabel("% of the diamond")
+    fraction.set_title(
+        "Range of the fast steering mirror: 100 % is the edge of what three stacks reach"
+    )
+    if loop.stacks is not None:
+        series = (ticks["time_s"][ready], 1e9 * loop.stacks.piston_m[ready])
+        trace(piston, time, series, PURPLE, "piston")
+    else:
+        piston.text(
+            0.5,
+            0.5,
+            "not known: no hysteresis in the rig file",
+            transform=piston.transAxes,
+            ha="center",
+        )
+    piston.set_ylabel("nm")
+    piston.set_title("Piston of the mirror (Eq. 4)")
+    piston.set_xlabel(time.label)
+    span([piston], time, findings.run.duration_s)
+    source = (
+        ""
+        if loop.stacks is None
+        else f" Piston is by {loop.stacks.source}, from the logged voltages."
+    )
+    caption = (
+        f"From COARSE on.{source} Ideal stacks have none; the middle does not matter, changes do."
+    )
+    return Plot(f"{loop.name}-mirror", "Mirror: range and piston", caption, figure)
+
+
+def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+    """Where the siderostat is on the sky, and how the mirror hands over to it."""
+    ticks = loop.ticks
+    mirror_px, motor_px, setpoint_px = motion_px(findings.run.rig, loop.name, ticks)
+    figure, (way, *offload) = panels(3, 5.8)
+    for number, axis in enumerate(AXES):
+        sky = motor_px[:, number] * loop.sky_arcsec_per_px
+        trace(way, time, (ticks["time_s"], sky), COLORS[axis], axis)
+    way.set_title("Siderostat, from where it was first (encoders)")
+    way.set_ylabel("arcsec on the sky")
+    way.legend(ncols=2, loc="best")
+    held = np.flatnonzero(ticks["mode_number"] == Mode.VERNIER)
+    for number, (axis, axes) in enumerate(zip(AXES, offload, strict=True)):
+        if len(held):
+            from_px = setpoint_px[held[0], number]
+            for series, color, label in (
+                (mirror_px[held, number], SKY, "mirror"),
+                (setpoint_px[held, number] - from_px, INK, "siderostat, set-point"),
+            ):
+                at_s, low, high = envelope(ticks["time_s"][held], series)
+                axes.plot(at_s / time.s_per_unit, (low + high) / 2, color=color, label=label)
+        axes.set_title(f"Offload in VERNIER, {axis}: motion of the star by either stage")
+        axes.set_ylabel("px")
+    offload[0].legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
+    offload[-1].set_xlabel(time.label)
+    span(offload[-1:], time, findings.run.duration_s)
+    caption = (
+        "What lasts goes from the mirror to the siderostat, and the mirror returns to its bias (0). The "
+        "siderostat's own way is from where it was when VERNIER first began; its play is not in its encoders."
+    )
+    return Plot(f"{loop.name}-siderostat", "Siderostat and offload", caption, figure)
+
+
+def timing(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+    """Age of frames, time of computation, lateness of the servo."""
+    ticks = loop.ticks
+    seconds = findings.gathered.timing[loop.name]
+    frames = ticks["number"] >= 0
+    figure, (age, compute, servo, distribution) = panels(2, 4.6, 2)
+    at_s = ticks["time_s"][frames]
+    trace(age, time, (at_s, 1e3 * ticks["frame_age_s"][frames]), AZ, "age")
+    age.set_title("Frame's age when it was used")
+    trace(compute, time, (at_s, 1e3 * ticks["compute_s"][frames]), GREEN, "compute")
+    compute.set_title("Tick: from frame to command")
+    if len(seconds.get("servo_late_worst_s", ())):
+        for name, color in (("worst", EL), ("median", AZ)):
+            values = 1e3 * seconds[f"servo_late_{name}_s"]
+            servo.plot(seconds["time_s"] / time.s_per_unit, values, color=color, label=name)
+        servo.legend(ncols=2, loc="upper right")
+    servo.set_title("Servo's wake-ups: late, a second at a time")
+    for axes in (age, compute, servo):
+        axes.set_ylabel("ms")
+        axes.set_xlabel(time.label)
+    span((age, compute, servo), time, findings.run.duration_s)
+    _exceeding(distribution, 1e3 * ticks["frame_age_s"][frames], AZ, "age")
+    _exceeding(distribution, 1e3 * ticks["compute_s"][frames], GREEN, "tick")
+    distribution.set_title("How many take longer")
+    distribution.set_xlabel("ms")
+    distribution.set_ylabel("part of the frames")
+    distribution.set_yscale("log")
+    decimal(distribution.yaxis)
+    distribution.legend(loc="upper right")
+    caption = (
+        "Controllers are designed for one fixed age of the frames. Where the machine stood still, all rise "
+        "together."
+    )
+    return Plot(f"{loop.name}-timing", "Loop timing", caption, figure)
+
+
+def _exceeding(axes: Axes, values: Floats, color: str, label: str) -> None:
+    if len(values) == 0:
+        return
+    ordered = np.sort(values)
+    above = 1 - np.arange(len(ordered)) / len(ordered)
+    # All of the tail; of the crowd before it, some.
+    last = len(ordered) - 1
+    tail = np.arange(max(0, last - 300), last + 1)
+    shown = np.unique(np.r_[np.linspace(0, last, 300).astype(int), tail])
+    axes.step(ordered[shown], above[shown], color=color, label=label, where="post")

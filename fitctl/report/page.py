@@ -1,0 +1,146 @@
+"""From findings to a page: which tables and plots stand where."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from fitctl.report import frequency, motion, tables, timeline
+from fitctl.report.drawing import Plot, time_axis
+from fitctl.report.findings import Findings, LoopFindings
+from fitctl.report.judged import TARGET_SETTLE_S
+from fitctl.report.residual import Word
+from fitctl.report.tables import Table
+from fitctl.supervisor.simulate import SETTLE_S
+
+SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
+JUDGED = (
+    f"Judged is VERNIER, from {SETTLE_S:g} s after it began and {TARGET_SETTLE_S:g} s after the target last "
+    "moved, on frames with a star. The error is the measured one: the camera's noise is in it. The interval "
+    "knows that neighbouring frames are alike (batch means). Met: all of both axes' intervals is within the "
+    "requirement. Not met: all of one is above. Else, or without enough data: not known."
+)
+
+
+class Card(NamedTuple):
+    """The verdict on one loop.
+
+    Attributes
+    ----------
+    title : str
+    word : Word
+    why : str
+    tables : list of Table
+    """
+
+    title: str
+    word: Word
+    why: str
+    tables: list[Table]
+
+
+class Section(NamedTuple):
+    """A part of a page.
+
+    Attributes
+    ----------
+    title : str
+    plots : list of Plot
+    tables : list of Table
+    text : str
+    fold : str
+        Long text that is opened on demand.
+    """
+
+    title: str
+    plots: list[Plot]
+    tables: list[Table]
+    text: str = ""
+    fold: str = ""
+
+    @property
+    def anchor(self) -> str:
+        """For links."""
+        return re.sub(r"\W+", "-", self.title.lower())
+
+
+def card(loop: LoopFindings) -> Card:
+    """Verdict, residual and key figures of a loop."""
+    title = f"Loop {loop.name}: {loop.requirement_px:g} px RMS on each axis"
+    its_tables = [tables.residual(loop), tables.key_figures(loop)]
+    return Card(title, loop.verdict.word, loop.verdict.why, its_tables)
+
+
+def sections(findings: Findings) -> list[Section]:
+    """All of a run's report. Draws its plots: call it within :func:`fitctl.report.drawing.styled`."""
+    run = findings.run
+    time = time_axis(run.duration_s, tables.utc(run, form="%H:%M:%S UTC"))
+    found: list[Section] = []
+    for loop in findings.loops.values():
+        if not len(loop.ticks["time_s"]):
+            text = "No tick of this loop is in the log, so there is nothing to draw."
+            found.append(Section(f"Loop {loop.name}", [], [], text))
+            continue
+        plots = [
+            timeline.timeline(findings, loop, time),
+            timeline.traces(findings, loop, time),
+            frequency.spectra(loop),
+            frequency.rejection(loop),
+            motion.mirror(findings, loop, time),
+            motion.siderostat(findings, loop, time),
+            frequency.hysteresis(loop),
+            motion.timing(findings, loop, time),
+        ]
+        why = "; ".join(one.why for one in loop.rejections if one.why)
+        text = f"The design's own figures are not known: {why}." if why else ""
+        found.append(
+            Section(f"Loop {loop.name}", plots, [tables.rejected(loop), tables.timings(loop)], text)
+        )
+    recorded = [tables.losses(findings), tables.files(run)]
+    told = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
+    rig = run.rig
+    designs = {
+        loop: json.loads(text).get("parameters")
+        for loop, text in run.metadata.get("designs", {}).items()
+    }
+    return [
+        *found,
+        Section("Events", [], told),
+        Section("Losses and files", [], recorded),
+        Section("Devices", [], [tables.devices(findings)]),
+        Section(
+            "Configuration and versions",
+            [],
+            [tables.versions(findings)],
+            f"Rig {rig.name}: {rig.description}",
+            json.dumps({"rig": rig.model_dump(mode="json"), "designs": designs}, indent=1),
+        ),
+    ]
+
+
+def render(
+    title: str,
+    facts: Sequence[str],
+    cards: list[Card],
+    parts: list[Section],
+    drawings: Mapping[str, str],
+) -> str:
+    """The page: one file, nothing from elsewhere; `drawings` are its plots as SVG by name."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    pages = Environment(
+        loader=PackageLoader("fitctl.report"), autoescape=True, undefined=StrictUndefined
+    )
+    return pages.get_template("page.html.j2").render(
+        title=title,
+        facts=facts,
+        cards=cards,
+        sections=parts,
+        drawings=drawings,
+        signs=SIGNS,
+        judged=JUDGED,
+        version=importlib.metadata.version("fitctl"),
+    )

@@ -1,0 +1,59 @@
+"""A page as PDF, printed by a browser that is there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_LIMIT_S = 120.0
+
+
+class PdfError(Exception):
+    """There is no PDF: why, and what to do."""
+
+
+def print_pdf(page: Path, pdf: Path) -> None:
+    """Print a page as a browser does.
+
+    Raises
+    ------
+    PdfError
+        If there is no browser, or it fails or takes too long.
+    """
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        msg = (
+            f"no PDF: it needs Chromium or Chrome ({', '.join(BROWSERS)} on the path); or print {page} from "
+            "any browser"
+        )
+        raise PdfError(msg)
+    with tempfile.TemporaryDirectory(prefix="fitctl-") as profile:
+        arguments = [
+            "--headless",
+            "--disable-gpu",
+            "--no-first-run",
+            "--no-pdf-header-footer",
+            f"--user-data-dir={profile}",
+            f"--print-to-pdf={pdf}",
+            # As root it refuses its sandbox; the page is our own, and has no script.
+            *(["--no-sandbox"] if os.geteuid() == 0 else []),
+            page.resolve().as_uri(),
+        ]
+        try:
+            done = subprocess.run(
+                [browser, *arguments], capture_output=True, text=True, timeout=_LIMIT_S, check=False
+            )
+        except subprocess.TimeoutExpired:
+            msg = f"no PDF: {browser} did not end within {_LIMIT_S:g} s; print {page} from any browser"
+            raise PdfError(msg) from None
+        except OSError as error:
+            msg = f"no PDF: {browser} cannot be started: {error.strerror}; print {page} from any browser"
+            raise PdfError(msg) from None
+    if done.returncode or not pdf.exists():
+        said = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        msg = f"no PDF: {browser} ended with {done.returncode} and said: {said}; print {page} from any browser"
+        raise PdfError(msg)

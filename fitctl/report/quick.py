@@ -1,0 +1,184 @@
+"""A quick look at fields of a log: in the terminal, in a window or as a picture."""
+
+from __future__ import annotations
+
+import shutil
+from collections import defaultdict
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import HEADER, column_blocks, log_info
+from fitctl.report.drawing import SERIES, TimeAxis, envelope, panels, styled, time_axis, trace
+
+Floats = NDArray[np.floating]
+MOST_FIELDS = 12
+_ROWS = 20_000
+_TERMINAL_BINS = 400
+_LEAST_LINES = 12  # of a panel
+UNITS = ("px", "v", "s", "rad", "arcsec", "dn", "fraction", "progress", "ns")
+
+
+class Series(NamedTuple):
+    """One field of one topic; times are seconds after the log's first record."""
+
+    topic: str
+    field: str
+    time_s: Floats
+    values: Floats
+
+    @property
+    def unit(self) -> str:
+        """As its name ends."""
+        end = self.field.rpartition("_")[2]
+        return end if end in UNITS else self.field
+
+    @property
+    def label(self) -> str:
+        """Topic and field."""
+        return f"{self.topic}.{self.field}"
+
+
+def read_series(
+    path: Path, wanted: Sequence[str], from_ns: int = 0, to_ns: int = 2**63 - 1
+) -> list[Series]:
+    """Fields of a log.
+
+    Parameters
+    ----------
+    wanted : sequence of str
+        ``TOPIC.FIELD``, ``TOPIC`` for all its fields, or ``FIELD`` of any topic; ``*`` stands for anything.
+    from_ns, to_ns : int
+        UTC, nanoseconds since 1970; the second is not included.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, one of `wanted` is nothing in it, or it is too much to look at.
+    """
+    info = log_info(path)
+    fields = {
+        topic: _fields(path, topic) for topic in sorted(info.counts) if not topic.endswith("/frame")
+    }
+    chosen: dict[str, list[str]] = defaultdict(list)
+    for text in wanted:
+        for topic, field in _matching(path, text, fields):
+            if field not in chosen[topic]:
+                chosen[topic].append(field)
+    number = sum(map(len, chosen.values()))
+    if number > MOST_FIELDS:
+        names = ", ".join(f"{topic}.{field}" for topic, its in chosen.items() for field in its)
+        msg = f"{path}: {number} fields are too many to look at, at most {MOST_FIELDS}; choose of {names}"
+        raise LogError(msg)
+    parts: dict[tuple[str, str], list[Floats]] = defaultdict(list)
+    start_ns = round(info.start_s * 1e9)
+    for topic, columns in column_blocks(path, list(chosen), _ROWS):
+        utc_ns = columns["publish_time_ns"]
+        inside = (utc_ns >= from_ns) & (utc_ns < to_ns)
+        parts[topic, ""].append((utc_ns[inside] - start_ns) / 1e9)
+        for field in chosen[topic]:
+            parts[topic, field].append(columns[field][inside].astype(np.float32))
+    return [
+        Series(topic, field, np.concatenate(parts[topic, ""]), np.concatenate(parts[topic, field]))
+        for topic, its in chosen.items()
+        for field in its
+    ]
+
+
+def _fields(path: Path, topic: str) -> list[str]:
+    """The numbers that a topic has."""
+    for _, columns in column_blocks(path, [topic], 1):
+        return [
+            name
+            for name, column in columns.items()
+            if column.dtype.kind in "fib" and name not in {*HEADER, "time_s"}
+        ]
+    return []
+
+
+def _matching(path: Path, text: str, fields: dict[str, list[str]]) -> list[tuple[str, str]]:
+    topic_part, dot, field_part = text.rpartition(".")
+    if not dot:
+        topic_part, field_part = (text, "*") if text.startswith("/") else ("*", text)
+    topics = [topic for topic in fields if fnmatchcase(topic, topic_part)]
+    found = [
+        (topic, field)
+        for topic in topics
+        for field in fields[topic]
+        if fnmatchcase(field, field_part)
+    ]
+    if not found:
+        there = (
+            f"{', '.join(topics)} has {', '.join(name for topic in topics for name in fields[topic])}"
+            if topics and topic_part != "*"
+            else f"its topics are {', '.join(fields) or 'none'}"
+        )
+        msg = f"{path}: has no {text}; {there}"
+        raise LogError(msg)
+    return found
+
+
+def _by_unit(series: Sequence[Series]) -> dict[str, list[Series]]:
+    grouped: dict[str, list[Series]] = defaultdict(list)
+    for one in series:
+        grouped[one.unit].append(one)
+    return grouped
+
+
+def _labels(series: Sequence[Series]) -> dict[str, str]:
+    """As short as they can be told apart."""
+    topics = {one.topic for one in series}
+    return {one.label: one.field if len(topics) == 1 else one.label for one in series}
+
+
+def _axis(path: Path, series: Sequence[Series]) -> TimeAxis:
+    last_s = max((float(one.time_s[-1]) for one in series if len(one.time_s)), default=0.0)
+    return time_axis(last_s, path.name)
+
+
+def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
+    """One panel for each unit, as wide and high as the terminal."""
+    import plotext
+
+    columns, lines = shutil.get_terminal_size()
+    grouped, labels, time = _by_unit(series), _labels(series), _axis(path, series)
+    figure: Any = plotext.figure
+    figure.clear()
+    figure.plot_size(columns, max(lines - 2, _LEAST_LINES * len(grouped)))
+    if len(grouped) > 1:
+        figure.subplots(len(grouped), 1)
+    for row, (unit, its) in enumerate(grouped.items(), start=1):
+        panel = figure.subplot(row, 1) if len(grouped) > 1 else figure
+        panel.theme("simple" if colours else "colorless")
+        for one in its:
+            at_s, low, high = envelope(one.time_s, one.values, _TERMINAL_BINS)
+            both_s, both = np.repeat(at_s, 2), np.column_stack([low, high]).ravel()
+            there = ~np.isnan(both)
+            if there.any():
+                points = panel.signal(
+                    (both_s[there] / time.s_per_unit).tolist(), both[there].tolist()
+                )
+                panel.draw(points.lines().label(labels[one.label]))
+        panel.label(unit, "y")
+    panel.label(time.label, "x")
+    return str(figure.build().string(colorless=not colours))
+
+
+def as_figure(path: Path, series: Sequence[Series]) -> Any:
+    """One panel for each unit, as a matplotlib figure."""
+    grouped, labels, time = _by_unit(series), _labels(series), _axis(path, series)
+    with styled():
+        figure, axes = panels(len(grouped), 1.2 + 2.0 * len(grouped))
+        for panel, (unit, its) in zip(axes, grouped.items(), strict=True):
+            for number, one in enumerate(its):
+                color = SERIES[number % len(SERIES)]
+                trace(panel, time, (one.time_s, one.values), color, labels[one.label])
+            panel.set_ylabel(unit)
+            panel.legend(loc="best")
+        axes[-1].set_xlabel(time.label)
+    return figure

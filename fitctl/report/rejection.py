@@ -1,0 +1,183 @@
+"""What each controller did about the disturbance, beside what its design says."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ConfigError, Rig
+from fitctl.controllers.design.basis import Basis, basis
+from fitctl.controllers.design.bound import bound, linear_residual
+from fitctl.controllers.design.choose import DESIGNS, design_for
+from fitctl.controllers.design.files import design_of
+from fitctl.controllers.design.loopshape import sampled_response
+from fitctl.controllers.pair import Design
+from fitctl.figures.attenuation import SEGMENT_S, Rebuilt, Spectra, attenuation, spectra, stages_px
+from fitctl.logging.reading import Columns
+from fitctl.report.gather import Gathered
+from fitctl.report.judged import Judged, regular
+
+Floats = NDArray[np.float64]
+AT_HZ = (0.25, 0.5, 1.0, 2.0, 5.0)
+_CHANGE = re.compile(r"controller (.+) -> (.+)")
+
+
+class Predicted(NamedTuple):
+    """What a design says of itself.
+
+    Attributes
+    ----------
+    rejection : array, shape (frequencies,)
+        Disturbance over error, as amplitudes.
+    residual_px, bound_px : float
+        What it leaves of the air path that it was made for, linear and true; and the least that any could.
+    """
+
+    rejection: Floats
+    residual_px: float
+    bound_px: float
+
+
+class Rejection(NamedTuple):
+    """One controller's part of a run.
+
+    Attributes
+    ----------
+    controller : str
+    judged_s : float
+        In pieces long enough for a spectrum.
+    spectra : Spectra
+        Of error and rebuilt disturbance, the mean of both axes.
+    predicted : Predicted or None
+        None where the design cannot be made again; then `why` says why.
+    """
+
+    controller: str
+    judged_s: float
+    spectra: Spectra
+    predicted: Predicted | None
+    why: str
+
+    @property
+    def measured(self) -> Floats:
+        """Disturbance over error, as amplitudes, shape (frequencies,)."""
+        return np.sqrt(self.spectra.disturbance / self.spectra.error)
+
+    def table(self) -> list[tuple[float, float, float]]:
+        """Frequency, measured, design's (nan if unknown), where the camera can tell."""
+        frequency_hz = self.spectra.frequency_hz
+        return [
+            (
+                at_hz,
+                attenuation(self.spectra, at_hz),
+                math.nan
+                if self.predicted is None
+                else float(np.interp(at_hz, frequency_hz, self.predicted.rejection)),
+            )
+            for at_hz in AT_HZ
+            if at_hz < 0.9 * frequency_hz[-1]
+        ]
+
+
+def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejection]:
+    """One for each controller that was in force long enough, in the order of their first use."""
+    rig, ticks = gathered.run.rig, gathered.ticks[loop_name]
+    if not judged.pieces:
+        return []
+    error_px = np.column_stack([ticks[f"error_{axis}_px"] for axis in ("az", "el")]).astype(float)
+    disturbance_px = error_px - stages_px(rig, loop_name, ticks)
+    period_s = rig.camera.period_s
+    controllers = _controllers(gathered, loop_name)
+    found = []
+    for name in dict.fromkeys(name for _, _, name in controllers):
+        spans = [(begin_s, end_s) for begin_s, end_s, its in controllers if its == name]
+        its_spectra, segments, seconds = [], [], 0.0
+        for piece in _within(judged, ticks, spans):
+            time_s = ticks["mid_exposure_s"][piece]
+            if time_s[-1] - time_s[0] < SEGMENT_S:
+                continue
+            both = np.hstack([error_px[piece], disturbance_px[piece]])
+            both = regular(time_s, both, period_s)
+            series = Rebuilt(time_s[0] + period_s * np.arange(len(both)), both[:, :2], both[:, 2:])
+            its_spectra.append(spectra(series, period_s))
+            seconds += len(both) * period_s
+            segments.append(2 * len(both) * period_s / SEGMENT_S - 1)
+        if its_spectra:
+            measured = Spectra(
+                its_spectra[0].frequency_hz,
+                np.average([one.error for one in its_spectra], axis=0, weights=segments),
+                np.average([one.disturbance for one in its_spectra], axis=0, weights=segments),
+            )
+            predicted, why = _predicted(gathered, loop_name, name, measured.frequency_hz)
+            found.append(Rejection(name, seconds, measured, predicted, why))
+    return found
+
+
+def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float, str]]:
+    """Begin, end and name of what was in force, from the run's description and its events."""
+    changes = [
+        (event["time_s"], *change.groups())
+        for event in gathered.events
+        if event["name"] == loop_name and (change := _CHANGE.fullmatch(event["message"]))
+    ]
+    logged = _logged_design(gathered, loop_name)
+    vernier = gathered.run.rig.loops[loop_name].vernier
+    name = changes[0][1] if changes else str(logged.get("name", vernier.controller))
+    begins: list[tuple[float, str]] = [(-math.inf, name)]
+    begins += [(time_s, after) for time_s, _, after in changes]
+    ends = [time_s for time_s, _ in begins[1:]] + [math.inf]
+    return [(begin_s, end_s, its) for (begin_s, its), end_s in zip(begins, ends, strict=True)]
+
+
+def _within(
+    judged: Judged, ticks: Columns, spans: list[tuple[float, float]]
+) -> list[NDArray[np.intp]]:
+    pieces = []
+    for piece in judged.pieces:
+        time_s = ticks["time_s"][piece]
+        for begin_s, end_s in spans:
+            inside = piece[(time_s >= begin_s) & (time_s < end_s)]
+            if len(inside) > 1:
+                pieces.append(inside)
+    return pieces
+
+
+def _predicted(
+    gathered: Gathered, loop_name: str, name: str, frequency_hz: Floats
+) -> tuple[Predicted | None, str]:
+    try:
+        its_basis = basis(gathered.run.rig, loop_name)
+        design = _design(gathered, loop_name, name, its_basis)
+    except ConfigError as error:
+        return None, str(error)
+    rejection = np.full(len(frequency_hz), math.inf)  # at rest: the siderostat integrates
+    above = frequency_hz > 0
+    loop = sampled_response(design, its_basis)(2 * math.pi * frequency_hz[above])
+    rejection[above] = np.abs(1 + loop)
+    return (
+        Predicted(
+            rejection,
+            linear_residual(design, its_basis),
+            bound(its_basis).residual_px,
+        ),
+        "",
+    )
+
+
+def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> Design:
+    """As it was logged; one that came later is made again by its name."""
+    rig: Rig = gathered.run.rig
+    logged = _logged_design(gathered, loop_name)
+    if logged.get("name") == name:
+        return design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
+    return design_for(rig, loop_name, name)
+
+
+def _logged_design(gathered: Gathered, loop_name: str) -> dict[str, Any]:
+    text = gathered.run.metadata.get("designs", {}).get(loop_name)
+    return json.loads(text, parse_int=float) if text else {}

@@ -1,0 +1,124 @@
+"""Which files are one run, and the rig that it was."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from fitctl.config import ConfigError, Rig, rig_from_document
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import LogInfo, log_info
+
+
+class Run(NamedTuple):
+    """The log of one start of a supervisor, in one file or several.
+
+    Attributes
+    ----------
+    logs : tuple of LogInfo
+        In order of time.
+    rig : Rig
+        As it was in force.
+    start_ns, end_ns : int
+        UTC of the first and the last record, nanoseconds since 1970; 0 without records.
+    """
+
+    logs: tuple[LogInfo, ...]
+    rig: Rig
+    start_ns: int
+    end_ns: int
+
+    @property
+    def name(self) -> str:
+        """By which people know it: its first file's."""
+        return self.logs[0].path.stem
+
+    @property
+    def duration_s(self) -> float:
+        """From the first record to the last."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Of the last file."""
+        return self.logs[-1].metadata
+
+    @property
+    def told(self) -> str:
+        """Its files, for errors."""
+        return ", ".join(str(log.path) for log in self.logs)
+
+
+def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
+    """The run that files, or the newest run that a folder holds.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files of one run in any order, or one folder.
+    rig : Rig, optional
+        In place of the one in the log.
+
+    Raises
+    ------
+    LogError
+        If there is no log, one cannot be read or is none of fitctl's, or they are of several runs.
+    ConfigError
+        If the rig in the log is none that this fitctl understands.
+    """
+    if len(paths) == 1 and paths[0].is_dir():
+        logs = _newest_run(paths[0])
+    else:
+        logs = [log_info(path) for path in paths]
+        for log in logs[1:]:
+            if _identity(log) != _identity(logs[0]):
+                msg = (
+                    f"{log.path}: is of another run than {logs[0].path}; report each alone, or put them "
+                    "side by side with --compare"
+                )
+                raise LogError(msg)
+    with_records = sorted((log for log in logs if log.counts), key=lambda log: log.start_s)
+    logs = with_records or logs[:1]
+    return Run(
+        logs=tuple(logs),
+        rig=rig or _rig_of(logs[-1]),
+        start_ns=round(logs[0].start_s * 1e9) if with_records else 0,
+        end_ns=round(max(log.end_s for log in logs) * 1e9) if with_records else 0,
+    )
+
+
+def _newest_run(folder: Path) -> list[LogInfo]:
+    logs = [log_info(path) for path in sorted(folder.glob("*.mcap"))]
+    logs = [log for log in logs if "rig" in log.metadata and log.counts]
+    if not logs:
+        msg = f"{folder}: holds no log of fitctl (*.mcap); name a file, or the rig's logging.folder"
+        raise LogError(msg)
+    newest = max(logs, key=lambda log: log.start_s)
+    return [log for log in logs if _identity(log) == _identity(newest)]
+
+
+def _identity(log: LogInfo) -> tuple[str, ...]:
+    """The same for all files of a run: rig, and the two clocks at its start."""
+    if "rig" not in log.metadata:
+        msg = f"{log.path}: says of no rig what it recorded; name a log that fitctl recorded"
+        raise LogError(msg)
+    clock = log.metadata.get("clock", {})
+    return log.metadata["rig"].get("name", ""), *clock.values()
+
+
+def _rig_of(log: LogInfo) -> Rig:
+    _identity(log)
+    try:
+        document = json.loads(log.metadata["rig"]["json"])
+    except (KeyError, ValueError) as error:
+        msg = f"{log.path}: the rig file in it cannot be read ({error}); give one with --rig"
+        raise LogError(msg) from None
+    try:
+        return rig_from_document(document, f"{log.path}: rig file in it")
+    except ConfigError as error:
+        first, *more = str(error).splitlines()
+        also = f" ({len(more)} more)" if more else ""
+        msg = f"{first}{also}; give a rig file that this fitctl knows with --rig"
+        raise ConfigError(msg) from None

@@ -1,0 +1,272 @@
+"""A report's figures as tables of text."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.residual import Estimate
+from fitctl.report.run import Run
+
+UNKNOWN = "not known"
+MOST_ROWS = 400
+_LEVELS = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}  # foxglove.Log
+
+
+class Table(NamedTuple):
+    """One table; its first column heads the rows.
+
+    Attributes
+    ----------
+    caption : str
+    head : sequence of str
+    rows : sequence of sequence of str
+    """
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def number(value: float, form: str, unit: str = "", scale: float = 1.0) -> str:
+    """A number with its unit, or that it is not known."""
+    if math.isnan(value):
+        return UNKNOWN
+    return f"{value * scale:{form}}{' ' if unit else ''}{unit}"
+
+
+def seconds(value: float) -> str:
+    """A length of time for people."""
+    if math.isnan(value):
+        return UNKNOWN
+    if value < 120:
+        return f"{value:.1f} s"
+    hours, rest = divmod(round(value), 3600)
+    minutes, left = divmod(rest, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {left:02d} s"
+
+
+def utc(run: Run, time_s: float = 0.0, form: str = "%Y-%m-%d %H:%M:%S UTC") -> str:
+    """A moment of a run."""
+    return time.strftime(form, time.gmtime(run.start_ns / 1e9 + time_s))
+
+
+def interval(found: Estimate) -> str:
+    """95 % confidence, px."""
+    return f"{found.low_px:.4f} to {found.high_px:.4f}" if found.known else UNKNOWN
+
+
+def residual(loop: LoopFindings) -> Table:
+    """What the verdict is of."""
+    return Table(
+        "Measured error about the target, RMS, with 95 % confidence",
+        [
+            "axis",
+            "px",
+            "interval, px",
+            "arcsec on the sky",
+            "of the requirement",
+            "independent blocks",
+        ],
+        [
+            [
+                axis,
+                number(found.rms_px, ".4f"),
+                interval(found),
+                number(found.rms_px * loop.sky_arcsec_per_px, ".4f"),
+                number(100 * found.rms_px / loop.requirement_px, ".0f", "%"),
+                f"{found.blocks:.0f} of {found.block_s:g} s" if found.blocks else "none",
+            ]
+            for axis, found in loop.residual.items()
+        ],
+    )
+
+
+def key_figures(loop: LoopFindings) -> Table:
+    """What else one asks first."""
+    judged, moved = loop.judged, loop.stages
+    share = 100 * judged.star_fraction
+    rows = [
+        ["time in VERNIER", seconds(judged.vernier_s)],
+        ["of it judged", f"{seconds(judged.judged_s)}; pieces: {len(judged.pieces)}"],
+        ["star seen in it", number(share, ".2f", "% of the frames")],
+        [
+            "mirror's range",
+            f"{number(moved.range_mean, '.1%')} mean, {number(moved.range_worst, '.1%')} worst",
+        ],
+        ["mirror saturated", number(moved.saturated_fraction, ".2%")],
+        ["piston (Eq. 4), RMS", number(moved.piston_rms_m, ".1f", "nm", 1e9)],
+    ]
+    rows += [
+        [
+            f"siderostat's set-point, {axis}",
+            number(px * loop.sky_arcsec_per_px, "+.2f", "arcsec on the sky from first to last"),
+        ]
+        for axis, px in zip(AXES, moved.motor_moved_px, strict=True)
+    ]
+    rows.append(
+        [
+            "modes",
+            ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks",
+        ]
+    )
+    return Table("In the part that is judged", ["what", "how much"], rows)
+
+
+def rejected(loop: LoopFindings) -> Table:
+    """Measured rejection beside the design's."""
+    head = ["controller", "judged", "bound", "design's residual"]
+    frequencies = [at_hz for at_hz, *_ in loop.rejections[0].table()] if loop.rejections else []
+    head += [f"{at_hz:g} Hz" for at_hz in frequencies]
+    rows = []
+    for found in loop.rejections:
+        predicted = found.predicted
+        least, left = (
+            (math.nan,) * 2 if predicted is None else (predicted.bound_px, predicted.residual_px)
+        )
+        row = [found.controller, seconds(found.judged_s)]
+        row += [number(least, ".4f", "px"), number(left, ".4f", "px")]
+        row += [
+            f"{measured:.2f} / {number(design, '.2f')}" for _, measured, design in found.table()
+        ]
+        rows.append(row)
+    return Table("Disturbance rejection: measured / design", head, rows)
+
+
+def timings(loop: LoopFindings) -> Table:
+    """Milliseconds."""
+    found = loop.timing
+    rows = {
+        "frame's age when used": (found["age_median_s"], found["age_worst_s"]),
+        "tick, from frame to command": (found["compute_median_s"], found["compute_worst_s"]),
+        "servo's wake-up late": (math.nan, found["servo_late_worst_s"]),
+        "the machine stood still": (math.nan, found["worst_stall_s"]),
+    }
+    texts = [
+        [what, *(number(value, ".3f", "ms", 1e3) for value in values)]
+        for what, values in rows.items()
+    ]
+    return Table("Timing", ["what", "median", "worst"], texts)
+
+
+def losses(findings: Findings) -> Table:
+    """What did not arrive, and what was late."""
+    run = findings.run
+    rows = [
+        [
+            name,
+            *(f"{loop.counts[what]}" for what in ("frames", "frames_lost", "late_ticks", "stalls")),
+        ]
+        for name, loop in findings.loops.items()
+    ]
+    lost = findings.gathered.lost
+    unfinished = [str(log.path.name) for log in run.logs if not log.finished]
+    caption = f"Losses. Records lost on the way to the log: {UNKNOWN if lost is None else lost}."
+    if unfinished:
+        caption += f" Not finished, so that its end may be missing: {', '.join(unfinished)}."
+    return Table(
+        caption, ["loop", "frames", "frames lost", "late ticks", "stalls of the machine"], rows
+    )
+
+
+def events(findings: Findings) -> Table:
+    """What an operator was told; of very many the worst first."""
+    told = findings.gathered.events
+    shown = sorted(told, key=lambda event: -event["level"])[:MOST_ROWS]
+    shown.sort(key=lambda event: event["time_s"])
+    caption = (
+        "Events" if len(shown) == len(told) else f"Events: {len(shown)} of {len(told)}, the gravest"
+    )
+    rows = [
+        [
+            utc(findings.run, event["time_s"], "%H:%M:%S"),
+            seconds(event["time_s"]),
+            _LEVELS.get(event["level"], str(event["level"])),
+            event["name"],
+            event["message"],
+        ]
+        for event in shown
+    ]
+    return Table(caption, ["UTC", "after start", "level", "of", "what"], rows)
+
+
+def modes(findings: Findings) -> Table:
+    """Every change."""
+    changes = findings.gathered.modes
+    rows = [
+        [
+            utc(findings.run, change["time_s"], "%H:%M:%S"),
+            seconds(change["time_s"]),
+            change["loop"],
+            f"{change['source']} → {change['target']}",
+            change["reason"],
+        ]
+        for change in changes[:MOST_ROWS]
+    ]
+    caption = "Changes of mode" + (
+        f": the first {MOST_ROWS} of {len(changes)}" if len(changes) > MOST_ROWS else ""
+    )
+    return Table(caption, ["UTC", "after start", "loop", "change", "why"], rows)
+
+
+def devices(findings: Findings) -> Table:
+    """How each was, and when that changed."""
+    rows = [
+        [
+            row["device"],
+            utc(findings.run, row["time_s"], "%H:%M:%S"),
+            row["state"],
+            row["identity"],
+            row["endpoint"],
+            row["detail"],
+        ]
+        for row in findings.gathered.health[:MOST_ROWS]
+    ]
+    return Table(
+        "Devices: each change of state",
+        ["device", "UTC", "state", "identity", "endpoint", "detail"],
+        rows,
+    )
+
+
+def attempts(findings: Findings) -> Table:
+    """Steps of sequences."""
+    rows = [
+        [
+            f"{row['sequence_name']} {row['step_number']}: {row['step']}",
+            row["loop"],
+            str(row["attempt"]),
+            seconds(row["ended_s"] - row["began_s"]),
+            row["outcome"],
+            row["message"],
+        ]
+        for row in findings.gathered.attempts[:MOST_ROWS]
+    ]
+    return Table("Steps of sequences", ["step", "loop", "attempt", "took", "outcome", "told"], rows)
+
+
+def versions(findings: Findings) -> Table:
+    """Of the software that recorded, and how it ran."""
+    metadata = findings.run.metadata
+    rows = [[name, version] for name, version in metadata.get("versions", {}).items()]
+    rows += [["scheduling", metadata.get("scheduling", {}).get("policy", UNKNOWN)]]
+    return Table("Versions when it was recorded", ["what", "which"], rows)
+
+
+def files(run: Run) -> Table:
+    """Of the run."""
+    rows = [
+        [
+            str(log.path.name),
+            utc(run, log.start_s - run.start_ns / 1e9) if log.counts else "no records",
+            seconds(log.duration_s),
+            f"{log.path.stat().st_size / 1e6:.1f} MB",
+            f"{sum(log.counts.values())}",
+            "yes" if log.finished else "no",
+        ]
+        for log in run.logs
+    ]
+    return Table("Files", ["file", "begins", "lasts", "size", "records", "finished"], rows)

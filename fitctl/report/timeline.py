@@ -1,0 +1,175 @@
+"""Plots of the whole run: modes and events, residual, traces."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.figures.plate import GREEN, ORANGE, PURPLE, SKY
+from fitctl.report.drawing import (
+    AZ,
+    COLORS,
+    EL,
+    FAINT,
+    INK,
+    Plot,
+    TimeAxis,
+    decimal,
+    panels,
+    span,
+    trace,
+)
+from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.supervisor.modes import Mode
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = NDArray[np.floating]
+_MODE_COLORS = {
+    Mode.OFF: FAINT,
+    Mode.STANDBY: SKY,
+    Mode.ACQUISITION: ORANGE,
+    Mode.COARSE: PURPLE,
+    Mode.VERNIER: GREEN,
+    Mode.SAFE: EL,
+    Mode.EXPERIMENT: AZ,
+}
+_SIGNS = {3: ("v", ORANGE, "warning"), 4: ("X", EL, "error")}  # by foxglove.Log's level
+WINDOW_S = 10.0
+
+
+def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
+    """Middles of windows of `WINDOW_S` and the RMS of each axis' error in VERNIER; NaN without a star."""
+    ticks = loop.ticks
+    held = (ticks["mode_number"] == Mode.VERNIER) & ticks["star_visible"]
+    time_s = ticks["time_s"][held]
+    if len(time_s) == 0:
+        return np.empty(0), {axis: np.empty(0) for axis in AXES}
+    window = np.floor(time_s / WINDOW_S).astype(int)
+    first, last = window[0], window[-1]
+    count = np.bincount(window - first, minlength=last - first + 1)
+    rms = {}
+    for axis in AXES:
+        squares = ticks[f"error_{axis}_px"][held].astype(float) ** 2
+        with np.errstate(invalid="ignore"):
+            rms[axis] = np.sqrt(np.bincount(window - first, squares) / count)
+    return (np.arange(first, last + 1) + 0.5) * WINDOW_S, rms
+
+
+def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+    """Modes, events and the residual, ten seconds at a time."""
+    figure, (modes, residual) = panels(2, 3.6, heights=(1, 2.4))
+    for begin_s, end_s, mode in _spans(loop):
+        modes.barh(
+            0,
+            (end_s - begin_s) / time.s_per_unit,
+            left=begin_s / time.s_per_unit,
+            height=0.6,
+            color=_MODE_COLORS[mode],
+            linewidth=0,
+        )
+    for mode in dict.fromkeys(mode for *_, mode in _spans(loop)):
+        modes.barh(0, 0, color=_MODE_COLORS[mode], label=mode.name)
+    for level, (sign, color, label) in _SIGNS.items():
+        times_s = [event["time_s"] for event in findings.gathered.events if event["level"] == level]
+        if times_s:
+            at = np.array(times_s) / time.s_per_unit
+            modes.plot(at, np.full(len(at), 0.55), sign, color=color, markersize=6, label=label)
+    modes.set_ylim(-0.45, 0.8)
+    modes.set_yticks([])
+    modes.set_title("Modes and events")
+    modes.legend(ncols=9, loc="lower left", bbox_to_anchor=(0.18, 0.98), borderaxespad=0)
+    modes.grid(visible=False, axis="y")
+    at_s, rms = running_rms(loop)
+    for axis in AXES:
+        marker = "o" if len(at_s) < 60 else ""
+        shown = at_s / time.s_per_unit
+        residual.plot(shown, rms[axis], marker, ls="-", ms=3, color=COLORS[axis], label=axis)
+    residual.axhline(
+        loop.requirement_px,
+        color=INK,
+        linestyle="--",
+        label=f"requirement {loop.requirement_px:g} px",
+    )
+    residual.set_yscale("log")
+    decimal(residual.yaxis, dense=True)
+    residual.set_ylabel("px")
+    residual.set_title(f"RMS of the measured error in VERNIER, {WINDOW_S:g} s at a time")
+    residual.set_xlabel(time.label)
+    residual.legend(ncols=3, loc="best")
+    span([residual], time, findings.run.duration_s)
+    caption = (
+        "Above: the loop's mode; marks are warnings and errors of the whole instrument. Below: RMS about the "
+        "target, steps and hand-over included."
+    )
+    return Plot(f"{loop.name}-timeline", "Timeline", caption, figure)
+
+
+def _spans(loop: LoopFindings) -> list[tuple[float, float, Mode]]:
+    ticks = loop.ticks
+    numbers, time_s = ticks["mode_number"], ticks["time_s"]
+    if len(numbers) == 0:
+        return []
+    apart = (np.diff(numbers) != 0) | (np.diff(time_s) > 1.0)
+    begins = np.flatnonzero(np.r_[True, apart])
+    ends = np.r_[begins[1:], len(numbers) - 1]
+    # Up to the next tick, but not over a time without any.
+    return [
+        (
+            time_s[begin],
+            min(time_s[end], time_s[max(begin, end - 1)] + 1.0),
+            Mode(int(numbers[begin])),
+        )
+        for begin, end in zip(begins, ends, strict=True)
+    ]
+
+
+def traces(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+    """Error, target and flux."""
+    ticks = loop.ticks
+    frames = ticks["star_visible"]
+    held = frames & (ticks["mode_number"] == Mode.VERNIER)
+    figure, (error, target, flux) = panels(3, 5.4)
+    for axis in AXES:
+        series = (ticks["time_s"][held], ticks[f"error_{axis}_px"][held])
+        trace(error, time, series, COLORS[axis], axis)
+        tracked = ticks["mode_number"] >= Mode.ACQUISITION
+        trace(
+            target,
+            time,
+            (ticks["time_s"][tracked], ticks[f"target_{axis}_px"][tracked]),
+            COLORS[axis],
+            axis,
+        )
+    for sign in (-1, 1):
+        error.axhline(sign * loop.requirement_px, color=INK, linestyle="--", linewidth=0.9)
+    beyond = _limit(error, loop, held)
+    trace(flux, time, (ticks["time_s"][frames], ticks["star_flux_dn"][frames]), GREEN, "flux")
+    error.set_title(f"Error in VERNIER: star less target{beyond}")
+    error.set_ylabel("px")
+    target.set_title("Target, as filtered")
+    target.set_ylabel("px")
+    flux.set_title("Light in the window")
+    flux.set_ylabel("DN")
+    flux.set_xlabel(time.label)
+    error.legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
+    span([flux], time, findings.run.duration_s)
+    caption = (
+        "Dashed: the requirement, either side, for comparison with the error's size. Long series are bands "
+        "from the lowest to the highest value of each piece of time."
+    )
+    return Plot(f"{loop.name}-traces", "Traces", caption, figure)
+
+
+def _limit(axes: Axes, loop: LoopFindings, held: NDArray[np.bool_]) -> str:
+    """So that a few frames of hand-over do not flatten the rest; returns what is to be said of them."""
+    if not held.any():
+        return ""
+    errors = np.abs(np.concatenate([loop.ticks[f"error_{axis}_px"][held] for axis in AXES]))
+    shown_px = max(1.3 * loop.requirement_px, 1.2 * float(np.quantile(errors, 0.995)))
+    worst_px = float(errors.max())
+    axes.set_ylim(-shown_px, shown_px)
+    return f"; at worst {worst_px:.2f} px, not shown" if worst_px > shown_px else ""

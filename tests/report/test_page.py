@@ -1,0 +1,178 @@
+"""The page and what is beside it."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import pytest
+from report_samples import record
+
+from fitctl.logging.records import Event
+from fitctl.report.compare import make_comparison
+from fitctl.report.drawing import VARIABLES, envelope
+from fitctl.report.findings import find
+from fitctl.report.make import make_report
+from fitctl.report.run import find_run
+
+VOID = {"meta", "br", "hr", "img", "link", "input"}
+
+
+class Reader(HTMLParser):
+    """Every element, what it points to, and whether all that is opened is closed."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.ids, self.references, self.text, self.scripts = [], [], [], [], 0
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.scripts += tag == "script"
+        found = dict(attrs)
+        if "id" in found:
+            self.ids.append(found["id"])
+        self.references += [
+            value
+            for name, value in attrs
+            if name in {"href", "src", "xlink:href", "data", "action"}
+        ]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+@pytest.fixture(scope="module")
+def made(findings, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    page = make_report(findings, folder)
+    return folder, page.read_text()
+
+
+def test_the_page_is_sound_html_and_needs_nothing_from_elsewhere(made):
+    _, page = made
+    read = Reader(page)
+
+    assert read.open == []
+    assert len(read.ids) == len(set(read.ids))
+    assert read.scripts == 0
+    assert all(to.startswith(("#", "data:")) for to in read.references), read.references
+    assert {to[1:] for to in read.references if to.startswith("#")} <= set(read.ids)
+    assert set(re.findall(r"url\(#([^)]+)\)", page)) <= set(read.ids)
+    assert not re.search(r"@import|url\((?!#)", page)
+
+
+def test_it_says_the_verdict_and_every_part_that_was_asked_for(made):
+    text = " ".join(Reader(made[1]).text)
+
+    for part in (
+        "met",
+        "Timeline",
+        "Traces",
+        "Before and after",
+        "Rejection against the design",
+        "range and piston",
+        "Siderostat and offload",
+        "Hysteresis in the commands",
+        "Loop timing",
+        "Losses",
+        "Configuration and versions",
+        "COARSE → VERNIER",
+        "numpy",
+    ):
+        assert part in text
+
+
+def test_every_plot_is_beside_it_as_png_and_svg(made):
+    folder, page = made
+    names = {path.stem for path in folder.glob("*.svg")}
+
+    assert len(names) == 8
+    assert page.count("<svg") == 8
+    for name in names:
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "#ffffff" in (folder / f"{name}.svg").read_text()
+
+
+def test_colours_on_the_page_are_those_of_the_light_or_dark_style(made):
+    _, page = made
+    drawings = "".join(re.findall(r"<svg.*?</svg>", page, re.DOTALL))
+    style = page[page.index("<style>") : page.index("</style>")]
+
+    fixed = set(re.findall(r"#[0-9a-f]{6}\b", drawings, re.IGNORECASE))
+    assert fixed <= {"#000000"}  # what no style sets
+    assert "stroke: #000000" not in drawings
+    light, dark = style.split("prefers-color-scheme: dark")
+    for variable in VARIABLES.values():
+        assert f"--{variable}:" in light
+        assert f"--{variable}:" in dark
+
+
+def test_the_figures_are_there_for_programs(made, findings):
+    figures = json.loads((made[0] / "report.json").read_text())
+
+    loop = figures["loops"]["right"]
+    assert figures["verdict"] == "met"
+    assert loop["residual"]["az"]["rms_px"] == findings.loops["right"].residual["az"].rms_px
+    assert loop["command_gap_px"] == [None, None]
+    assert loop["controllers"][0]["rejection"][0]["hz"] == 0.25
+
+
+def test_a_run_with_nothing_in_it_makes_a_page_that_says_so(rig, tmp_path):
+    path = tmp_path / "off.mcap"
+    evil = '<script>alert("x")</script>'
+
+    def course(simulation):
+        simulation.run(1.0)
+        simulation._take(
+            Event(time_s=simulation.clock.now_s(), severity="error", source="x", message=evil)
+        )
+
+    record(rig, path, course)
+
+    page = make_report(find(find_run([path])), tmp_path).read_text()
+
+    read = Reader(page)
+    assert read.scripts == 0
+    assert evil in read.text
+    assert "not known" in page
+    assert "none of" not in page
+
+
+def test_nights_are_put_side_by_side(findings, rig, tmp_path):
+    path = tmp_path / "short.mcap"
+    record(rig, path, lambda simulation: simulation.run(1.0))
+
+    page = make_comparison([findings, find(find_run([path]))], tmp_path).read_text()
+
+    read = Reader(page)
+    text = " ".join(read.text)
+    assert read.open == []
+    assert "✓ met" in text
+    assert "? not known" in text
+    assert (tmp_path / "right-spectra.png").exists()
+    nights = json.loads((tmp_path / "report.json").read_text())["nights"]
+    assert [night["verdict"] for night in nights] == ["met", "not known"]
+
+
+def test_a_trace_shows_its_extremes_however_long_it_is():
+    import numpy as np
+
+    time_s = np.arange(1_000_000) * 0.02
+    values = np.zeros(len(time_s))
+    values[123_456], values[654_321] = 5.0, -7.0
+
+    at_s, low, high = envelope(time_s, values, 900)
+
+    assert len(at_s) == 900
+    assert (low.min(), high.max()) == (-7.0, 5.0)
+    assert at_s[high.argmax()] == pytest.approx(time_s[123_456], abs=time_s[-1] / 900)

@@ -1,0 +1,159 @@
+"""Which files are a run, and what becomes of files that are not whole, double, empty or somebody else's."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from report_samples import record
+
+from fitctl.config import ConfigError
+from fitctl.logging.copying import cut
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import log_info
+from fitctl.logging.records import Event, RecorderStatus
+from fitctl.logging.writer import LogWriter
+from fitctl.report.findings import find
+from fitctl.report.gather import gather
+from fitctl.report.run import find_run
+from fitctl.supervisor.run import run_info
+
+
+@pytest.fixture
+def halves(held, tmp_path):
+    """The log in two files that have a second in common, as when a recorder died between them."""
+    info = log_info(held[1])
+    middle_ns = round((info.start_s + 30.0) * 1e9)
+    cut(held[1], tmp_path / "a.mcap", from_ns=0, to_ns=middle_ns + 10**9)
+    cut(held[1], tmp_path / "b.mcap", from_ns=middle_ns, to_ns=2**63)
+    return tmp_path
+
+
+def test_a_run_of_several_files_is_one_and_what_two_have_counts_once(halves, held, findings):
+    found = find(find_run([halves / "b.mcap", halves / "a.mcap"]))
+
+    assert [log.path.name for log in found.run.logs] == ["a.mcap", "b.mcap"]
+    for name, column in findings.loops["right"].ticks.items():
+        np.testing.assert_array_equal(found.loops["right"].ticks[name], column)
+    assert [m["reason"] for m in found.gathered.modes] == [
+        m["reason"] for m in findings.gathered.modes
+    ]
+    assert found.gathered.lost == 3
+
+
+def test_a_folder_is_its_newest_run(halves, rig):
+    other = halves / "older.mcap"
+    info = run_info(rig, "simulated", now_s=-5000.0)
+    with LogWriter(other, rig.logging) as log:
+        log.write(info, 1000.0)
+        log.write(Event(time_s=1.0, severity="info", source="x", message="y"), 1000.0)
+
+    assert [log.path.name for log in find_run([halves]).logs] == ["a.mcap", "b.mcap"]
+    with pytest.raises(LogError, match=r"older\.mcap: is of another run.*--compare"):
+        find_run([halves / "a.mcap", other])
+
+
+def test_a_log_that_was_cut_off_is_judged_as_far_as_it_goes(held, tmp_path):
+    path = tmp_path / "cut.mcap"
+    whole = held[1].read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+
+    found = find(find_run([path]))
+
+    assert not found.run.logs[0].finished
+    assert 5 < found.loops["right"].judged.judged_s < 40
+
+
+def test_a_log_without_ticks_is_not_known(rig, tmp_path):
+    path = tmp_path / "off.mcap"
+    with LogWriter(path, rig.logging) as log:
+        info = run_info(rig, "simulated", now_s=0.0)
+        log.write(info, info.wall_minus_monotonic_s)
+        log.write(Event(time_s=1.0, severity="error", source="camera", message="gone"), 1.8e9)
+
+    found = find(find_run([path]))
+
+    assert found.word == "not known"
+    assert "no time in VERNIER" in found.loops["right"].verdict.why
+    assert found.gathered.lost is None
+    assert [event["message"] for event in found.gathered.events] == ["gone"]
+
+
+def test_time_in_off_is_no_pointing(rig, tmp_path):
+    path = tmp_path / "off.mcap"
+    record(rig, path, lambda simulation: simulation.run(3.0))
+
+    assert find(find_run([path])).word == "not known"
+
+
+def test_two_loops_are_judged_each_by_itself(rig, tmp_path):
+    document = rig.model_dump(mode="json")
+    for section in (document["loops"], document["plant"]["loops"], document["mocks"]["loops"]):
+        section["left"] = section["right"]
+    document["loops"]["left"]["target_px"] = {"az": 12.0, "el": 30.0}
+    both = type(rig).model_validate_json(json.dumps(document))
+    path = tmp_path / "both.mcap"
+
+    def course(simulation):
+        simulation.acquire()
+        simulation.run(4.0)
+
+    record(both, path, course)
+
+    found = find(find_run([path]))
+
+    assert list(found.loops) == ["right", "left"]
+    assert all(len(loop.ticks["time_s"]) > 100 for loop in found.loops.values())
+
+
+def test_every_recorder_counts_its_own_losses(rig, tmp_path):
+    path = tmp_path / "lost.mcap"
+    with LogWriter(path, rig.logging) as log:
+        info = run_info(rig, "simulated", now_s=0.0)
+        log.write(info, info.wall_minus_monotonic_s)
+        for second, lost in enumerate([0, 2, 2, 0, 5]):
+            status = RecorderStatus(
+                time_s=float(second), path="p", records=1, lost=lost, bytes_written=1
+            )
+            log.write(status, 1.8e9 + second)
+
+    assert gather(find_run([path])).lost == 7
+
+
+def foreign(path, metadata):
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for name, values in metadata.items():
+            writer.add_metadata(name, values)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("metadata", "error", "told"),
+    [
+        ({}, LogError, "says of no rig what it recorded"),
+        ({"rig": {"name": "x", "json": "{"}}, LogError, "cannot be read .*--rig"),
+        ({"rig": {"name": "x", "json": '{"name": "x"}'}}, ConfigError, "--rig"),
+    ],
+)
+def test_somebody_else_s_log_is_refused_in_one_line(metadata, error, told, tmp_path):
+    with pytest.raises(error) as raised:
+        find_run([foreign(tmp_path / "f.mcap", metadata)])
+
+    assert re.search(told, str(raised.value))
+    assert "\n" not in str(raised.value)
+    assert "f.mcap" in str(raised.value)
+
+
+def test_a_folder_without_logs_is_refused(tmp_path):
+    with pytest.raises(LogError, match="holds no log"):
+        find_run([tmp_path])
+
+
+def test_a_file_that_is_none_is_refused():
+    with pytest.raises(LogError, match="cannot be opened"):
+        find_run([Path("missing.mcap")])
