@@ -65,8 +65,8 @@ class Door:
         self._whose = whose
         self._frames: list[zmq.Frame] = []
 
-    def take(self, frames: int) -> tuple[list[Parcel], bool]:
-        """At most so many frames: the whole messages of the right shape in them, and whether more may wait.
+    def take(self, frames: int) -> list[Parcel]:
+        """At most so many frames: the whole messages of the right shape in them.
 
         Others are thrown away, however many parts they have.
         """
@@ -75,7 +75,7 @@ class Door:
             try:
                 frame = self.router.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
-                return parcels, False
+                break
             # One more than there may be is kept, to tell that there are too many.
             self._frames = [*self._frames[:FRAMES], frame]
             if not frame.more:
@@ -83,7 +83,7 @@ class Door:
                 if len(whole) == FRAMES:
                     identity, tag, payload = (bytes(part.buffer) for part in whole)
                     parcels.append(Parcel(identity, tag, payload, self._whose(frame)))
-        return parcels, True
+        return parcels
 
     def answer(self, identity: bytes, tag: bytes, payload: bytes) -> None:
         """Send a reply; one that cannot be sent now is not waited for."""
