@@ -20,7 +20,12 @@ from zmq.utils import z85
 
 from fitctl.config import ConfigError, Rig
 from fitctl.supervisor.admission import Sender
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, tcp_endpoint
+from fitctl.supervisor.endpoints import (
+    COMMAND_SOCKET,
+    TELEMETRY_SOCKET,
+    keep_alive,
+    tcp_endpoint,
+)
 from fitctl.supervisor.keys import AllowedKey, allowed_keys, keys_signature, server_pair
 from fitctl.supervisor.messages import MAX_COMMAND_BYTES
 
@@ -28,8 +33,6 @@ _QUEUED = 64  # messages of one connection
 _QUEUED_TELEMETRY = 50
 _LINGER_MS = 200
 _HANDSHAKE_MS = 5000
-_HEARTBEAT_MS = 2000
-_SILENCE_MS = 10_000
 FRAMES = 3  # of a command: identity, tag, payload
 _ZAP_FRAMES = 7
 
@@ -269,8 +272,7 @@ class KeyedDoor:
         bare.curve_secretkey = self._pair.secret.encode()
         bare.setsockopt(zmq.ZAP_DOMAIN, b"fitctl")
         bare.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
-        bare.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
-        bare.setsockopt(zmq.HEARTBEAT_TIMEOUT, _SILENCE_MS)
+        keep_alive(bare)
         return bare
 
     def _bind(self, keyed: zmq.Socket[bytes], port: int) -> None:
