@@ -10,7 +10,7 @@ from fitctl.supervisor.messages import Status, TakeOver
 def fitctl(*arguments):
     with pytest.raises(SystemExit) as ended:
         main([str(argument) for argument in arguments])
-    return ended.value.code
+    return ended.value.code or 0
 
 
 @pytest.fixture

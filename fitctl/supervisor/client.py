@@ -13,15 +13,13 @@ from typing import TypeVar
 import msgspec
 import zmq
 
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, tcp_endpoint
+from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, keep_alive, tcp_endpoint
 from fitctl.supervisor.keys import RemoteKey
 from fitctl.supervisor.messages import MAX_COMMAND_BYTES, AnyCommand, Reply, Telemetry
 
 REPLY_TIMEOUT_S = 2.0
 _REFUSED_TIMEOUT_S = 1.0
 _CLOCK_MESSAGES = 100
-_HEARTBEAT_MS = 2000
-_SILENCE_MS = 10_000
 
 _T = TypeVar("_T")
 
@@ -131,8 +129,7 @@ class Client:
             new.curve_publickey = self._where.public.encode()
             new.curve_secretkey = self._where.secret.encode()
             new.setsockopt(zmq.IPV6, ":" in self._where.host)
-            new.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)  # a link that broke is made anew
-            new.setsockopt(zmq.HEARTBEAT_TIMEOUT, _SILENCE_MS)
+            keep_alive(new)
         return new
 
     def _connect(self, unconnected: zmq.Socket[bytes], which: str) -> None:

@@ -20,7 +20,12 @@ from zmq.utils import z85
 
 from fitctl.config import ConfigError, Rig
 from fitctl.supervisor.admission import Sender
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, tcp_endpoint
+from fitctl.supervisor.endpoints import (
+    COMMAND_SOCKET,
+    TELEMETRY_SOCKET,
+    keep_alive,
+    tcp_endpoint,
+)
 from fitctl.supervisor.keys import AllowedKey, allowed_keys, keys_signature, server_pair
 from fitctl.supervisor.messages import MAX_COMMAND_BYTES
 
@@ -28,8 +33,6 @@ _QUEUED = 64  # messages of one connection
 _QUEUED_TELEMETRY = 50
 _LINGER_MS = 200
 _HANDSHAKE_MS = 5000
-_HEARTBEAT_MS = 2000
-_SILENCE_MS = 10_000
 FRAMES = 3  # of a command: identity, tag, payload
 _ZAP_FRAMES = 7
 
@@ -65,8 +68,8 @@ class Door:
         self._whose = whose
         self._frames: list[zmq.Frame] = []
 
-    def take(self, frames: int) -> tuple[list[Parcel], bool]:
-        """At most so many frames: the whole messages of the right shape in them, and whether more may wait.
+    def take(self, frames: int) -> list[Parcel]:
+        """At most so many frames: the whole messages of the right shape in them.
 
         Others are thrown away, however many parts they have.
         """
@@ -75,7 +78,7 @@ class Door:
             try:
                 frame = self.router.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
-                return parcels, False
+                break
             # One more than there may be is kept, to tell that there are too many.
             self._frames = [*self._frames[:FRAMES], frame]
             if not frame.more:
@@ -83,7 +86,7 @@ class Door:
                 if len(whole) == FRAMES:
                     identity, tag, payload = (bytes(part.buffer) for part in whole)
                     parcels.append(Parcel(identity, tag, payload, self._whose(frame)))
-        return parcels, True
+        return parcels
 
     def answer(self, identity: bytes, tag: bytes, payload: bytes) -> bool:
         """Send a reply; False if whoever asked has gone, or does not read."""
@@ -275,8 +278,7 @@ class KeyedDoor:
         bare.curve_secretkey = self._pair.secret.encode()
         bare.setsockopt(zmq.ZAP_DOMAIN, b"fitctl")
         bare.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
-        bare.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
-        bare.setsockopt(zmq.HEARTBEAT_TIMEOUT, _SILENCE_MS)
+        keep_alive(bare)
         return bare
 
     def _bind(self, keyed: zmq.Socket[bytes], port: int) -> None:

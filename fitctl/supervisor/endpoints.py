@@ -7,6 +7,8 @@ import stat
 import tempfile
 from pathlib import Path
 
+import zmq
+
 from fitctl.config import ConfigError, Rig
 
 COMMAND_SOCKET = "command"
@@ -46,6 +48,18 @@ def _own_folder() -> Path:
 def tcp_endpoint(host: str, port: int) -> str:
     """As ZeroMQ writes it."""
     return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+
+def keep_alive(tcp_socket: zmq.Socket[bytes]) -> None:
+    """Have the kernel notice within about 12 s that a link has broken.
+
+    ZeroMQ's own heartbeats would do, but libzmq 4.3.5 aborts the process when one is due on a connection
+    whose peer hung up while its messages were held back (``out_event`` asserts that there was no error).
+    """
+    tcp_socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+    tcp_socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 6)
+    tcp_socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
+    tcp_socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
 
 
 def make_service_folder(rig: Rig) -> Path:

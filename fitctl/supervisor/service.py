@@ -34,8 +34,8 @@ from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 SOURCE = "service"  # of its events
 _ROUND_MS = 5
-_FRAMES_A_ROUND = 16 * FRAMES
-_HANDSHAKES_A_ROUND = 8
+_FRAMES_A_ROUND = 8 * FRAMES
+_HANDSHAKES_A_ROUND = 4
 _JOINED_STOPS = 1000
 _LOOK_S = 0.25
 _TELL_S = 5.0
@@ -117,8 +117,10 @@ class Service(threading.Thread):
         publish_s = look_s = self._clock.now_s()
         try:
             while not self._ending.is_set():
-                if poller.poll(_ROUND_MS) and self._serve():
-                    self._ending.wait(_ROUND_MS / 1000)  # more may be there: the loop comes first
+                if poller.poll(_ROUND_MS):
+                    self._serve()
+                    self._send_replies()
+                    self._ending.wait(_ROUND_MS / 1000)  # however much more there is
                 self._send_replies()
                 now_s = self._clock.now_s()
                 if now_s >= publish_s:
@@ -138,17 +140,13 @@ class Service(threading.Thread):
 
     # ------------------------------------------------------------ commands
 
-    def _serve(self) -> bool:
-        """Take a bounded number of messages from each door; True if one had as many."""
+    def _serve(self) -> None:
+        """Take a bounded number of messages from each door."""
         if self._keyed is not None:
             self._keyed.admit(_HANDSHAKES_A_ROUND)
-        busy = False
         for door in self._doors:
-            parcels, more = door.take(_FRAMES_A_ROUND)
-            for parcel in parcels:
+            for parcel in door.take(_FRAMES_A_ROUND):
                 self._receive(Waiting(door, parcel))
-            busy = busy or more
-        return busy
 
     def _receive(self, waiting: Waiting) -> None:
         sender, now_s = waiting.parcel.sender, self._clock.now_s()

@@ -46,7 +46,7 @@ def test_a_commander_elsewhere_commands_and_sees_what_the_owner_sees(served):
     telemetry = served.follow(lambda t: t.commander == "anna", client=anna)
     assert telemetry.rig_name == "fit-mock"
     assert served.follow(lambda t: t.sequence > telemetry.sequence).commander == "anna"
-    assert ("anna", True) in served.commands("Standby")
+    until(lambda: ("anna", True) in served.commands("Standby"))
 
 
 def test_a_viewer_sees_everything_and_commands_nothing(served):
@@ -58,7 +58,7 @@ def test_a_viewer_sees_everything_and_commands_nothing(served):
         reply = viewer.send(command)
         assert not reply.accepted
         assert "may watch and not command" in reply.text
-    assert ("viewer", False) in served.commands("Stop")
+    until(lambda: ("viewer", False) in served.commands("Stop"))
 
 
 def test_stop_is_taken_from_whoever_may_command(served):

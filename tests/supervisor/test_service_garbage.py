@@ -1,5 +1,7 @@
 """The service, reached by anything at all: it stays well, and what is a command is still obeyed."""
 
+import time
+
 import pytest
 import zmq
 from hypothesis import HealthCheck, given, settings
@@ -66,8 +68,13 @@ def test_any_bytes_on_the_wire_leave_it_well(served, streams, keyed):
     assert served.client.send(Status()).accepted
 
 
-def test_a_flood_of_commands_is_held_back_and_a_stop_comes_through(served):
+def test_a_flood_of_commands_is_held_back_and_a_stop_comes_through(served, monkeypatch):
     """More than it takes: what is too much waits with its sender, and hinders nobody else."""
+    taken, take = [], served.service._doors[0].take
+    monkeypatch.setattr(
+        served.service._doors[0], "take", lambda frames: taken.append(take(frames)) or taken[-1]
+    )
+    begun_s = time.monotonic()
     with zmq.Context() as context, context.socket(zmq.DEALER) as flood:
         flood.setsockopt(zmq.LINGER, 0)
         flood.setsockopt(zmq.SNDHWM, 1000)
@@ -79,4 +86,6 @@ def test_a_flood_of_commands_is_held_back_and_a_stop_comes_through(served):
 
         assert served.client.send(Stop()).accepted
         assert served.client.send(Status()).text == "right SAFE"
+    lasted_s = time.monotonic() - begun_s
+    assert sum(map(len, taken)) <= 8 * (lasted_s / 0.005 + 2)
     assert sum("no commands" in told for told in served.events()) <= 10
