@@ -241,7 +241,11 @@ def console(
     """Attach an operator console to the running supervisor of a rig."""
     from fitctl.commands.instrument import run_console
 
-    run_console(_rig(rig, overrides), quitting_ends_instrument=quitting_ends_instrument)
+    run_console(
+        _rig(rig, overrides),
+        _rig_arguments(rig, overrides),
+        quitting_ends_instrument=quitting_ends_instrument,
+    )
 
 
 @app.command()

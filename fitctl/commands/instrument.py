@@ -286,11 +286,16 @@ def run_recorder(rig: Rig, *, parent_pid: int | None) -> None:
 # ---------------------------------------------------------------- a running instrument
 
 
-def run_console(rig: Rig, *, quitting_ends_instrument: bool) -> None:
-    """Attach a console."""
+def run_console(rig: Rig, rig_arguments: Sequence[str], *, quitting_ends_instrument: bool) -> None:
+    """Attach a console; other commands that it runs are given `rig_arguments`."""
     from fitctl.tui.app import ConsoleApp
 
-    app = ConsoleApp(Client(service_folder(rig)), quit_shuts_down=quitting_ends_instrument)
+    app = ConsoleApp(
+        Client(service_folder(rig)),
+        quit_shuts_down=quitting_ends_instrument,
+        rig_arguments=rig_arguments,
+        log_folder=Path(rig.logging.folder).expanduser(),
+    )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     app.run()
 

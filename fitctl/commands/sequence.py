@@ -38,13 +38,28 @@ def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Ri
 
 
 @app.command("list")
-def list_() -> None:
+def list_(
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="[FILE...]", help="These, not the shipped ones.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Every step with every key, as JSON.")
+    ] = False,
+) -> None:
     """Print the shipped sequences."""
     from fitctl.sequences.reading import read_sequence, shipped_folder
 
-    shipped = [read_sequence(path) for path in sorted(shipped_folder().glob("*.toml"))]
-    width = max(len(sequence.name) for sequence in shipped)
-    for sequence in shipped:
+    paths = files or sorted(shipped_folder().glob("*.toml"))
+    listed = {path: read_sequence(path) for path in paths}
+    if as_json:
+        documents = [
+            {"file": str(path), **sequence.model_dump(exclude_none=True)}
+            for path, sequence in listed.items()
+        ]
+        typer.echo(msgspec.json.encode(documents).decode())
+        return
+    width = max(len(sequence.name) for sequence in listed.values())
+    for sequence in listed.values():
         typer.echo(f"{sequence.name:<{width}}  {sequence.description}")
 
 
