@@ -237,9 +237,18 @@ def console(
     quitting_ends_instrument: Annotated[
         bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
     ] = False,
+    web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig."""
     from fitctl.commands.instrument import run_console
+
+    if web:
+        from fitctl.commands.web import serve_console
+
+        _rig(rig, overrides)  # what is wrong with it is said here, not in the browser
+        serve_console(_rig_arguments(rig, overrides), port)
+        return
 
     run_console(
         _rig(rig, overrides),

@@ -30,6 +30,7 @@ class Alarm:
     did: str
     todo: str
     count: int = 0
+    latches: bool = True
     over_s: float | None = None
     acknowledged: bool = False
     silenced: bool = False
@@ -39,7 +40,7 @@ class AlarmBook:
     """Alarms as an operator has them: new, acknowledged, silenced, over.
 
     An error that is over stays until it is acknowledged, so that nobody misses what happened while
-    nobody looked. A warning goes by itself.
+    nobody looked. A warning goes by itself, and so does a silence of the supervisor.
     """
 
     def __init__(self) -> None:
@@ -64,7 +65,7 @@ class AlarmBook:
         for key, alarm in list(self.alarms.items()):
             if key in wrong:
                 continue
-            if alarm.acknowledged or not alarm.error:
+            if alarm.acknowledged or not alarm.error or not alarm.latches:
                 del self.alarms[key]
             elif alarm.over_s is None:
                 alarm.over_s = _time_s(state)
@@ -115,8 +116,10 @@ def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
         ):
             told.add(change.reason)
             yield _fault(loop, change)
+    changed_s = max((loop.since_s for loop in newest.loops), default=0.0)
     for device in newest.devices:
-        if device.state == "fault" and device.detail not in told:
+        # What was told of a device before the last change of mode is of the past.
+        if device.state == "fault" and device.detail not in told and device.time_s >= changed_s:
             yield _device(newest, device)
     yield from _log(state, newest)
 
@@ -130,6 +133,7 @@ def _no_data(state: ConsoleState) -> Alarm:
         state.received_s,
         "the console goes on trying to connect",
         "is the supervisor running? STOP may not reach it: be ready to cut the power",
+        latches=False,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ class JogPad:
 
     number: int = 0
     step_numbers: list[int] = field(default_factory=lambda: [1] * len(STAGES))
-    pressed_s: float = -AGAIN_S
+    pressed_s: float = -math.inf
     place: tuple[float, float] = (0.0, 0.0)
 
     def stage(self, mode: str) -> Stage | None:
@@ -53,7 +54,11 @@ class JogPad:
     def next_stage(self) -> None:
         """Take the other stage."""
         self.number += 1
-        self.pressed_s = -AGAIN_S
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """The next press is from where telemetry says that it is."""
+        self.pressed_s = -math.inf
 
     def change_step(self, stage: Stage, by: int) -> None:
         """Take a coarser or finer step."""

@@ -10,7 +10,7 @@ from textual.containers import Container
 
 from fitctl.supervisor.messages import SetBiasOffset, SetTarget
 from fitctl.tui.commands import Key, keys_of
-from fitctl.tui.jog import AGAIN_S, JogPad
+from fitctl.tui.jog import JogPad
 from fitctl.tui.views.view import View
 from fitctl.tui.widgets.events import Events
 from fitctl.tui.widgets.focalplane import FocalPlane
@@ -161,7 +161,7 @@ class OperateView(View):
     def action_zero(self) -> None:
         """The mirror back to its bias."""
         if self.hand == "jog" and self.state.mode == "STANDBY":
-            self.pad.pressed_s = -AGAIN_S
+            self.pad.begin_anew()
             self.console.give(SetBiasOffset(az_urad=0.0, el_urad=0.0))
 
     def action_leave(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import ClassVar
 
 from fitctl.tui.alarms import Alarm, AlarmBook
@@ -25,6 +26,7 @@ from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
 MOST_ROWS = 3
+_ENDPOINT = re.compile(r" at \S+:(?= )")  # all of it is a key away
 DID_FROM_COLUMNS = 130
 
 
@@ -49,19 +51,22 @@ class AlarmBar(Panel):
         lines: list[Line] = []
         for number, alarm in enumerate(alarms[:rows], start=1):
             more = len(alarms) - number if number == rows else 0
-            lines.append(self._row(alarm, more, columns))
+            lines.append(self._row(alarm, more, columns, first=number == 1))
         return lines
 
-    def _row(self, alarm: Alarm, more: int, columns: int) -> Line:
+    def _row(self, alarm: Alarm, more: int, columns: int, *, first: bool) -> Line:
         ground = RED if alarm.error else ORANGE
         sign = "✗" if alarm.error else "▲"
         since = wall(self.state.wall_s(alarm.since_s))
         keys: Line = []
         if more:
             keys += [text(f" +{more}", INK, bold=True)]
-        keys += clickable([text(" v", SKY, bold=True), text(" all", DIM)], "app.alarms")
-        if not alarm.acknowledged:
-            keys += clickable([text(" k", SKY, bold=True), text(" seen", DIM)], "app.acknowledge")
+        if first:
+            keys += clickable([text(" v", SKY, bold=True), text(" all", DIM)], "app.alarms")
+            if not all(each.acknowledged for each in self._book.alarms.values()):
+                keys += clickable(
+                    [text(" k", SKY, bold=True), text(" seen", DIM)], "app.acknowledge"
+                )
         room = columns - width(keys)
         if alarm.acknowledged:
             head = [text(f" {sign} {since} ", ground)]
@@ -76,7 +81,8 @@ class AlarmBar(Panel):
         over = f" (over {wall(self.state.wall_s(alarm.over_s))})" if alarm.over_s else ""
         did = f" — {alarm.did}" if columns >= DID_FROM_COLUMNS else ""
         todo = f" ▸ {alarm.todo}"
-        what = shorten(alarm.what + over, max(columns - len(did) - len(todo), (columns * 11) // 20))
+        brief = _ENDPOINT.sub(":", alarm.what, count=1)
+        what = shorten(brief + over, max(columns - len(did) - len(todo), (columns * 11) // 20))
         return [
             text(what, ink, bold=True),
             text(did, DIM),

@@ -32,7 +32,7 @@ NAME_COLUMNS = 21
 # How a device's link is judged: a quantity, its unit as people write it, and what it is in it.
 LINKS = {
     "camera": ("frame_late_s", "frame late", 1e3, "ms"),
-    "siderostat": ("amplifier_round_trip_periods", "round trip", 100.0, "% of a period"),
+    "siderostat": ("amplifier_round_trip_periods", "round trip", 100.0, "% of period"),
     "D/A": ("dac_round_trip_s", "round trip", 1e3, "ms"),
 }
 UNITS = {"s": "s", "bytes": "GB", "rad": "rad", "v": "V", "fraction": "%", "periods": "periods"}
@@ -44,8 +44,11 @@ def in_units(quantity: str, value: float | None) -> str:
     if value is None:
         return ""
     suffix = quantity.rpartition("_")[2]
-    unit = UNITS.get(suffix, "")
-    return f"{number(FACTORS.get(suffix, 1.0) * value, '.3g')} {unit}".rstrip()
+    return f"{_scaled(suffix, value)} {UNITS.get(suffix, '')}".rstrip()
+
+
+def _scaled(suffix: str, value: float) -> str:
+    return number(FACTORS.get(suffix, 1.0) * value, ".3g")
 
 
 class DeviceList(Choice):
@@ -65,7 +68,7 @@ class DeviceList(Choice):
             text(f"{look.symbol} ", look.colour, bold=True),
             text(device.device.ljust(17), INK, bold=True),
             text(f"{device.state:<7}", look.colour),
-            text(f"{self.link_of(device):<26}", INK),
+            text(f"{self.link_of(device):<29}", INK),
         ]
         told = device.detail if device.state == "fault" else f"{device.identity}  {device.detail}"
         rest = columns - width(line)
@@ -85,7 +88,7 @@ class DeviceList(Choice):
         row = next((row for row in loop.state.watched if row.quantity == quantity), None)
         if row is None or math.isnan(row.value):
             return ""
-        return f"{name} {number(factor * row.value, '.2f')} {unit}"
+        return f"{name} {number(factor * row.value, '.1f')} {unit}"
 
 
 class Readings(Choice):
@@ -138,7 +141,7 @@ def _reading(row: Watched, columns: int, *, tripped: bool) -> Line:
 def _allowed(row: Watched) -> str:
     low, high = in_units(row.quantity, row.low), in_units(row.quantity, row.high)
     if low and high:
-        return f"{low} to {high}"
+        return f"{low.partition(' ')[0]} to {high}"
     return f"≤ {high}" if high else f"≥ {low}" if low else "only not stale"
 
 
