@@ -100,7 +100,7 @@ LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-e
     --custom-compile-command "make lock" --quiet
 
 lock: $(READY)  ## Resolve the requirements anew (needs uv)
-	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --group dev $(LOCK) -o requirements/dev.lock
+	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --extra web --group dev $(LOCK) -o requirements/dev.lock
 	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
 	uv pip compile --group docs $(LOCK) --constraint requirements/dev.lock -o requirements/docs.lock

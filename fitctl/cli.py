@@ -192,13 +192,24 @@ def console(
     quitting_ends_instrument: Annotated[
         bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
     ] = False,
+    web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig."""
     from fitctl.commands.connecting import connect
     from fitctl.commands.instrument import run_console
 
+    arguments = ["--remote", str(remote)] if remote else _rig_arguments(rig, overrides)
     client = connect(rig, overrides, remote)
-    run_console(client, quitting_ends_instrument=quitting_ends_instrument)
+    if web:
+        from fitctl.commands.web import serve_console
+
+        client.close()  # what is wrong with the rig is said here, not in the browser
+        serve_console(arguments, port)
+        return
+    # The logs of a rig elsewhere are elsewhere too.
+    log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()
+    run_console(client, arguments, log_folder, quitting_ends_instrument=quitting_ends_instrument)
 
 
 class _SendCommand(TyperCommand):

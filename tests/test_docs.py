@@ -43,7 +43,7 @@ from fitctl.supervisor.metrics import InstrumentCollector
 from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
 from fitctl.supervisor.run import run_info
 from fitctl.supervisor.simulate import Simulation
-from fitctl.tui.commands import OPERATOR_COMMANDS
+from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from tests.tui.fake import FakeSupervisor
 
 MAKE_TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
@@ -283,8 +283,22 @@ def test_the_diagram_of_modes_is_that_of_the_code():
 
 def test_the_console_keys_are_those_of_the_console():
     rows = [[f"`{command.key}`", command.label, command.help] for command in OPERATOR_COMMANDS]
+    rows += [[f"`{view.key}`", view.label, f"screen: {view.help}"] for view in VIEWS]
 
-    assert between("operating.md", "keys") == table(["key", "command", "what it does"], rows)
+    assert between("console.md", "keys") == table(["key", "command", "what it does"], rows)
+
+
+def test_the_other_keys_of_the_console_are_those_of_its_screens():
+    screens = {"": "every screen"} | {view.name: view.label for view in VIEWS}
+    rows = [
+        [screen, f"`{key.shown}`", key.label, key.help]
+        for name, screen in screens.items()
+        for key in keys_of(name)
+    ]
+
+    assert between("console.md", "screens") == table(
+        ["on", "key", "in the footer", "what it does"], rows
+    )
 
 
 def test_the_commands_are_those_of_the_table():

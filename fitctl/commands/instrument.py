@@ -293,11 +293,23 @@ def run_metrics(rig: Rig, *, parent_pid: int | None) -> None:
 # ---------------------------------------------------------------- a running instrument
 
 
-def run_console(client: Client, *, quitting_ends_instrument: bool) -> None:
-    """Attach a console."""
+def run_console(
+    client: Client,
+    arguments: Sequence[str],
+    log_folder: Path | None,
+    *,
+    quitting_ends_instrument: bool,
+) -> None:
+    """Attach a console; other commands that it runs are given `arguments`."""
     from fitctl.tui.app import ConsoleApp
 
-    app = ConsoleApp(client, quit_shuts_down=quitting_ends_instrument, clock=client.now_s)
+    app = ConsoleApp(
+        client,
+        quit_shuts_down=quitting_ends_instrument,
+        clock=client.now_s,
+        rig_arguments=arguments,
+        log_folder=log_folder,
+    )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     app.run()
 

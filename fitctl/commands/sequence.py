@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import msgspec
 import typer
 
 from fitctl.commands import completing
@@ -68,13 +69,27 @@ def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Ri
 
 
 @app.command("list")
-def list_() -> None:
+def list_(
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="[FILE...]", help="These, not the shipped ones.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Every step with every key, as JSON.")
+    ] = False,
+) -> None:
     """Print the shipped sequences."""
     from fitctl.sequences.reading import read_sequence, shipped_sequences
 
-    shipped = [read_sequence(path) for path in shipped_sequences()]
-    width = max(len(sequence.name) for sequence in shipped)
-    for sequence in shipped:
+    listed = {path: read_sequence(path) for path in files or shipped_sequences()}
+    if as_json:
+        documents = [
+            {"file": str(path), **sequence.model_dump(exclude_none=True)}
+            for path, sequence in listed.items()
+        ]
+        typer.echo(msgspec.json.encode(documents).decode())
+        return
+    width = max(len(sequence.name) for sequence in listed.values())
+    for sequence in listed.values():
         typer.echo(f"{sequence.name:<{width}}  {sequence.description}")
 
 

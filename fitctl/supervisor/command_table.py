@@ -32,6 +32,8 @@ class CommandRow(NamedTuple):
         On a command line; empty for what programs alone send.
     key, label : str
         In the console.
+    question : str
+        What the console asks first, where the command is laborious to undo.
     logged : bool
         Each gets a record of its own in the log; reports, which come every second, do not.
     """
@@ -41,6 +43,7 @@ class CommandRow(NamedTuple):
     word: str = ""
     key: str = ""
     label: str = ""
+    question: str = ""
     logged: bool = True
 
     @property
@@ -74,7 +77,14 @@ COMMANDS = (
     CommandRow(messages.Acquire, "the instrument", "acquire", "a", "Acquire"),
     CommandRow(messages.Hold, "the instrument", "hold", "h", "Hold"),
     CommandRow(messages.Recover, "the instrument", "recover", "r", "Recover"),
-    CommandRow(messages.Off, "the instrument", "off", "o", "Off"),
+    CommandRow(
+        messages.Off,
+        "the instrument",
+        "off",
+        "o",
+        "Off",
+        question="Disable the amplifiers and let go of all devices?",
+    ),
     CommandRow(messages.SetTarget, "the instrument", "target"),
     CommandRow(messages.Jog, "the instrument", "jog"),
     CommandRow(messages.SetBiasOffset, "the instrument", "bias-offset"),

@@ -1,8 +1,130 @@
-"""The commands that the console has on keys: for keys, footer, palette and help."""
+"""The operator's commands and every other key: one table for keys, footer, mouse, palette and help."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
+from textual.binding import Binding
+
 from fitctl.supervisor.command_table import COMMANDS
+from fitctl.tui.state import ConsoleState
 
 OPERATOR_COMMANDS = tuple(row for row in COMMANDS if row.key)
 BY_NAME = {row.name: row for row in OPERATOR_COMMANDS}
+
+
+class ViewName(NamedTuple):
+    """A screen, and the key that leads to it."""
+
+    key: str
+    name: str
+    label: str
+    help: str
+
+
+VIEWS = (
+    ViewName("1", "operate", "Operate", "focal plane, pointing error, stages, health, events"),
+    ViewName("2", "devices", "Devices", "every reading beside its limits, links, faults"),
+    ViewName("3", "loop", "Loop", "timing, spectrum of the error, margins of the design"),
+    ViewName("4", "sequences", "Sequences", "list, edit, rehearse, run, stop"),
+    ViewName("5", "logs", "Logs", "list, keep, verify, report, replay"),
+    ViewName("6", "help", "Help", "every key, mode and sign"),
+)
+
+
+class Key(NamedTuple):
+    """A key of the console itself.
+
+    Attributes
+    ----------
+    keys : str
+        As Textual names them, several with commas.
+    shown : str
+        As people write it.
+    label : str
+        In the footer.
+    action : str
+        What Textual calls.
+    help : str
+    view : str
+        The screen that has it; empty for all.
+    matters : callable
+        Whether it matters now; then the footer has it.
+    """
+
+    keys: str
+    shown: str
+    label: str
+    action: str
+    help: str
+    view: str = ""
+    matters: Callable[[ConsoleState], bool] = lambda _: True
+
+    def binding(self) -> Binding:
+        """For Textual."""
+        return Binding(self.keys, self.action, self.label, show=False)
+
+
+def _never(_state: ConsoleState) -> bool:
+    return False
+
+
+def _several_loops(state: ConsoleState) -> bool:
+    return len(state.loops) > 1
+
+
+def _by_hand(state: ConsoleState) -> bool:
+    return state.mode in {"STANDBY", "COARSE", "VERNIER"}
+
+
+def _has_star(state: ConsoleState) -> bool:
+    return state.mode in {"COARSE", "VERNIER"}
+
+
+def _sequence(state: ConsoleState) -> bool:
+    return bool(state.newest and state.newest.running_sequence)
+
+
+KEYS = (
+    Key("t", "t", "Target", "screen.aim", "put a cursor on the focal plane", "operate", _has_star),
+    Key("j", "j", "Jog", "screen.jog", "move a stage by the arrow keys", "operate", _by_hand),
+    Key("w", "w", "Window", "app.window", "RMS and traces over 10, 60 or 1 s", "operate"),
+    Key("x", "x", "Stretch", "screen.stretch", "grey scale: asinh, square root, linear", "operate"),
+    Key("c", "c", "Colours", "screen.colours", "colour map of the focal plane", "operate"),
+    Key("up,down", "↑↓", "Choose", "", "choose a reading", "devices"),
+    Key(
+        "enter", "enter", "More", "screen.more", "all about the chosen device or reading", "devices"
+    ),
+    Key("n", "n", "Reset", "screen.reset", "let the chosen interlock go", "devices"),
+    Key("w", "w", "Window", "app.window", "over 10, 60 or 1 s", "loop"),
+    Key("up,down", "↑↓", "Choose", "", "choose a sequence or a parameter", "sequences"),
+    Key("tab", "tab", "Other list", "screen.other", "sequences or parameters", "sequences"),
+    Key("enter", "enter", "Edit", "screen.edit", "change the chosen parameter", "sequences"),
+    Key("d", "d", "Dry run", "screen.dry_run", "the whole of it on the virtual clock", "sequences"),
+    Key("g", "g", "Go", "screen.go", "run it on the instrument", "sequences"),
+    Key("p", "p", "Pause", "screen.pause", "pause it, or let it go on", "sequences", _sequence),
+    Key("z", "z", "End it", "screen.end", "end it; its stages are held", "sequences", _sequence),
+    Key("f", "f", "File", "screen.file", "open a sequence file of your own", "sequences", _never),
+    Key("up,down", "↑↓", "Choose", "", "choose a log", "logs"),
+    Key("enter", "enter", "Info", "screen.tool('info')", "what the chosen log holds", "logs"),
+    Key("m", "m", "Keep", "screen.keep", "mark it, so that it is never deleted; or not", "logs"),
+    Key("f", "f", "Verify", "screen.tool('verify')", "whether it is whole", "logs"),
+    Key("t", "t", "Report", "screen.tool('report')", "one page about it", "logs"),
+    Key("y", "y", "Replay", "screen.tool('replay')", "decide its frames again", "logs"),
+    Key("k", "k", "Acknowledge", "app.acknowledge", "you have seen the alarms", "", _never),
+    Key("u", "u", "Silence", "app.silence", "no bell for these alarms", "", _never),
+    Key(
+        "v", "v", "Alarms", "app.alarms", "alarms in full: what, since when, what to do", "", _never
+    ),
+    Key("e", "e", "Events", "app.events", "all events at full length"),
+    Key("l", "l", "Loop", "app.next_loop", "show the next loop", "", _several_loops),
+    Key("ctrl+p", "^p", "Palette", "app.command_palette", "every command by its name"),
+    Key("question_mark,f1", "?", "Help", "app.view('help')", "this help"),
+    Key("q", "q", "Quit", "app.quit", "leave the console"),
+)
+
+
+def keys_of(view: str) -> list[Key]:
+    """The keys that one screen has for itself; an empty name is for what all have."""
+    return [key for key in KEYS if key.view == view]

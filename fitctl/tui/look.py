@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -77,6 +78,42 @@ def text(content: str, colour: str = INK, *, on: str | None = None, bold: bool =
     return Segment(content, style(colour, on, bold=bold))
 
 
+@lru_cache(maxsize=256)
+def _doing(action: str) -> Style:
+    return Style.from_meta({"@click": action})
+
+
+def clickable(line: Iterable[Segment], action: str) -> Line:
+    """The same, but a click on it does a Textual action, such as ``app.command('Stop')``; empty: none."""
+    if not action:
+        return list(line)
+    return [Segment(part.text, (part.style or Style()) + _doing(action)) for part in line]
+
+
+def cap(key: str, label: str, action: str, *, on: str = SKY) -> Line:
+    """A key and what it does, for keyboard and mouse."""
+    return clickable([text(key, PAPER, on=on, bold=True), text(f" {label} ", INK)], action)
+
+
+def wall(seconds: float) -> str:
+    """Unix time as UTC ``hh:mm:ss``; not-a-number is dashes."""
+    if not math.isfinite(seconds):
+        return "--:--:--"
+    return datetime.fromtimestamp(seconds, UTC).strftime("%H:%M:%S")
+
+
+def in_columns(left: list[Line], columns: int, right: list[Line]) -> list[Line]:
+    """Two blocks beside each other, the left one `columns` wide."""
+    rows = max(len(left), len(right))
+    empty: list[Line] = [[]]
+    return [
+        [*pad(a, columns), *b]
+        for a, b in zip(
+            left + empty * (rows - len(left)), right + empty * (rows - len(right)), strict=True
+        )
+    ]
+
+
 def width(line: Iterable[Segment]) -> int:
     """Columns that a line takes."""
     return sum(segment.cell_length for segment in line)
@@ -91,6 +128,11 @@ def spread(left: Line, right: Line, columns: int) -> Line:
 def pad(line: Line, columns: int) -> Line:
     """Cut or fill a line to a number of columns."""
     return list(Strip(line).adjust_cell_length(columns))
+
+
+def mark(*, good: bool) -> Segment:
+    """A tick or a cross, by sign and by colour."""
+    return text("✓" if good else "✗", GREEN if good else RED, bold=True)
 
 
 def shorten(content: str, columns: int) -> str:

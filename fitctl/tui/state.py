@@ -5,19 +5,29 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.records import Event, LoopTiming, ModeChange, PiezoReading, Tick
 from fitctl.supervisor.messages import LoopState, Telemetry
+from fitctl.tui.history import Past
 
-TRACE_S = 20.0
-RMS_S = 10.0
 STALE_S = 1.0
 EVENTS_KEPT = 500
 RATE_MESSAGES = 60
+TRAIL_STEP_SKY_ARCSEC = 3.0
+
+
+class Window(NamedTuple):
+    """Over how much the RMS is taken, and how much of the past the traces show."""
+
+    rms_s: float
+    trace_s: float
+
+
+WINDOWS = (Window(10.0, 20.0), Window(60.0, 60.0), Window(1.0, 5.0))
 
 
 class _OfLoop(Protocol):
@@ -34,34 +44,42 @@ def _last_of(loop: str, records: list[RecordT]) -> RecordT | None:
 
 @dataclass
 class LoopView:
-    """One loop: its newest state, and its ticks of the last `TRACE_S`."""
+    """One loop: its newest state and tick, its past, and the way of its search."""
 
     state: LoopState
-    ticks: deque[Tick] = field(default_factory=deque)
+    tick: Tick | None = None
+    past: Past = field(default_factory=Past)
     change: ModeChange | None = None
     timing: LoopTiming | None = None
     piezo: PiezoReading | None = None
+    search_trail_sky_arcsec: list[tuple[float, float]] = field(default_factory=list)
 
     def accept(self, state: LoopState, message: Telemetry) -> None:
-        """Take what a message holds of this loop, and forget what is older than the traces."""
+        """Take what a message holds of this loop."""
         name = state.name
+        if state.mode == "ACQUISITION" and state.since_s != self.state.since_s:
+            self.search_trail_sky_arcsec.clear()
         self.state = state
-        self.ticks.extend(tick for tick in message.ticks if tick.loop == name)
-        while self.ticks and self.ticks[0].time_s < message.time_s - TRACE_S:
-            self.ticks.popleft()
+        ticks = [tick for tick in message.ticks if tick.loop == name]
+        self.past.add(ticks, message.time_s)
+        self.tick = ticks[-1] if ticks else self.tick
         self.change = state.last_change
         self.timing = _last_of(name, message.timing) or self.timing
         self.piezo = _last_of(name, message.piezo) or self.piezo
+        if state.mode == "ACQUISITION":
+            for tick in ticks:
+                self._extend_trail(tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec)
 
-    @property
-    def tick(self) -> Tick | None:
-        """The newest tick."""
-        return self.ticks[-1] if self.ticks else None
+    def _extend_trail(self, az_sky_arcsec: float, el_sky_arcsec: float) -> None:
+        trail = self.search_trail_sky_arcsec
+        here = (az_sky_arcsec, el_sky_arcsec)
+        if not trail or math.dist(trail[-1], here) >= TRAIL_STEP_SKY_ARCSEC:
+            trail.append(here)
 
-    def errors(self) -> NDArray[np.float64]:
+    def errors(self, span_s: float) -> NDArray[np.float64]:
         """Time in s and errors az, el in px, one row a tick; shape (ticks, 3), oldest first."""
-        rows = [(tick.time_s, tick.error_az_px, tick.error_el_px) for tick in self.ticks]
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        newest_s = self.tick.time_s if self.tick else 0.0
+        return self.past.since(newest_s - span_s, "time_s", "error_az_px", "error_el_px")
 
 
 @dataclass
@@ -73,13 +91,12 @@ class Rms:
     span_s: float
 
 
-def error_rms(errors: NDArray[np.float64], now_s: float, since_s: float) -> Rms:
-    """RMS of the last `RMS_S`, but not from before `since_s`, when the present mode began.
+def error_rms(errors: NDArray[np.float64], since_s: float) -> Rms:
+    """RMS of errors as :meth:`LoopView.errors` has them, but not from before `since_s`.
 
     Ticks without a star do not count, and none at all gives not-a-number.
     """
-    first_s = max(now_s - RMS_S, since_s)
-    recent = errors[(errors[:, 0] >= first_s) & np.isfinite(errors[:, 1:]).all(axis=1)]
+    recent = errors[(errors[:, 0] >= since_s) & np.isfinite(errors[:, 1:]).all(axis=1)]
     if len(recent) < 2:
         return Rms(math.nan, math.nan, 0.0)
     az_px, el_px = np.sqrt(np.mean(recent[:, 1:] ** 2, axis=0))
@@ -101,6 +118,8 @@ class ConsoleState:
         Newest first.
     shown : str
         Name of the loop on the screen.
+    window : Window
+        One of `WINDOWS`, as the operator chose.
     missed : int
         Messages of this supervisor that did not come, because this console or its link was too slow.
     """
@@ -112,6 +131,7 @@ class ConsoleState:
         self.loops: dict[str, LoopView] = {}
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.shown = ""
+        self.window = WINDOWS[0]
         self.missed = 0
         self._arrivals_s: deque[float] = deque(maxlen=RATE_MESSAGES)
 
@@ -145,6 +165,16 @@ class ConsoleState:
     def loop(self) -> LoopView | None:
         """The loop on the screen."""
         return self.loops.get(self.shown)
+
+    @property
+    def mode(self) -> str:
+        """The mode of the loop on the screen; empty before anything came."""
+        return self.loop.state.mode if self.loop else ""
+
+    @property
+    def usable_commands(self) -> set[str]:
+        """Commands that mean something now; none while nothing is known."""
+        return set(self.loop.state.usable_commands) if self.loop and not self.stale else set()
 
     @property
     def silent_s(self) -> float:
@@ -182,6 +212,10 @@ class ConsoleState:
         names = list(self.loops)
         if names:
             self.shown = names[(names.index(self.shown) + 1) % len(names)]
+
+    def next_window(self) -> None:
+        """Cycle through the windows of RMS and traces."""
+        self.window = WINDOWS[(WINDOWS.index(self.window) + 1) % len(WINDOWS)]
 
     def wall_s(self, time_s: float) -> float:
         """Unix time of a monotonic time; not-a-number before anything came."""

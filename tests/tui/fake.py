@@ -26,11 +26,14 @@ from fitctl.logging.records import (
 )
 from fitctl.supervisor.messages import (
     AnyCommand,
+    LoopLimits,
     LoopState,
     Reply,
+    SequenceStatus,
     Status,
     Telemetry,
     TrippedInterlock,
+    Watched,
 )
 
 START_S = 1000.0
@@ -42,7 +45,34 @@ BIAS_DN = 1000.0
 NOISE_DN = 20.0
 SPOT_SIGMA_PX = 0.75
 TARGET_PX = (24.0, 19.5)
-MODE_NUMBERS = {"OFF": 0, "STANDBY": 1, "ACQUISITION": 2, "COARSE": 3, "VERNIER": 4, "SAFE": 5}
+MODE_NUMBERS = {
+    "OFF": 0,
+    "STANDBY": 1,
+    "ACQUISITION": 2,
+    "COARSE": 3,
+    "VERNIER": 4,
+    "SAFE": 5,
+    "EXPERIMENT": 6,
+}
+WITH_STAR = {"COARSE", "VERNIER", "EXPERIMENT"}
+LIMITS = LoopLimits(
+    fsm_range_rad=1.772e-4,
+    siderostat_travel_sky_arcsec=600.0,
+    search_radius_sky_arcsec=215.0,
+    spiral_pitch_sky_arcsec=50.0,
+)
+SPIRAL_S = 8.0
+# A few rows of the shipped table of interlocks: name, quantity, reading, low, high, action, in which modes.
+WATCHED = (
+    ("star_lost", "star_flux_fraction", 0.98, 0.05, None, "warn", WITH_STAR),
+    ("fsm_edge", "fsm_range_fraction", 0.31, None, 0.9, "warn", {"VERNIER"}),
+    ("following_error", "following_error_rad", 0.012, None, 0.5, "safe", set(MODE_NUMBERS)),
+    ("amplifier_slow", "amplifier_round_trip_periods", 0.21, None, 1.0, "warn", set(MODE_NUMBERS)),
+    ("dac_slow", "dac_round_trip_s", 0.0011, None, 0.005, "warn", set(MODE_NUMBERS)),
+    ("frame_age", "frame_late_s", 0.0004, None, 0.01, "warn", set(MODE_NUMBERS)),
+    ("disk_space", "disk_free_bytes", 8.1e10, 1e9, None, "warn", set(MODE_NUMBERS)),
+    ("piezo_limit", "piezo_limit_error_v", float("nan"), -1.0, 1.0, "safe", set()),
+)
 USABLE = {
     "OFF": ["Standby"],
     "STANDBY": ["Acquire", "Off"],
@@ -50,6 +80,7 @@ USABLE = {
     "COARSE": ["Hold"],
     "VERNIER": ["Hold"],
     "SAFE": ["Recover", "Off"],
+    "EXPERIMENT": ["Hold"],
 }
 
 
@@ -85,6 +116,7 @@ class FakeSupervisor:
         self.error_px = error_px
         self.pid = pid
         self.rng = np.random.default_rng(seed)
+        self.jitter = np.random.default_rng(seed + 1)
         self.error = {loop: error_px * self.rng.standard_normal(2) for loop in loops}
         self.number = 0
         self.sequence = 0
@@ -92,6 +124,10 @@ class FakeSupervisor:
         self.records_lost = 0
         self.ticks_unsent = 0
         self.interlocks: list[TrippedInterlock] = []
+        self.running_sequence: SequenceStatus | None = None
+        self.trigger = "IN_REACH"
+        self.reason = "5 frames within 50 % of the range"
+        self.bias_offset_urad = (0.0, 0.0)
 
     @property
     def time_s(self) -> float:
@@ -140,6 +176,7 @@ class FakeSupervisor:
                 replies_unsent=0,
             ),
             scheduling="SCHED_OTHER: real-time priority not permitted",
+            running_sequence=self.running_sequence,
         )
 
     def _state(self, loop: str) -> LoopState:
@@ -153,7 +190,33 @@ class FakeSupervisor:
             controller="minimum-variance",
             last_change=self._change(loop),
             interlocks=self.interlocks,
+            limits=LIMITS,
+            watched=[self._watched(*row) for row in WATCHED],
+            bias_offset_urad=self.bias_offset_urad,
+            search_centre_sky_arcsec=(100.0, -40.0) if self.mode == "ACQUISITION" else None,
         )
+
+    def _watched(self, name, quantity, value, low, high, action, modes) -> Watched:
+        return Watched(
+            name=name,
+            quantity=quantity,
+            value=value,
+            age_s=float("nan") if np.isnan(value) else 0.01,
+            low=low,
+            high=high,
+            stale_s=1.0,
+            action=action,
+            judged=self.mode in modes,
+        )
+
+    def _siderostat_arcsec(self) -> tuple[float, float]:
+        """At rest, or on its spiral about the search's centre."""
+        if self.mode != "ACQUISITION":
+            return 123.4, -54.8
+        turns = self.number * FRAME_S / SPIRAL_S
+        radius = LIMITS.spiral_pitch_sky_arcsec * turns
+        angle = 2 * np.pi * turns
+        return 100.0 + radius * float(np.cos(angle)), -40.0 + radius * float(np.sin(angle))
 
     def _change(self, loop: str) -> ModeChange:
         modes = list(MODE_NUMBERS)
@@ -164,17 +227,19 @@ class FakeSupervisor:
             source=source,
             target=self.mode,
             target_number=MODE_NUMBERS[self.mode],
-            trigger="IN_REACH",
-            reason="5 frames within 50 % of the range",
+            trigger=self.trigger,
+            reason=self.reason,
         )
 
     def _tick(self, loop: str) -> Tick:
-        seen = self.mode in {"COARSE", "VERNIER"}
+        seen = self.mode in WITH_STAR
         memory = np.exp(-FRAME_S / 0.2)
         kick = self.error_px * np.sqrt(1 - memory**2)
         self.error[loop] = memory * self.error[loop] + kick * self.rng.standard_normal(2)
         error_az, error_el = self.error[loop] if seen else (np.nan, np.nan)
         star_az, star_el = TARGET_PX[0] - error_az, TARGET_PX[1] - error_el
+        sky_az, sky_el = self._siderostat_arcsec()
+        took_s = 1.8e-4 + 1e-5 * float(self.jitter.exponential(3.0))
         phase = self.number * FRAME_S / 7
         fsm_az, fsm_el = 5e-5 * np.sin(phase), 3e-5 * np.cos(1.3 * phase)
         return Tick(
@@ -184,8 +249,8 @@ class FakeSupervisor:
             mode=self.mode,
             mode_number=MODE_NUMBERS[self.mode],
             mid_exposure_s=self.time_s - 0.035,
-            frame_age_s=0.035,
-            compute_s=2.1e-4,
+            frame_age_s=0.035 + took_s,
+            compute_s=took_s,
             late=False,
             frames_lost=0,
             star_visible=seen,
@@ -211,16 +276,18 @@ class FakeSupervisor:
             siderostat_el_rad=-9.47,
             siderostat_setpoint_az_rad=21.3104,
             siderostat_setpoint_el_rad=-9.4702,
-            siderostat_az_sky_arcsec=123.4,
-            siderostat_el_sky_arcsec=-54.8,
+            siderostat_az_sky_arcsec=sky_az,
+            siderostat_el_sky_arcsec=sky_el,
             search_progress=0.37 if self.mode == "ACQUISITION" else float("nan"),
+            sense_s=6e-5,
+            decide_s=5e-5,
         )
 
     def _frame(self, now_s: float) -> FrameRecord:
         error_az, error_el = self.error[self.loops[0]]
         star = (TARGET_PX[0] - error_az, TARGET_PX[1] - error_el, 28000.0)
         fringe = (star[0] - 12, star[1], 11000.0)
-        seen = self.mode in {"COARSE", "VERNIER"}
+        seen = self.mode in WITH_STAR
         image = spot_image(self.rng, [star, fringe] if seen else [])
         return FrameRecord(
             time_s=now_s - 0.035,

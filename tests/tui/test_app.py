@@ -28,9 +28,12 @@ from fitctl.supervisor.messages import (
     TrippedInterlock,
 )
 from fitctl.tui import app as console_app
-from fitctl.tui.app import UNDRAWN_MESSAGES, ConsoleApp
-from fitctl.tui.screens import Reader
+from fitctl.tui.app import ConsoleApp
+from fitctl.tui.dialogs import Confirm, Reader
+from fitctl.tui.views.help import HelpView
+from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.header import Header
+from fitctl.tui.wire import UNDRAWN_MESSAGES
 from tests.tui.fake import START_S, FakeLink, FakeSupervisor
 
 DEADLINE_S = 10.0
@@ -75,8 +78,10 @@ def run(
 
 def header_text(app: ConsoleApp) -> str:
     app.draw_all()
-    header = app.query_one(Header)
-    return "\n".join(header.render_line(y).text for y in range(3))
+    panels = (app.view.query_one(Header), app.view.query_one(AlarmBar))
+    return "\n".join(
+        panel.render_line(y).text for panel in panels for y in range(panel.size.height)
+    )
 
 
 def notifications(app: ConsoleApp) -> str:
@@ -90,7 +95,6 @@ def notifications(app: ConsoleApp) -> str:
         ("h", Hold(loop="right")),
         ("r", Recover(loop="right")),
         ("b", Standby(loop="right")),
-        ("o", Off(loop="right")),
         ("s", Stop()),
         ("space", Stop()),
         ("ctrl+s", Stop()),
@@ -104,12 +108,34 @@ def test_every_command_is_one_key(key, command):
     assert run(scenario).sent == [command]
 
 
+@pytest.mark.parametrize(
+    ("answer", "sent"), [("y", [Off(loop="right")]), ("n", []), ("escape", [])]
+)
+def test_off_asks_once(answer, sent):
+    async def scenario(app, pilot, link):
+        await pilot.press("o")
+        await until(pilot, lambda: isinstance(app.screen, Confirm))
+        await pilot.press(answer)
+        await until(pilot, lambda: not isinstance(app.screen, Confirm))
+        await until(pilot, lambda: len(link.sent) == len(sent))
+
+    assert run(scenario, supervisor=FakeSupervisor("STANDBY")).sent == sent
+
+
+def test_off_where_it_means_nothing_is_left_to_the_supervisor_to_refuse():
+    async def scenario(app, pilot, link):
+        await pilot.press("o")
+        await until(pilot, lambda: link.sent)
+
+    assert run(scenario).sent == [Off(loop="right")]
+
+
 @pytest.mark.parametrize("key", ["s", "space", "ctrl+s"])
-@pytest.mark.parametrize("opener", ["question_mark", "e"])
+@pytest.mark.parametrize("opener", ["v", "e"])
 def test_stop_works_from_every_dialog(opener, key):
     async def scenario(app, pilot, link):
         await pilot.press(opener)
-        assert isinstance(app.screen, Reader)
+        assert app.screen.is_modal
         await pilot.press(key)
         await until(pilot, lambda: link.sent)
 
@@ -130,7 +156,7 @@ def test_stop_works_from_the_palette_and_s_is_a_letter_there():
 
 def test_other_commands_do_not_reach_through_a_dialog():
     async def scenario(app, pilot, link):
-        await pilot.press("question_mark", "a", "o")
+        await pilot.press("e", "a", "o")
         await pilot.press("escape", "h")
         await until(pilot, lambda: link.sent)
 
@@ -166,7 +192,7 @@ def test_a_stop_just_before_quitting_is_still_sent():
 
 def test_ctrl_c_quits_even_over_a_dialog():
     async def scenario(app, pilot, link):
-        await pilot.press("question_mark", "ctrl+c")
+        await pilot.press("e", "ctrl+c")
         await until(pilot, lambda: not app.is_running)
 
     assert run(scenario).closed
@@ -233,7 +259,7 @@ def test_a_console_without_a_supervisor_says_so():
         async with app.run_test(size=(80, 24)):
             clock.now_s += 4.0
             assert "connecting" in header_text(app)
-            assert "NO DATA for 4 s; is the supervisor running?" in header_text(app)
+            assert "NO DATA for 4 s ▸ is the supervisor running?" in header_text(app)
 
     asyncio.run(main())
 
@@ -316,13 +342,22 @@ def test_loops_are_cycled_and_commands_go_to_the_shown_one():
     ]
 
 
-@pytest.mark.parametrize("closing", ["escape", "question_mark", "q"])
-def test_help_names_every_key_and_closes(closing):
+@pytest.mark.parametrize("closing", ["escape", "e", "q"])
+def test_the_events_open_and_close(closing):
     async def scenario(app, pilot, link):
-        await pilot.press("question_mark")
+        await pilot.press("e")
         assert isinstance(app.screen, Reader)
         await pilot.press(closing)
         await until(pilot, lambda: not isinstance(app.screen, Reader))
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("key", ["question_mark", "f1", "6"])
+def test_help_is_a_key_away(key):
+    async def scenario(app, pilot, link):
+        await pilot.press(key)
+        await until(pilot, lambda: isinstance(app.screen, HelpView))
 
     run(scenario)
 

@@ -1,12 +1,15 @@
+import matplotlib as mpl
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.segment import Segment
 
 from fitctl.tui.draw import frame
+from fitctl.tui.draw.colours import ANCHORS, colour_map
 from fitctl.tui.look import width
 from tests.tui.fake import spot_image
+
+INFERNO = colour_map("inferno")
 
 
 def image(star=(24.0, 19.5)):
@@ -36,7 +39,7 @@ def test_every_frame_fits_every_panel(width_px, height_px, columns, rows):
     picture = np.full((height_px, width_px), 1000, dtype=np.uint16)
     levels = frame.levels_on_screen(picture, placing)
     assert levels.shape == (2 * placing.rows, placing.columns)
-    lines = frame.frame_lines(levels, placing, {}, columns, rows)
+    lines = frame.frame_lines(levels, placing, {}, columns, rows, INFERNO)
     assert len(lines) == rows
     assert all(width(line) <= columns for line in lines)
 
@@ -80,7 +83,7 @@ def test_a_star_survives_shrinking():
 def test_equal_neighbours_share_a_segment():
     placing = frame.place(40, 40, 40, 20)
     levels = np.zeros((40, 40), dtype=np.int64)
-    lines = frame.frame_lines(levels, placing, {}, 40, 20)
+    lines = frame.frame_lines(levels, placing, {}, 40, 20, INFERNO)
     assert all(len(line) == 1 for line in lines)
 
 
@@ -89,12 +92,12 @@ def test_a_mark_takes_one_cell_and_contrasts():
     levels = np.zeros((40, 40), dtype=np.int64)
     levels[20:22] = frame.LEVELS - 1
     marks = {(7, 10): frame.Mark("+"), (7, 3): frame.Mark("+")}
-    lines = frame.frame_lines(levels, placing, marks, 40, 20)
+    lines = frame.frame_lines(levels, placing, marks, 40, 20, INFERNO)
 
     def mark_style(line):
         return next(segment.style for segment in line if segment.text == "+")
 
-    assert mark_style(lines[10]).color.name == frame.colour_map()[0]
+    assert mark_style(lines[10]).color.name == INFERNO[0]
     assert mark_style(lines[3]).color.name == "#ffffff"
     assert width(lines[10]) == 40
 
@@ -114,10 +117,38 @@ def test_the_box_is_closed():
     assert marks[10, 8].character == "┘"
 
 
-def test_lightness_grows_from_black_to_bright():
-    channels = [[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in frame.colour_map()]
+@pytest.mark.parametrize("name", ANCHORS)
+def test_lightness_grows_from_dark_to_bright(name):
+    channels = [[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in colour_map(name)]
     lightness = np.array(channels) @ [0.2126, 0.7152, 0.0722]
+    assert len(lightness) == frame.LEVELS
     assert np.all(np.diff(lightness) > 0)
-    assert isinstance(
-        frame.frame_lines(np.zeros((2, 1), int), frame.place(1, 2, 1, 1), {}, 1, 1)[0][0], Segment
-    )
+
+
+@pytest.mark.parametrize("name", ["inferno", "viridis", "cividis"])
+def test_the_maps_are_those_of_matplotlib(name):
+    theirs = mpl.colormaps[name](np.linspace(0, 1, frame.LEVELS))[:, :3] * 255
+    ours = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in colour_map(name)])
+    assert np.abs(ours - theirs).max() < 12
+
+
+@pytest.mark.parametrize("kind", frame.STRETCHES)
+def test_every_stretch_keeps_the_order_of_pixels_and_uses_all_levels(kind):
+    picture = image()
+    levels = frame.stretch(picture, kind)
+    order = np.argsort(picture, axis=None)
+    assert np.all(np.diff(levels.ravel()[order]) >= 0)
+    assert (levels.min(), levels.max()) == (0, frame.LEVELS - 1)
+
+
+@given(
+    az_px=st.integers(0, 39),
+    el_px=st.integers(0, 39),
+    size=st.sampled_from([(40, 20), (80, 40), (130, 47), (30, 11)]),
+)
+def test_a_click_is_read_as_the_pixel_that_is_drawn_there(az_px, el_px, size):
+    placing = frame.place(40, 40, *size)
+    column, row = int(placing.column(az_px)), int(placing.row(el_px))
+    az, el = placing.pixel(column, row)
+    assert abs(az - az_px) <= placing.shrink / 2 + 0.5
+    assert abs(el - el_px) <= placing.shrink + 0.5

@@ -1,20 +1,35 @@
+import json
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+import scipy.signal
 
 from fitctl.logging.records import Event
-from fitctl.supervisor.messages import TrippedInterlock
+from fitctl.supervisor.messages import SequenceStatus, TrippedInterlock
+from fitctl.tui.alarms import AlarmBook
+from fitctl.tui.commands import VIEWS, keys_of
 from fitctl.tui.draw.frame import place
+from fitctl.tui.jog import JogPad
 from fitctl.tui.palette import parse_target
 from fitctl.tui.state import ConsoleState
+from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.events import Events, event_lines
 from fitctl.tui.widgets.focalplane import FocalPlane, tick_marks
+from fitctl.tui.widgets.hand import Hand
 from fitctl.tui.widgets.header import Header
 from fitctl.tui.widgets.health import Devices, Timing
 from fitctl.tui.widgets.keys import Keys
+from fitctl.tui.widgets.loglist import LogList
+from fitctl.tui.widgets.margins import Margins
+from fitctl.tui.widgets.printed import Printed
+from fitctl.tui.widgets.readings import DeviceList, Readings, in_units
+from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
+from fitctl.tui.widgets.spectrum import Spectrum, spectra_of
 from fitctl.tui.widgets.stages import Stages, working_point
+from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces, axis_limit_px, trace_lines
 from tests.tui.fake import START_S, FakeSupervisor
 
@@ -32,15 +47,81 @@ def plain(lines):
 
 
 def changed_tick(state, **fields):
-    state.loop.ticks[-1] = msgspec.structs.replace(state.loop.tick, **fields)
+    state.loop.tick = msgspec.structs.replace(state.loop.tick, **fields)
     return state.loop.tick
 
 
-PANELS = (Header, FocalPlane, Traces, Stages, Devices, Timing, Events, Keys)
+def header(state):
+    return Header(state, "operate")
+
+
+def keys(state):
+    return Keys(state, "operate")
+
+
+def alarm_bar(state):
+    book = AlarmBook()
+    book.judge(state)
+    return AlarmBar(state, book)
+
+
+def hand(state):
+    return Hand(state, JogPad())
+
+
+def parameters(state):
+    sequences = SequenceList(state, "")
+    sequences.documents = [
+        {
+            "file": "jog.toml",
+            "name": "jog",
+            "description": "A jog.",
+            "steps": [{"step": "off", "loop": ""}],
+        }
+    ]
+    return Parameters(state, "", sequences)
+
+
+def sequence_list(state):
+    return parameters(state)._sequences
+
+
+def log_list(state):
+    return LogList(state, "", Path("no such folder"))
+
+
+def printed(state):
+    return Printed(state, "", "Choose something. " * 20)
+
+
+PANELS = (
+    header,
+    alarm_bar,
+    keys,
+    hand,
+    FocalPlane,
+    Traces,
+    Stages,
+    Devices,
+    Timing,
+    Events,
+    DeviceList,
+    Readings,
+    Histograms,
+    Breakdown,
+    Spectrum,
+    Margins,
+    sequence_list,
+    parameters,
+    Progress,
+    printed,
+    log_list,
+)
+MODES = ["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT"]
 
 
 @pytest.mark.parametrize("panel", PANELS)
-@pytest.mark.parametrize("mode", ["OFF", "ACQUISITION", "VERNIER", "SAFE"])
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("size", [(39, 3), (80, 20), (3, 1), (200, 60)])
 def test_every_panel_draws_in_every_mode_and_size(panel, mode, size):
     panel(shown(FakeSupervisor(mode))).draw(*size)
@@ -51,17 +132,17 @@ def test_every_panel_draws_before_anything_came(panel):
     panel(ConsoleState(START_S)).draw(80, 20)
 
 
-@pytest.mark.parametrize("panel", [Header, FocalPlane, Traces, Stages, Devices, Timing, Keys])
+@pytest.mark.parametrize("panel", [header, FocalPlane, Traces, Stages, Devices, Timing, keys])
 @pytest.mark.parametrize("mode", ["ACQUISITION", "VERNIER"])
 def test_nothing_is_wider_than_its_panel_at_80_columns(panel, mode):
     columns, rows = {
-        Header: (80, 3),
+        header: (80, 3),
         FocalPlane: (40, 20),
         Traces: (39, 8),
         Stages: (39, 4),
         Devices: (39, 2),
         Timing: (39, 3),
-        Keys: (80, 1),
+        keys: (80, 1),
     }[panel]
     lines = plain(panel(shown(FakeSupervisor(mode), 450)).draw(columns, rows))
     assert len(lines) <= rows
@@ -85,6 +166,7 @@ def test_the_trace_has_its_scale_beside_it():
         np.array([1.0]),
         np.array([0.0]),
         now_s=1.0,
+        span_s=20.0,
         limit_px=0.2,
         requirement_px=0.1,
         colour="#ffffff",
@@ -197,40 +279,152 @@ def test_a_long_event_is_wrapped_under_itself():
     assert max(map(len, lines)) <= 39
 
 
-def test_the_header_says_when_nothing_comes():
+def test_the_footer_has_stop_and_what_can_be_done_now_and_nothing_else():
+    line = plain(keys(shown(FakeSupervisor("SAFE"))).draw(160, 1))[0]
+    assert line.startswith(" s STOP ")
+    assert "r Recover" in line
+    assert "o Off" in line
+    assert "Acquire" not in line
+    assert "? Help" in line
+
+
+def test_a_narrow_footer_keeps_stop_the_commands_and_help():
+    line = plain(keys(shown(FakeSupervisor("SAFE"))).draw(40, 1))[0]
+    assert all(word in line for word in ("s STOP", "r Recover", "o Off", "? Help"))
+    assert len(line.rstrip()) <= 41
+
+
+@pytest.mark.parametrize("view", [view.name for view in VIEWS])
+def test_every_key_of_a_screen_is_clicked_as_it_is_pressed(view):
+    line = Keys(shown(FakeSupervisor()), view).draw(300, 1)[0]
+    actions = {segment.style.meta.get("@click") for segment in line if segment.style}
+    wanted = {
+        key.action for key in keys_of(view) if key.action and key.matters(shown(FakeSupervisor()))
+    }
+    assert wanted <= actions
+    assert "app.command('Stop')" in actions
+
+
+def test_the_header_leads_to_every_screen_by_mouse():
+    for columns in (80, 120):
+        lines = Header(shown(FakeSupervisor()), "loop").draw(columns, 3)
+        actions = {s.style.meta.get("@click") for line in lines for s in line if s.style}
+        assert {f"app.view('{view.name}')" for view in VIEWS} <= actions
+
+
+def test_a_reading_out_of_its_range_changes_its_sign():
+    supervisor = FakeSupervisor()
+    before = plain(Readings(shown(supervisor)).draw(100, 20))
+    supervisor.interlocks = [
+        TrippedInterlock(
+            name="dac_slow", since_s=START_S, action="warn", reset="itself", reason="slow; wait"
+        )
+    ]
+    after = plain(Readings(shown(supervisor)).draw(100, 20))
+    row = next(number for number, line in enumerate(after) if "dac_slow" in line)
+    assert before[row].lstrip("▌ ").startswith("✓ dac_slow")
+    assert after[row].lstrip("▌ ").startswith("▲ dac_slow")
+
+
+@pytest.mark.parametrize(
+    ("quantity", "value", "told"),
+    [
+        ("frame_late_s", 0.0004, "0.0004 s"),
+        ("fsm_range_fraction", 0.314, "31.4 %"),
+        ("disk_free_bytes", 8.1e10, "81 GB"),
+        ("amplifier_round_trip_periods", 0.21, "0.21 periods"),
+        ("amplifier_fault", 1.0, "1"),
+        ("piezo_limit_error_v", -0.5, "−0.5 V"),
+        ("dac_unwritten_s", None, ""),
+    ],
+)
+def test_readings_are_told_in_the_units_of_their_names(quantity, value, told):
+    assert in_units(quantity, value) == told
+
+
+def test_a_list_scrolls_to_what_is_chosen():
+    readings = Readings(shown(FakeSupervisor()))
+    readings.draw(80, 4)
+    for wanted in (6, 0, 7):
+        readings.chosen = wanted
+        lines = plain(readings.draw(80, 4))
+        assert len(lines) == 4
+        chosen = [line for line in lines if line.startswith("▌")]
+        assert len(chosen) == 1
+        assert readings.watched()[wanted].name in chosen[0]
+
+
+def test_the_siderostat_is_told_with_its_limits_and_warned_of_near_them():
     state = shown(FakeSupervisor())
-    state.now_s += 7.0
-    assert "NO DATA for 7 s" in plain(Header(state).draw(80, 3))[2]
+    assert "of ±600″" in "".join(plain(Stages(state).draw(100, 9)))
+    changed_tick(state, siderostat_az_sky_arcsec=590.0)
+    assert "″!" in "".join(plain(Stages(state).draw(100, 9)))
 
 
-def tripped(name, since_s, **fields):
-    told = {"action": "warn", "reset": "hand", "reason": f"interlock {name}: look at it"}
-    return TrippedInterlock(name=name, since_s=since_s, **(told | fields))
+def test_the_search_has_its_map_with_the_way_and_the_field():
+    lines = plain(Traces(shown(FakeSupervisor("ACQUISITION"), 400)).draw(76, 20))
+    told = "\n".join(lines)
+    assert "searched 37 %" in told
+    assert "field, 108″" in told
+    assert "radius 215″" in told
 
 
-def test_the_header_shows_what_is_tripped_how_many_there_are_and_how_to_reset_it():
+def test_the_spectrum_has_a_line_where_the_error_has_one():
+    times_s = np.arange(0, 20, 0.02)
+    tone = np.sqrt(2) * 0.05 * np.sin(2 * np.pi * 4.0 * times_s)
+    spectra = spectra_of(scipy.signal, np.column_stack([times_s, tone, 0 * tone]))
+    peak_hz = spectra.frequency_hz[np.argmax(spectra.density_px_per_sqrt_hz[:, 0])]
+    assert peak_hz == pytest.approx(4.0, abs=0.2)
+    step_hz = np.diff(spectra.frequency_hz)[0]
+    rms_px = np.sqrt(np.sum(spectra.density_px_per_sqrt_hz**2, axis=0) * step_hz)
+    assert rms_px == pytest.approx([0.05, 0.0], abs=0.003)
+
+
+def test_the_spectrum_is_of_the_ticks_since_the_star_was_missed():
+    errors = np.column_stack([np.arange(200) * 0.02, np.zeros((200, 2))])
+    errors[150, 1:] = math.nan
+    assert spectra_of(scipy.signal, errors) is None
+    errors[150, 1:] = 0.0
+    errors[20, 1:] = math.nan
+    assert spectra_of(scipy.signal, errors) is not None
+
+
+def test_margins_are_judged_against_what_is_usual():
+    margins = Margins(shown(FakeSupervisor(), 400))
+    told = {
+        "stable": True,
+        "crossover_hz": 3.9,
+        "phase_margin_deg": 22.7,
+        "gain_margin_db": 7.1,
+        "peak_sensitivity": 1.9,
+        "attenuation_1hz": 6.1,
+        "residual_px": 0.0131,
+    }
+    margins.told("minimum-variance", json.dumps(told), 0)
+    lines = plain(margins.draw(60, 12))
+    assert next(line for line in lines if "phase" in line).endswith("▲")
+    assert next(line for line in lines if "gain" in line).endswith("✓")
+    assert any("0.0131 px, by linear theory" in line for line in lines)
+    margins.told("minimum-variance", "design: no such loop", 2)
+    assert "✗ design: no such loop" in "\n".join(plain(margins.draw(60, 12)))
+
+
+def test_the_tick_is_broken_down_into_parts_that_make_up_the_whole():
+    state = shown(FakeSupervisor(), 400)
+    lines = plain(Breakdown(state).draw(100, 8))
+    median = {line.split()[0]: float(line.split()[1]) for line in lines[1:]}
+    whole = median["sense"] + median["decide"] + median["write"]
+    assert whole == pytest.approx(median["tick"], abs=0.02)
+
+
+def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():
     supervisor = FakeSupervisor()
-    supervisor.interlocks = [tripped("disk_space", START_S), tripped("clock_step", START_S + 1)]
-    line = plain(Header(shown(supervisor)).draw(120, 3))[2]
-
-    assert "▲ clock_step warn +1  interlock clock_step: look at it; reset clock_step" in line
-
-
-def test_what_resets_itself_asks_for_no_hand_and_a_short_line_is_cut():
-    supervisor = FakeSupervisor()
-    supervisor.interlocks = [tripped("flux_low", START_S, reset="itself", reason="far " * 60)]
-    line = plain(Header(shown(supervisor)).draw(80, 3))[2]
-
-    assert "flux_low warn  far far" in line
-    assert "reset" not in line
-    assert len(line.rstrip()) <= 80
-
-
-def test_a_command_of_no_use_loses_its_cap():
-    keys = Keys(shown(FakeSupervisor("SAFE"))).draw(80, 1)[0]
-    capped = {segment.text.strip() for segment in keys if segment.style and segment.style.bgcolor}
-    assert {"s STOP", "r", "o"} <= capped
-    assert "a" not in capped
+    supervisor.running_sequence = SequenceStatus(
+        run="1", name="jog", state="running", steps=3, step_number=2, step="hold", wanted="pause"
+    )
+    told = "\n".join(plain(Progress(shown(supervisor)).draw(90, 2)))
+    assert "▶ jog running; asked to pause" in told
+    assert "step 2/3 hold" in told
 
 
 @pytest.mark.parametrize(

@@ -1,32 +1,27 @@
-"""The whole screen as it looks, at the sizes that people use. ``pytest --snapshot-update`` accepts a change."""
+"""The whole screen as it looks, at the sizes that people use. ``pytest --snapshot-update`` accepts a change.
+
+Pictures (SVG) of every screen and dialog; and, for every screen in every mode at every size, its text with a
+digest of its colours, which is smaller and quicker by far.
+"""
 
 import asyncio
+import hashlib
 
 import pytest
 from textual.pilot import Pilot
 
-from fitctl.tui.app import ConsoleApp
-from tests.tui.fake import START_S, FakeLink, FakeSupervisor
+from fitctl.tui.commands import VIEWS
+from tests.tui.fake import MODE_NUMBERS, FakeSupervisor
+from tests.tui.fixed import FixedApp, make_logs, settle
 
-MESSAGES = 420
+SIZES = [(80, 24), (120, 40), (200, 60)]
 
 
-class FixedApp(ConsoleApp):
-    """A console on recorded telemetry whose clock stands still after the last message."""
-
-    def __init__(self, supervisor: FakeSupervisor, silent_s: float = 0.02) -> None:
-        self.recorded = supervisor.messages(MESSAGES)
-        self.fixed_s = START_S
-        super().__init__(FakeLink(), clock=lambda: self.fixed_s)
-        self.silent_s = silent_s
-
-    def feed(self) -> None:
-        """All telemetry, each message at its own time."""
-        for message in self.recorded:
-            self.fixed_s = message.time_s
-            self.state.accept(message, message.time_s)
-        self.fixed_s += self.silent_s
-        self.draw_all()
+@pytest.fixture
+def logs(tmp_path, monkeypatch):
+    """A folder of logs that has the same name in every run."""
+    make_logs(tmp_path / "logs")
+    monkeypatch.chdir(tmp_path)
 
 
 def looking(*keys: str):
@@ -35,30 +30,89 @@ def looking(*keys: str):
         assert isinstance(app, FixedApp)
         app.feed()
         await pilot.press(*keys)
-        await pilot.pause()
-        await asyncio.sleep(0.3)  # every timed redraw has happened; the clock stands still
-        await pilot.pause()
+        await settle(app, pilot)
 
     return run_before
 
 
-@pytest.mark.parametrize("size", [(80, 24), (120, 40), (200, 60)])
-def test_vernier(snap_compare, size):
-    assert snap_compare(FixedApp(FakeSupervisor()), terminal_size=size, run_before=looking())
+def lines_of(app: FixedApp) -> list[str]:
+    """The screen's text; before each line, a digest of how its parts are coloured."""
+    lines = []
+    for strip in app.screen._compositor.render_strips():
+        text = "".join(segment.text for segment in strip)
+        styles = ";".join(
+            f"{len(s.text)}:{s.style.color}:{s.style.bgcolor}:{s.style.bold}"
+            for s in strip
+            if s.style
+        )
+        lines.append(f"{hashlib.md5(styles.encode()).hexdigest()[:6]} {text.rstrip()}")
+    return lines
 
 
-def test_acquisition(snap_compare):
+@pytest.mark.usefixtures("logs")
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize("mode", MODE_NUMBERS)
+def test_every_screen_in_every_mode(snapshot, mode, size):
+    async def look() -> dict[str, list[str]]:
+        app = FixedApp(FakeSupervisor(mode))
+        seen = {}
+        async with app.run_test(size=size) as pilot:
+            app.feed()
+            for view in VIEWS:
+                await pilot.press(view.key)
+                await settle(app, pilot)
+                seen[view.name] = lines_of(app)
+        return seen
+
+    assert asyncio.run(look()) == snapshot
+
+
+@pytest.mark.usefixtures("logs")
+@pytest.mark.parametrize("size", SIZES)
+def test_operate(snap_compare, size):
+    app = FixedApp(FakeSupervisor())
+    assert snap_compare(app, terminal_size=size, run_before=looking())
+
+
+@pytest.mark.usefixtures("logs")
+@pytest.mark.parametrize("view", [view.name for view in VIEWS[1:]])
+def test_screen(snap_compare, view):
+    key = next(each.key for each in VIEWS if each.name == view)
+    app = FixedApp(FakeSupervisor())
+    assert snap_compare(app, terminal_size=(120, 40), run_before=looking(key))
+
+
+@pytest.mark.parametrize(
+    "keys", ["e", "v", "o", "t", "j"], ids=["events", "alarms", "off", "target", "jog"]
+)
+def test_dialog(snap_compare, keys):
+    app = FixedApp(FakeSupervisor("VERNIER" if keys in "tje" else "STANDBY"))
+    assert snap_compare(app, terminal_size=(80, 24), run_before=looking(*keys))
+
+
+def test_search(snap_compare):
     app = FixedApp(FakeSupervisor("ACQUISITION"))
-    assert snap_compare(app, terminal_size=(80, 24), run_before=looking())
+    assert snap_compare(app, terminal_size=(120, 40), run_before=looking())
 
 
-def test_safe_with_a_fault_and_lost_records(snap_compare):
+def safe_with_a_fault() -> FakeSupervisor:
     supervisor = FakeSupervisor("SAFE")
-    supervisor.faulty = {
-        "right siderostat": "axis 2: following error; clear the cause, then Recover"
-    }
+    told = "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error"
+    supervisor.trigger, supervisor.reason = "FAULT", f"{told}; remove its cause, then recover"
+    supervisor.faulty = {"right siderostat": supervisor.reason}
     supervisor.records_lost = 1234
-    assert snap_compare(FixedApp(supervisor), terminal_size=(120, 40), run_before=looking())
+    return supervisor
+
+
+@pytest.mark.parametrize("size", SIZES[:2])
+def test_safe_with_a_fault_and_lost_records(snap_compare, size):
+    app = FixedApp(safe_with_a_fault())
+    assert snap_compare(app, terminal_size=size, run_before=looking())
+
+
+def test_alarms_of_a_fault(snap_compare):
+    app = FixedApp(safe_with_a_fault())
+    assert snap_compare(app, terminal_size=(80, 24), run_before=looking("v"))
 
 
 def test_stale(snap_compare):
@@ -66,9 +120,10 @@ def test_stale(snap_compare):
     assert snap_compare(app, terminal_size=(80, 24), run_before=looking())
 
 
-def test_help(snap_compare):
+def test_without_colour(snap_compare, monkeypatch):
+    monkeypatch.setenv("NO_COLOR", "1")
     app = FixedApp(FakeSupervisor())
-    assert snap_compare(app, terminal_size=(80, 24), run_before=looking("question_mark"))
+    assert snap_compare(app, terminal_size=(80, 24), run_before=looking())
 
 
 def test_two_loops_on_a_wide_and_low_terminal(snap_compare):

@@ -4,7 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from fitctl.tui.state import TRACE_S, ConsoleState, error_rms
+from fitctl.tui.history import KEPT_S, Past
+from fitctl.tui.state import WINDOWS, ConsoleState, error_rms
 from tests.tui.fake import MESSAGE_S, START_S, WALL_MINUS_MONOTONIC_S, FakeSupervisor
 
 
@@ -15,34 +16,69 @@ def fed(supervisor, count):
     return state
 
 
-def test_ticks_are_kept_for_as_long_as_the_traces():
-    state = fed(FakeSupervisor(), 600)
-    times_s = state.loop.errors()[:, 0]
-    assert times_s[-1] - times_s[0] == pytest.approx(TRACE_S, abs=0.05)
-    assert len(times_s) == pytest.approx(TRACE_S * 50, abs=2)
+def test_ticks_are_kept_for_the_longest_window_and_no_longer():
+    state = fed(FakeSupervisor(), 1600)
+    times_s = state.loop.errors(1000.0)[:, 0]
+    assert times_s[-1] - times_s[0] == pytest.approx(KEPT_S, abs=0.05)
+    assert len(state.loop.past) == len(times_s) == pytest.approx(KEPT_S * 50, abs=3)
+    assert max(map(max, WINDOWS)) <= KEPT_S
 
 
-def test_the_rms_is_about_the_target_and_of_the_last_ten_seconds():
+@pytest.mark.parametrize("count", [1, 5, 4095, 4096, 4097, 9000])
+def test_the_past_is_whole_however_long_it_grows(count):
+    past = Past()
+    ticks = FakeSupervisor().message().ticks
+    for number in range(count):
+        past.add([msgspec.structs.replace(ticks[0], time_s=number * 0.01)], number * 0.01)
+    times_s = past.since(-1.0, "time_s")[:, 0]
+    kept = min(count, round(KEPT_S / 0.01) + 1)
+    assert times_s == pytest.approx(np.arange(count - kept, count) * 0.01)
+
+
+def test_the_past_is_asked_from_a_time_on():
+    state = fed(FakeSupervisor(), 100)
+    now_s = state.loop.tick.time_s
+    errors = state.loop.errors(1.0)
+    assert errors.shape == (51, 3)
+    assert errors[0, 0] == pytest.approx(now_s - 1.0, abs=0.011)
+
+
+def test_the_rms_is_about_the_target_and_not_from_before_a_time():
     times_s = np.arange(0, 20, 0.02)
     offset = np.where(times_s < 9.5, 5.0, 0.1)
-    rms = error_rms(np.column_stack([times_s, offset, -2 * offset]), 19.98, 0.0)
+    rms = error_rms(np.column_stack([times_s, offset, -2 * offset]), 9.98)
     assert rms.az_px == pytest.approx(0.1)
     assert rms.el_px == pytest.approx(0.2)
     assert rms.span_s == pytest.approx(10.0, abs=0.05)
 
 
-def test_the_rms_forgets_the_mode_before():
-    errors = np.array([[1.0, 9.0, 9.0], [2.0, 0.1, 0.1], [3.0, 0.1, 0.1]])
-    rms = error_rms(errors, 3.0, 1.5)
-    assert (rms.az_px, rms.span_s) == (pytest.approx(0.1), pytest.approx(1.0))
-
-
 def test_ticks_without_a_star_do_not_count():
     errors = np.array([[1.0, 0.3, 0.4], [1.1, math.nan, math.nan], [1.2, 0.3, 0.4]])
-    rms = error_rms(errors, 1.2, 0.0)
+    rms = error_rms(errors, 0.0)
     assert (rms.az_px, rms.el_px) == (pytest.approx(0.3), pytest.approx(0.4))
-    assert math.isnan(error_rms(errors[1:2], 1.2, 0.0).az_px)
-    assert math.isnan(error_rms(np.empty((0, 3)), 1.2, 0.0).az_px)
+    assert math.isnan(error_rms(errors[1:2], 0.0).az_px)
+    assert math.isnan(error_rms(np.empty((0, 3)), 0.0).az_px)
+
+
+def test_the_way_of_a_search_is_kept_until_the_next_one_begins():
+    supervisor = FakeSupervisor("ACQUISITION")
+    state = fed(supervisor, 300)
+    trail = state.loop.search_trail_sky_arcsec
+    assert len(trail) > 20
+    assert math.dist(trail[0], (100.0, -40.0)) < 5.0
+    message = supervisor.message()
+    again = [msgspec.structs.replace(loop, since_s=START_S + 50) for loop in message.loops]
+    state.accept(msgspec.structs.replace(message, loops=again), START_S)
+    assert len(state.loop.search_trail_sky_arcsec) <= 3
+
+
+def test_windows_are_cycled():
+    state = ConsoleState(START_S)
+    seen = []
+    for _ in range(len(WINDOWS) + 1):
+        seen.append(state.window)
+        state.next_window()
+    assert seen == [*WINDOWS, WINDOWS[0]]
 
 
 def test_data_are_stale_before_the_first_message_and_a_second_after_the_last():
@@ -68,7 +104,7 @@ def test_loops_are_cycled_by_name():
     assert state.shown == "right"
     state.show_next_loop()
     assert state.shown == "left"
-    assert {tick.loop for tick in state.loop.ticks} == {"left"}
+    assert state.loop.tick.loop == "left"
     state.show_next_loop()
     assert state.shown == "right"
 
@@ -83,7 +119,7 @@ def test_a_loop_that_is_gone_is_not_shown():
 def test_another_supervisor_starts_with_an_empty_past():
     state = fed(FakeSupervisor(pid=1), 100)
     state.accept(FakeSupervisor(pid=2).message(), START_S + 60)
-    assert len(state.loop.ticks) < 10
+    assert len(state.loop.past) < 10
 
 
 def test_lost_records_are_the_greater_of_both_counts():

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+
+from fitctl.tui.look import Line, text
 
 Dots = NDArray[np.bool_]
 
@@ -21,6 +25,60 @@ def cells(dots: Dots) -> NDArray[np.int64]:
     rows, columns = dots.shape[0] // 4, dots.shape[1] // 2
     blocks = dots.reshape(rows, 4, columns, 2)
     return _BLANK + np.einsum("rycx,yx->rc", blocks.astype(np.int64), _WEIGHTS)
+
+
+def layered(layers: Sequence[tuple[Dots, str]]) -> list[Line]:
+    """Lines of several canvases over each other; a cell has the colour of the last layer that has a dot in it.
+
+    Parameters
+    ----------
+    layers : sequence of (bool array, shape (4 rows, 2 columns)), and colour
+        All of one shape, the lowest first.
+    """
+    codes = np.full((layers[0][0].shape[0] // 4, layers[0][0].shape[1] // 2), _BLANK)
+    owner = np.zeros_like(codes)
+    for number, (dots, _) in enumerate(layers):
+        own = cells(dots)
+        owner[own != _BLANK] = number
+        codes |= own
+    lines: list[Line] = []
+    for row, owners in zip(codes.tolist(), owner.tolist(), strict=True):
+        line: Line = []
+        start = 0
+        for x in range(1, len(row) + 1):
+            if x == len(row) or owners[x] != owners[start]:
+                line.append(text("".join(map(chr, row[start:x])), layers[owners[start]][1]))
+                start = x
+        lines.append(line)
+    return lines
+
+
+def scatter(dots: Dots, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    """Set dots at places from 0 to 1, shape (n,) each, y upwards; what lies outside is left out."""
+    height, width = dots.shape
+    with np.errstate(invalid="ignore"):
+        inside = (x >= 0) & (x <= 1) & (y >= 0) & (y <= 1)
+    column = np.rint(x[inside] * (width - 1)).astype(np.int64)
+    row = np.rint((1 - y[inside]) * (height - 1)).astype(np.int64)
+    dots[row, column] = True
+
+
+def polyline(dots: Dots, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    """Join places from 0 to 1, shape (n,) each, by straight lines; not-a-number leaves a gap."""
+    if len(x) < 2:
+        scatter(dots, x, y)
+        return
+    steps = 2 * max(dots.shape)
+    between = np.linspace(0.0, 1.0, steps)
+    length = np.hypot(np.diff(x), np.diff(y))
+    for index in np.flatnonzero(np.isfinite(length)):
+        part = between[:: max(1, int(1 / max(float(length[index]), 1 / steps)))]
+        ends = np.append(part, 1.0)
+        scatter(
+            dots,
+            x[index] + ends * (x[index + 1] - x[index]),
+            y[index] + ends * (y[index + 1] - y[index]),
+        )
 
 
 def envelope(

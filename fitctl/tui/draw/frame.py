@@ -3,45 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.segment import Segment
 
+from fitctl.tui.draw.colours import LEVELS
 from fitctl.tui.look import WHITE, Line, style
 
-# Anchors of the "inferno" map of matplotlib (CC0): even steps of lightness, safe for colour blindness.
-_INFERNO = [
-    "#000004",
-    "#160b39",
-    "#420a68",
-    "#6a176e",
-    "#932667",
-    "#bc3754",
-    "#dd513a",
-    "#f37819",
-    "#fca50a",
-    "#f6d746",
-    "#fcffa4",
-]
-LEVELS = 32
+Floats = NDArray[np.float64]
+
+STRETCHES: dict[str, Callable[[Floats, float], Floats]] = {
+    "asinh": lambda above, noise: np.arcsinh(above / (4 * noise)),
+    "sqrt": lambda above, _: np.sqrt(np.maximum(above, 0.0)),
+    "linear": lambda above, _: above,
+}
 
 
-@lru_cache(maxsize=1)
-def colour_map() -> tuple[str, ...]:
-    """`LEVELS` colours from dark to bright."""
-    anchors = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in _INFERNO])
-    places = np.linspace(0, len(anchors) - 1, LEVELS)
-    channels = [np.interp(places, np.arange(len(anchors)), anchors[:, i]) for i in range(3)]
-    return tuple(
-        f"#{int(r):02x}{int(g):02x}{int(b):02x}" for r, g, b in zip(*channels, strict=True)
-    )
-
-
-def stretch(image: NDArray[np.uint16]) -> NDArray[np.int64]:
-    """Colour levels, 0 to ``LEVELS - 1``: asinh from just above the background to the brightest pixel.
+def stretch(image: NDArray[np.uint16], kind: str = "asinh") -> NDArray[np.int64]:
+    """Colour levels, 0 to ``LEVELS - 1``, from just above the background to the brightest pixel.
 
     The median stands for bias and sky; the scatter below it, which no star touches, for the noise.
     Black is one deviation above the background: most of the field is calm, and cheap to send to a
@@ -51,10 +33,10 @@ def stretch(image: NDArray[np.uint16]) -> NDArray[np.int64]:
     background = float(np.median(values))
     below = background - values[values < background]
     noise = max(1.0, 1.4826 * float(np.median(below)) if below.size else 1.0)
-    softening = 4 * noise
     black = background + noise
     top = max(float(values.max()) - black, 30 * noise)
-    scaled = np.arcsinh((values - black) / softening) / math.asinh(top / softening)
+    curve = STRETCHES[kind]
+    scaled = curve(values - black, noise) / curve(np.array(top), noise)
     return np.clip(np.rint(scaled * (LEVELS - 1)), 0, LEVELS - 1).astype(np.int64)
 
 
@@ -78,6 +60,12 @@ class Placing:
         """Panel row of an elevation; a cell's upper edge is a whole number."""
         return self.top + (self.height_px - 0.5 - el_px) * self.zoom / self.shrink / 2
 
+    def pixel(self, column: int, row: int) -> tuple[float, float]:
+        """Azimuth and elevation in px at the middle of a cell."""
+        az_px = (column + 0.5 - self.left) * self.shrink / self.zoom - 0.5
+        el_px = self.height_px - 0.5 - (row + 0.5 - self.top) * 2 * self.shrink / self.zoom
+        return az_px, el_px
+
 
 def place(width_px: int, height_px: int, columns: int, rows: int) -> Placing:
     """The largest whole zoom that fits the panel, in its middle; a frame too large is shrunk."""
@@ -98,12 +86,14 @@ def place(width_px: int, height_px: int, columns: int, rows: int) -> Placing:
     )
 
 
-def levels_on_screen(image: NDArray[np.uint16], placing: Placing) -> NDArray[np.int64]:
+def levels_on_screen(
+    image: NDArray[np.uint16], placing: Placing, kind: str = "asinh"
+) -> NDArray[np.int64]:
     """Levels of the screen's half cells, uppermost first; shape (2 rows, columns).
 
     A shrunken frame shows the brightest pixel of each block, so that no star can vanish.
     """
-    levels = stretch(image)[::-1]
+    levels = stretch(image, kind)[::-1]
     n = placing.shrink
     if n > 1:
         height, width = levels.shape[0] // n * n, levels.shape[1] // n * n
@@ -153,10 +143,17 @@ def reticle_marks(column: float, row: float, gap: tuple[int, int], colour: str) 
 
 
 def frame_lines(
-    levels: NDArray[np.int64], placing: Placing, marks: Marks, columns: int, rows: int
+    levels: NDArray[np.int64],
+    placing: Placing,
+    marks: Marks,
+    columns: int,
+    rows: int,
+    colours: Sequence[str],
 ) -> list[Line]:
-    """Lines of the panel: the image in its place, marks on top, equal neighbours in one segment."""
-    colours = colour_map()
+    """Lines of the panel: the image in its place, marks on top, equal neighbours in one segment.
+
+    `colours` are of the levels, from dark to bright.
+    """
     lines: list[Line] = [[] for _ in range(rows)]
     for row in range(placing.rows):
         upper, lower = levels[2 * row].tolist(), levels[2 * row + 1].tolist()
@@ -181,7 +178,7 @@ def frame_lines(
     return lines
 
 
-def _pixels(count: int, pair: tuple[int, int], colours: tuple[str, ...]) -> Segment:
+def _pixels(count: int, pair: tuple[int, int], colours: Sequence[str]) -> Segment:
     upper, lower = pair
     if upper == lower:
         return Segment(" " * count, style(None, colours[upper]))

@@ -1,1 +1,1 @@
-"""The panels of the console's one screen, a module each."""
+"""The panels of the console's screens, a module each."""

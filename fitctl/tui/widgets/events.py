@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import textwrap
-from datetime import UTC, datetime
 
 from fitctl.logging.records import Event
-from fitctl.tui.look import DIM, SEVERITIES, Line, text
+from fitctl.tui.look import DIM, SEVERITIES, Line, text, wall
 from fitctl.tui.widgets.panel import Panel
 
 STAMP_COLUMNS = 11
@@ -28,12 +27,11 @@ class Events(Panel):
 def event_lines(event: Event, wall_s: float, columns: int) -> list[Line]:
     """One event: time, sign of its severity, source and message, wrapped under itself."""
     look = SEVERITIES[event.severity]
-    at = datetime.fromtimestamp(wall_s, UTC).strftime("%H:%M:%S")
     room = max(10, columns - STAMP_COLUMNS)
     pieces = textwrap.wrap(f"{event.source}: {event.message}", room) or [""]
     lines: list[Line] = [
         [
-            text(f"{at} ", DIM),
+            text(f"{wall(wall_s)} ", DIM),
             text(f"{look.symbol} ", look.colour, bold=True),
             text(pieces[0], look.colour),
         ]

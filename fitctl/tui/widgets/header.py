@@ -1,13 +1,14 @@
-"""The three lines on top: what runs, its mode and for how long, how it came there, and whether data flow."""
+"""The lines on top: what runs, its mode and for how long, whether data flow, and the way to other screens."""
 
 from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
+from typing import ClassVar
 
 from rich.segment import Segment
 
-from fitctl.supervisor.messages import TrippedInterlock
+from fitctl.tui.commands import VIEWS
 from fitctl.tui.look import (
     DIM,
     FAINT,
@@ -21,42 +22,48 @@ from fitctl.tui.look import (
     UNKNOWN_MODE,
     WHITE,
     Line,
+    clickable,
     duration,
-    shorten,
     spread,
     text,
-    width,
 )
+from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
 BADGE_COLUMNS = 19
-BADGE_FROM_COLUMNS = 100
-
+WIDE_FROM_COLUMNS = 100
 ASIDE = {"SAFE", "EXPERIMENT"}
 
 
 class Header(Panel):
-    """Rig, loop, mode, time in mode, link, clock; the modes as a diagram; interlocks or last transition."""
+    """Rig, loop, mode, time in mode, link and clock; the modes as a diagram; the screens.
+
+    On a narrow terminal the diagram gives way.
+    """
+
+    every: ClassVar[int] = 2
+
+    def __init__(self, state: ConsoleState, view: str) -> None:
+        super().__init__(state)
+        self._view = view
 
     def draw(self, columns: int, rows: int) -> list[Line]:
-        """Three lines, with a large badge of the mode beside them where there is room."""
-        badge = self._badge() if columns >= BADGE_FROM_COLUMNS else None
-        inner = columns - (BADGE_COLUMNS + 2 if badge else 0)
+        """Three lines beside a badge of the mode, or two."""
+        if columns < WIDE_FROM_COLUMNS:
+            return [self._status(columns, small_badge=True), self._screens()]
+        inner = columns - (BADGE_COLUMNS + 2)
         lines = [
-            self._status(inner, small_badge=badge is None),
+            self._status(inner, small_badge=False),
             spread(self._diagram(), [], inner),
-            self._news(inner),
+            self._screens(),
         ]
-        if badge:
-            lines = [
-                [*left, Segment("  "), *right] for left, right in zip(badge, lines, strict=True)
-            ]
-        return lines
+        return [
+            [*left, Segment("  "), *right] for left, right in zip(self._badge(), lines, strict=True)
+        ]
 
     @property
     def _mode(self) -> str:
-        loop = self.state.loop
-        return loop.state.mode if loop else "NO DATA"
+        return self.state.mode or "NO DATA"
 
     def _badge(self) -> list[Line]:
         look = MODES.get(self._mode, UNKNOWN_MODE)
@@ -118,38 +125,12 @@ class Header(Panel):
                 line.append(text(mode, DIM))
         return line
 
-    def _news(self, columns: int) -> Line:
-        state = self.state
-        if state.stale:
-            old = "; what you see is old" if state.newest else "; is the supervisor running?"
-            message = f" ✗ NO DATA for {state.silent_s:.0f} s{old}; reconnecting"
-            return [text(message.ljust(columns), PAPER, on=RED, bold=True)]
-        tripped = state.loop.state.interlocks if state.loop else []
-        if tripped:
-            return self._tripped(tripped, columns)
-        change = state.loop.change if state.loop else None
-        if change is None:
-            return [text("no change of mode since this console began to listen", DIM)]
-        line = [
-            text(f"{self._at(change.time_s)} ", DIM),
-            text(f"{change.source} → {change.target}", INK),
-            text(f"  {change.trigger.lower().replace('_', ' ')}", SKY),
-        ]
-        if change.reason:
-            line.append(text(shorten(f"  {change.reason}", columns - width(line)), DIM))
+    def _screens(self) -> Line:
+        line: Line = []
+        for key, name, label, _ in VIEWS:
+            if name == self._view:
+                piece = [text(f" {key} {label} ", PAPER, on=INK, bold=True)]
+            else:
+                piece = [text(f" {key}", SKY, bold=True), text(f" {label} ", DIM)]
+            line += clickable(piece, f"app.view('{name}')")
         return line
-
-    def _tripped(self, tripped: list[TrippedInterlock], columns: int) -> Line:
-        """The one that tripped last in full, and how many there are besides."""
-        last = max(tripped, key=lambda trip: trip.since_s)
-        others = f" +{len(tripped) - 1}" if len(tripped) > 1 else ""
-        colour = ORANGE if last.action == "warn" else RED
-        line = [
-            text(f"{self._at(last.since_s)} ", DIM),
-            text(f"▲ {last.name} {last.action}{others}", colour, bold=True),
-        ]
-        how = "" if last.reset == "itself" else f"; reset {last.name}"
-        return [*line, text(shorten(f"  {last.reason}{how}", columns - width(line)), DIM)]
-
-    def _at(self, time_s: float) -> str:
-        return datetime.fromtimestamp(self.state.wall_s(time_s), UTC).strftime("%H:%M:%S")

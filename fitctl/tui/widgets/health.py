@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import PurePath
+from typing import ClassVar
 
 import msgspec
 
@@ -35,6 +36,8 @@ class Devices(Panel):
     Where rows are short, ill devices keep rows of their own; the well ones of the loop on the screen
     share the rest.
     """
+
+    every: ClassVar[int] = 5
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """Ill devices first when not all have a row of their own."""
@@ -99,6 +102,8 @@ def _packed(devices: list[DeviceHealth], columns: int) -> list[Line]:
 
 class Timing(Panel):
     """Median and worst times, what was late or lost, the scheduling reached, and the log file."""
+
+    every: ClassVar[int] = 5
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """A table where there is room for one, else two dense lines; the log in the last line."""

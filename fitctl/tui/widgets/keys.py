@@ -1,38 +1,63 @@
-"""The bottom line: every key, with those of no use now set back."""
+"""The bottom line: the keys that matter now, for keyboard and mouse."""
 
 from __future__ import annotations
 
-from fitctl.tui.commands import OPERATOR_COMMANDS
-from fitctl.tui.look import INK, PAPER, RED, SKY, Line, text, width
+from collections.abc import Callable
+from typing import ClassVar
+
+from fitctl.tui.commands import OPERATOR_COMMANDS, Key, keys_of
+from fitctl.tui.look import PAPER, RED, Line, cap, clickable, text, width
+from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
 
 class Keys(Panel):
-    """Key caps and labels. A command of no use now loses its cap; stop always has one."""
+    """STOP always; commands that mean something now; the screen's own keys; the rest where there is room.
+
+    Parameters
+    ----------
+    state : ConsoleState
+    view : str
+        Name of the screen.
+    now : callable
+        Keys that go before the screen's own at this moment, such as those of a jog.
+    """
+
+    every: ClassVar[int] = 2
+
+    def __init__(
+        self,
+        state: ConsoleState,
+        view: str,
+        now: Callable[[], list[Key]] = list,
+    ) -> None:
+        super().__init__(state)
+        self._view = view
+        self._now = now
 
     def draw(self, columns: int, rows: int) -> list[Line]:
-        """One line; labels that do not fit are left to the help screen."""
-        loop = self.state.loop
-        usable = set(loop.state.usable_commands) if loop and not self.state.stale else set()
-        line: Line = []
-        for command in OPERATOR_COMMANDS:
-            if command.name == "Stop":
-                line += [
-                    text(f" {command.key} {command.label} ", PAPER, on=RED, bold=True),
-                    text(" "),
-                ]
-            else:
-                line += _cap(command.key, command.label, usable=command.name in usable)
-        others = [("l", "Loop")] if len(self.state.loops) > 1 else []
-        others += [("?", "Help"), ("q", "Quit"), ("e", "Events"), ("^p", "Palette")]
-        for key, label in others:
-            cap = _cap(key, label, usable=True)
-            if width(line) + width(cap) <= columns + 1:
-                line += cap
+        """One line; what does not fit is left to the help."""
+        stop = [text(" s STOP ", PAPER, on=RED, bold=True)]
+        line: Line = [*clickable(stop, "app.command('Stop')"), text(" ")]
+        for key, label, action in self._in_order():
+            piece = cap(key, label, action)
+            if width(line) + width(piece) <= columns + 1:
+                line += piece
         return [line]
 
-
-def _cap(key: str, label: str, *, usable: bool) -> Line:
-    if usable:
-        return [text(key, PAPER, on=SKY, bold=True), text(f" {label} ", INK)]
-    return [text(f"{key} {label} ", "#5a6675")]
+    def _in_order(self) -> list[tuple[str, str, str]]:
+        now = self._now()
+        usable = self.state.usable_commands
+        commands = [
+            (command.key, command.label, f"app.command('{command.name}')")
+            for command in OPERATOR_COMMANDS
+            if command.name != "Stop" and command.name in usable
+        ]
+        own = [key for key in keys_of(self._view) if key.matters(self.state)]
+        common = [key for key in keys_of("") if key.matters(self.state)]
+        told = [(key.shown, key.label, key.action) for key in now]
+        # While the arrow keys move something, that is what matters.
+        rest = [(key.shown, key.label, key.action) for key in ([] if now else own) + common]
+        help_ = next(item for item in rest if item[1] == "Help")
+        rest.remove(help_)
+        return [*told, *commands, help_, *rest]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
@@ -19,7 +21,14 @@ class Panel(Widget, can_focus=False):
         Read at every redraw; never changed here.
     title : str
         Shown in the panel's upper border, where the layout gives it one.
+
+    Attributes
+    ----------
+    every : int
+        It is drawn at each of so many beats of the console (:data:`fitctl.tui.app.BEAT_S`).
     """
+
+    every: ClassVar[int] = 2
 
     def __init__(self, state: ConsoleState, title: str = "") -> None:
         super().__init__(id=type(self).__name__.lower())

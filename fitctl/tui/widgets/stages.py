@@ -1,10 +1,11 @@
-"""Both stages: the fast steering mirror on its diamond, its stacks, the siderostat, the search."""
+"""Both stages: the mirror on its diamond with its trail, its stacks, the siderostat and its limits."""
 
 from __future__ import annotations
 
 import math
 
-from rich.segment import Segment
+import numpy as np
+from numpy.typing import NDArray
 
 from fitctl.logging.records import Tick
 from fitctl.tui.draw import braille
@@ -14,13 +15,14 @@ from fitctl.tui.look import (
     GREEN,
     INK,
     ORANGE,
+    PAPER,
     RED,
+    SKY,
     YELLOW,
     Line,
     bar,
     number,
     pad,
-    style,
     text,
     width,
 )
@@ -30,6 +32,7 @@ from fitctl.tui.widgets.panel import Panel
 HIGH_RANGE = 0.8
 NUMBER_COLUMNS = 28
 LIMIT_FROM_COLUMNS = 34
+TRAIL_S = 10.0
 
 
 class Stages(Panel):
@@ -41,7 +44,9 @@ class Stages(Panel):
         tick = loop.tick if loop else None
         if loop is None or tick is None:
             return []
-        picture = diamond_lines(tick, min(rows, max(3, (columns - NUMBER_COLUMNS) // 2 - 1)))
+        trail = trail_on_diamond(loop, tick)
+        side = min(rows, max(3, (columns - NUMBER_COLUMNS) // 2 - 1))
+        picture = diamond_lines(tick, side, trail)
         left = width(picture[0]) + 1
         above = (rows - len(picture)) // 2
         picture = [*([] for _ in range(above)), *picture]
@@ -63,48 +68,64 @@ def working_point(tick: Tick) -> tuple[float, float]:
     return tick.fsm_az_rad * scale, tick.fsm_el_rad * scale
 
 
-def diamond_lines(tick: Tick, rows: int) -> list[Line]:
-    """The mirror's range ``|az| + |el| <= 1`` with the working point; about twice as many columns as rows."""
+def trail_on_diamond(loop: LoopView, tick: Tick) -> NDArray[np.float64]:
+    """Where the mirror was in the last `TRAIL_S`, shape (n, 2); the corners are at 1."""
+    past = loop.past.since(tick.time_s - TRAIL_S, "fsm_az_rad", "fsm_el_rad")
+    limits = loop.state.limits
+    return past / limits.fsm_range_rad if limits else np.empty((0, 2))
+
+
+def diamond_lines(tick: Tick, rows: int, trail: NDArray[np.float64]) -> list[Line]:
+    """The mirror's range ``|az| + |el| <= 1``, trail and working point; about twice as many columns as rows."""
     columns = 2 * rows + 1
     az, el = working_point(tick)
-    point = (
-        round((az + 1) / 2 * (columns - 1)),
-        round((1 - el) / 2 * (rows - 1)),
+    x, y = round((az + 1) / 2 * (columns - 1)), round((1 - el) / 2 * (rows - 1))
+    sign, colour = (
+        ("✗", RED) if tick.fsm_saturated else ("●", _range_colour(tick.fsm_range_fraction))
     )
-    look = ("✗", RED) if tick.fsm_saturated else ("●", _range_colour(tick.fsm_range_fraction))
-    lines: list[Line] = []
-    for y, codes in enumerate(braille.cells(braille.diamond(rows, columns)).tolist()):
-        row = "".join(map(chr, codes))
-        if y == point[1]:
-            before, after = row[: point[0]], row[point[0] + 1 :]
-            lines.append(
-                [
-                    Segment(before, style(DIM)),
-                    text(look[0], look[1], bold=True),
-                    Segment(after, style(DIM)),
-                ]
-            )
-        else:
-            lines.append([Segment(row, style(DIM))])
+    way = braille.empty(rows, columns)
+    braille.scatter(way, (trail[:, 0] + 1) / 2, (trail[:, 1] + 1) / 2)
+    lines = braille.layered([(braille.diamond(rows, columns), DIM), (way, SKY)])
+    at = pad(lines[y], columns)
+    before, after = _cut(at, x)
+    lines[y] = [*before, text(sign, colour, bold=True), *after]
     return lines
+
+
+def _cut(line: Line, column: int) -> tuple[Line, Line]:
+    """What is left and what is right of one column."""
+    before: Line = []
+    after: Line = []
+    at = 0
+    for segment in line:
+        cut = min(max(column - at, 0), len(segment.text))
+        skipped = 1 if at <= column < at + len(segment.text) else 0
+        if cut:
+            before.append(type(segment)(segment.text[:cut], segment.style))
+        if segment.text[cut + skipped :]:
+            after.append(type(segment)(segment.text[cut + skipped :], segment.style))
+        at += len(segment.text)
+    return before, after
 
 
 def _numbers(loop: LoopView, tick: Tick, columns: int, rows: int) -> list[Line]:
     mirror = _mirror_bar(tick, columns)
     stacks_v = (tick.stack1_v, tick.stack2_v, tick.stack3_v)
     stacks = _row("D/A", " ".join(number(v, ".2f") for v in stacks_v), "V")
-    sky_arcsec = (tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec)
-    siderostat = _row("sider.", _pair(*sky_arcsec, "+.1f"), "″")
+    siderostat = _siderostat(loop, tick, columns)
     behind_rad = (
         tick.siderostat_setpoint_az_rad - tick.siderostat_az_rad,
         tick.siderostat_setpoint_el_rad - tick.siderostat_el_rad,
     )
     behind = _row("to go", _pair(1e3 * behind_rad[0], 1e3 * behind_rad[1], "+.1f"), "mrad")
-    last = _search_bar(tick, columns) if tick.mode == "ACQUISITION" else behind
     if rows <= 4:
+        last = _search_bar(tick, columns) if tick.mode == "ACQUISITION" else behind
         return [mirror, stacks, siderostat, last]
     mirror_urad = (1e6 * tick.fsm_az_rad, 1e6 * tick.fsm_el_rad)
-    lines = [mirror, _row("tilt", _pair(*mirror_urad, "+.1f"), "µrad"), stacks]
+    lines = [mirror, _row("tilt", _pair(*mirror_urad, "+.1f"), "µrad")]
+    if any(loop.state.bias_offset_urad):
+        lines.append(_row("offset", _pair(*loop.state.bias_offset_urad, "+.1f"), "µrad"))
+    lines.append(stacks)
     if loop.piezo is not None:
         measured_v = (loop.piezo.stack1_v, loop.piezo.stack2_v, loop.piezo.stack3_v)
         unit = f"V, limit {loop.piezo.limit_v:g}" if columns >= LIMIT_FROM_COLUMNS else "V"
@@ -121,6 +142,24 @@ def _pair(az: float, el: float, form: str) -> str:
     return f"{number(az, form):>8} {number(el, form):>8}"
 
 
+def _siderostat(loop: LoopView, tick: Tick, columns: int) -> Line:
+    """On the sky, beside how far it may go."""
+    az_arcsec, el_arcsec = tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec
+    limits = loop.state.limits
+    unit = "″"
+    line = _row("sider.", _pair(az_arcsec, el_arcsec, "+.1f"), unit)
+    if limits is None:
+        return line
+    travel_arcsec = limits.siderostat_travel_sky_arcsec
+    used = max(abs(az_arcsec), abs(el_arcsec)) / travel_arcsec
+    if used > HIGH_RANGE:
+        line[1] = text(line[1].text, ORANGE, bold=True)
+        line.append(text("!", ORANGE, bold=True))
+    if columns >= LIMIT_FROM_COLUMNS:
+        line.append(text(f" of ±{travel_arcsec:g}″", DIM))
+    return line
+
+
 def _range_colour(fraction: float) -> str:
     return ORANGE if fraction > HIGH_RANGE else GREEN
 
@@ -128,13 +167,14 @@ def _range_colour(fraction: float) -> str:
 def _mirror_bar(tick: Tick, columns: int) -> Line:
     fraction = tick.fsm_range_fraction
     if tick.fsm_saturated:
-        return [text("FSM    ", DIM), text(" ✗ SATURATED ", "#0b0e13", on=RED, bold=True)]
-    percent = f"{number(100 * fraction, '3.0f')} %"
+        return [text("FSM    ", DIM), text(" ✗ SATURATED ", PAPER, on=RED, bold=True)]
+    high = fraction > HIGH_RANGE
+    percent = f"{number(100 * fraction, '3.0f')} %{'!' if high else ''}"
     return [
         text("FSM    ", DIM),
-        text(percent, INK, bold=True),
+        text(percent, ORANGE if high else INK, bold=True),
         text(" "),
-        *bar(fraction, max(4, columns - 13), _range_colour(fraction)),
+        *bar(fraction, max(4, columns - 14), _range_colour(fraction)),
     ]
 
 

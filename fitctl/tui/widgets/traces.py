@@ -1,4 +1,4 @@
-"""The pointing error of both axes over the last seconds, against the requirement."""
+"""The pointing error of both axes over the last seconds; while searching, the search."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.segment import Segment
 
 from fitctl.tui.draw import braille
 from fitctl.tui.look import (
@@ -15,22 +14,23 @@ from fitctl.tui.look import (
     GREEN,
     INK,
     ORANGE,
-    RED,
     SKY,
     Line,
+    mark,
     number,
     spread,
-    style,
     text,
     width,
 )
-from fitctl.tui.state import RMS_S, TRACE_S, LoopView, Rms, error_rms
+from fitctl.tui.state import LoopView, Rms, Window, error_rms
 from fitctl.tui.widgets.panel import Panel
+from fitctl.tui.widgets.searchmap import search_lines
 
 AXIS_COLUMNS = 6
 STEPS = (1.0, 2.0, 5.0)
 TIME_AXIS_FROM_ROWS = 12
 LONG_HEADINGS_FROM_COLUMNS = 68
+TITLES = {True: "Search on the sky", False: "Pointing error"}
 
 
 class Traces(Panel):
@@ -44,23 +44,30 @@ class Traces(Panel):
         loop = self.state.loop
         if loop is None or self.state.newest is None:
             return []
-        now_s = self.state.newest.time_s
-        errors = loop.errors()
+        searching = loop.state.mode == "ACQUISITION"
+        self.border_title = TITLES[searching]
+        if searching:
+            frame = self.state.newest.frame
+            return search_lines(loop, frame.width_px if frame else 0, columns, rows)
+        window, now_s = self.state.window, self.state.newest.time_s
+        errors = loop.errors(max(window))
         since_s = loop.state.since_s
-        rms = error_rms(errors, now_s, since_s)
+        rms = error_rms(errors, max(since_s, now_s - window.rms_s))
         time_axis = rows >= TIME_AXIS_FROM_ROWS
         trace_rows = max(1, (rows - 2 - time_axis) // 2)
-        in_mode_px = errors[errors[:, 0] >= since_s, 1:]
+        in_mode_px = errors[errors[:, 0] >= max(since_s, now_s - window.trace_s), 1:]
         scale_px = axis_limit_px(in_mode_px, loop.state.requirement_px)
         lines: list[Line] = []
         for index, (name, colour, rms_px) in enumerate(
             (("az", SKY, rms.az_px), ("el", ORANGE, rms.el_px)), start=1
         ):
-            lines.append(_heading(name, colour, errors[:, index], rms_px, rms, loop, columns))
+            now_px = float(errors[-1, index]) if len(errors) else math.nan
+            lines.append(_heading(name, colour, now_px, rms_px, rms, window, loop, columns))
             lines += trace_lines(
                 errors[:, 0],
                 errors[:, index],
                 now_s=now_s,
+                span_s=window.trace_s,
                 limit_px=scale_px,
                 requirement_px=loop.state.requirement_px,
                 colour=colour,
@@ -68,7 +75,7 @@ class Traces(Panel):
                 rows=trace_rows,
             )
         if time_axis:
-            lines.append(_time_axis(columns))
+            lines.append(_time_axis(columns, window.trace_s))
         return lines
 
 
@@ -88,6 +95,7 @@ def trace_lines(
     errors_px: NDArray[np.float64],
     *,
     now_s: float,
+    span_s: float,
     limit_px: float,
     requirement_px: float,
     colour: str,
@@ -99,25 +107,18 @@ def trace_lines(
     if across < 1:
         return [[] for _ in range(rows)]
     trace = braille.empty(rows, across)
-    braille.envelope(trace, times_s, errors_px, now_s=now_s, span_s=TRACE_S, limit=limit_px)
+    braille.envelope(trace, times_s, errors_px, now_s=now_s, span_s=span_s, limit=limit_px)
     guides = braille.empty(rows, across)
     braille.guide(guides, 0.0, limit_px, 6)
     for sign in (-1, 1):
         braille.guide(guides, sign * requirement_px, limit_px, 2)
-    has_trace = (braille.cells(trace) != braille.cells(braille.empty(rows, across))).tolist()
-    codes = braille.cells(trace | guides).tolist()
     labels = _axis_labels(rows, limit_px, requirement_px)
-    lines: list[Line] = []
-    for y in range(rows):
-        line = [text(labels[y].rjust(AXIS_COLUMNS - 1), DIM), text("▕", FAINT)]
-        start = 0
-        for x in range(1, across + 1):
-            if x == across or has_trace[y][x] != has_trace[y][start]:
-                run = "".join(map(chr, codes[y][start:x]))
-                line.append(Segment(run, style(colour if has_trace[y][start] else GREEN)))
-                start = x
-        lines.append(line)
-    return lines
+    return [
+        [text(label.rjust(AXIS_COLUMNS - 1), DIM), text("▕", FAINT), *line]
+        for label, line in zip(
+            labels, braille.layered([(guides, GREEN), (trace, colour)]), strict=True
+        )
+    ]
 
 
 def _axis_labels(rows: int, limit_px: float, requirement_px: float) -> list[str]:
@@ -135,13 +136,13 @@ def _axis_labels(rows: int, limit_px: float, requirement_px: float) -> list[str]
 def _heading(
     name: str,
     colour: str,
-    errors_px: NDArray[np.float64],
+    now_px: float,
     rms_px: float,
     rms: Rms,
+    window: Window,
     loop: LoopView,
     columns: int,
 ) -> Line:
-    now_px = float(errors_px[-1]) if len(errors_px) else math.nan
     requirement_px = loop.state.requirement_px
     line = [
         text(f"{name} ", colour, bold=True),
@@ -149,15 +150,14 @@ def _heading(
     ]
     if math.isnan(rms_px):
         return spread(line, [text("no star, no RMS", DIM)], columns)
-    good = rms_px <= requirement_px
-    sign = text("✓" if good else "✗", GREEN if good else RED, bold=True)
+    sign = mark(good=rms_px <= requirement_px)
     part = rms_px / requirement_px
     ratio = f"{100 * part:.0f} %" if part < 10 else f"{part:.0f}×"
     on_sky = f"{1000 * loop.state.sky_arcsec_per_px * rms_px:.0f} mas"
     if columns < LONG_HEADINGS_FROM_COLUMNS:
-        short = f"rms {rms.span_s:.0f} s " if rms.span_s < 0.9 * RMS_S else "rms "
+        usual = rms.span_s >= 0.9 * window.rms_s and window.rms_s == 10.0
         right = [
-            text(short, DIM),
+            text("rms " if usual else f"rms {rms.span_s:.0f} s ", DIM),
             text(f"{rms_px:.3f}", INK, bold=True),
             text(f" {ratio} ", INK),
             sign,
@@ -176,8 +176,8 @@ def _heading(
     return spread(line, right, columns)
 
 
-def _time_axis(columns: int) -> Line:
+def _time_axis(columns: int, span_s: float) -> Line:
     room = columns - AXIS_COLUMNS
-    left, middle, right = f"−{TRACE_S:.0f} s", f"−{TRACE_S / 2:.0f} s", "now"
+    left, middle, right = f"−{span_s:g} s", f"−{span_s / 2:g} s", "now"
     row = left + middle.center(room - len(left) - len(right)) + right
     return [text(" " * AXIS_COLUMNS + row, DIM)]

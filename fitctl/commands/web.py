@@ -1,0 +1,88 @@
+"""`fitctl console --web`: the same console in a browser on this machine, and in no other."""
+
+from __future__ import annotations
+
+import secrets
+import shlex
+import sys
+from collections.abc import Awaitable, Callable, Sequence
+
+from fitctl.config import ConfigError
+
+HOST = "127.0.0.1"
+COOKIE = "fitctl-console"
+_Handler = Callable[..., Awaitable]
+
+
+def serve_console(rig_arguments: Sequence[str], port: int) -> None:
+    """Serve consoles by textual-serve, one process for each page, until Ctrl-C.
+
+    Whoever can open the page can command the instrument. A port of loopback is open to every user and to
+    every page in a browser of this machine, so only who has the printed address is let in: its key becomes
+    a cookie that pages of other sites cannot use.
+
+    Raises
+    ------
+    ConfigError
+        If textual-serve is not installed, or the port is taken.
+    """
+    try:
+        from aiohttp import web
+        from textual_serve.server import Server
+    except ModuleNotFoundError as error:
+        msg = f"console --web needs textual-serve ({error.name} is missing): pip install 'fitctl[web]'"
+        raise ConfigError(msg) from None
+
+    key = secrets.token_urlsafe(24)
+    address = f"http://{HOST}:{port}"
+
+    class GuardedServer(Server):
+        """Lets in who has the key."""
+
+        async def _make_app(self) -> web.Application:
+            app = await super()._make_app()
+            app.middlewares.append(web.middleware(_guard(web, address, key)))
+            return app
+
+        def initialize_logging(self) -> None:
+            """Nothing but the address is printed."""
+
+        async def on_startup(self, app: web.Application) -> None:
+            """Say where."""
+            print(f"console: {address}/?key={key}", flush=True)
+            print("Ctrl-C ends it; each page is a console of its own.", flush=True)
+
+    command = shlex.join([sys.executable, "-m", "fitctl", "console", *rig_arguments])
+    try:
+        GuardedServer(command, host=HOST, port=port, title="fitctl").serve()
+    except OSError as error:
+        msg = f"console --web: port {port}: {error.strerror}; choose another with --port"
+        raise ConfigError(msg) from None
+
+
+def _nothing_from_elsewhere(host: str) -> str:
+    """A policy for browsers; textual-serve's page would get a font from the Internet."""
+    inline = "'self' 'unsafe-inline'"
+    return (
+        f"default-src 'self'; style-src {inline}; script-src {inline}; font-src 'self' data:; "
+        f"img-src 'self' data:; connect-src ws://{host} http://{host}; frame-ancestors 'none'"
+    )
+
+
+def _guard(web, address: str, key: str) -> _Handler:  # type: ignore[no-untyped-def]  # a module
+    host = address.removeprefix("http://")
+
+    async def guard(request, handler):  # type: ignore[no-untyped-def]  # aiohttp's
+        at_home = request.host == host and request.headers.get("Origin", address) == address
+        if at_home and secrets.compare_digest(request.query.get("key", ""), key):
+            there = web.HTTPFound("/")
+            there.set_cookie(COOKIE, key, httponly=True, samesite="Strict")
+            return there
+        if at_home and secrets.compare_digest(request.cookies.get(COOKIE, ""), key):
+            response = await handler(request)
+            if not response.prepared:
+                response.headers["Content-Security-Policy"] = _nothing_from_elsewhere(host)
+            return response
+        return web.Response(status=403, text="open the address that fitctl console --web printed\n")
+
+    return guard

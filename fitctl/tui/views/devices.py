@@ -1,0 +1,59 @@
+"""Devices: every reading beside its limits, links, faults, and what can be done."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from rich.table import Table
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.binding import BindingType
+
+from fitctl.supervisor.messages import Reset
+from fitctl.tui.commands import keys_of
+from fitctl.tui.dialogs import Reader
+from fitctl.tui.look import DIM, INK
+from fitctl.tui.views.listing import ListingView
+from fitctl.tui.widgets.readings import DeviceList, Readings, device_lines, reading_lines
+from fitctl.tui.widgets.stages import Stages
+
+
+class DevicesView(ListingView):
+    """Devices above, readings below, the stages beside them where there is room."""
+
+    view_name = "devices"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        key.binding() for key in keys_of("devices") if key.action
+    ]
+
+    def parts(self) -> ComposeResult:
+        """Two lists and the stages."""
+        yield DeviceList(self.state, "Devices")
+        yield Readings(self.state, "Readings")
+        yield Stages(self.state, "Stages")
+
+    def action_more(self) -> None:
+        """All about the chosen row."""
+        devices, readings = self.query_one(DeviceList), self.query_one(Readings)
+        loop, row = self.state.loop, readings.now()
+        known = devices.devices()
+        if devices.active and known:
+            device = known[min(devices.chosen, len(known) - 1)]
+            self.app.push_screen(Reader(device.device, _table(device_lines(devices, device))))
+        elif readings.active and loop is not None and row is not None:
+            self.app.push_screen(Reader(row.name, _table(reading_lines(loop, row))))
+
+    def action_reset(self) -> None:
+        """Let the chosen interlock go."""
+        row = self.query_one(Readings).now()
+        if row is None or not self.query_one(Readings).active:
+            self.notify("choose an interlock first: tab, then up and down", timeout=3)
+        else:
+            self.console.give(Reset(name=row.name))
+
+
+def _table(lines: list[tuple[str, str]]) -> Table:
+    table = Table.grid(padding=(0, 2))
+    for name, told in lines:
+        table.add_row(Text(name, DIM), Text(told, INK))
+    return table

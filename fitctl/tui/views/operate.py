@@ -1,0 +1,185 @@
+"""Operate: what an operator watches and does while a star is sought and held."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Container
+
+from fitctl.supervisor.messages import SetBiasOffset, SetTarget
+from fitctl.tui.commands import Key, keys_of
+from fitctl.tui.jog import JogPad
+from fitctl.tui.views.view import View
+from fitctl.tui.widgets.events import Events
+from fitctl.tui.widgets.focalplane import FocalPlane
+from fitctl.tui.widgets.hand import Hand
+from fitctl.tui.widgets.health import Devices, Timing
+from fitctl.tui.widgets.stages import Stages
+from fitctl.tui.widgets.traces import Traces
+
+AIM_STEP_PX = 0.5
+MODES_WITH_STAR = {"COARSE", "VERNIER"}
+_AIM_KEYS = [
+    Key("", "↑↓←→", "Move", "", ""),
+    Key("enter", "enter", "Set target", "screen.take", ""),
+    Key("escape", "esc", "Leave", "screen.leave", ""),
+]
+_JOG_KEYS = [
+    Key("", "↑↓←→", "Jog", "", ""),
+    Key("", "[ ]", "Step", "screen.step(1)", ""),
+    Key("tab", "tab", "Stage", "screen.next_stage", ""),
+    Key("0", "0", "Zero offset", "screen.zero", ""),
+    Key("escape", "esc", "Leave", "screen.leave", ""),
+]
+
+
+class OperateView(View):
+    """Focal plane, pointing error or search, stages, health and events."""
+
+    view_name = "operate"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        *(key.binding() for key in keys_of("operate")),
+        Binding("up", "nudge(0, 1)", show=False),
+        Binding("down", "nudge(0, -1)", show=False),
+        Binding("right", "nudge(1, 0)", show=False),
+        Binding("left", "nudge(-1, 0)", show=False),
+        Binding("left_square_bracket", "step(-1)", show=False),
+        Binding("right_square_bracket", "step(1)", show=False),
+        Binding("tab", "next_stage", show=False),
+        Binding("0", "zero", show=False),
+        Binding("enter", "take", show=False),
+        Binding("escape", "leave", show=False),
+    ]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.hand: Literal["", "aim", "jog"] = ""
+        self.pad = JogPad()
+
+    def parts(self) -> ComposeResult:
+        """All panels, in reading order; the stylesheet places them."""
+        yield FocalPlane(self.state, "Focal plane")
+        yield Traces(self.state, "Pointing error")
+        yield Stages(self.state, "Mirror and siderostat")
+        with Container(id="health"):
+            yield Devices(self.state, "Devices")
+            yield Timing(self.state, "Timing and log")
+        yield Events(self.state, "Events")
+        yield Hand(self.state, self.pad)
+
+    def keys_now(self) -> list[Key]:
+        """What the arrow keys are for."""
+        return {"": [], "aim": _AIM_KEYS, "jog": _JOG_KEYS}[self.hand]
+
+    def before_drawing(self) -> None:
+        """A mode in which nothing can be moved takes the hand away."""
+        mode = self.state.mode
+        idle = {"aim": mode not in MODES_WITH_STAR, "jog": self.pad.stage(mode) is None}
+        if idle.get(self.hand):
+            self._take_hand("")
+
+    @property
+    def _plane(self) -> FocalPlane:
+        return self.query_one(FocalPlane)
+
+    def _take_hand(self, hand: Literal["", "aim", "jog"]) -> None:
+        self.hand = hand
+        if hand != "aim":
+            self._plane.cursor_px = None
+        self.query_one(Hand).display = hand == "jog"
+        self.query_one(Events).display = hand != "jog"
+        self.call_after_refresh(self.console.draw_all)
+
+    # ------------------------------------------------------------ target
+
+    def action_aim(self) -> None:
+        """Put a cursor on the target."""
+        tick = self.state.loop.tick if self.state.loop else None
+        if tick is not None:
+            self._aim_at(tick.target_az_px, tick.target_el_px)
+
+    def on_focal_plane_picked(self, event: FocalPlane.Picked) -> None:
+        """Put the cursor where the mouse was; the target moves when it is confirmed."""
+        self._aim_at(event.az_px, event.el_px)
+
+    def _aim_at(self, az_px: float, el_px: float) -> None:
+        if self.state.mode not in MODES_WITH_STAR:
+            self.notify("a target is moved while a star is held", timeout=3)
+            return
+        frame = self.state.newest.frame if self.state.newest else None
+        if frame is not None:
+            az_px = min(max(az_px, 0.0), frame.width_px - 1.0)
+            el_px = min(max(el_px, 0.0), frame.height_px - 1.0)
+        self._plane.cursor_px = (az_px, el_px)
+        self._take_hand("aim")
+
+    def action_take(self) -> None:
+        """Move the target to the cursor."""
+        cursor = self._plane.cursor_px
+        if self.hand == "aim" and cursor is not None:
+            self.console.give(SetTarget(az_px=round(cursor[0], 3), el_px=round(cursor[1], 3)))
+            self._take_hand("")
+
+    # ------------------------------------------------------------ jog
+
+    def action_jog(self) -> None:
+        """Let the arrow keys move a stage, or no more."""
+        if self.hand == "jog":
+            self._take_hand("")
+        elif self.pad.stage(self.state.mode) is None:
+            self.notify(
+                "stages are moved by hand in STANDBY, targets while a star is held", timeout=4
+            )
+        else:
+            self._take_hand("jog")
+
+    def action_nudge(self, right: int, up: int) -> None:
+        """An arrow key: the cursor, or a stage; without either, nothing moves."""
+        cursor, loop = self._plane.cursor_px, self.state.loop
+        if self.hand == "aim" and cursor is not None:
+            self._aim_at(cursor[0] + right * AIM_STEP_PX, cursor[1] + up * AIM_STEP_PX)
+        elif self.hand == "jog" and loop is not None and not self.state.stale:
+            command = self.pad.press(loop, right, up, self.console.clock())
+            if command is not None:
+                self.console.give(command)
+
+    def action_step(self, by: int) -> None:
+        """A finer or a coarser step."""
+        stage = self.pad.stage(self.state.mode)
+        if self.hand == "jog" and stage is not None:
+            self.pad.change_step(stage, by)
+            self.console.draw_all()
+
+    def action_next_stage(self) -> None:
+        """The other stage."""
+        if self.hand == "jog":
+            self.pad.next_stage()
+            self.console.draw_all()
+
+    def action_zero(self) -> None:
+        """The mirror back to its bias."""
+        if self.hand == "jog" and self.state.mode == "STANDBY":
+            self.pad.begin_anew()
+            self.console.give(SetBiasOffset(az_urad=0.0, el_urad=0.0))
+
+    def action_leave(self) -> None:
+        """The arrow keys move nothing any more."""
+        self._take_hand("")
+
+    # ------------------------------------------------------------ picture
+
+    def action_colours(self) -> None:
+        """The next colour map."""
+        self._plane.next_colours()
+        self._told(f"Focal plane · {self._plane.colours} · {self._plane.stretch}")
+
+    def action_stretch(self) -> None:
+        """The next stretch."""
+        self._plane.next_stretch()
+        self._told(f"Focal plane · {self._plane.colours} · {self._plane.stretch}")
+
+    def _told(self, title: str) -> None:
+        self._plane.border_title = title
+        self.console.draw_all()

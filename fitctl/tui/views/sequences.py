@@ -1,0 +1,181 @@
+"""Sequences: choose one, change its parameters, rehearse it, run it, steer it."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any, ClassVar
+
+import tomli_w
+from textual.app import ComposeResult
+from textual.binding import BindingType
+
+from fitctl.supervisor.messages import SequenceControl
+from fitctl.tui.commands import keys_of
+from fitctl.tui.dialogs import Ask
+from fitctl.tui.jobs import Job
+from fitctl.tui.views.listing import ListingView
+from fitctl.tui.widgets.printed import Printed
+from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
+
+HINT = (
+    "Choose a sequence. tab and enter change its parameters, d rehearses all of it on the virtual clock, "
+    "g runs it on the instrument."
+)
+
+
+class SequencesView(ListingView):
+    """Sequences at the left, parameters at the right, progress and what was printed below.
+
+    Everything that is run is `fitctl sequence` as a process of its own, which goes on when the console
+    is left.
+    """
+
+    view_name = "sequences"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        key.binding() for key in keys_of("sequences") if key.action
+    ]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._folder = tempfile.TemporaryDirectory(prefix="fitctl-console-")
+        self._list: Job | None = None
+        self._job: Job | None = None
+
+    def parts(self) -> ComposeResult:
+        """Two lists, and two panels below them."""
+        sequences = SequenceList(self.state, "Sequences")
+        yield sequences
+        yield Parameters(self.state, "Parameters", sequences)
+        yield Progress(self.state, "On the instrument")
+        yield Printed(self.state, "Printed", HINT)
+
+    def on_mount(self) -> None:
+        """Ask which sequences there are."""
+        super().on_mount()
+        self._list = self.console.start_job(["sequence", "list", "--json"])
+
+    def on_unmount(self) -> None:
+        """What was begun is ended, but a sequence on the instrument goes on."""
+        for job in (self._list, self._job):
+            if job is not None:
+                job.end()
+        self._folder.cleanup()
+
+    def before_drawing(self) -> None:
+        """Take the list of sequences once it has come."""
+        job = self._list
+        if job is None or job.status is None:
+            return
+        self._list = None
+        if job.status == 0:
+            self._take(json.loads(job.text()))
+            job.end()
+        else:
+            self.query_one(Printed).job = self._job = job  # it says why
+
+    def _take(self, documents: list[dict[str, Any]]) -> None:
+        sequences = self.query_one(SequenceList)
+        known = [d for d in sequences.documents if d["file"] not in {n["file"] for n in documents}]
+        sequences.documents = [*known, *documents]
+        if known:
+            sequences.chosen = len(known)
+
+    # ------------------------------------------------------------ keys
+
+    def action_edit(self) -> None:
+        """Change the chosen parameter."""
+        sequences, parameter = self.query_one(SequenceList), self.query_one(Parameters).now()
+        document = sequences.document
+        if document is None or parameter is None or not self.query_one(Parameters).active:
+            self.notify("choose a parameter first: tab, then up and down", timeout=3)
+            return
+        step = document["steps"][parameter.step]
+
+        def take(value: str | None) -> None:
+            if value is not None:
+                step[parameter.key] = parsed(value)
+                sequences.edited.add(document["file"])
+                self._start(["sequence", "check", self._file(), *self.console.rig_arguments])
+
+        told = (
+            f"step {parameter.step + 1}, {step['step']}: {parameter.key} (is {parameter.value!r})"
+        )
+        self.app.push_screen(Ask(document["name"], told, str(parameter.value)), take)
+
+    def action_dry_run(self) -> None:
+        """Rehearse the chosen sequence on the virtual clock."""
+        if self._chosen():
+            self._start(["sequence", "dry-run", self._file(), *self.console.rig_arguments])
+
+    def action_go(self) -> None:
+        """Run the chosen sequence on the instrument, once the operator has said yes."""
+        document = self._chosen()
+        if document is None:
+            return
+        steps = ", ".join(step["step"] for step in document["steps"])
+        question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
+        file = self._file()
+        arguments = ["sequence", "run", file, *self.console.rig_arguments]
+        self.console.ask("Run", question, lambda: self._start(arguments, outlives=True))
+
+    def action_pause(self) -> None:
+        """Pause what is under way, or let it go on."""
+        status = self.state.newest.running_sequence if self.state.newest else None
+        paused = status is not None and "pause" in {status.wanted, status.state.removesuffix("d")}
+        self.console.give(SequenceControl(action="resume" if paused else "pause"))
+
+    def action_end(self) -> None:
+        """End what is under way; its stages are held."""
+        self.console.give(SequenceControl(action="stop"))
+
+    def action_file(self) -> None:
+        """Read a file of the operator's own."""
+
+        def take(name: str | None) -> None:
+            if name and self._list is None:
+                self._list = self.console.start_job(["sequence", "list", "--json", name])
+
+        def refused(name: str) -> str:
+            return "" if Path(name).is_file() else f"{name}: no such file"
+
+        self.app.push_screen(Ask("Open", "a sequence file (TOML)", "", refused), take)
+
+    # ------------------------------------------------------------ children
+
+    def _chosen(self) -> dict[str, Any] | None:
+        document = self.query_one(SequenceList).document
+        if document is None:
+            self.notify("no sequence is chosen yet", timeout=3)
+        return document
+
+    def _file(self) -> str:
+        """The chosen sequence's own file, or, once it was edited, one of ours."""
+        sequences = self.query_one(SequenceList)
+        document = sequences.document or {}
+        if document["file"] not in sequences.edited:
+            return document["file"]
+        path = Path(self._folder.name) / f"{document['name']}.toml"
+        path.write_text(tomli_w.dumps({k: v for k, v in document.items() if k != "file"}))
+        return str(path)
+
+    def _start(self, arguments: list[str], *, outlives: bool = False) -> None:
+        if self._job is not None and self._job.status is None:
+            self.notify(f"still at work: {self._job.told}", severity="warning", timeout=4)
+            return
+        if self._job is not None:
+            self._job.end()
+        self._job = self.query_one(Printed).job = self.console.start_job(
+            arguments, outlives=outlives
+        )
+        self.console.draw_all()
+
+
+def parsed(value: str) -> Any:
+    """A TOML value, or, if it is none, the text itself."""
+    try:
+        return tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return value

@@ -1,0 +1,89 @@
+"""The base of all screens: header and status bar above, keys below, and what is the screen's own between."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, cast
+
+from textual.app import ComposeResult
+from textual.containers import Container
+from textual.events import Resize
+from textual.screen import Screen
+
+from fitctl.tui.commands import Key
+from fitctl.tui.state import ConsoleState
+from fitctl.tui.widgets.alarmbar import AlarmBar
+from fitctl.tui.widgets.header import WIDE_FROM_COLUMNS, Header
+from fitctl.tui.widgets.keys import Keys
+from fitctl.tui.widgets.panel import Panel
+
+if TYPE_CHECKING:
+    from fitctl.tui.app import ConsoleApp
+
+TALL_FROM_ROWS = 36
+
+
+class View(Screen[None]):
+    """One of the console's screens.
+
+    Attributes
+    ----------
+    view_name : str
+        As :data:`fitctl.tui.commands.VIEWS` has it.
+    """
+
+    view_name: ClassVar[str]
+
+    @property
+    def console(self) -> ConsoleApp:
+        """The console that this is a screen of."""
+        return cast("ConsoleApp", self.app)
+
+    @property
+    def state(self) -> ConsoleState:
+        """What the console knows."""
+        return self.console.state
+
+    def compose(self) -> ComposeResult:
+        """From top to bottom."""
+        yield Header(self.state, self.view_name)
+        yield AlarmBar(self.state, self.console.alarms)
+        with Container(id="body"):
+            yield from self.parts()
+        yield Keys(self.state, self.view_name, self.keys_now)
+
+    def parts(self) -> ComposeResult:
+        """The screen's own part."""
+        raise NotImplementedError
+
+    def keys_now(self) -> list[Key]:
+        """Keys that go before the screen's own, at this moment."""
+        return []
+
+    def on_mount(self) -> None:
+        """Take the layout that fits."""
+        self._arrange(self.app.size.width, self.app.size.height)
+
+    def on_resize(self, event: Resize) -> None:
+        """Take the layout that fits now."""
+        self._arrange(event.size.width, event.size.height)
+
+    def _arrange(self, columns: int, rows: int) -> None:
+        tall = rows >= TALL_FROM_ROWS
+        zoom = 3 if columns >= 220 and rows >= 82 else 2 if columns >= 150 and rows >= 58 else 1
+        self.set_class(not tall, "short")
+        self.set_class(tall, "tall")
+        self.set_class(columns >= WIDE_FROM_COLUMNS, "broad")
+        self.set_class(tall and columns >= 40 * zoom + 76, "wide")
+        self.set_class(tall and zoom == 2, "zoom2")
+        self.set_class(tall and zoom == 3, "zoom3")
+
+    def draw(self, beat: int | None) -> None:
+        """Draw the panels whose turn it is; all without a beat."""
+        self.set_class(self.state.stale, "stale")
+        self.before_drawing()
+        for panel in self.query(Panel):
+            if panel.display and (beat is None or beat % panel.every == 0):
+                panel.redraw()
+
+    def before_drawing(self) -> None:
+        """What must be done at each beat."""

@@ -1,0 +1,53 @@
+"""What the arrow keys move, where it is, and by how much."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from fitctl.tui.jog import JogPad
+from fitctl.tui.look import DIM, INK, PAPER, WHITE, YELLOW, Line, number, text
+from fitctl.tui.state import ConsoleState, LoopView
+from fitctl.tui.widgets.panel import Panel
+
+
+class Hand(Panel):
+    """Shown in the place of the events while a stage is moved by hand."""
+
+    every: ClassVar[int] = 1
+
+    def __init__(self, state: ConsoleState, pad: JogPad) -> None:
+        super().__init__(state, "By hand")
+        self._pad = pad
+        self.display = False
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """Stage and step, where it is, the steps to choose from."""
+        loop = self.state.loop
+        stage = self._pad.stage(self.state.mode)
+        if loop is None or stage is None:
+            return []
+        step = self._pad.step(stage)
+        steps: Line = [text("steps ", DIM)]
+        for each in stage.steps:
+            here = each == step
+            steps.append(text(f" {each:g} ", WHITE if here else DIM, bold=here))
+        return [
+            [
+                text(f" JOG {stage.name} ", PAPER, on=YELLOW, bold=True),
+                text(f"  ±{step:g} {stage.unit}", INK, bold=True),
+                text(f"  {stage.told}", DIM),
+            ],
+            [text("at    ", DIM), text(_place(loop, stage.name), INK)],
+            steps,
+        ]
+
+
+def _place(loop: LoopView, stage: str) -> str:
+    tick = loop.tick
+    if stage == "mirror" or tick is None:
+        az, el = loop.state.bias_offset_urad
+        return f"offset az {number(az, '+.1f')} el {number(el, '+.1f')} µrad"
+    if stage == "siderostat":
+        az, el = tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec
+        return f"az {number(az, '+.1f')}″ el {number(el, '+.1f')}″"
+    return f"az {number(tick.target_az_px, '.2f')} el {number(tick.target_el_px, '.2f')} px"

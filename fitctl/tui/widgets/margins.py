@@ -1,0 +1,85 @@
+"""The Loop screen's design: its margins, and what it should leave, beside what is left."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, ClassVar
+
+from fitctl.tui.look import DIM, INK, ORANGE, RED, Line, mark, number, shorten, text
+from fitctl.tui.state import error_rms
+from fitctl.tui.widgets.panel import Panel
+
+LEAST_PHASE_DEG = 30.0
+LEAST_GAIN_DB = 6.0
+MOST_SENSITIVITY = 2.0
+
+
+class Margins(Panel):
+    """What `fitctl design` says of the design at work; :meth:`told` hands it in.
+
+    The limits beside the margins are the usual ones of textbooks (30 deg, 6 dB, 2).
+    """
+
+    every: ClassVar[int] = 5
+    design: str = ""
+    figures: dict[str, Any] | None = None
+    problem: str = ""
+
+    def told(self, design: str, output: str, status: int) -> None:
+        """Take what the command printed."""
+        self.design = design
+        self.figures, self.problem = None, ""
+        if status == 0:
+            self.figures = json.loads(output.strip().splitlines()[-1])
+        else:
+            self.problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """A row a figure."""
+        loop, newest = self.state.loop, self.state.newest
+        if loop is None or newest is None:
+            return []
+        design = loop.state.controller
+        lines: list[Line] = [[text("design ", DIM), text(design, INK, bold=True)]]
+        if self.problem:
+            return [*lines, [text(shorten(f"✗ {self.problem}", columns), RED)]]
+        figures = self.figures
+        if figures is None or self.design != design:
+            return [*lines, [text("its margins are being worked out", DIM)]]
+        if not figures["stable"]:
+            return [*lines, [text("✗ unstable by the rig file's values", RED, bold=True)]]
+        since_s = newest.time_s - self.state.window.rms_s
+        rms = error_rms(loop.errors(self.state.window.rms_s), max(since_s, loop.state.since_s))
+        measured_px = max(rms.az_px, rms.el_px) if not math.isnan(rms.az_px) else math.nan
+        attenuation = "  ".join(
+            f"{figures[f'attenuation_{hz:g}hz']:.1f}× at {hz:g} Hz"
+            for hz in (0.1, 0.5, 1.0, 2.0)
+            if figures.get(f"attenuation_{hz:g}hz") is not None
+        )
+        return [
+            *lines,
+            _figure("crossover", figures["crossover_hz"], "Hz"),
+            _judged("phase margin", figures["phase_margin_deg"], "°", least=LEAST_PHASE_DEG),
+            _judged("gain margin", figures["gain_margin_db"], "dB", least=LEAST_GAIN_DB),
+            _judged("sensitivity", figures["peak_sensitivity"], "at most", most=MOST_SENSITIVITY),
+            [text(f"{'attenuates':<14}", DIM), text(shorten(attenuation, columns - 14), INK)],
+            _figure("should leave", figures["residual_px"], "px, by linear theory", ".4f"),
+            _figure("measured", measured_px, "px, the worse axis", ".4f"),
+        ][:rows]
+
+
+def _figure(name: str, value: float, unit: str, form: str = ".2f") -> Line:
+    return [
+        text(f"{name:<14}", DIM),
+        text(f"{number(value, form):>8}", INK, bold=True),
+        text(f" {unit}", DIM),
+    ]
+
+
+def _judged(
+    name: str, value: float, unit: str, least: float = -math.inf, most: float = math.inf
+) -> Line:
+    limit = f"≥ {least:g}" if math.isfinite(least) else f"≤ {most:g}"
+    sign = mark(good=True) if least <= value <= most else text("▲", ORANGE, bold=True)
+    return [*_figure(name, value, unit), text(f"  {limit} ", DIM), sign]

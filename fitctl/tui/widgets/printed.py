@@ -1,0 +1,55 @@
+"""What another fitctl command has printed."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import ClassVar
+
+from fitctl.tui.jobs import Job
+from fitctl.tui.look import DIM, GREEN, INK, RED, SKY, Line, shorten, text
+from fitctl.tui.state import ConsoleState
+from fitctl.tui.widgets.panel import Panel
+
+MOST_LINES = 400
+
+
+class Printed(Panel):
+    """The newest command, how it goes, and the end of what it printed.
+
+    Attributes
+    ----------
+    job : Job or None
+        It belongs to the screen.
+    """
+
+    every: ClassVar[int] = 3
+
+    def __init__(self, state: ConsoleState, title: str, hint: str) -> None:
+        super().__init__(state, title)
+        self._hint = hint
+        self.job: Job | None = None
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """The command and its state, then its last lines."""
+        job = self.job
+        if job is None:
+            return [[text(line, DIM)] for line in textwrap.wrap(self._hint, max(10, columns))]
+        sign, colour, told = _how_it_went(job.status)
+        head = [
+            text(f"{sign} ", colour, bold=True),
+            text(shorten(job.told, columns - len(told) - 4), INK, bold=True),
+            text(f"  {told}", colour),
+        ]
+        lines = [
+            piece
+            for line in job.text().splitlines()[-MOST_LINES:]
+            for piece in textwrap.wrap(line, max(10, columns), subsequent_indent="  ", tabsize=4)
+            or [""]
+        ]
+        return [head, *([text(line, INK)] for line in lines[-max(0, rows - 1) :])][:rows]
+
+
+def _how_it_went(status: int | None) -> tuple[str, str, str]:
+    if status is None:
+        return "◌", SKY, "at work"
+    return ("✓", GREEN, "done") if status == 0 else ("✗", RED, f"status {status}")

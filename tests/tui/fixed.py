@@ -1,0 +1,119 @@
+"""A console on recorded telemetry whose clock stands still, with other commands answered by heart."""
+
+import asyncio
+import json
+import os
+from pathlib import Path
+
+from fitctl.tui.app import ConsoleApp
+from fitctl.tui.widgets.spectrum import Spectrum
+from tests.tui.fake import START_S, FakeLink, FakeSupervisor
+
+MESSAGES = 420
+LOG_TIME_S = 1796021000.0
+DESIGN = {
+    "stable": True,
+    "crossover_hz": 3.9,
+    "phase_margin_deg": 40.7,
+    "gain_margin_db": 7.1,
+    "peak_sensitivity": 1.89,
+    "attenuation_0.1hz": 88.9,
+    "attenuation_0.5hz": 18.7,
+    "attenuation_1hz": 6.1,
+    "attenuation_2hz": 1.8,
+    "residual_px": 0.0131,
+}
+SEQUENCES = [
+    {
+        "file": "acquire.toml",
+        "schema_version": 1,
+        "name": "acquire",
+        "description": "Power up, search for the star, hold it.",
+        "steps": [{"step": "acquire", "loop": "", "timeout_s": 120.0, "attempts": 2}],
+    },
+    {
+        "file": "jog.toml",
+        "schema_version": 1,
+        "name": "jog",
+        "description": "Jogs of the star by one pixel, both axes, and its steady RMS (Fig. 12).",
+        "steps": [
+            {"step": "acquire", "loop": "", "timeout_s": 120.0, "attempts": 2},
+            {"step": "jog", "loop": "", "jog_px": 1.0, "dwell_s": 20.0, "steady_after_s": 10.0},
+        ],
+    },
+]
+
+
+class FakeJob:
+    """Answers at once what a command would print."""
+
+    started: list["FakeJob"]
+
+    def __init__(self, arguments, *, outlives=False):
+        self.arguments = list(arguments)
+        self.told = " ".join(["fitctl", *arguments])
+        self.outlives = outlives
+        self.status = 0
+        self.ended = False
+
+    def text(self):
+        if self.arguments[0] == "design":
+            return json.dumps(DESIGN)
+        if self.arguments[:2] == ["sequence", "list"]:
+            return json.dumps(SEQUENCES)
+        return "first line\nlast line\n"
+
+    def end(self):
+        self.ended = True
+
+
+def make_logs(folder: Path) -> Path:
+    """Three logs of known size and time; one is kept."""
+    folder.mkdir(exist_ok=True)
+    for number, size in enumerate((1_500_000, 42_000_000, 9_000)):
+        path = folder / f"fit-mock_2026113{number}T031500Z.mcap"
+        path.touch()
+        os.truncate(path, size)
+        os.utime(path, (LOG_TIME_S + number, LOG_TIME_S + number))
+    (folder / "fit-mock_20261131T031500Z.mcap.keep").touch()
+    return folder
+
+
+class FixedApp(ConsoleApp):
+    """A console on recorded telemetry whose clock stands still after the last message."""
+
+    def __init__(self, supervisor: FakeSupervisor, silent_s: float = 0.02, log_folder=Path("logs")):
+        self.recorded = supervisor.messages(MESSAGES)
+        self.fixed_s = START_S
+        self.jobs: list[FakeJob] = []
+        super().__init__(
+            FakeLink(),
+            clock=lambda: self.fixed_s,
+            log_folder=log_folder,
+            start_job=self.start_fake,
+        )
+        self.silent_s = silent_s
+
+    def start_fake(self, arguments, **options):
+        self.jobs.append(FakeJob(arguments, **options))
+        return self.jobs[-1]
+
+    def feed(self) -> None:
+        """All telemetry, each message at its own time."""
+        for message in self.recorded:
+            self.fixed_s = message.time_s
+            self.state.accept(message, message.time_s)
+        self.fixed_s += self.silent_s
+        self.draw_all()
+
+
+async def settle(app: ConsoleApp, pilot) -> None:
+    """Wait until everything that is drawn in its own time has been drawn."""
+    await pilot.pause()
+    while any(spectrum._signal is None for spectrum in app.screen_stack[0].query(Spectrum)):
+        await asyncio.sleep(0.02)
+    app.draw_all()  # children are asked for
+    app.draw_all()  # and have answered
+    await pilot.pause()
+    app.draw_all()
+    await pilot.pause()

@@ -1,0 +1,200 @@
+"""Alarms: what is wrong comes up once, says what to do, and goes when it should."""
+
+import msgspec
+import pytest
+
+from fitctl.supervisor.messages import TrippedInterlock
+from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
+from fitctl.tui.dialogs import alarms_text
+from fitctl.tui.state import ConsoleState
+from fitctl.tui.widgets.alarmbar import AlarmBar
+from tests.tui.fake import START_S, FakeSupervisor
+
+FAULT = (
+    "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error; "
+    "remove its cause, then recover"
+)
+
+
+def tripped(name="flux_low", **fields):
+    told = {"action": "warn", "reset": "itself", "reason": f"interlock {name}: low; look at it"}
+    return TrippedInterlock(name=name, since_s=START_S, **(told | fields))
+
+
+class Watch:
+    """A console's state and alarms, fed message by message."""
+
+    def __init__(self, supervisor):
+        self.supervisor = supervisor
+        self.state = ConsoleState(START_S)
+        self.book = AlarmBook()
+        self.bells = 0
+
+    def hear(self, count=1):
+        for message in self.supervisor.messages(count):
+            self.state.accept(message, message.time_s)
+            self.state.now_s = message.time_s
+            self.bells += self.book.judge(self.state)
+        return self.book.in_order
+
+    def row(self, columns=200):
+        bar = AlarmBar(self.state, self.book)
+        return ["".join(segment.text for segment in line) for line in bar.draw(columns, 3)]
+
+
+def test_there_is_nothing_when_all_is_well():
+    watch = Watch(FakeSupervisor())
+    assert watch.hear(50) == []
+    assert watch.row() == []
+    assert watch.bells == 0
+
+
+def test_a_warning_comes_says_what_to_do_and_goes_by_itself():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped()]
+    (alarm,) = watch.hear()
+    assert (alarm.what, alarm.todo) == ("interlock flux_low: low", "look at it")
+    assert alarm.did == "nothing was changed"
+    assert not alarm.error
+    watch.supervisor.interlocks = []
+    assert watch.hear() == []
+
+
+def test_what_is_reset_by_hand_says_so():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped(reset="hand")]
+    (alarm,) = watch.hear()
+    assert alarm.todo == "look at it; then reset flux_low"
+
+
+@pytest.mark.parametrize(
+    ("action", "did"),
+    [
+        ("hold", "the stages wait where they are"),
+        ("flatten", "the mirror goes to its bias, the siderostat waits"),
+        ("safe", "the loop went to SAFE"),
+    ],
+)
+def test_what_was_done_is_said_and_an_error_stays_until_it_is_seen(action, did):
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped(action=action)]
+    (alarm,) = watch.hear()
+    assert alarm.did == did
+    watch.supervisor.interlocks = []
+    (alarm,) = watch.hear()
+    assert alarm.over_s is not None
+    assert "(over " in watch.row()[0]
+    watch.book.acknowledge()
+    assert watch.hear() == []
+
+
+def failed():
+    supervisor = FakeSupervisor("SAFE")
+    supervisor.trigger, supervisor.reason = "FAULT", FAULT
+    supervisor.faulty = {"right siderostat": FAULT}
+    return supervisor
+
+
+def test_a_fault_is_told_once_though_loop_and_device_both_tell_it():
+    (alarm,) = Watch(failed()).hear()
+    assert alarm.did == "right went to SAFE"
+    assert alarm.todo == "remove its cause, then recover"
+
+
+def test_what_a_device_told_before_the_recovery_is_no_new_alarm():
+    watch = Watch(failed())
+    watch.hear()
+    watch.book.acknowledge()
+    message = watch.supervisor.message()
+    loops = [
+        msgspec.structs.replace(loop, mode="STANDBY", since_s=message.time_s + 0.05)
+        for loop in message.loops
+    ]
+    watch.state.accept(msgspec.structs.replace(message, loops=loops), message.time_s)
+    watch.book.judge(watch.state)
+    assert watch.book.in_order == []
+
+
+def test_stop_by_the_operator_is_no_alarm():
+    supervisor = FakeSupervisor("SAFE")
+    supervisor.trigger, supervisor.reason = "STOP", "operator"
+    assert Watch(supervisor).hear() == []
+
+
+def test_lost_records_alarm_again_when_more_are_lost():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.records_lost = 5
+    watch.hear()
+    watch.book.acknowledge()
+    assert watch.hear()[0].acknowledged
+    watch.supervisor.records_lost = 6
+    (alarm,) = watch.hear()
+    assert not alarm.acknowledged
+    assert alarm.what == "6 records lost from the log"
+
+
+def test_silence_of_the_supervisor_is_an_alarm_that_ends_with_it():
+    watch = Watch(FakeSupervisor())
+    watch.hear()
+    watch.state.now_s += 7.0
+    watch.book.judge(watch.state)
+    (alarm,) = watch.book.in_order
+    assert alarm.what == "NO DATA for 7 s; what you see is old"
+    assert "STOP may not reach it" in alarm.todo
+    assert watch.hear() == []
+
+
+def test_the_bell_rings_until_it_is_silenced_and_again_for_something_new():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped()]
+    watch.hear(round(2.5 * BELL_EVERY_S / 0.05))
+    assert watch.bells == 3
+    watch.book.silence()
+    watch.hear(round(2.5 * BELL_EVERY_S / 0.05))
+    assert watch.bells == 3
+    watch.supervisor.interlocks = [tripped(), tripped("fsm_edge")]
+    watch.hear()
+    assert watch.bells == 4
+
+
+def test_what_was_acknowledged_does_not_ring():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped()]
+    watch.hear()
+    watch.book.acknowledge()
+    watch.hear(round(2.5 * BELL_EVERY_S / 0.05))
+    assert watch.bells == 1
+
+
+def test_the_weightiest_comes_first_and_the_rest_are_counted():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [
+        *(tripped(f"number_{number}") for number in range(4)),
+        tripped("worst", action="hold"),
+    ]
+    watch.hear()
+    rows = watch.row()
+    assert "worst" in rows[0]
+    assert "+2" in rows[-1]
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120, 300])
+def test_the_status_bar_says_what_and_what_to_do_at_every_width(columns):
+    watch = Watch(failed())
+    watch.hear()
+    row = watch.row(columns)[0]
+    assert len(row) <= columns
+    assert "✗" in row
+    assert "siderostat right" in row
+    assert "▸ remove" in row
+    assert "k seen" in row
+
+
+def test_the_list_has_everything_in_full():
+    watch = Watch(failed())
+    watch.hear()
+    told = alarms_text(watch.state, watch.book).plain
+    assert "got axis 2: following error" in told
+    assert "remove its cause, then recover" in told
+    assert "right went to SAFE" in told
+    assert "not acknowledged" in told

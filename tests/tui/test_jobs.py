@@ -1,0 +1,33 @@
+"""Other fitctl commands as children: real processes."""
+
+import time
+
+from fitctl.tui.jobs import Job
+
+LIMIT_S = 60.0
+
+
+def finished(job):
+    end_s = time.monotonic() + LIMIT_S
+    while job.status is None:
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+    return job.status
+
+
+def test_a_job_tells_how_it_ended_and_what_it_printed():
+    job = Job(["check", "no-such-rig.toml"])
+    try:
+        assert finished(job) == 2
+        assert "no-such-rig.toml" in job.text()
+    finally:
+        job.end()
+
+
+def test_a_job_is_ended_with_the_console_unless_it_is_to_outlive_it():
+    job, other = Job(["mocks", "--free-ports"]), Job(["check", "no-such.toml"], outlives=True)
+    assert job.status is None
+    job.end()
+    assert job.status not in {None, 0}
+    other.end()
+    assert finished(other) == 2
