@@ -151,14 +151,18 @@ class LoggedServo(SiderostatServo):
         super().__init__(name, rig.loops[name], NoDevice(), clock, rig.camera.period_s)
         self._told = clock
         self._tick: Any = None
+        self._ticked = False
         self._moments: deque[Floats] = deque()
         self._timing = ServoTiming([], 0, 0)
 
     def tell(self, step: LoggedStep) -> None:
         """What is known of it in a step."""
+        if self._ticked:  # else what was told may still be to come
+            self._moments.clear()
+        self._ticked = self.name in step.ticks
         self._tick = step.ticks.get(self.name, self._tick)
         changes = (ModeChange, ControllerChange)
-        self._moments = deque(
+        self._moments.extend(
             _az_el(record.message, "siderostat")
             for record in step.before_tick.get(self.name, ())
             if record.kind in changes

@@ -128,10 +128,14 @@ def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
         kind, message = record
         loop = getattr(message, "loop", "")
         if _is_over(step, record, any(powered.values())):
+            if not step.ticks:
+                step.before_tick, before_tick = before_tick, defaultdict(list)
             yield step
             step = LoggedStep()
         if kind in _BEGIN:
             step.begin.append(record)
+        if kind is ModeChange and message.target_number == Mode.OFF:
+            powered[loop] = False
         if kind in _BEFORE_TICK:
             before_tick[loop].append(record)
         elif kind is Tick:

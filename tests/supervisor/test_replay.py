@@ -147,6 +147,18 @@ def _fails(part, method, error=TIMEOUT):
     return course
 
 
+def off_and_on_in_one_breath(simulation):
+    """Without a camera no tick is logged between the two."""
+    hold_a_star(simulation)
+    simulation.command(Stop())
+    camera = simulation.supervisor._devices.camera
+    well, camera.next_frame = camera.next_frame, failing(TIMEOUT)
+    simulation.run(0.5)
+    camera.next_frame = well
+    simulation.command(Off())
+    hold_a_star(simulation)
+
+
 def interlocks(simulation):
     """One flattens for a while, one holds until it is reset, one makes safe."""
     hold_a_star(simulation)
@@ -179,6 +191,7 @@ COURSES = {
     "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),
     "a lost star": (a_star_that_is_lost, [], {"STAR_LOST", "STAR_FOUND", "IN_REACH"}),
     "nothing opens": (nothing_that_opens, [], {"STANDBY", "IN_REACH"}),
+    "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
     "the D/A fails": (_fails("dac", "write_v"), [], FAULT),
     "the amplifiers fail": (_fails("amplifiers", "exchange"), [], FAULT),
