@@ -77,6 +77,8 @@ def runnable(found):
     match found.words[1:]:
         case ["--help"] | ["check" | "log", *_] | [_, "--help"] | ["replay", _]:
             return True
+        case ["init", *options]:
+            return "--no-doctor" in options
         case ["simulate", *options] if "--duration" in options:
             return float(options[options.index("--duration") + 1]) <= LONGEST_RUN_S
     return False
