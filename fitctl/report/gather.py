@@ -115,12 +115,18 @@ def gather(run: Run) -> Gathered:
         for loop in (loops if "{loop}" in TOPICS[kind] else [""])
     }
     blocks: dict[tuple[str, str], list[Columns]] = defaultdict(list)
+    health: list[dict[str, Any]] = []
+    states: dict[str, str] = {}
     for log in run.logs:
         for topic, columns in column_blocks(log.path, list(places), _ROWS):
             place = places[topic]
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
             kept = _small(columns, time_s, str(log.path)) if place[0] == "ticks" else columns
-            blocks[place].append(kept | {"time_s": time_s})
+            block = kept | {"time_s": time_s}
+            if place[0] == "health":  # tells the same every second, all night
+                health += _changes(_rows([block]), states)
+            else:
+                blocks[place].append(block)
     of_loops = {
         name: {loop: _in_order(_joined(blocks.pop((name, loop), []))) for loop in loops}
         for name in ("ticks", "timing", "piezo")
@@ -131,7 +137,7 @@ def gather(run: Run) -> Gathered:
         **of_loops,
         modes=sorted(modes, key=itemgetter("time_s")),
         events=_rows(blocks["events", ""]),
-        health=_changes(_rows(blocks["health", ""])),
+        health=health,
         attempts=_rows(blocks["attempts", ""]),
         lost=_lost(_rows(blocks["recorder", ""])),
     )
@@ -181,8 +187,8 @@ def _rows(blocks: list[Columns]) -> list[dict[str, Any]]:
     return once
 
 
-def _changes(health: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    states: dict[str, str] = {}
+def _changes(health: list[dict[str, Any]], states: dict[str, str]) -> list[dict[str, Any]]:
+    """Where a device is not as it was before; `states` is kept up."""
     changed = []
     for row in health:
         if states.get(row["device"]) != row["state"]:

@@ -15,6 +15,7 @@ from fitctl.model.optics import piston_m, scales
 
 Floats = NDArray[np.float64]
 _SAME_PLACE_PX = 0.02  # of the target
+_PIECE = 100_000
 
 
 class Stacks(NamedTuple):
@@ -118,9 +119,9 @@ def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
         plays_v = play(plays_v, stack_v[:, None], half_v)
         displacement_m[row] = np.vecdot(plays_v, gains)
     displacement_m -= gains @ np.maximum(fsm.bias_v - half_v, 0.0)
-    piston = np.array([])
-    if len(volts):
-        piston = piston_m(displacement_m, fsm.stack_radius_m)
+    # Piece by piece: its vectors would take ten times the room of what comes of them.
+    pieces = np.array_split(displacement_m, 1 + len(volts) // _PIECE)
+    piston = np.concatenate([piston_m(piece, fsm.stack_radius_m) for piece in pieces])
     return Stacks(source, displacement_m, piston)
 
 

@@ -85,9 +85,9 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     modes.grid(visible=False, axis="y")
     at_s, rms = running_rms(loop)
     for axis in AXES:
-        marker = "o" if len(at_s) < 60 else ""
+        line = "o-" if len(at_s) < 60 else "-"
         shown = at_s / time.s_per_unit
-        residual.plot(shown, rms[axis], marker, ls="-", ms=3, color=COLORS[axis], label=axis)
+        residual.plot(shown, rms[axis], line, ms=3, color=COLORS[axis], label=axis)
     residual.axhline(
         loop.requirement_px,
         color=INK,
@@ -99,7 +99,7 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     residual.set_ylabel("px")
     residual.set_title(f"RMS of the measured error in VERNIER, {WINDOW_S:g} s at a time")
     residual.set_xlabel(time.label)
-    residual.legend(ncols=3, loc="best")
+    residual.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
     span([residual], time, findings.run.duration_s)
     caption = (
         "Above: the loop's mode; marks are warnings and errors of the whole instrument. Below: RMS about the "

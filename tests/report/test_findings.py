@@ -90,9 +90,9 @@ def test_what_was_lost_late_and_when_is_counted(findings):
 def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
     def course(simulation):
         simulation.acquire()
-        simulation.run(35.0)
+        simulation.run(30.0)
         simulation.command(SetController(loop="right", name="minimum-variance"))
-        simulation.run(20.0)
+        simulation.run(12.0)
 
     path = tmp_path / "two.mcap"
     record(with_controller(rig, "right", "eq20"), path, course)
@@ -101,7 +101,7 @@ def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
 
     assert [one.controller for one in found] == ["eq20", "minimum-variance"]
     assert all(one.predicted is not None for one in found)
-    assert found[1].judged_s == pytest.approx(20.0, abs=1.0)
+    assert found[1].judged_s == pytest.approx(12.0, abs=1.0)
 
 
 def test_a_disturbance_that_cannot_be_designed_for_leaves_the_measurement(held, rig):

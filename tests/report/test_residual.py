@@ -2,14 +2,14 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from fitctl.report.residual import Estimate, night_verdict, rms_estimate, verdict
 
 PERIOD_S = 0.02
-RUNS = 200
+RUNS = 120
 
 
 def motion(rng, duration_s, correlated_s):
@@ -40,6 +40,7 @@ def test_frames_that_resemble_their_neighbours_tell_less():
     assert slow_width > 2 * quick_width
 
 
+@settings(max_examples=20)
 @given(st.floats(1e-6, 1e3), st.integers(1, 4))
 def test_the_interval_scales_with_the_motion_and_pieces_count_alike(factor, pieces):
     series = motion(np.random.default_rng(7), 60.0, 0.1)
