@@ -9,7 +9,7 @@ PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-sim fuzz lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-console bench-devices bench-recorder bench-sim fuzz lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -71,6 +71,9 @@ bench-sim: $(READY)  ## How many times real time the simulation and the batch ru
 
 bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
 	$(BIN)/python -m benchmarks.recorder $(ARGS)
+
+bench-console: $(READY)  ## What a console costs, and what it does to the loop
+	$(BIN)/python -m benchmarks.console $(ARGS)
 
 bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN servo cycle, the camera's stream
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock

@@ -278,7 +278,9 @@ def test_the_other_keys_of_the_console_are_those_of_its_screens():
         for key in keys_of(name)
     ]
 
-    assert between("console.md", "screens") == table(["on", "key", "in the footer", "what it does"], rows)
+    assert between("console.md", "screens") == table(
+        ["on", "key", "in the footer", "what it does"], rows
+    )
 
 
 def test_the_faults_are_those_of_the_mocks():

@@ -20,6 +20,7 @@ from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
 from fitctl.tui.jobs import Job
 from fitctl.tui.link import Link
+from fitctl.tui.pace import Pace
 from fitctl.tui.palette import ControllerProvider, ResetProvider, TargetProvider
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.views.devices import DevicesView
@@ -32,7 +33,7 @@ from fitctl.tui.views.view import View
 from fitctl.tui.wire import UNREADABLE_NOTICE_S, Wire
 
 BEAT_S = 0.1
-"""How often something is drawn; a panel says at which of these beats."""
+"""How often something is drawn, if the machine allows; a panel says at which of these beats."""
 
 
 class Received(Message):
@@ -126,6 +127,7 @@ class ConsoleApp(App[None]):
         self.state = ConsoleState(clock())
         self.alarms = AlarmBook()
         self._beat = 0
+        self._pace = Pace()
         self._wire = Wire(
             link,
             clock,
@@ -169,8 +171,9 @@ class ConsoleApp(App[None]):
         return bottom[0] if bottom and isinstance(bottom[0], View) else None
 
     def _draw_due(self) -> None:
-        self._beat += 1
-        self._draw(self._beat)
+        if self._pace.due():
+            self._beat += 1
+            self._draw(self._beat)
 
     def draw_all(self) -> None:
         """Bring everything on the screen up to date now."""
