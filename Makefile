@@ -10,7 +10,7 @@ FUZZ_S ?= 120
 SOAK_S ?= 3600
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-console bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -78,6 +78,9 @@ bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
 
 bench-flood: $(READY)  ## The tick while the service is flooded, beside the tick while it is not
 	$(BIN)/python -m benchmarks.flood $(ARGS)
+
+bench-console: $(READY)  ## What a console costs, and what it does to the loop
+	$(BIN)/python -m benchmarks.console $(ARGS)
 
 bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN servo cycle, the camera's stream
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
