@@ -29,6 +29,7 @@ from fitctl.supervisor.endpoints import (
     RECORDS_SOCKET,
     TELEMETRY_SOCKET,
     make_service_folder,
+    service_folder,
 )
 from fitctl.supervisor.machine import Machine
 from fitctl.supervisor.realtime import (
@@ -180,6 +181,7 @@ def run_supervisor(
     ConfigError
         If the socket folder cannot be used, or another supervisor has this rig.
     """
+    service_folder(rig)  # refused before anything is made
     log_folder = Path(rig.logging.folder).expanduser()
     check_log_folder(log_folder)
     folder = make_service_folder(rig)
