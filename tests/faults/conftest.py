@@ -2,12 +2,11 @@
 
 import json
 import os
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from .setups import start
+from .setups import started
 
 RESULTS = {}
 
@@ -15,12 +14,13 @@ RESULTS = {}
 @pytest.fixture(scope="module")
 def rig(request, tmp_path_factory):
     """The running rig of a name; all entries of it follow each other."""
-    with ExitStack() as stack:
-        yield start(stack, request.param, tmp_path_factory.mktemp("faults"))
+    with started(request.param, tmp_path_factory.mktemp("faults"), RESULTS) as rig:
+        yield rig
 
 
 def pytest_sessionfinish():
-    """Leave what was measured where FITCTL_FAULT_RESULTS says."""
-    path = os.environ.get("FITCTL_FAULT_RESULTS")
-    if path and RESULTS:
-        Path(path).write_text(json.dumps(RESULTS, indent=1) + "\n")
+    """Add what was measured to the file that FITCTL_FAULT_RESULTS names."""
+    path = Path(os.environ.get("FITCTL_FAULT_RESULTS", os.devnull))
+    if RESULTS and path != Path(os.devnull):
+        before = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps(before | RESULTS, indent=1) + "\n")

@@ -9,8 +9,9 @@ from system.conftest import Rig
 
 from fitctl.mocks.bench import ClearFaults, SetFault, StagesQuestion, ask_faults, ask_stages
 from fitctl.model.drives import Drive
-from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Experiment, Hold, Off, Recover, Standby, Stop
+
+from .console import Console
 
 LOOK_S = 0.1  # between two looks at where the stages truly are
 REACH_S = 60.0
@@ -56,12 +57,19 @@ class WatchedRig(Rig):
         self.places = []
         self.bench_answers = True
         self._looked_s = 0.0
+        self.logs = folder
         self.console = None
+        self.heard = []  # what was answered to strange commands
+        self.shown = set()  # times of all ticks in telemetry
+        self.lost_of = {}  # records lost by each supervisor's own count
+        self.deaths_s = []  # when supervisors ended without a chance to see their records written
 
     def receive(self, timeout_s):
         telemetry = super().receive(min(timeout_s, LOOK_S))
         if telemetry is not None:
             self.telemetry.append(telemetry)
+            self.shown.update(tick.time_s for tick in telemetry.ticks)
+            self.lost_of[telemetry.pid] = telemetry.records_lost
         self.look()
         return telemetry
 
@@ -75,6 +83,7 @@ class WatchedRig(Rig):
     def start_supervisor(self):
         if self.client is not None:
             self.client.close()
+            self.supervisor.stdout.close()
         super().start_supervisor()
 
     def restart_mocks(self):
@@ -91,6 +100,8 @@ class WatchedRig(Rig):
 
     def process(self, name):
         """The process of a name, once it is there."""
+        if name == "console":
+            return self._open_console()
         if name != "recorder":
             return psutil.Process({"supervisor": self.supervisor, "mocks": self.mocks}[name].pid)
         end_s = time.monotonic() + ANSWER_S
@@ -99,6 +110,21 @@ class WatchedRig(Rig):
                 return self.recorder()
             self.receive(LOOK_S)
         return self.recorder()
+
+    def _open_console(self):
+        """The console's process, once it has drawn something."""
+        if self.console is not None and self.console.process.poll() is not None:
+            self.console.close()
+            self.console = None
+        if self.console is None:
+            self.console = Console(self.common)
+            self.follow(lambda _: self.console.drawn, REACH_S)
+        return psutil.Process(self.console.process.pid)
+
+    def close(self):
+        if self.console is not None:
+            self.console.close()
+        super().close()
 
     def reach(self, wanted, limit_s=REACH_S):
         """Bring the loop to a mode, whatever it is in; every fault is ended first."""
