@@ -8,6 +8,8 @@ import importlib.metadata
 import math
 import os
 import platform
+import signal
+import sys
 import tempfile
 import threading
 import time
@@ -48,6 +50,10 @@ _WIND_DOWN_S = 1.0
 _RECORDER_END_S = 5.0
 _RECORDER_WELL_S = 10.0  # a recorder that lived this long is started again at once
 _RECORDER_PATIENCE_S = 60.0
+_CUT = (
+    f"recorder: it did not end within {_RECORDER_END_S:g} s and was killed; the last records, up to {{}}, "
+    "are not in the log; mend it with: fitctl log recover"
+)
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
 _VERSIONED = (
     "fitctl",
@@ -106,9 +112,10 @@ class Recorder:
         if now_s >= self._again_s:
             self._start()
 
-    def end(self) -> None:
-        """Let it write what it has and end."""
+    def end(self) -> bool:
+        """Let it write what it has and end; False if it had to be killed."""
         end_process(self._process, _RECORDER_END_S)
+        return self._process.returncode != -signal.SIGKILL
 
     def _start(self) -> None:
         with self._errors.open("wb") as errors:
@@ -230,7 +237,10 @@ def run_supervisor(
             for thread in threads:
                 thread.stop()
             service.stop()
-            queue.close()  # while the recorder, which the stack ends, still listens
+            unconfirmed = queue.waiting
+            queue.close()  # while the recorder still listens
+            if not recorder.end():
+                print(_CUT.format(unconfirmed), file=sys.stderr)
 
 
 def _loop(

@@ -45,7 +45,7 @@ WRONG = (
     Wrong("more range than the D/A has volts", "range_rad", ("loops.right.fsm.range_rad=1.9e-4",)),
     Wrong("a servo that would swing", "gain_per_s", ("loops.right.siderostat.servo.rate_hz=50.0",)),
     Wrong("a flux range upside down", "low", ("loops.right.flux_range.low=2.0",)),
-    Wrong("an interlock without a limit", "interlocks.odd", (
+    Wrong("an interlock without a limit", "odd", (
         "interlocks.odd={ quantity = 'disk_free_bytes', for_s = 0.0, modes = ['OFF'],"
         " action = 'warn', reset = 'hand' }",)),
     Wrong("an interlock on nothing known", "quantity", ("interlocks.disk_space.quantity=moon",)),

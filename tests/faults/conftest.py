@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -22,5 +23,10 @@ def pytest_sessionfinish():
     """Add what was measured to the file that FITCTL_FAULT_RESULTS names."""
     path = Path(os.environ.get("FITCTL_FAULT_RESULTS", os.devnull))
     if RESULTS and path != Path(os.devnull):
+        RESULTS["run"] = {
+            "date": time.strftime("%Y-%m-%d", time.gmtime()),
+            "load": round(os.getloadavg()[2], 1),
+            "cores": os.cpu_count(),
+        }
         before = json.loads(path.read_text()) if path.exists() else {}
         path.write_text(json.dumps(before | RESULTS, indent=1) + "\n")

@@ -9,7 +9,9 @@ from .strikes import strike
 
 STAYS_S = 2.0  # a mode in which the loop stays is watched for so long
 SETTLE_S = 0.4  # from entering a mode of rest to standing still
-DEAD_SETTLE_S = 1.6  # without a supervisor: the drive's heartbeat and the D/A's watchdog, and what they take
+DEAD_SETTLE_S = (
+    1.6  # without a supervisor: the drive's heartbeat and the D/A's watchdog, and what they take
+)
 PROCESSES = {"mocks", "supervisor", "recorder", "console"}
 REST = {"OFF", "STANDBY", "SAFE"}
 STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
@@ -79,10 +81,7 @@ def attempted(rig, entry, home, stalled):
     del rig.telemetry[:-1], rig.places[:], rig.heard[:]
     struck_s = time.monotonic()
     with strike(rig, entry):
-        if deaf:
-            took_s = rests(rig, struck_s, DEAD_SETTLE_S, stalled)
-        else:
-            took_s = watch(rig, entry, struck_s, stalled)
+        took_s = (rests if deaf else watch)(rig, entry, struck_s, stalled)
     healed_s = time.monotonic()
     if deaf:
         watch(rig, entry, healed_s, stalled)
@@ -103,7 +102,11 @@ def watch(rig, entry, since_s, stalled):
         texts.extend(said(telemetry))
         now_s = time.monotonic()
         loop = telemetry.loops[0]
-        if not done_s and (stays or loop.mode in entry.modes) and entry.says in " ".join([*rig.heard, *texts]):
+        if (
+            not done_s
+            and (stays or loop.mode in entry.modes)
+            and entry.says in " ".join([*rig.heard, *texts])
+        ):
             done_s.append(now_s)
         return bool(done_s) and (not stays or now_s > since_s + STAYS_S)
 
@@ -111,12 +114,19 @@ def watch(rig, entry, since_s, stalled):
     try:
         seen = rig.follow(over, limit_s + 1.0)
     except AssertionError as error:
-        raise AssertionError(f"{entry.name}: expected {entry.modes} and {entry.says!r}: {error}") from None
+        raise AssertionError(
+            f"{entry.name}: expected {entry.modes} and {entry.says!r}: {error}"
+        ) from None
     if stays:
         modes = [telemetry.loops[0].mode for telemetry in seen]
-        assert set(modes) <= entry.modes if len(entry.modes) == 1 else modes[-1] in entry.modes, (modes, texts)
+        assert set(modes) <= entry.modes if len(entry.modes) == 1 else modes[-1] in entry.modes, (
+            modes,
+            texts,
+        )
     took_s = done_s[0] - since_s
-    assert took_s <= entry.within_s + stalled.total_s, f"{took_s:.2f} s instead of {entry.within_s} s"
+    assert took_s <= entry.within_s + stalled.total_s, (
+        f"{took_s:.2f} s instead of {entry.within_s} s"
+    )
     return took_s
 
 
@@ -128,16 +138,16 @@ def said(telemetry):
     yield from (trip.name for trip in loop.interlocks)
 
 
-def rests(rig, since_s, within_s, stalled):
+def rests(rig, _entry, since_s, stalled):
     """Without a supervisor the stages come to rest by themselves; how long that took."""
-    while time.monotonic() < since_s + within_s + stalled.total_s + SETTLE_S:
+    while time.monotonic() < since_s + DEAD_SETTLE_S + stalled.total_s + SETTLE_S:
         time.sleep(0.02)
         rig.look()
     last = rig.places[-1]
     assert all(abs(v - BIAS_V) < STILL_V for v in last.stack_v), last
     moving = [place.time_s for place in rig.places if not near(place, last)]
     took_s = max(moving, default=since_s) - since_s
-    assert took_s <= within_s + stalled.total_s, took_s
+    assert took_s <= DEAD_SETTLE_S + stalled.total_s, took_s
     return took_s
 
 
@@ -157,7 +167,10 @@ def stood_still(rig, entry, struck_s, deaf):
     changes = {c.time_s: c.target for t in rig.telemetry for c in t.mode_changes}
     course = [(struck_s, entry.mode), *sorted(changes.items()), (time.monotonic(), "")]
     if deaf:
-        course = [(struck_s + DEAD_SETTLE_S, "SAFE"), *[c for c in course if c[0] > struck_s + DEAD_SETTLE_S]]
+        course = [
+            (struck_s + DEAD_SETTLE_S, "SAFE"),
+            *[c for c in course if c[0] > struck_s + DEAD_SETTLE_S],
+        ]
     for (since_s, mode), (until_s, _) in pairwise(course):
         places = [p for p in rig.places if since_s + SETTLE_S < p.time_s < until_s]
         if mode in REST and places:

@@ -6,7 +6,9 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.logging.verifying import verify
 
-MAY_BE_LOST_S = 1.5  # before a supervisor is killed: what the recorder was not yet sent, and a stall
+MAY_BE_LOST_S = (
+    1.5  # before a supervisor is killed: what the recorder was not yet sent, and a stall
+)
 
 
 def settle(rig):
@@ -29,6 +31,7 @@ def settle(rig):
     }
     counted = sum(rig.lost_of.values())
     assert not problems
+    assert "Traceback" not in rig.complaints()
     assert len(missing - excused) <= counted, f"{len(missing - excused)} missing, {counted} counted"
     return {
         "shown": len(rig.shown),

@@ -14,7 +14,7 @@ from .commands import FLOOD, FLOODED, SENT, answers
 SLOW_S = 0.015  # stopped for so long, then running for so long: half of its time
 ENDS_WITHIN_S = 10.0
 DRAWS_WITHIN_S = 10.0
-FLOOD_S = 2.0
+RECORDER_BACK_S = 60.0  # its supervisor waits longer from try to try
 
 
 @contextmanager
@@ -61,6 +61,14 @@ def stopped(rig, entry):
 
 
 @contextmanager
+def stuck(rig, entry):
+    """The recorder is stopped until its queue is full."""
+    with stopped(rig, entry):
+        yield
+    writes_again(rig)
+
+
+@contextmanager
 def slowed(rig, entry):
     """SIGSTOP and SIGCONT in turn: it has half of its time, in pieces."""
     process = rig.process(entry.struck)
@@ -103,6 +111,7 @@ def told_to_end(rig, _entry):
     rig.client.send(Shutdown())
     rig.supervisor.wait(ENDS_WITHIN_S)
     rig.deaths_s.append(time.monotonic())
+    rig.heard.append(rig.complaints())
     yield
     rig.start_supervisor()
 
@@ -160,6 +169,18 @@ def full(rig, _entry):
         os.posix_fallocate(file.fileno(), 0, status.f_bavail * status.f_bsize)
     yield
     filler.unlink()
+    writes_again(rig)
+
+
+def writes_again(rig):
+    """A recorder is at work again, and has noticed all that was lost meanwhile."""
+    healed_s, lost = time.monotonic(), rig.lost_of[rig.supervisor.pid]
+    rig.follow(
+        lambda t: (
+            t.recorder is not None and t.recorder.time_s > healed_s and t.recorder.lost >= lost
+        ),
+        RECORDER_BACK_S,
+    )
 
 
 @contextmanager
@@ -170,6 +191,7 @@ def read_only(rig, _entry):
     subprocess.run([*rig.before, "mount", "-o", "remount,bind,ro", folder], check=True)
     yield
     subprocess.run([*rig.before, "umount", folder], check=True)
+    writes_again(rig)
 
 
 @contextmanager
@@ -186,6 +208,7 @@ def clock(rig, entry):
 STRIKES = {
     "killed": killed,
     "stopped": stopped,
+    "stuck": stuck,
     "slowed": slowed,
     "told to end while its recorder is stopped": told_to_end,
     "not read by its terminal": not_read,

@@ -6,7 +6,6 @@ from fitctl.cli import main
 from fitctl.config import default_rig_path
 
 from .configuration import WRONG
-from .conftest import RESULTS
 
 
 def refused(arguments, capsys):
@@ -34,4 +33,3 @@ def test_it_is_told_in_a_line_and_nothing_is_started(wrong, tmp_path, capsys, mo
     assert wrong.says in said
     assert len(said.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == [file]
-    RESULTS[f"configuration: {wrong.what}"] = {"said": said.strip()}

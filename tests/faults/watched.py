@@ -37,7 +37,7 @@ TOWARDS = {
     "VERNIER": _UP | {"EXPERIMENT": Hold},
     "EXPERIMENT": _UP | {"VERNIER": experiment},
 }
-"""The command that leads towards a mode, by the mode in which the loop is; without one it gets there by itself."""
+"""The command that leads towards a mode, by the mode of the loop; without one it gets there by itself."""
 
 
 class Place(NamedTuple):
@@ -58,6 +58,7 @@ class WatchedRig(Rig):
         self.bench_answers = True
         self._looked_s = 0.0
         self.logs = folder
+        self.errors = (folder / "errors.txt").open("a")
         self.console = None
         self.heard = []  # what was answered to strange commands
         self.shown = set()  # times of all ticks in telemetry
@@ -125,6 +126,11 @@ class WatchedRig(Rig):
         if self.console is not None:
             self.console.close()
         super().close()
+        self.errors.close()
+
+    def complaints(self):
+        """All that mocks and supervisors wrote to their error output."""
+        return (self.folder / "errors.txt").read_text()
 
     def reach(self, wanted, limit_s=REACH_S):
         """Bring the loop to a mode, whatever it is in; every fault is ended first."""

@@ -57,11 +57,14 @@ class Rig:
             f"service.folder={self.sockets}",
         ]
         self.before = ()  # what goes before the supervisor on its command line
+        self.errors = None  # where the error output of mocks and supervisor goes; None is our own
         self.mocks = self.supervisor = None
         self.client = None
 
     def start_mocks(self, *arguments):
-        self.mocks = fitctl("mocks", *self.common, "--json", *arguments, stdout=subprocess.PIPE)
+        self.mocks = fitctl(
+            "mocks", *self.common, "--json", *arguments, stdout=subprocess.PIPE, stderr=self.errors
+        )
         self.endpoints = json.loads(self.mocks.stdout.readline())
 
     def restart_mocks(self):
@@ -87,7 +90,14 @@ class Rig:
             if not key.startswith("mocks.")
             for part in ("--set", f"{key}={value}")
         ]
-        self.supervisor = fitctl("run", *self.common, *devices, before=self.before, stdout=subprocess.PIPE)
+        self.supervisor = fitctl(
+            "run",
+            *self.common,
+            *devices,
+            before=self.before,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+        )
         assert "supervising" in self.supervisor.stdout.readline()
         self.client = Client(self.sockets)
 
