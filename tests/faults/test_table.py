@@ -3,11 +3,12 @@
 import pytest
 from documents import between
 
+from fitctl.commands.fault import kinds
+
 from .catalogue import GROUPS, RUNNING
 from .configuration import WRONG
 from .devices import STRUCK
 from .report import MEASURED, promised, wrong_table
-from fitctl.commands.fault import kinds
 
 # Which device each table of kinds is for.
 DEVICES = {
