@@ -12,11 +12,14 @@ SETTLE_S = 0.4  # from entering a mode of rest to standing still
 DEAD_SETTLE_S = (
     1.6  # without a supervisor: the drive's heartbeat and the D/A's watchdog, and what they take
 )
+BESIDE = {"recorder", "console", "command", "disk", "log folder", "clock"}
+"""What stands beside the tick, which goes on whatever becomes of them."""
 PROCESSES = {"mocks", "supervisor", "recorder", "console"}
 REST = {"OFF", "STANDBY", "SAFE"}
 STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
 STILL_V = 0.1
 BIAS_V = 5.0
+FRAMES_PER_S = 50
 STALL_S = 0.02
 STALLED_S = 0.1
 TRIES = 3  # another only where the machine itself stood still
@@ -82,6 +85,8 @@ def attempted(rig, entry, home, stalled):
     struck_s = time.monotonic()
     with strike(rig, entry):
         took_s = (rests if deaf else watch)(rig, entry, struck_s, stalled)
+    if entry.struck in BESIDE:
+        ticks_went_on(rig, stalled)
     healed_s = time.monotonic()
     if deaf:
         watch(rig, entry, healed_s, stalled)
@@ -136,6 +141,14 @@ def said(telemetry):
     yield from (event.message for event in telemetry.events)
     yield from (change.reason for change in telemetry.mode_changes)
     yield from (trip.name for trip in loop.interlocks)
+
+
+def ticks_went_on(rig, stalled):
+    """No frame is without its tick but for those of a stall."""
+    numbers = [tick.number for t in rig.telemetry for tick in t.ticks if tick.number >= 0]
+    missing = numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
+    excused = FRAMES_PER_S * (stalled.total_s + supervisor_stalled_s(rig))
+    assert missing <= 1 + excused, f"{missing} frames without a tick"
 
 
 def rests(rig, _entry, since_s, stalled):

@@ -9,6 +9,7 @@ from documents import ROOT, table
 
 from .catalogue import GROUPS
 from .configuration import WRONG
+from .entry import STAYED
 
 PAGE = ROOT / "docs" / "reliability.md"
 HEADER = [
@@ -40,17 +41,19 @@ def promised(entry):
     ]
 
 
-def measured(result):
+def measured(entry, result):
     """What a run has found: how long until it was so, and from healing to holding the star again."""
     if result is None:
         return ["not run", ""]
     again = f", try {result['attempts']}" if result["attempts"] > 1 else ""
-    return [f"{result['took_s']:.2f} s{again}", f"{result['back_s']:.0f} s"]
+    nothing_to_wait_for = STAYED in entry.ends and not entry.says
+    took = "stayed" if nothing_to_wait_for else f"{result['took_s']:.2f} s"
+    return [took + again, f"{result['back_s']:.0f} s"]
 
 
 def running_table(entries, results):
     """One group of entries."""
-    return table(HEADER, [promised(e) + measured(results.get(e.name)) for e in entries])
+    return table(HEADER, [promised(e) + measured(e, results.get(e.name)) for e in entries])
 
 
 def wrong_table():
@@ -76,9 +79,9 @@ def run_line(results):
     known = [results[entry.name] for entry in entries if entry.name in results]
     first = sum(result["attempts"] == 1 for result in known)
     return (
-        f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g} at "
-        f"the end of the run. {len(known)} of {len(entries)} entries ended as they should, {first} at the first "
-        "try; another is made only where the machine itself stood still.*"
+        f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g}. "
+        f"{len(known)} of {len(entries)} entries ended as they should, {first} at the first try; "
+        "another is made only where the machine itself stood still.*"
     )
 
 

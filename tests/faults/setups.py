@@ -13,6 +13,7 @@ from fitctl.config import default_rig_path
 from .ledger import settle
 from .watched import WatchedRig
 
+SOON = "loops.right.coarse.reach_fraction=0.3"  # the mirror takes over early: seconds less for each entry
 CLOCK = Path(__file__).parent / "clock"
 OWN_MOUNT = 'mount -t tmpfs -o size=64m tmpfs "$0" && echo ready && exec sleep infinity'
 
@@ -71,7 +72,7 @@ def started(name, folder, account):
     with ExitStack() as stack:
         before, root = setup.where(stack, folder)
         with running(
-            folder, NEAR, *setup.settings, file=file, kind=WatchedRig, before=before
+            folder, NEAR, SOON, *setup.settings, file=file, kind=WatchedRig, before=before
         ) as rig:
             rig.logs = root / folder.relative_to("/") if root else folder
             yield rig

@@ -22,8 +22,10 @@ def device(rig, entry):
     """A fault of the mocks."""
     kind, *value = entry.how.split()
     rig.tell(SetFault(entry.struck, kind, value=float(value[0]) if value else None))
-    yield
-    rig.tell(ClearFaults(entry.struck, kind))
+    try:
+        yield
+    finally:
+        rig.tell(ClearFaults(entry.struck, kind))
 
 
 # ---------------------------------------------------------------- processes
@@ -39,11 +41,13 @@ def killed(rig, entry):
     if entry.struck == "supervisor":
         rig.supervisor.wait()
         rig.deaths_s.append(time.monotonic())
-    yield
-    if entry.struck == "mocks":
-        rig.restart_mocks()
-    if entry.struck == "supervisor":
-        rig.start_supervisor()
+    try:
+        yield
+    finally:
+        if entry.struck == "mocks":
+            rig.restart_mocks()
+        if entry.struck == "supervisor":
+            rig.start_supervisor()
 
 
 @contextmanager
@@ -112,8 +116,10 @@ def told_to_end(rig, _entry):
     rig.supervisor.wait(ENDS_WITHIN_S)
     rig.deaths_s.append(time.monotonic())
     rig.heard.append(rig.complaints())
-    yield
-    rig.start_supervisor()
+    try:
+        yield
+    finally:
+        rig.start_supervisor()
 
 
 # ---------------------------------------------------------------- consoles
@@ -124,9 +130,11 @@ def not_read(rig, entry):
     """Nobody takes what the console draws, as a terminal does that hangs."""
     rig.process("console")
     rig.console.reads.clear()
-    yield
-    rig.console.reads.set()
-    goes_on(rig, entry)
+    try:
+        yield
+    finally:
+        rig.console.reads.set()
+        goes_on(rig, entry)
 
 
 @contextmanager
@@ -142,8 +150,10 @@ def many_events(rig, entry):
 def many_messages(rig, entry):
     """As many as the rig's telemetry_hz."""
     rig.process("console")
-    yield
-    goes_on(rig, entry)
+    try:
+        yield
+    finally:
+        goes_on(rig, entry)
 
 
 # ---------------------------------------------------------------- commands, disk and clock
@@ -167,9 +177,11 @@ def full(rig, _entry):
     with filler.open("wb", buffering=0) as file:
         status = os.statvfs(rig.logs)
         os.posix_fallocate(file.fileno(), 0, status.f_bavail * status.f_bsize)
-    yield
-    filler.unlink()
-    writes_again(rig)
+    try:
+        yield
+    finally:
+        filler.unlink()
+        writes_again(rig)
 
 
 def writes_again(rig):
@@ -189,9 +201,11 @@ def read_only(rig, _entry):
     folder = str(rig.folder)
     subprocess.run([*rig.before, "mount", "--bind", folder, folder], check=True)
     subprocess.run([*rig.before, "mount", "-o", "remount,bind,ro", folder], check=True)
-    yield
-    subprocess.run([*rig.before, "umount", folder], check=True)
-    writes_again(rig)
+    try:
+        yield
+    finally:
+        subprocess.run([*rig.before, "umount", folder], check=True)
+        writes_again(rig)
 
 
 @contextmanager
@@ -199,10 +213,12 @@ def clock(rig, entry):
     """Wall time is so many seconds later, then as before."""
     step = rig.folder / "step"
     step.write_text(entry.how)
-    yield
-    step.unlink()
-    time.sleep(2.0)  # it is looked at once a second
-    rig.client.send(Reset(name="clock_step"))
+    try:
+        yield
+    finally:
+        step.unlink()
+        time.sleep(2.0)  # it is looked at once a second
+        rig.client.send(Reset(name="clock_step"))
 
 
 STRIKES = {
