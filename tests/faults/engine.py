@@ -1,9 +1,9 @@
 """Strike, watch, heal, judge: the same for every entry that needs a running instrument."""
 
-import threading
 import time
-from contextlib import contextmanager
 from itertools import pairwise
+
+from stalls import stalls
 
 from .strikes import strike
 
@@ -20,38 +20,8 @@ STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
 STILL_V = 0.1
 BIAS_V = 5.0
 FRAMES_PER_S = 50
-STALL_S = 0.02
 STALLED_S = 0.1
 TRIES = 3  # another only where the machine itself stood still
-
-
-class Stalls:
-    """How long this process was kept from running in all: so long the machine stood still."""
-
-    def __init__(self):
-        self.total_s = 0.0
-
-
-@contextmanager
-def stalls():
-    """Watch for stalls of the machine."""
-    seen, ending = Stalls(), threading.Event()
-
-    def watch():
-        before_s = time.monotonic()
-        while not ending.wait(0.005):
-            now_s = time.monotonic()
-            if now_s - before_s > STALL_S:
-                seen.total_s += now_s - before_s
-            before_s = now_s
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield seen
-    finally:
-        ending.set()
-        thread.join()
 
 
 def run(rig, entry, home):
