@@ -19,14 +19,16 @@ def rig(request, tmp_path_factory):
         yield rig
 
 
-def pytest_sessionfinish():
-    """Add what was measured to the file that FITCTL_FAULT_RESULTS names."""
-    path = Path(os.environ.get("FITCTL_FAULT_RESULTS", os.devnull))
-    if RESULTS and path != Path(os.devnull):
-        RESULTS["run"] = {
-            "date": time.strftime("%Y-%m-%d", time.gmtime()),
-            "load": round(os.getloadavg()[2], 1),
-            "cores": os.cpu_count(),
-        }
-        before = json.loads(path.read_text()) if path.exists() else {}
-        path.write_text(json.dumps(before | RESULTS, indent=1) + "\n")
+def pytest_runtest_logfinish():
+    """Add what was measured to the file that FITCTL_FAULT_RESULTS names, entry by entry."""
+    path = os.environ.get("FITCTL_FAULT_RESULTS")
+    if not path or not RESULTS:
+        return
+    file = Path(path)
+    RESULTS["run"] = {
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "load": round(os.getloadavg()[2], 1),
+        "cores": os.cpu_count(),
+    }
+    before = json.loads(file.read_text()) if file.exists() else {}
+    file.write_text(json.dumps(before | RESULTS, indent=1) + "\n")

@@ -17,6 +17,8 @@ LOOK_S = 0.1  # between two looks at where the stages truly are
 REACH_S = 60.0
 ANSWER_S = 5.0  # to a command that is accepted
 OPENING_S = 20.0
+CALM_S = 10.0
+BUSY = {"servo_overrun", "loop_overrun", "frame_age"}
 HIDDEN = SetFault("camera", "star_fading", value=0.001)
 TRACKING = ("ACQUISITION", "COARSE", "VERNIER", "EXPERIMENT")
 
@@ -133,7 +135,10 @@ class WatchedRig(Rig):
         return (self.folder / "errors.txt").read_text()
 
     def reach(self, wanted, limit_s=REACH_S):
-        """Bring the loop to a mode, whatever it is in; every fault is ended first."""
+        """Bring the loop to a mode, whatever it is in; every fault is ended first.
+
+        Where the machine has no time for the loop just now, a better moment is waited for.
+        """
         self.tell(ClearFaults())
         if wanted == "ACQUISITION":
             self.tell(HIDDEN)
@@ -147,6 +152,8 @@ class WatchedRig(Rig):
                     lambda t, mode=mode: t.loops[0].mode != mode or failed(t),
                     (OPENING_S if make in {Standby, Recover} else ANSWER_S) if accepted else 0.2,
                 )
+        with suppress(AssertionError):
+            self.follow(lambda t: not {trip.name for trip in t.loops[0].interlocks} & BUSY, CALM_S)
 
 
 def failed(telemetry):
