@@ -29,7 +29,9 @@ def test_the_committed_table_has_every_entry_and_what_a_run_has_found(name):
     cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
 
     assert [row[:-MEASURED] for row in cells] == [promised(entry) for entry in GROUPS[name]]
-    assert all(re.fullmatch(r"not run|(stayed|\d+\.\d\d s)(, try \d)?", row[-MEASURED]) for row in cells)
+    assert all(
+        re.fullmatch(r"not run|(stayed|\d+\.\d\d s)(, try \d)?", row[-MEASURED]) for row in cells
+    )
 
 
 def test_the_committed_table_has_every_wrong_configuration():
