@@ -115,7 +115,8 @@ def ticks_went_on(rig, stalled):
 
 def rests(rig, _entry, since_s, stalled):
     """Without a supervisor the stages come to rest by themselves; how long that took."""
-    while time.monotonic() < since_s + DEAD_SETTLE_S + stalled.total_s + SETTLE_S:
+    end_s = time.monotonic() + DEAD_SETTLE_S + SETTLE_S
+    while time.monotonic() < end_s + stalled.total_s:
         time.sleep(0.02)
         rig.look()
     last = rig.places[-1]

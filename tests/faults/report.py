@@ -44,7 +44,7 @@ def promised(entry):
 def measured(entry, result):
     """What a run has found: how long until it was so, and from healing to holding the star again."""
     if result is None:
-        return ["not run", ""]
+        return ["no result", ""]
     again = f", try {result['attempts']}" if result["attempts"] > 1 else ""
     nothing_to_wait_for = STAYED in entry.ends and not entry.says
     took = "stayed" if nothing_to_wait_for else f"{result['took_s']:.2f} s"
@@ -80,7 +80,7 @@ def run_line(results):
     first = sum(result["attempts"] == 1 for result in known)
     return (
         f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g}. "
-        f"{len(known)} of {len(entries)} entries ended as they should, {first} at the first try; "
+        f"{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
         "another is made only where the machine itself stood still.*"
     )
 

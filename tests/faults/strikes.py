@@ -1,6 +1,7 @@
 """How things are struck: each begins something, and heals it when it is left."""
 
 import os
+import re
 import subprocess
 import threading
 import time
@@ -114,8 +115,9 @@ def told_to_end(rig, _entry):
     rig.recorder().suspend()
     rig.client.send(Shutdown())
     rig.supervisor.wait(ENDS_WITHIN_S)
-    rig.deaths_s.append(time.monotonic())
     rig.heard.append(rig.complaints())
+    told = re.findall(r"the last records, up to (\d+)", rig.complaints())
+    rig.lost_of["told at the end"] = sum(map(int, told))
     try:
         yield
     finally:

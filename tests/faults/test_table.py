@@ -30,7 +30,7 @@ def test_the_committed_table_has_every_entry_and_what_a_run_has_found(name):
 
     assert [row[:-MEASURED] for row in cells] == [promised(entry) for entry in GROUPS[name]]
     assert all(
-        re.fullmatch(r"not run|(stayed|\d+\.\d\d s)(, try \d)?", row[-MEASURED]) for row in cells
+        re.fullmatch(r"no result|(stayed|\d+\.\d\d s)(, try \d)?", row[-MEASURED]) for row in cells
     )
 
 

@@ -64,7 +64,7 @@ class WatchedRig(Rig):
         self.console = None
         self.heard = []  # what was answered to strange commands
         self.shown = set()  # times of all ticks in telemetry
-        self.lost_of = {}  # records lost by each supervisor's own count
+        self.lost_of = {}  # records lost, by each supervisor's own count
         self.deaths_s = []  # when supervisors ended without a chance to see their records written
 
     def receive(self, timeout_s):
