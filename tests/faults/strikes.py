@@ -68,9 +68,10 @@ def stopped(rig, entry):
 @contextmanager
 def stuck(rig, entry):
     """The recorder is stopped until its queue is full."""
+    lost_before = lost_so_far(rig)
     with stopped(rig, entry):
         yield
-    writes_again(rig)
+    writes_again(rig, lost_before)
 
 
 @contextmanager
@@ -175,7 +176,7 @@ def command(rig, entry):
 @contextmanager
 def full(rig, _entry):
     """A file takes all the room that there is."""
-    filler = rig.logs / "filler"
+    filler, lost_before = rig.logs / "filler", lost_so_far(rig)
     with filler.open("wb", buffering=0) as file:
         status = os.statvfs(rig.logs)
         os.posix_fallocate(file.fileno(), 0, status.f_bavail * status.f_bsize)
@@ -183,12 +184,12 @@ def full(rig, _entry):
         yield
     finally:
         filler.unlink()
-        writes_again(rig)
+        writes_again(rig, lost_before)
 
 
-def writes_again(rig):
-    """A recorder is at work again, and has noticed all that was lost meanwhile."""
-    healed_s, lost = time.monotonic(), rig.lost_of[rig.supervisor.pid]
+def writes_again(rig, lost_before):
+    """A recorder is at work again, and has noticed all that was lost since it was struck."""
+    healed_s, lost = time.monotonic(), lost_so_far(rig) - lost_before
     rig.follow(
         lambda t: (
             t.recorder is not None and t.recorder.time_s > healed_s and t.recorder.lost >= lost
@@ -197,17 +198,22 @@ def writes_again(rig):
     )
 
 
+def lost_so_far(rig):
+    """By the supervisor's count."""
+    return rig.telemetry[-1].records_lost
+
+
 @contextmanager
 def read_only(rig, _entry):
     """Mounted once more over itself, for reading: what is open stays so, the next file cannot begin."""
-    folder = str(rig.folder)
+    folder, lost_before = str(rig.folder), lost_so_far(rig)
     subprocess.run([*rig.before, "mount", "--bind", folder, folder], check=True)
     subprocess.run([*rig.before, "mount", "-o", "remount,bind,ro", folder], check=True)
     try:
         yield
     finally:
         subprocess.run([*rig.before, "umount", folder], check=True)
-        writes_again(rig)
+        writes_again(rig, lost_before)
 
 
 @contextmanager
