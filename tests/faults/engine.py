@@ -59,8 +59,8 @@ def attempted(rig, entry, home, stalled):
         healed_s = time.monotonic()
     if entry.struck in BESIDE:
         ticks_went_on(rig, stalled)
-    if deaf:
-        watch(rig, entry, healed_s, stalled)
+    if deaf:  # what it says once it is awake, or a new one once it has started
+        watch(rig, entry, healed_s if entry.how == "stopped" else time.monotonic(), stalled)
     rig.reach(home)
     back_s = time.monotonic() - healed_s
     if not entry.moves:

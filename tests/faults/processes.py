@@ -32,7 +32,7 @@ ENTRIES = (
     *in_each_mode("mocks", "killed", 2.0, ("SAFE",), "expected"),
     *in_each_mode("mocks", "stopped", 3.0, ("SAFE",), "expected"),
     *in_each_mode("mocks", "slowed", 2.0, ANY, ""),
-    *in_each_mode("supervisor", "killed", 10.0, ("OFF",), "", ("OFF",)),
+    *in_each_mode("supervisor", "killed", 5.0, ("OFF",), "", ("OFF",)),
     *in_each_mode("supervisor", "stopped", 5.0, ("SAFE",), "expected"),
     *in_each_mode("supervisor", "slowed", 2.0, ANY, ""),
     *in_each_mode("recorder", "killed", 5.0, STAYS, "the recorder was killed by signal 9",
