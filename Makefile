@@ -8,9 +8,10 @@ READY := $(VENV)/.ready
 PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
 SOAK_S ?= 3600
+FAULT_RESULTS ?= .fault-results.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-console bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults reliability test-peers bench-console bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -51,8 +52,12 @@ endif
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
-test-faults: $(READY)  ## The whole instrument, in real time, under each fault of each device
-	$(BIN)/pytest -m fault tests/system $(ARGS)
+test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
+	$(BIN)/pytest -m fault tests/faults $(ARGS)
+
+reliability: $(READY)  ## The fault catalogue, and its results into docs/reliability.md
+	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault tests/faults $(ARGS)
+	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
 
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
 	$(BIN)/pytest -m peer tests/peers $(ARGS)

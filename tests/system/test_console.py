@@ -39,8 +39,8 @@ class Terminal:
         env = {
             name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}
         }
-        told = {"check": True, "capture_output": True, "text": True, "timeout": LIMIT_S, "env": env}
-        return subprocess.run([*self._tmux, *words], **told).stdout
+        told = {"capture_output": True, "text": True, "timeout": LIMIT_S, "env": env}
+        return subprocess.run([*self._tmux, *words], check=True, **told).stdout
 
     def press(self, *keys):
         self._run("send-keys", "-t", "fitctl", *keys)
