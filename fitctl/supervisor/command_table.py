@@ -52,17 +52,30 @@ class CommandRow(NamedTuple):
         return self.make.__name__
 
     @property
-    def values(self) -> tuple[str, ...]:
-        """Names of its values, in the order in which they are given."""
+    def fields(self) -> dict[str, bool]:
+        """Names of its values, and whether each must be given."""
         common = {field.name for field in msgspec.structs.fields(Command)}
-        return tuple(
-            field.name for field in msgspec.structs.fields(self.make) if field.name not in common
-        )
+        return {
+            field.name: field.required
+            for field in msgspec.structs.fields(self.make)
+            if field.name not in common
+        }
+
+    @property
+    def values(self) -> list[str]:
+        """Names of the values that it needs, in the order in which they are given."""
+        return [name for name, required in self.fields.items() if required]
+
+    @property
+    def options(self) -> list[str]:
+        """Names of the values that it may be given, as NAME=VALUE."""
+        return [name for name, required in self.fields.items() if not required]
 
     @property
     def usage(self) -> str:
         """Its word and what must follow."""
-        return " ".join([self.word, *(value.upper() for value in self.values)])
+        may = [f"[{name}=]" for name in self.options]
+        return " ".join([self.word, *(value.upper() for value in self.values), *may])
 
     @property
     def help(self) -> str:
@@ -114,11 +127,17 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
-    if len(values) != len(row.values):
+    named = [text for text in values if text.partition("=")[0] in row.options]
+    plain = [text for text in values if text not in named]
+    if len(plain) != len(row.values):
         needs = " ".join(row.values) or "no values"
-        msg = f"send: {word} needs {needs} (is {' '.join(values) or 'nothing'})"
+        may = (
+            f", and may have {', '.join(f'{name}=' for name in row.options)}" if row.options else ""
+        )
+        msg = f"send: {word} needs {needs}{may} (is {' '.join(values) or 'nothing'})"
         raise ConfigError(msg)
-    given = dict(zip(row.values, values, strict=True)) | {"loop": loop}
+    options = dict(text.split("=", 1) for text in named)
+    given = dict(zip(row.values, plain, strict=True)) | options | {"loop": loop}
     try:
         # Numbers come as text here; msgspec reads them, and checks what they may be.
         return msgspec.convert(given, row.make, strict=False)
@@ -131,7 +150,7 @@ def command_record(
     command: AnyCommand, reply: Reply, sender: str, address: str, now_s: float
 ) -> CommandRecord:
     """What the log keeps of a command and its answer."""
-    values = {name: getattr(command, name) for name in ROWS[type(command)].values}
+    values = {name: getattr(command, name) for name in ROWS[type(command)].fields}
     return CommandRecord(
         time_s=now_s,
         sender=sender,

@@ -218,6 +218,8 @@ class ConsoleApp(App[None]):
     def on_answered(self, message: Answered) -> None:
         """Say what became of a command, where that is not plain to see."""
         name = type(message.command).__name__
+        if name == "Status":
+            return  # which only keeps the instrument; a lost link is in the header
         if message.reply is None:
             text = message.problem
             if name == "Stop":

@@ -266,9 +266,9 @@ def test_what_no_console_was_sent_stands_beside_the_other_counts(rows):
 def test_the_header_says_how_much_a_slow_console_missed():
     supervisor = FakeSupervisor()
     state = shown(supervisor)
-    assert "missed" not in " ".join(plain(Header(state).draw(80, 3)))
+    assert "missed" not in " ".join(plain(Header(state, "operate").draw(80, 3)))
     state.accept(supervisor.messages(5)[-1], state.now_s)
-    assert "4 missed!" in " ".join(plain(Header(state).draw(80, 3)))
+    assert "4 missed!" in " ".join(plain(Header(state, "operate").draw(80, 3)))
 
 
 def test_a_long_event_is_wrapped_under_itself():
