@@ -174,7 +174,7 @@ def _log(state: ConsoleState, newest: Telemetry) -> Iterator[Alarm]:
         what = f"{lost:,} records lost from the log".replace(",", " ")
         did = "the loop goes on; the gap is counted in the log"
         todo = "see the events for the reason"
-        yield Alarm("records", True, what, newest.time_s, did, todo, count=lost)
+        yield Alarm("records", False, what, newest.time_s, did, todo, count=lost)
     if newest.recorder is None and any(loop.mode != "OFF" for loop in newest.loops):
         did = "the loop goes on, the supervisor tries again"
         todo = "see the events: disk full, or logging.folder?"

@@ -186,7 +186,7 @@ def test_a_click_puts_the_cursor_and_moves_nothing_by_itself():
 
 def test_the_cursor_stays_on_the_frame():
     async def scenario(app, pilot):
-        await pressed(app, pilot, "t", *["left"] * 60)
+        await pressed(app, pilot, "t", *["left"] * 50)
         assert app.view.query_one(FocalPlane).cursor_px == (0.0, 19.5)
 
     run(scenario)
