@@ -53,16 +53,22 @@ class CommandRow(NamedTuple):
 
     @property
     def values(self) -> tuple[str, ...]:
-        """Names of its values, in the order in which they are given."""
+        """Names of its values."""
         common = {field.name for field in msgspec.structs.fields(Command)}
         return tuple(
             field.name for field in msgspec.structs.fields(self.make) if field.name not in common
         )
 
     @property
+    def words(self) -> tuple[str, ...]:
+        """Names of those that must be given, in their order; what may be left out, programs alone give."""
+        fields = msgspec.structs.fields(self.make)
+        return tuple(f.name for f in fields if f.required and f.name in self.values)
+
+    @property
     def usage(self) -> str:
         """Its word and what must follow."""
-        return " ".join([self.word, *(value.upper() for value in self.values)])
+        return " ".join([self.word, *(value.upper() for value in self.words)])
 
     @property
     def help(self) -> str:
@@ -114,11 +120,11 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
-    if len(values) != len(row.values):
-        needs = " ".join(row.values) or "no values"
+    if len(values) != len(row.words):
+        needs = " ".join(row.words) or "no values"
         msg = f"send: {word} needs {needs} (is {' '.join(values) or 'nothing'})"
         raise ConfigError(msg)
-    given = dict(zip(row.values, values, strict=True)) | {"loop": loop}
+    given = dict(zip(row.words, values, strict=True)) | {"loop": loop}
     try:
         # Numbers come as text here; msgspec reads them, and checks what they may be.
         return msgspec.convert(given, row.make, strict=False)

@@ -41,7 +41,9 @@ class Standby(Command, frozen=True, kw_only=True):
 
 
 class Acquire(Command, frozen=True, kw_only=True):
-    """Search for the star, pull it in, hold it; what is given stands in place of the rig file's, this once.
+    """Search for the star, pull it in, hold it.
+
+    What is given stands in place of the rig file's, this once.
 
     Attributes
     ----------
