@@ -8,9 +8,10 @@ READY := $(VENV)/.ready
 PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
 SOAK_S ?= 3600
+FAULT_RESULTS ?= .fault-results.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults test-peers bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults reliability test-peers bench-console bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -51,8 +52,12 @@ endif
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
-test-faults: $(READY)  ## The whole instrument, in real time, under each fault of each device
-	$(BIN)/pytest -m fault tests/system $(ARGS)
+test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
+	$(BIN)/pytest -m fault tests/faults $(ARGS)
+
+reliability: $(READY)  ## The fault catalogue, and its results into docs/reliability.md
+	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault tests/faults $(ARGS)
+	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
 
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
 	$(BIN)/pytest -m peer tests/peers $(ARGS)
@@ -78,6 +83,9 @@ bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
 
 bench-flood: $(READY)  ## The tick while the service is flooded, beside the tick while it is not
 	$(BIN)/python -m benchmarks.flood $(ARGS)
+
+bench-console: $(READY)  ## What a console costs, and what it does to the loop
+	$(BIN)/python -m benchmarks.console $(ARGS)
 
 bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN servo cycle, the camera's stream
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock

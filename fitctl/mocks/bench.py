@@ -46,6 +46,20 @@ class Residual(msgspec.Struct, frozen=True):
     error: str = ""
 
 
+class StagesQuestion(_Question, frozen=True):
+    """Asks where the stages of a loop are, whatever their devices say."""
+
+    loop: str
+
+
+class StagesNow(msgspec.Struct, frozen=True):
+    """Motor angles, and the stacks' volts in the D/A's scale: az, el; stack 1 to 3."""
+
+    motor_rad: list[float]
+    stack_v: list[float]
+    error: str = ""
+
+
 class SetFault(_Question, frozen=True):
     """Begin a fault; fields as in :class:`fitctl.config.Fault`."""
 
@@ -76,7 +90,7 @@ class FaultsNow(msgspec.Struct, frozen=True):
     error: str = ""
 
 
-_AnyQuestion = ResidualQuestion | SetFault | ClearFaults | ListFaults
+_AnyQuestion = ResidualQuestion | StagesQuestion | SetFault | ClearFaults | ListFaults
 
 
 class FaultTable:
@@ -188,14 +202,23 @@ class Bench:
             answer = self._answer(await self._socket.recv())
             await self._socket.send(msgspec.msgpack.encode(answer))
 
-    def _answer(self, message: bytes) -> Residual | FaultsNow:
+    def _answer(self, message: bytes) -> Residual | StagesNow | FaultsNow:
         try:
             question = msgspec.msgpack.decode(message, type=_AnyQuestion)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return Residual(np.nan, np.nan, 0, f"not a question: {error}")
         if isinstance(question, ResidualQuestion):
             return self._residual(question)
+        if isinstance(question, StagesQuestion):
+            return self._stages(question)
         return self._faults.answer(question)
+
+    def _stages(self, question: StagesQuestion) -> StagesNow:
+        plant = self._plants.get(question.loop)
+        if plant is None:
+            return StagesNow([], [], f"no loop is named {question.loop}")
+        state = plant.state
+        return StagesNow(state.motor_rad[0].tolist(), state.stack_v[0].tolist())
 
     def _residual(self, question: ResidualQuestion) -> Residual:
         if not np.all(np.isfinite([question.start_s, question.end_s])):
@@ -222,6 +245,17 @@ def ask_bench(port: int, question: ResidualQuestion) -> Residual:
         If none answers within five seconds.
     """
     return msgspec.msgpack.decode(_ask(port, question), type=Residual)
+
+
+def ask_stages(port: int, question: StagesQuestion) -> StagesNow:
+    """Ask a running bench where the stages are.
+
+    Raises
+    ------
+    ConnectionError
+        If none answers within five seconds.
+    """
+    return msgspec.msgpack.decode(_ask(port, question), type=StagesNow)
 
 
 def ask_faults(port: int, question: SetFault | ClearFaults | ListFaults) -> FaultsNow:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from fitctl.logging.records import Severity
 from fitctl.processes import end_process, last_line, start_process
 
-_END_S = 5.0
+END_S = 5.0
 _WELL_S = 10.0  # one that lived this long is started again at once
 _PATIENCE_S = 60.0
 
@@ -70,9 +71,10 @@ class Child:
         if now_s >= self._again_s:
             self._start()
 
-    def end(self) -> None:
-        """Let it finish what it has and end."""
-        end_process(self._process, _END_S)
+    def end(self) -> bool:
+        """Let it write what it has and end; False if it had to be killed."""
+        end_process(self._process, END_S)
+        return self._process.returncode != -signal.SIGKILL
 
     def _start(self) -> None:
         with self._errors.open("wb") as errors:

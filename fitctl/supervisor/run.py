@@ -7,6 +7,7 @@ import gc
 import importlib.metadata
 import os
 import platform
+import sys
 import tempfile
 import threading
 import time
@@ -22,13 +23,14 @@ from fitctl.controllers.design.files import design_json
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.processes import ended_by_signals
-from fitctl.supervisor.children import Child
+from fitctl.supervisor.children import END_S, Child
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
     COMMAND_SOCKET,
     RECORDS_SOCKET,
     TELEMETRY_SOCKET,
     make_service_folder,
+    service_folder,
 )
 from fitctl.supervisor.machine import Machine
 from fitctl.supervisor.periodic import PeriodicThread
@@ -54,6 +56,10 @@ _METRICS_ERRORS = "metrics.err"
 _FILES = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, _RECORDER_ERRORS, _METRICS_ERRORS)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
+_CUT = (
+    f"recorder: it did not end within {END_S:g} s and was killed; the last records, up to {{}}, "
+    "are not in the log; mend it with: fitctl log recover"
+)
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
 _VERSIONED = (
     "fitctl",
@@ -132,6 +138,7 @@ def run_supervisor(
     ConfigError
         If the socket folder cannot be used, or another supervisor has this rig.
     """
+    service_folder(rig)  # refused before anything is made
     log_folder = Path(rig.logging.folder).expanduser()
     check_log_folder(log_folder)
     folder = make_service_folder(rig)
@@ -189,7 +196,10 @@ def run_supervisor(
             for thread in threads:
                 thread.stop()
             service.stop()
-            queue.close()  # while the recorder, which the stack ends, still listens
+            unconfirmed = queue.waiting
+            queue.close()  # while the recorder still listens
+            if not children[0].end():
+                print(_CUT.format(unconfirmed), file=sys.stderr)
 
 
 def _children(

@@ -29,6 +29,7 @@ from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
 from fitctl.tui.jobs import Job
 from fitctl.tui.link import Link
+from fitctl.tui.pace import Pace
 from fitctl.tui.palette import ControllerProvider, ResetProvider, TargetProvider
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.views.devices import DevicesView
@@ -41,7 +42,7 @@ from fitctl.tui.views.view import View
 from fitctl.tui.wire import UNREADABLE_NOTICE_S, Wire
 
 BEAT_S = 0.1
-"""How often something is drawn; a panel says at which of these beats."""
+"""How often something is drawn, if the machine allows; a panel says at which of these beats."""
 KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 
 
@@ -136,6 +137,7 @@ class ConsoleApp(App[None]):
         self.state = ConsoleState(clock())
         self.alarms = AlarmBook()
         self._beat = 0
+        self._pace = Pace()
         self._wire = Wire(
             link,
             clock,
@@ -181,8 +183,9 @@ class ConsoleApp(App[None]):
         return bottom[0] if bottom and isinstance(bottom[0], View) else None
 
     def _draw_due(self) -> None:
-        self._beat += 1
-        self._draw(self._beat)
+        if self._pace.due():
+            self._beat += 1
+            self._draw(self._beat)
 
     def draw_all(self) -> None:
         """Bring everything on the screen up to date now."""

@@ -1,6 +1,5 @@
 """Everything dies at a random moment, or the disk is full: what the log still has."""
 
-import contextlib
 import random
 import resource
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from log_samples import RUN_INFO, logs_in, start_recorder, tick, wait_until
+from stalls import stalls
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.copying import recover
@@ -40,28 +40,6 @@ for number in range(1_000_000):
     if sys.argv[4] == "frames":
         queue.offer(picture)
 """
-
-
-@contextlib.contextmanager
-def stalls():
-    """How long this process stood still at the worst: the machine's doing, not the recorder's."""
-    worst_s = [0.0]
-    done = threading.Event()
-
-    def watch():
-        last_s = time.monotonic()
-        while not done.wait(0.005):
-            now_s = time.monotonic()
-            worst_s[0] = max(worst_s[0], now_s - last_s - 0.005)
-            last_s = now_s
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield worst_s
-    finally:
-        done.set()
-        thread.join()
 
 
 def begun(folder):
@@ -97,7 +75,7 @@ def lost_s_of_runs(tmp_path, moments_s):
     def one(number, after_s):
         results[number] = run_and_kill(tmp_path / str(number), after_s, PACES[number])
 
-    with stalls() as worst_s:
+    with stalls() as stalled:
         threads = [threading.Thread(target=one, args=pair) for pair in enumerate(moments_s)]
         for thread in threads:
             thread.start()
@@ -114,7 +92,7 @@ def lost_s_of_runs(tmp_path, moments_s):
         assert verify(mended).problems == ()
         assert saved.records == sum(log_info(path).counts.values())
         assert log_info(mended).metadata["rig"]["name"] == "bench"
-    return lost_s, worst_s[0]
+    return lost_s, stalled.worst_s
 
 
 def test_a_kill_of_everything_costs_at_most_a_second(tmp_path):
@@ -176,7 +154,7 @@ def test_a_full_disk_costs_nothing_once_there_is_room_again(queue, tmp_path):
         (path,) = logs_in(folder)
         resource.prlimit(first.pid, resource.RLIMIT_FSIZE, (path.stat().st_size + 5000,) * 2)
         full_s = time.monotonic()
-        with stalls() as worst_s:
+        with stalls() as stalled:
             while first.poll() is None and time.monotonic() < full_s + 20:
                 count = offer_for(queue, 0.1, count)
         assert first.returncode == 1  # `fitctl record` turns it into one line and status 2
@@ -189,7 +167,7 @@ def test_a_full_disk_costs_nothing_once_there_is_room_again(queue, tmp_path):
         first.stdout.close()
         first.stderr.close()
     times_s = tick_arrays(path, "right")["time_s"]
-    assert full_s - times_s[-1] <= MAY_BE_LOST_S + worst_s[0]
+    assert full_s - times_s[-1] <= MAY_BE_LOST_S + stalled.worst_s
     record_what_waits(queue, f"ipc://{tmp_path}/records", folder)
     files = [numbers(path) for path in logs_in(folder)]
     assert set().union(*files) == set(range(count))

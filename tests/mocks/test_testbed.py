@@ -13,7 +13,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.modbus_dac.driver import ModbusDac
-from fitctl.mocks.bench import ResidualQuestion, ask_bench
+from fitctl.mocks.bench import ResidualQuestion, StagesQuestion, ask_bench, ask_stages
 from fitctl.mocks.testbed import Testbed as MockTestbed
 from fitctl.model.hysteresis import stack_gains
 from fitctl.model.optics import scales
@@ -152,6 +152,20 @@ def test_the_bench_knows_where_the_star_truly_is(running):
     assert residual.az_rms_px == pytest.approx(0.0, abs=1e-6)
     assert residual.el_rms_px == pytest.approx(1.0, abs=1e-6)
     assert residual.samples == pytest.approx(600, abs=2)
+
+
+def test_the_bench_knows_where_the_stages_truly_are(running):
+    port = running.endpoints["mocks.bench_port"]
+    dac = ModbusDac(running.rig.loops["right"].fsm.dac)
+    dac.open()
+    dac.write_v(np.array([6.0, 5.0, 4.0]))
+    dac.close()
+
+    stages = ask_stages(port, StagesQuestion("right"))
+
+    assert stages.stack_v == pytest.approx([6.0, 5.0, 4.0], abs=1e-3)
+    assert stages.motor_rad == [0.0, 0.0]
+    assert "no loop is named left" in ask_stages(port, StagesQuestion("left")).error
 
 
 def test_the_bench_answers_nonsense_with_an_error(running):

@@ -20,10 +20,10 @@ START_S = 60.0
 NEAR = "plant.loops.right.star_offset_sky_arcsec_max=5.0"  # found at once
 
 
-def fitctl(*arguments, **options):
-    """Start ``fitctl ARGUMENTS``."""
+def fitctl(*arguments, before=(), **options):
+    """Start ``fitctl ARGUMENTS``; `before` goes before it on the command line, such as ``env NAME=VALUE``."""
     return subprocess.Popen(
-        [sys.executable, "-m", "fitctl", *map(str, arguments)],
+        [*before, sys.executable, "-m", "fitctl", *map(str, arguments)],
         stdin=subprocess.DEVNULL,
         text=True,
         **options,
@@ -56,11 +56,15 @@ class Rig:
             "--set",
             f"service.folder={self.sockets}",
         ]
+        self.before = ()  # what goes before the supervisor on its command line
+        self.errors = None  # where the error output of mocks and supervisor goes; None is our own
         self.mocks = self.supervisor = None
         self.client = None
 
     def start_mocks(self, *arguments):
-        self.mocks = fitctl("mocks", *self.common, "--json", *arguments, stdout=subprocess.PIPE)
+        self.mocks = fitctl(
+            "mocks", *self.common, "--json", *arguments, stdout=subprocess.PIPE, stderr=self.errors
+        )
         self.endpoints = json.loads(self.mocks.stdout.readline())
 
     def restart_mocks(self):
@@ -86,7 +90,14 @@ class Rig:
             if not key.startswith("mocks.")
             for part in ("--set", f"{key}={value}")
         ]
-        self.supervisor = fitctl("run", *self.common, *devices, stdout=subprocess.PIPE)
+        self.supervisor = fitctl(
+            "run",
+            *self.common,
+            *devices,
+            before=self.before,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+        )
         assert "supervising" in self.supervisor.stdout.readline()
         self.client = Client(self.sockets)
 
@@ -95,7 +106,7 @@ class Rig:
         seen = []
         end_s = time.monotonic() + limit_s
         while time.monotonic() < end_s:
-            telemetry = self.client.receive(0.5)
+            telemetry = self.receive(0.5)
             if telemetry is not None:
                 seen.append(telemetry)
                 if reached(telemetry):
@@ -103,6 +114,10 @@ class Rig:
         mode = seen[-1].loops[0].mode if seen else "no telemetry"
         events = [event.message for telemetry in seen for event in telemetry.events]
         raise AssertionError(f"not reached within {limit_s} s; {mode}; {events}")
+
+    def receive(self, timeout_s):
+        """The next telemetry message, or None when none came in time."""
+        return self.client.receive(timeout_s)
 
     def follow_to(self, mode, limit_s=START_S):
         return self.follow(lambda telemetry: telemetry.loops[0].mode == mode, limit_s)
@@ -128,15 +143,16 @@ class Rig:
                 end(process)
                 process.stdout.close()
         for path in sorted(self.sockets.glob("*")):
-            path.unlink()
+            path.unlink(missing_ok=True)
         if self.sockets.exists():
             self.sockets.rmdir()
 
 
 @contextmanager
-def running(folder, *settings, file=None, mocks=()):
+def running(folder, *settings, file=None, kind=Rig, before=(), mocks=()):
     """Mock testbed and supervisor of a rig, with some values replaced; `mocks` are options of the testbed."""
-    rig = Rig(folder, file)
+    rig = kind(folder, file)
+    rig.before = before
     rig.common += [part for setting in settings for part in ("--set", setting)]
     try:
         rig.start_mocks("--free-ports", *mocks)

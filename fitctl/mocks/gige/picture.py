@@ -18,6 +18,9 @@ HOT_PIXEL = (0.25, 0.75)  # its place on the sensor, across and down, in parts o
 
 PICTURE_FAULTS = {
     "star_fading": FaultKind("starlight halves, again and again, each time within this", "s", 1.0),
+    "star_dim": FaultKind("this part of the starlight is left", "of its light", 0.7),
+    "star_jump": FaultKind("the whole picture is displaced by this, along both axes", "px", 4.0),
+    "star_double": FaultKind("all light is there once more, this far off along az", "px", 8.0),
     "background_jump": FaultKind("every pixel reads more by this", "DN", 2000.0),
     "hot_pixel": FaultKind("one pixel reads more by this", "DN", 20000.0),
     "saturation": FaultKind("no pixel reads more than this", "DN", 3000.0),
@@ -51,6 +54,15 @@ class Sensor:
         if halving_s is not None:
             fading_s = max(0.0, host_s - self._fading_since_s)
             dn = self._faded(dn, 0.5 ** (fading_s / max(halving_s, _HALVING_MIN_S)))
+        dim = values["star_dim"]
+        if dim is not None:
+            dn = self._faded(dn, min(max(dim, 0.0), 1.0))
+        jump_px = values["star_jump"]
+        if jump_px is not None:
+            dn = self._displaced(dn, round(jump_px), round(jump_px))
+        double_px = values["star_double"]
+        if double_px is not None:
+            dn += self._displaced(dn, 0, round(double_px)) - self._camera.bias_dn
         dn += values["background_jump"] or 0.0
         across, down = HOT_PIXEL
         height_px, width_px = image.shape
@@ -64,6 +76,18 @@ class Sensor:
         bias_dn, noise_dn = self._camera.bias_dn, self._camera.pixel_noise_dn
         noise = self._random.standard_normal(dn.shape)
         return bias_dn + left * (dn - bias_dn) + noise_dn * math.sqrt(1 - left**2) * noise
+
+    def _displaced(self, dn: NDArray[np.float64], down: int, across: int) -> NDArray[np.float64]:
+        """Moved by whole pixels; what comes in from outside is dark."""
+        camera, (height, width) = self._camera, dn.shape
+        moved = camera.bias_dn + camera.pixel_noise_dn * self._random.standard_normal(dn.shape)
+        rows, columns = np.arange(height) - down, np.arange(width) - across
+        inside_rows = (rows >= 0) & (rows < height)
+        inside_columns = (columns >= 0) & (columns < width)
+        moved[np.ix_(inside_rows, inside_columns)] = dn[
+            np.ix_(rows[inside_rows], columns[inside_columns])
+        ]
+        return moved
 
     def _note(self, kind: str) -> None:
         if kind == "star_fading":

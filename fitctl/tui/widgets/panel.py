@@ -8,8 +8,10 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
-from fitctl.tui.look import Line
+from fitctl.tui.look import INK, PAPER, Line, style
 from fitctl.tui.state import ConsoleState
+
+GROUND = style(INK, PAPER)  # the stylesheet's, which takes long to ask for at every line
 
 
 class Panel(Widget, can_focus=False):
@@ -60,7 +62,7 @@ class Panel(Widget, can_focus=False):
 
     def render_line(self, y: int) -> Strip:
         """One line for Textual's compositor."""
-        base = self.rich_style
+        columns = self.content_size.width
         if y >= len(self._strips):
-            return Strip.blank(self.content_size.width, base)
-        return self._strips[y].adjust_cell_length(self.content_size.width).apply_style(base)
+            return Strip.blank(columns, GROUND)
+        return self._strips[y].adjust_cell_length(columns).apply_style(GROUND)

@@ -207,9 +207,42 @@ def test_a_fading_star_goes_and_the_noise_stays(serve: Serve, connect: Connect) 
     np.testing.assert_array_equal(image_after(camera, time.monotonic()), STAR)
 
 
+def test_a_dim_star_has_part_of_its_light(serve: Serve, connect: Connect) -> None:
+    served, camera = running(serve, connect, STAR)
+    served.fault("star_dim", value=0.5)
+    dim = image_after(camera, time.monotonic())
+    assert abs(dim[20, 24] - 5000) < 150
+    assert 12 < dim[:10].std() < 23  # what is left of an image without noise
+
+
+def test_a_star_that_jumps_is_elsewhere_on_a_dark_picture(serve: Serve, connect: Connect) -> None:
+    served, camera = running(serve, connect, STAR)
+    served.fault("star_jump", value=5.0)
+    jumped = image_after(camera, time.monotonic())
+    np.testing.assert_array_equal(jumped[5:, 5:], STAR[:-5, :-5])
+    assert abs(jumped[:5].mean() - 1000) < 20
+    assert 15 < jumped[:5].std() < 25  # the rig's 20 DN
+
+
+def test_a_doubled_star_is_there_twice(serve: Serve, connect: Connect) -> None:
+    served, camera = running(serve, connect, STAR)
+    served.fault("star_double", value=8.0)
+    doubled = image_after(camera, time.monotonic())
+    for across in (24, 32):
+        assert abs(doubled[20, across] - 9000) < 150
+
+
 @pytest.mark.parametrize(
     ("kind", "value"),
-    [("star_fading", 0.0), ("saturation", -5.0), ("background_jump", 1e9), ("hot_pixel", -1e9)],
+    [
+        ("star_fading", 0.0),
+        ("star_dim", -1.0),
+        ("star_jump", 1e9),
+        ("star_double", -1e9),
+        ("saturation", -5.0),
+        ("background_jump", 1e9),
+        ("hot_pixel", -1e9),
+    ],
 )
 def test_values_beyond_sense_harm_nobody(
     serve: Serve, connect: Connect, kind: str, value: float

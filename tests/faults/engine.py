@@ -1,0 +1,163 @@
+"""Strike, watch, heal, judge: the same for every entry that needs a running instrument."""
+
+import time
+from contextlib import suppress
+from itertools import pairwise
+
+from stalls import stalls
+
+from .strikes import strike
+
+STAYS_S = 2.0  # a mode in which the loop stays is watched for so long
+SETTLE_S = 0.4  # from entering a mode of rest to standing still
+DEAD_SETTLE_S = (
+    1.6  # without a supervisor: the drive's heartbeat and the D/A's watchdog, and what they take
+)
+BESIDE = {"recorder", "console", "command", "disk", "log folder", "clock"}
+"""What stands beside the tick, which goes on whatever becomes of them."""
+PROCESSES = {"mocks", "supervisor", "recorder", "console"}
+REST = {"OFF", "STANDBY", "SAFE"}
+STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
+STILL_V = 0.1
+BIAS_V = 5.0
+FRAMES_PER_S = 50
+STALLED_S = 0.1
+TRIES = 3  # another only where the machine itself stood still
+
+
+def run(rig, entry, home):
+    """One entry, tried again only if the machine stood still meanwhile; what was measured."""
+    for attempt in range(1, TRIES + 1):
+        with stalls() as stalled:
+            try:
+                return attempted(rig, entry, home, stalled) | {
+                    "stalled_s": round(stalled.total_s, 3),
+                    "attempts": attempt,
+                }
+            except AssertionError:
+                if attempt == TRIES or stalled.total_s + supervisor_stalled_s(rig) < STALLED_S:
+                    raise
+                rig.reach(home)
+    raise AssertionError
+
+
+def supervisor_stalled_s(rig):
+    """How long the supervisor's own threads were woken too late, by its own account."""
+    timing = {t.time_s: t for telemetry in rig.telemetry for t in telemetry.timing}.values()
+    return sum(t.stalls * t.worst_stall_s for t in timing)
+
+
+def attempted(rig, entry, home, stalled):
+    rig.reach(entry.mode)
+    if entry.struck in PROCESSES:
+        rig.process(entry.struck)  # a console is opened, a recorder may just be starting
+    deaf = entry.struck == "supervisor" and entry.how != "slowed"
+    del rig.telemetry[:-1], rig.places[:], rig.heard[:]
+    struck_s = time.monotonic()
+    with strike(rig, entry):
+        took_s = (rests if deaf else watch)(rig, entry, struck_s, stalled)
+        healed_s = time.monotonic()
+    if entry.struck in BESIDE:
+        ticks_went_on(rig, stalled)
+    if deaf:  # what it says once it is awake, or a new one once it has started
+        watch(rig, entry, healed_s if entry.how == "stopped" else time.monotonic(), stalled)
+    rig.reach(home)
+    back_s = time.monotonic() - healed_s
+    if not entry.moves:
+        stood_still(rig, entry, struck_s, deaf)
+    return {"took_s": round(took_s, 3), "back_s": round(back_s, 1)}
+
+
+def watch(rig, entry, since_s, stalled):
+    """Follow until it has ended as it should; how long that took."""
+    stays = entry.mode in entry.modes
+    modes, texts, done_s = [], [], []
+
+    def over(telemetry):
+        if telemetry.time_s < since_s:  # it was on its way when we struck
+            return False
+        now_s = time.monotonic()
+        modes.append(telemetry.loops[0].mode)
+        texts.extend(said(telemetry, since_s))
+        so_far = " ".join([*rig.heard, *texts])
+        if not done_s and (stays or modes[-1] in entry.modes) and entry.says in so_far:
+            done_s.append(now_s)
+        return bool(done_s) and (not stays or now_s > since_s + STAYS_S)
+
+    limit_s = max(entry.within_s, STAYS_S) + 1.0 + stalled.total_s
+    with suppress(AssertionError):
+        rig.follow(over, limit_s)
+    seen = f"{entry.name}: {sorted(set(modes))}, {texts}"
+    assert done_s, f"not {entry.modes} and {entry.says!r} within {limit_s:.1f} s; {seen}"
+    if stays:
+        assert modes[-1] in entry.modes, seen
+        assert len(entry.modes) > 1 or set(modes) == entry.modes, seen
+    took_s = done_s[0] - since_s
+    assert took_s <= entry.within_s + stalled.total_s, f"{took_s:.2f} s; {seen}"
+    return took_s
+
+
+def said(telemetry, since_s):
+    """All that a message tells people of what has happened since."""
+    loop = telemetry.loops[0]
+    yield from (event.message for event in telemetry.events if event.time_s >= since_s)
+    yield from (change.reason for change in telemetry.mode_changes if change.time_s >= since_s)
+    yield from (trip.name for trip in loop.interlocks if trip.since_s >= since_s)
+
+
+def ticks_went_on(rig, stalled):
+    """No frame is without its tick but for those of a stall."""
+    numbers = [tick.number for t in rig.telemetry for tick in t.ticks if tick.number >= 0]
+    missing = numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
+    excused = FRAMES_PER_S * (stalled.total_s + supervisor_stalled_s(rig))
+    assert missing <= 1 + excused, f"{missing} frames without a tick"
+
+
+def rests(rig, _entry, since_s, stalled):
+    """Without a supervisor the stages come to rest by themselves; how long that took."""
+    end_s = time.monotonic() + DEAD_SETTLE_S + SETTLE_S
+    while time.monotonic() < end_s + stalled.total_s:
+        time.sleep(0.02)
+        rig.look()
+    last = rig.places[-1]
+    assert all(abs(v - BIAS_V) < STILL_V for v in last.stack_v), last
+    moving = [place.time_s for place in rig.places if not near(place, last)]
+    took_s = max(moving, default=since_s) - since_s
+    assert took_s <= DEAD_SETTLE_S + stalled.total_s, took_s
+    return took_s
+
+
+def near(place, other):
+    return all(
+        abs(a - b) < most
+        for mine, theirs, most in (
+            (place.motor_rad, other.motor_rad, STILL_RAD),
+            (place.stack_v, other.stack_v, STILL_V),
+        )
+        for a, b in zip(mine, theirs, strict=True)
+    )
+
+
+def stood_still(rig, entry, struck_s, deaf):
+    """Nothing moved in a mode of rest but the mirror, towards its bias."""
+    changes = {c.time_s: c.target for t in rig.telemetry for c in t.mode_changes}
+    course = [(struck_s, entry.mode), *sorted(changes.items()), (time.monotonic(), "")]
+    if deaf:
+        course = [
+            (struck_s + DEAD_SETTLE_S, "SAFE"),
+            *[c for c in course if c[0] > struck_s + DEAD_SETTLE_S],
+        ]
+    for (since_s, mode), (until_s, _) in pairwise(course):
+        places = [p for p in rig.places if since_s + SETTLE_S < p.time_s < until_s]
+        if mode in REST and places:
+            check_still(places)
+
+
+def check_still(places):
+    first = places[0]
+    for place in places:
+        for was_rad, is_rad in zip(first.motor_rad, place.motor_rad, strict=True):
+            assert abs(is_rad - was_rad) < STILL_RAD, (first, place)
+        for was_v, is_v in zip(first.stack_v, place.stack_v, strict=True):
+            low_v, high_v = sorted((was_v, BIAS_V))
+            assert low_v - STILL_V < is_v < high_v + STILL_V, (first, place)

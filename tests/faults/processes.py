@@ -1,0 +1,42 @@
+"""Each process killed, stopped and slowed, in each mode, and started or woken again."""
+
+from .entry import STAYED, Entry
+
+STAYS = (STAYED,)
+MODES = ("OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "EXPERIMENT", "SAFE")
+POWERED = MODES[1:6]
+
+
+def rig_for(mode):
+    """COARSE lasts only where nothing is ever in reach."""
+    return "never in reach" if mode == "COARSE" else "fit-mock"
+
+
+def in_each_mode(struck, how, within_s, ends, says, ends_at_rest=STAYS, says_at_rest=""):
+    """One entry for each mode; in OFF and SAFE there is less to be noticed."""
+    for mode in MODES:
+        powered = mode in POWERED
+        yield Entry(
+            struck,
+            how,
+            ends if powered else ends_at_rest,
+            says if powered else says_at_rest,
+            mode,
+            within_s,
+            rig=rig_for(mode),
+        )
+
+
+ANY = (STAYED, "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE")
+ENTRIES = (
+    *in_each_mode("mocks", "killed", 2.0, ("SAFE",), "expected"),
+    *in_each_mode("mocks", "stopped", 3.0, ("SAFE",), "expected"),
+    *in_each_mode("mocks", "slowed", 2.0, ANY, ""),
+    *in_each_mode("supervisor", "killed", 5.0, ("OFF",), "", ("OFF",)),
+    *in_each_mode("supervisor", "stopped", 5.0, ("SAFE",), "expected"),
+    *in_each_mode("supervisor", "slowed", 2.0, ANY, ""),
+    *in_each_mode("recorder", "killed", 5.0, STAYS, "the recorder was killed by signal 9",
+                  STAYS, "the recorder was killed by signal 9"),
+    *in_each_mode("recorder", "stopped", 2.0, STAYS, ""),
+    *in_each_mode("recorder", "slowed", 2.0, STAYS, ""),
+)  # fmt: skip

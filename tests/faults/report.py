@@ -1,0 +1,115 @@
+"""The tables of docs/reliability.md from the results of a run: ``python -m faults.report FILE``."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+from documents import ROOT, table
+
+from .catalogue import GROUPS
+from .configuration import WRONG
+from .entry import STAYED
+
+PAGE = ROOT / "docs" / "reliability.md"
+HEADER = [
+    "what is struck",
+    "how",
+    "in",
+    "the loop is then",
+    "it says",
+    "within",
+    "took",
+    "back after",
+]
+MEASURED = 2  # columns, the last ones
+ELSEWHERE = "fit-mock"  # where a rig is not named
+
+
+def promised(entry):
+    """What the table says of an entry before anything is measured."""
+    rig = "" if entry.rig == ELSEWHERE else f" ({entry.rig})"
+    ends = " or ".join(sorted(entry.modes))
+    moves = f"; {entry.moves}" if entry.moves else ""
+    return [
+        f"{entry.struck}{rig}",
+        entry.how,
+        entry.mode,
+        ends + moves,
+        f"`{entry.says}`" if entry.says else "",
+        f"{entry.within_s:g} s",
+    ]
+
+
+def measured(entry, result):
+    """What a run has found: how long until it was so, and from healing to holding the star again."""
+    if result is None:
+        return ["no result", ""]
+    again = f", try {result['attempts']}" if result["attempts"] > 1 else ""
+    nothing_to_wait_for = STAYED in entry.ends and not entry.says
+    took = "stayed" if nothing_to_wait_for else f"{result['took_s']:.2f} s"
+    return [took + again, f"{result['back_s']:.0f} s"]
+
+
+def running_table(entries, results):
+    """One group of entries."""
+    return table(HEADER, [promised(e) + measured(e, results.get(e.name)) for e in entries])
+
+
+def wrong_table():
+    """The wrong configurations, none of which needs a clock."""
+    rows = [[wrong.what, f"`{wrong.says}`"] for wrong in WRONG]
+    return table(["what is wrong", "the line says"], rows)
+
+
+def records_table(results):
+    """What each rig was shown and what it lost."""
+    rows = [
+        [name.removeprefix("records: "), *(str(result[key]) for key in RECORDS)]
+        for name, result in results.items()
+        if name.startswith("records: ")
+    ]
+    return table(["rig", *RECORDS], rows)
+
+
+def run_line(results):
+    """When and where."""
+    run = results["run"]
+    entries = [entry for group in GROUPS.values() for entry in group]
+    known = [results[entry.name] for entry in entries if entry.name in results]
+    first = sum(result["attempts"] == 1 for result in known)
+    return (
+        f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g}. "
+        f"{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
+        "another is made only where the machine itself stood still.*"
+    )
+
+
+RECORDS = ("shown", "missing", "counted", "with a killed supervisor", "logs")
+
+
+def tables(results):
+    """Every table by its name in the page."""
+    return (
+        {name: running_table(entries, results) for name, entries in GROUPS.items()}
+        | {"wrong-configuration": wrong_table()}
+        | {"records": records_table(results), "run": run_line(results)}
+    )
+
+
+def main():
+    """Put the tables into the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    for name, lines in tables(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))).items():
+        begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"
+        pattern = re.escape(begin) + ".*?" + re.escape(end)
+        text, found = re.subn(
+            pattern, lambda _, new=begin + lines + "\n" + end: new, text, flags=re.DOTALL
+        )
+        if found != 1:
+            sys.exit(f"{PAGE}: {found} places for the table {name}; expected one")
+    PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

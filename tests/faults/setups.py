@@ -1,0 +1,81 @@
+"""The rigs on which entries run: which file, what differs from it, and where it runs."""
+
+import subprocess
+from collections.abc import Callable
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from system.conftest import NEAR, end, running
+
+from fitctl.config import default_rig_path
+
+from .ledger import settle
+from .watched import WatchedRig
+
+SOON = "loops.right.coarse.reach_fraction=0.3"  # the mirror takes over early: seconds less for each entry
+CLOCK = Path(__file__).parent / "clock"
+OWN_MOUNT = 'mount -t tmpfs -o size=64m tmpfs "$0" && echo ready && exec sleep infinity'
+
+
+def plainly(_stack, _folder):
+    """As it is."""
+    return (), None
+
+
+def on_a_disk_of_its_own(stack, folder):
+    """The log folder is a small disk that the supervisor alone sees, in a mount namespace of its own."""
+    holder = subprocess.Popen(
+        ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", OWN_MOUNT, str(folder)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    stack.callback(lambda: (end(holder), holder.stdout.close()))
+    if holder.stdout.readline() != "ready\n":
+        pytest.skip("needs a mount namespace of its own, which this machine does not give to users")
+    enter = ("nsenter", "--target", str(holder.pid), "--user", "--mount", "--preserve-credentials")
+    return enter, Path(f"/proc/{holder.pid}/root")
+
+
+def by_a_clock_of_its_own(_stack, folder):
+    """Its time.time() is off by what a file says."""
+    return ("env", f"PYTHONPATH={CLOCK}:{Path.cwd()}", f"FITCTL_TEST_CLOCK={folder / 'step'}"), None
+
+
+class Setup(NamedTuple):
+    """One rig; `home` is the mode to which it comes back, `where` says what it runs in."""
+
+    file: str = "fit-mock"
+    settings: tuple[str, ...] = ()
+    home: str = "VERNIER"
+    where: Callable = plainly
+
+
+SETUPS = {
+    "fit-mock": Setup(),
+    "never in reach": Setup(settings=("loops.right.coarse.reach_frames=1000000",), home="COARSE"),
+    "ensemble": Setup(file="ensemble"),
+    "fit-bal-analog": Setup(file="fit-bal-analog"),
+    "fast telemetry": Setup(settings=("supervisor.telemetry_hz=100.0",)),
+    "small disk": Setup(
+        settings=("logging.queue_records=300", "logging.rotate_s=8.0"), where=on_a_disk_of_its_own
+    ),
+    "own clock": Setup(settings=("logging.rotate_s=4.0",), where=by_a_clock_of_its_own),
+}
+
+
+@contextmanager
+def started(name, folder, account):
+    """The rig of a name, running; once it has ended, what it lost goes to `account`."""
+    setup = SETUPS[name]
+    file = default_rig_path().parent / f"{setup.file}.toml"
+    with ExitStack() as stack:
+        before, root = setup.where(stack, folder)
+        with running(
+            folder, NEAR, SOON, *setup.settings, file=file, kind=WatchedRig, before=before
+        ) as rig:
+            rig.logs = root / folder.relative_to("/") if root else folder
+            yield rig
+        account[f"records: {name}"] = settle(rig)

@@ -1,0 +1,250 @@
+"""How things are struck: each begins something, and heals it when it is left."""
+
+import re
+import subprocess
+import threading
+import time
+from contextlib import contextmanager, suppress
+
+from fitctl.mocks.bench import ClearFaults, SetFault
+from fitctl.supervisor.messages import Reset, Shutdown, Stop
+
+from .commands import FLOOD, FLOODED, SENT, answers
+
+SLOW_S = 0.015  # stopped for so long, then running for so long: half of its time
+ENDS_WITHIN_S = 10.0
+DRAWS_WITHIN_S = 10.0
+RECORDER_BACK_S = 60.0  # its supervisor waits longer from try to try
+
+
+@contextmanager
+def device(rig, entry):
+    """A fault of the mocks."""
+    kind, *value = entry.how.split()
+    rig.tell(SetFault(entry.struck, kind, value=float(value[0]) if value else None))
+    try:
+        yield
+    finally:
+        rig.tell(ClearFaults(entry.struck, kind))
+
+
+# ---------------------------------------------------------------- processes
+
+
+@contextmanager
+def killed(rig, entry):
+    """SIGKILL; then started again by whoever started it, the recorder by its supervisor."""
+    rig.process(entry.struck).kill()
+    if entry.struck == "mocks":
+        rig.bench_answers = False
+        rig.mocks.wait()
+    if entry.struck == "supervisor":
+        rig.supervisor.wait()
+        rig.deaths_s.append(time.monotonic())
+    try:
+        yield
+    finally:
+        if entry.struck == "mocks":
+            rig.restart_mocks()
+        if entry.struck == "supervisor":
+            rig.start_supervisor()
+
+
+@contextmanager
+def stopped(rig, entry):
+    """SIGSTOP, then SIGCONT."""
+    process = rig.process(entry.struck)
+    rig.bench_answers = entry.struck != "mocks"
+    process.suspend()
+    try:
+        yield
+    finally:
+        process.resume()
+        rig.bench_answers = True
+    goes_on(rig, entry)
+
+
+@contextmanager
+def stuck(rig, entry):
+    """The recorder is stopped until its queue is full."""
+    lost_before = lost_so_far(rig)
+    with stopped(rig, entry):
+        yield
+    writes_again(rig, lost_before)
+
+
+@contextmanager
+def slowed(rig, entry):
+    """SIGSTOP and SIGCONT in turn: it has half of its time, in pieces."""
+    process = rig.process(entry.struck)
+    with repeated(lambda: (process.suspend(), time.sleep(SLOW_S), process.resume()), SLOW_S):
+        yield
+    goes_on(rig, entry)
+
+
+@contextmanager
+def repeated(action, every_s):
+    """Do something again and again, meanwhile."""
+    ending = threading.Event()
+
+    def go_on():
+        while not ending.wait(every_s):
+            action()
+
+    thread = threading.Thread(target=go_on)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
+
+
+def goes_on(rig, entry):
+    """A console draws again."""
+    if entry.struck == "console":
+        drawn, end_s = rig.console.drawn, time.monotonic() + DRAWS_WITHIN_S
+        while rig.console.drawn == drawn:
+            assert time.monotonic() < end_s, "the console draws no more"
+            rig.receive(0.05)
+
+
+@contextmanager
+def told_to_end(rig, _entry):
+    """The supervisor is asked to end while its recorder cannot; a new one is started."""
+    rig.recorder().suspend()
+    rig.client.send(Shutdown())
+    rig.supervisor.wait(ENDS_WITHIN_S)
+    rig.heard.append(rig.complaints())
+    told = re.findall(r"the last records, up to (\d+)", rig.complaints())
+    rig.lost_of["told at the end"] = sum(map(int, told))
+    try:
+        yield
+    finally:
+        rig.start_supervisor()
+
+
+# ---------------------------------------------------------------- consoles
+
+
+@contextmanager
+def not_read(rig, entry):
+    """Nobody takes what the console draws, as a terminal does that hangs."""
+    rig.process("console")
+    rig.console.reads.clear()
+    try:
+        yield
+    finally:
+        rig.console.reads.set()
+        goes_on(rig, entry)
+
+
+@contextmanager
+def many_events(rig, entry):
+    """Each STOP in SAFE is an event."""
+    rig.process("console")
+    with repeated(lambda: rig.client.send(Stop()), 0.001):
+        yield
+    goes_on(rig, entry)
+
+
+@contextmanager
+def many_messages(rig, entry):
+    """As many as the rig's telemetry_hz."""
+    rig.process("console")
+    try:
+        yield
+    finally:
+        goes_on(rig, entry)
+
+
+# ---------------------------------------------------------------- commands, disk and clock
+
+
+@contextmanager
+def command(rig, entry):
+    """What is no command; what comes back is heard."""
+    if entry.how in SENT:
+        rig.heard += answers(rig.sockets, SENT[entry.how][0])
+    else:
+        count = sum(1 for _ in answers(rig.sockets, FLOODED, FLOOD))
+        rig.heard.append(f"{count} answers")
+    yield
+
+
+@contextmanager
+def full(rig, _entry):
+    """A file takes all the room that there is."""
+    filler, lost_before = rig.logs / "filler", lost_so_far(rig)
+    try:
+        with suppress(OSError), filler.open("wb", buffering=0) as file:
+            while file.write(bytes(65536)):
+                pass
+        yield
+    finally:
+        filler.unlink()
+        writes_again(rig, lost_before)
+
+
+def writes_again(rig, lost_before):
+    """A recorder is at work again, and has noticed all that was lost since it was struck."""
+    healed_s, lost = time.monotonic(), lost_so_far(rig) - lost_before
+    rig.follow(
+        lambda t: (
+            t.recorder is not None and t.recorder.time_s > healed_s and t.recorder.lost >= lost
+        ),
+        RECORDER_BACK_S,
+    )
+
+
+def lost_so_far(rig):
+    """By the supervisor's count."""
+    return rig.telemetry[-1].records_lost
+
+
+@contextmanager
+def read_only(rig, _entry):
+    """Mounted once more over itself, for reading: what is open stays so, the next file cannot begin."""
+    folder, lost_before = str(rig.folder), lost_so_far(rig)
+    subprocess.run([*rig.before, "mount", "--bind", folder, folder], check=True)
+    subprocess.run([*rig.before, "mount", "-o", "remount,bind,ro", folder], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run([*rig.before, "umount", folder], check=True)
+        writes_again(rig, lost_before)
+
+
+@contextmanager
+def clock(rig, entry):
+    """Wall time is so many seconds later, then as before."""
+    step = rig.folder / "step"
+    step.write_text(entry.how)
+    try:
+        yield
+    finally:
+        step.unlink()
+        time.sleep(2.0)  # it is looked at once a second
+        rig.client.send(Reset(name="clock_step"))
+
+
+STRIKES = {
+    "killed": killed,
+    "stopped": stopped,
+    "stuck": stuck,
+    "slowed": slowed,
+    "told to end while its recorder is stopped": told_to_end,
+    "not read by its terminal": not_read,
+    "flooded with events": many_events,
+    "sent 100 messages a second": many_messages,
+    "full": full,
+    "read-only": read_only,
+    "command": command,
+    "clock": clock,
+}
+"""By how, or by what is struck; everything else is a fault of a mock device."""
+
+
+def strike(rig, entry):
+    """The entry's strike, as a context."""
+    return (STRIKES.get(entry.how) or STRIKES.get(entry.struck) or device)(rig, entry)

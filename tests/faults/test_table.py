@@ -1,0 +1,49 @@
+"""docs/reliability.md lists exactly what is in the catalogue."""
+
+import re
+
+import pytest
+from documents import between
+
+from fitctl.commands.fault import kinds
+
+from .catalogue import GROUPS, RUNNING
+from .configuration import WRONG
+from .devices import STRUCK
+from .report import MEASURED, promised, wrong_table
+
+# Which device each table of kinds is for.
+DEVICES = {
+    "camera": ("fit-mock", "camera"),
+    "drive": ("fit-mock", "right.drive"),
+    "drive (ensemble)": ("ensemble", "right.drive"),
+    "drive (bal_analog)": ("fit-bal-analog", "right.drive"),
+    "dac": ("fit-mock", "right.dac"),
+    "mdt693": ("fit-mock", "right.mdt693"),
+}
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_the_committed_table_has_every_entry_and_what_a_run_has_found(name):
+    lines = between("reliability.md", name).splitlines()[2:]
+    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+
+    assert [row[:-MEASURED] for row in cells] == [promised(entry) for entry in GROUPS[name]]
+    assert all(
+        re.fullmatch(r"no result|(stayed|\d+\.\d\d s)(, try \d)?", row[-MEASURED]) for row in cells
+    )
+
+
+def test_the_committed_table_has_every_wrong_configuration():
+    assert between("reliability.md", "wrong-configuration") == wrong_table()
+    assert len(WRONG) >= 30
+
+
+def test_no_two_entries_have_the_same_name():
+    names = [entry.name for entry in RUNNING]
+    assert len(set(names)) == len(names) >= 60
+
+
+def test_every_fault_of_every_mock_is_in_the_catalogue():
+    struck = {(rig, device): {how.split()[0] for how, *_ in table} for rig, device, table in STRUCK}
+    assert {DEVICES[name]: set(table) for name, table in kinds().items()} == struck

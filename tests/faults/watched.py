@@ -1,0 +1,161 @@
+"""A rig whose whole course is kept, and that can be brought to any mode."""
+
+import time
+from contextlib import suppress
+from typing import NamedTuple
+
+import psutil
+from system.conftest import Rig
+
+from fitctl.mocks.bench import ClearFaults, SetFault, StagesQuestion, ask_faults, ask_stages
+from fitctl.model.drives import Drive
+from fitctl.supervisor.messages import Acquire, Experiment, Hold, Off, Recover, Standby, Stop
+
+from .console import Console
+
+LOOK_S = 0.1  # between two looks at where the stages truly are
+REACH_S = 60.0
+ANSWER_S = 5.0  # to a command that is accepted
+OPENING_S = 20.0
+CALM_S = 10.0
+BUSY = {"servo_overrun", "loop_overrun", "frame_age"}
+HIDDEN = SetFault("camera", "star_fading", value=0.001)
+TRACKING = ("ACQUISITION", "COARSE", "VERNIER", "EXPERIMENT")
+
+
+def experiment():
+    """A mirror that moves a little for longer than any entry takes."""
+    drive = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=0.5, duration_s=120.0)
+    return Experiment(name="fault catalogue", drives=[drive])
+
+
+_UP = {"OFF": Standby, "SAFE": Recover, "STANDBY": Acquire}
+TOWARDS = {
+    "OFF": {"STANDBY": Off, "SAFE": Off} | dict.fromkeys(TRACKING, Hold),
+    "SAFE": dict.fromkeys(("OFF", "STANDBY", *TRACKING), Stop),
+    "STANDBY": {"OFF": Standby, "SAFE": Recover} | dict.fromkeys(TRACKING, Hold),
+    "ACQUISITION": _UP,
+    "COARSE": _UP | {"EXPERIMENT": Hold},
+    "VERNIER": _UP | {"EXPERIMENT": Hold},
+    "EXPERIMENT": _UP | {"VERNIER": experiment},
+}
+"""The command that leads towards a mode, by the mode of the loop; without one it gets there by itself."""
+
+
+class Place(NamedTuple):
+    """Where the stages truly were, by the mocks' bench: motors in rad, stacks in volts at the D/A."""
+
+    time_s: float
+    motor_rad: list[float]
+    stack_v: list[float]
+
+
+class WatchedRig(Rig):
+    """Keeps all telemetry but the frames, and where the stages truly were."""
+
+    def __init__(self, folder, file=None):
+        super().__init__(folder, file)
+        self.telemetry = []
+        self.places = []
+        self.bench_answers = True
+        self._looked_s = 0.0
+        self.logs = folder
+        self.errors = (folder / "errors.txt").open("a")
+        self.console = None
+        self.heard = []  # what was answered to strange commands
+        self.shown = set()  # times of all ticks in telemetry
+        self.lost_of = {}  # records lost, by each supervisor's own count
+        self.deaths_s = []  # when supervisors ended without a chance to see their records written
+
+    def receive(self, timeout_s):
+        telemetry = super().receive(min(timeout_s, LOOK_S))
+        if telemetry is not None:
+            self.telemetry.append(telemetry)
+            self.shown.update(tick.time_s for tick in telemetry.ticks)
+            self.lost_of[telemetry.pid] = telemetry.records_lost
+        self.look()
+        return telemetry
+
+    def look(self):
+        now_s = time.monotonic()
+        if self.bench_answers and now_s >= self._looked_s + LOOK_S:
+            self._looked_s = now_s
+            stages = ask_stages(self.endpoints["mocks.bench_port"], StagesQuestion("right"))
+            self.places.append(Place(time.monotonic(), stages.motor_rad, stages.stack_v))
+
+    def start_supervisor(self):
+        if self.client is not None:
+            self.client.close()
+            self.supervisor.stdout.close()
+        super().start_supervisor()
+
+    def restart_mocks(self):
+        self.mocks.stdout.close()
+        super().restart_mocks()
+        self.bench_answers = True
+
+    def tell(self, question):
+        answer = ask_faults(self.endpoints["mocks.bench_port"], question)
+        assert not answer.error, answer.error
+
+    def mode(self):
+        return self.follow(lambda _: True)[-1].loops[0].mode
+
+    def process(self, name):
+        """The process of a name, once it is there."""
+        if name == "console":
+            return self._open_console()
+        if name != "recorder":
+            return psutil.Process({"supervisor": self.supervisor, "mocks": self.mocks}[name].pid)
+        end_s = time.monotonic() + ANSWER_S
+        while time.monotonic() < end_s:
+            with suppress(StopIteration):
+                return self.recorder()
+            self.receive(LOOK_S)
+        return self.recorder()
+
+    def _open_console(self):
+        """The console's process, once it has drawn something."""
+        if self.console is not None and self.console.process.poll() is not None:
+            self.console.close()
+            self.console = None
+        if self.console is None:
+            self.console = Console(self.common)
+            self.follow(lambda _: self.console.drawn, REACH_S)
+        return psutil.Process(self.console.process.pid)
+
+    def close(self):
+        if self.console is not None:
+            self.console.close()
+        super().close()
+        self.errors.close()
+
+    def complaints(self):
+        """All that mocks and supervisors wrote to their error output."""
+        return (self.folder / "errors.txt").read_text()
+
+    def reach(self, wanted, limit_s=REACH_S):
+        """Bring the loop to a mode, whatever it is in; every fault is ended first.
+
+        Where the machine has no time for the loop just now, a better moment is waited for.
+        """
+        self.tell(ClearFaults())
+        if wanted == "ACQUISITION":
+            self.tell(HIDDEN)
+        end_s = time.monotonic() + limit_s
+        while (mode := self.mode()) != wanted:
+            assert time.monotonic() < end_s, f"{mode} instead of {wanted} after {limit_s} s"
+            make = TOWARDS[wanted].get(mode)
+            accepted = make is None or self.client.send(make()).accepted
+            with suppress(AssertionError):
+                self.follow(
+                    lambda t, mode=mode: t.loops[0].mode != mode or failed(t),
+                    (OPENING_S if make in {Standby, Recover} else ANSWER_S) if accepted else 0.2,
+                )
+        with suppress(AssertionError):
+            self.follow(lambda t: not {trip.name for trip in t.loops[0].interlocks} & BUSY, CALM_S)
+
+
+def failed(telemetry):
+    """Whether devices could not be opened."""
+    return any("failed: " in event.message for event in telemetry.events)

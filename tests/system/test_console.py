@@ -1,0 +1,228 @@
+"""The real console on a real terminal, driven by keys and read as a person reads it; and in a browser."""
+
+import os
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.system.conftest import NEAR, end, fitctl, running
+
+pytestmark = pytest.mark.fault
+LIMIT_S = 90.0
+# It is the console that is tried here: a machine that is slow for seconds must not end the acquisition.
+PATIENT = (
+    NEAR,
+    "loops.right.siderostat.servo.reading_timeout_s=5.0",
+    "loops.right.siderostat.servo.following_error_limit_rad=100.0",
+    "interlocks.frame_missing.stale_s=5.0",
+    "interlocks.siderostat_rate.for_s=5.0",
+)
+
+
+class Terminal:
+    """A tmux session of its own, with one program in it."""
+
+    def __init__(self, name, arguments, size=(120, 40)):
+        self._tmux = ["tmux", "-L", name, "-f", os.devnull]
+        program = shlex.join([sys.executable, "-m", "fitctl", *map(str, arguments)])
+        columns, rows = map(str, size)
+        self._run("new-session", "-d", "-s", "fitctl", "-x", columns, "-y", rows, program)
+
+    def _run(self, *words):
+        # pytest's own idea of a terminal's size is not this one's
+        env = {
+            name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}
+        }
+        told = {"capture_output": True, "text": True, "timeout": LIMIT_S, "env": env}
+        return subprocess.run([*self._tmux, *words], check=True, **told).stdout
+
+    def press(self, *keys):
+        self._run("send-keys", "-t", "fitctl", *keys)
+
+    def screen(self):
+        return self._run("capture-pane", "-p", "-t", "fitctl")
+
+    def until(self, words, limit_s=LIMIT_S):
+        """Wait until the screen has these words; it is returned."""
+        end_s = time.monotonic() + limit_s
+        while words not in (screen := self.screen()):
+            assert time.monotonic() < end_s, f"no {words!r} within {limit_s} s:\n{screen}"
+            time.sleep(0.2)
+        return screen
+
+    def is_open(self):
+        listed = subprocess.run([*self._tmux, "list-sessions"], capture_output=True, check=False)
+        return listed.returncode == 0
+
+    def close(self):
+        subprocess.run([*self._tmux, "kill-server"], capture_output=True, check=False)
+
+
+@pytest.fixture
+def rig(tmp_path):
+    with running(tmp_path, *PATIENT) as rig:
+        yield rig
+
+
+@pytest.fixture
+def terminal(rig):
+    if shutil.which("tmux") is None:
+        pytest.skip("tmux is not installed")
+    terminal = Terminal(f"fitctl-test-{os.getpid()}", ["console", *rig.common])
+    try:
+        yield terminal
+    finally:
+        terminal.close()
+
+
+@pytest.mark.timeout(400)
+def test_a_whole_acquisition_is_driven_by_keys_at_a_terminal(rig, terminal):
+    assert "1 Operate" in terminal.until("○ OFF")
+    terminal.press("b")
+    terminal.until("◐ STANDBY")
+    terminal.press("j")
+    terminal.until("JOG siderostat")
+    terminal.press("Right")
+    terminal.press("Escape")
+    terminal.until("a Acquire")
+    terminal.press("a")
+    screen = terminal.until("◆ VERNIER")
+    assert "Pointing error" in screen
+    terminal.until("✓", LIMIT_S)
+
+    for key, words in (
+        ("2", "interlock "),
+        ("3", "Spectrum of the pointing error"),
+        ("4", "On the instrument"),
+        ("5", "recording"),
+        ("6", "Commands, on every screen"),
+        ("1", "Focal plane"),
+    ):
+        terminal.press(key)
+        assert "s STOP" in terminal.until(words)
+
+    terminal.press("t")
+    terminal.until("target here?")
+    terminal.press("Right", "Right", "Enter")
+    moved = rig.follow(lambda t: t.ticks and abs(t.ticks[-1].target_az_px - 25.0) < 0.05)
+    assert moved[-1].loops[0].mode == "VERNIER"
+
+    terminal.press("s")
+    terminal.until("■ SAFE")
+    terminal.press("r")
+    terminal.until("◐ STANDBY")
+    terminal.press("o")
+    terminal.until("y  yes")
+    terminal.press("y")
+    terminal.until("○ OFF")
+
+    terminal.press("q")
+    end_s = time.monotonic() + LIMIT_S
+    while terminal.is_open():
+        assert time.monotonic() < end_s
+        time.sleep(0.2)
+    assert rig.supervisor.poll() is None, "leaving a console must leave the instrument running"
+
+
+@pytest.mark.timeout(400)
+def test_several_consoles_come_and_go_and_connect_again_by_themselves(rig, terminal):
+    other = Terminal(f"fitctl-other-{os.getpid()}", ["console", *rig.common], size=(80, 24))
+    try:
+        terminal.until("○ OFF")
+        other.until("○ OFF")
+        end(rig.supervisor, signal.SIGKILL)
+        terminal.until("NO DATA")
+        other.until("NO DATA")
+        rig.supervisor.stdout.close()
+        rig.client.close()
+        rig.start_supervisor()
+        terminal.until("● live")
+        other.until("● live")
+        other.press("q")
+        terminal.press("b")
+        terminal.until("◐ STANDBY")
+    finally:
+        other.close()
+
+
+# ---------------------------------------------------------------- in a browser
+
+
+@pytest.fixture
+def page(rig):
+    """The address of a console in a browser."""
+    pytest.importorskip("textual_serve")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = fitctl("console", *rig.common, "--web", "--port", port, stdout=subprocess.PIPE)
+    try:
+        yield server.stdout.readline().split()[1]
+    finally:
+        end(server, timeout_s=30.0)
+        server.stdout.close()
+
+
+def seen_by_chromium(address, folder):
+    """The page as a picture, shape (rows, columns, 3), once its program had time to draw."""
+    import matplotlib.image
+
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("there is no Chromium")
+    picture = folder / "page.png"
+    flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"]
+    flags += [f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=30000"]
+    subprocess.run(
+        [chromium, *flags, f"--screenshot={picture}", address],
+        check=True,
+        capture_output=True,
+        timeout=LIMIT_S,
+    )
+    return (255 * matplotlib.image.imread(picture)[:, :, :3]).round()
+
+
+@pytest.mark.timeout(400)
+def test_a_browser_shows_the_same_console(rig, page, tmp_path):
+    stop_rgb = (0xFF, 0x6B, 0x4A)
+    end_s = time.monotonic() + 3 * LIMIT_S
+    while True:
+        picture = seen_by_chromium(page, tmp_path)
+        red = (abs(picture - stop_rgb) < 8).all(axis=2)
+        if red.sum() > 200:
+            break
+        assert time.monotonic() < end_s, "the STOP key does not come up in the browser"
+    rows, columns = red.nonzero()
+    assert rows.min() > 0.9 * picture.shape[0], "STOP is in the last line"
+    assert columns.max() < 0.2 * picture.shape[1]
+
+
+@pytest.mark.timeout(400)
+def test_a_page_is_for_who_has_its_key_alone(page):
+    import urllib.error
+    import urllib.request
+
+    def status(address, **headers):
+        request = urllib.request.Request(address, headers=headers)
+        try:
+            with urllib.request.build_opener(urllib.request.HTTPCookieProcessor()).open(
+                request, timeout=LIMIT_S
+            ) as answer:
+                return answer.status
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    base, _, query = page.partition("?")
+    assert status(page) == 200
+    assert status(base) == 403
+    assert status(f"{base}ws") == 403
+    assert status(f"{base}static/js/textual.js") == 403
+    assert status(f"{base}?{query[:-1]}x") == 403
+    assert status(page, Origin="http://elsewhere.example") == 403
+    assert status(page, Host="elsewhere.example") == 403
