@@ -24,6 +24,12 @@ def told(supervisor=None, **changes):
     return msgspec.structs.replace((supervisor or FakeSupervisor()).message(), **changes)
 
 
+def told_of_losses(count):
+    supervisor = FakeSupervisor()
+    supervisor.records_lost = count
+    return supervisor.message()
+
+
 # ---------------------------------------------------------------- what is not well
 
 
@@ -40,7 +46,7 @@ def test_an_instrument_that_is_off_is_well():
     [
         (lambda: told(FakeSupervisor("SAFE")), "right is SAFE: "),
         (lambda: told(recorder=None), "nothing is recorded"),
-        (lambda: told(records_lost=3), "3 records are missing"),
+        (lambda: told_of_losses(3), "3 records are missing"),
         (lambda: told(time_s=told().time_s + 1.1 * RECORDER_SILENT_S), "said nothing for 11 s"),
     ],
     ids=["safe", "no recorder", "losses", "silent recorder"],
@@ -82,13 +88,14 @@ def test_the_document_has_all_of_a_message_but_its_streams():
 
 
 def test_people_read_the_verdict_first_then_loops_devices_and_log():
-    message = told(records_lost=3)
+    message = told_of_losses(3)
     first, second, *rest = status_lines(message, troubles(message))
 
     assert first == "fit-mock: not well"
     assert second.strip() == "! 3 records are missing from the log of this run"
     text = "\n".join(rest)
     assert "VERNIER for 2 min 13 s, controller minimum-variance" in text
+    assert "0 ticks, 0 events, 0 mode changes, 0 replies" in text
     for device in message.devices:
         assert device.endpoint in text
     assert message.recorder.path in text

@@ -9,7 +9,7 @@ import pytest
 
 from fitctl.commands.fault import kinds
 from fitctl.config import CONTROLLERS, default_rig_path
-from fitctl.sequences.reading import shipped_folder
+from fitctl.sequences.reading import shipped_sequences
 
 pytestmark = pytest.mark.skipif(not shutil.which("bash"), reason="needs bash")
 ASK = """
@@ -73,7 +73,7 @@ def test_rig_files_are_offered_and_no_others(tab):
 
 
 def test_shipped_sequences_are_offered(tab):
-    assert tab("sequence", "run", "") == sorted(path.stem for path in shipped_folder().iterdir())
+    assert tab("sequence", "run", "") == [path.stem for path in shipped_sequences()]
 
 
 @pytest.mark.parametrize(

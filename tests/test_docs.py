@@ -386,7 +386,9 @@ def default_rig():
 
 
 def test_every_rig_key_that_the_documents_name_exists():
-    rig = default_rig()
+    # With those that the shipped rig shows as comments, because they may be left out.
+    shown = re.sub(r"^# (?=\w+ = )", "", default_rig_path().read_text(), flags=re.MULTILINE)
+    rig = tomllib.loads(shown)
     missing = []
     for document, text in quoted():
         key = text.partition("=")[0].strip()

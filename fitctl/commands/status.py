@@ -11,7 +11,7 @@ import typer
 from fitctl.supervisor import messages
 from fitctl.supervisor.client import REPLY_TIMEOUT_S, Client
 from fitctl.supervisor.messages import Telemetry
-from fitctl.supervisor.troubles import records_lost, troubles
+from fitctl.supervisor.troubles import records_lost, troubles, unsent_of
 
 WELL = 0
 NOT_WELL = 1
@@ -90,13 +90,13 @@ def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
     if telemetry.recorder is not None:
         told = f"{telemetry.recorder.path}, {telemetry.recorder.records} records"
         lines.append(_line("log", f"{told}, {records_lost(telemetry)} lost"))
+    unsent = ", ".join(f"{count} {name}" for name, count in unsent_of(telemetry).items())
+    lines.append(_line("unsent", unsent.replace("_", " ")))
     running = telemetry.running_sequence
     if running is not None:
         told = f"{running.name} {running.state}, step {running.step_number} of {running.steps}"
         lines.append(_line("sequence", f"{told} ({running.step})"))
-    commander = getattr(telemetry, "commander", "")
-    if commander:
-        lines.append(_line("commander", commander))
+    lines.append(_line("commander", telemetry.commander or "nobody"))
     lines.append(_line("supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"))
     return lines
 

@@ -127,7 +127,7 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
-    named = [text for text in values if text.partition("=")[0] in row.options]
+    named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]
     plain = [text for text in values if text not in named]
     if len(plain) != len(row.values):
         needs = " ".join(row.values) or "no values"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from fitctl.supervisor.messages import Telemetry
 from fitctl.supervisor.modes import Mode
 
@@ -33,6 +35,16 @@ def records_lost(telemetry: Telemetry) -> int:
     """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
     recorder = telemetry.recorder
     return max(telemetry.records_lost, 0 if recorder is None else recorder.lost)
+
+
+def unsent_of(telemetry: Telemetry) -> dict[str, int]:
+    """How many of what the supervisor let go instead of sending, because somebody was too slow for it."""
+    losses = msgspec.structs.asdict(telemetry.losses)
+    return {
+        name.removesuffix("_unsent"): count
+        for name, count in losses.items()
+        if name.endswith("_unsent")
+    }
 
 
 def _of_recording(telemetry: Telemetry) -> list[str]:

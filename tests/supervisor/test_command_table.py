@@ -21,8 +21,8 @@ def test_words_and_keys_are_not_ambiguous():
     assert len(keys) == len(set(keys))
 
 
-def test_what_has_no_values_can_be_on_a_key():
-    assert all(not row.values and row.word for row in COMMANDS if row.key)
+def test_what_needs_no_values_can_be_on_a_key():
+    assert all(not row.words and row.word for row in COMMANDS if row.key)
 
 
 @pytest.mark.parametrize("row", COMMANDS, ids=lambda row: row.name)

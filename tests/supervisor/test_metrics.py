@@ -137,6 +137,8 @@ def test_what_is_tripped_lost_or_missed_is_counted(served):
 
     assert seen[of("fitctl_telemetry_missed_total")] == 3
     assert seen[of("fitctl_records_lost_total")] == 12
+    queues = {dict(labels)["queue"] for name, labels in seen if name == "fitctl_unsent_total"}
+    assert queues == {"ticks", "events", "mode_changes", "replies"}
     assert seen[of("fitctl_interlocks_tripped", loop="right")] == 1
     assert (
         seen[of("fitctl_interlock_tripped", loop="right", interlock="fsm_edge", action="warn")] == 1
