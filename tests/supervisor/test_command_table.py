@@ -22,7 +22,7 @@ def test_words_and_keys_are_not_ambiguous():
 
 
 def test_what_needs_no_values_can_be_on_a_key():
-    assert all(not row.words and row.word for row in COMMANDS if row.key)
+    assert all(not row.values and row.word for row in COMMANDS if row.key)
 
 
 @pytest.mark.parametrize("row", COMMANDS, ids=lambda row: row.name)
