@@ -19,9 +19,7 @@ def refused(arguments, capsys):
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.what)
-def test_it_is_told_in_a_line_and_nothing_is_started(
-    wrong, tmp_path_factory, capsys, monkeypatch
-):
+def test_it_is_told_in_a_line_and_nothing_is_started(wrong, tmp_path_factory, capsys, monkeypatch):
     tmp_path = tmp_path_factory.mktemp("w")  # short: a Unix socket's path may not be long
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "sockets"))
     monkeypatch.chdir(tmp_path)  # where logs would be
