@@ -40,7 +40,7 @@ _KINDS: dict[Any, str] = {
     SequenceAttempt: "attempts",
     RecorderStatus: "recorder",
 }
-_TICK_FIELDS: dict[str, Any] = {
+TICK_FIELDS: dict[str, Any] = {
     "time_s": np.float64,
     "mid_exposure_s": np.float64,
     "siderostat_az_rad": np.float64,
@@ -145,18 +145,18 @@ def gather(run: Run) -> Gathered:
 
 def _small(columns: Columns, time_s: NDArray[np.float64], path: str) -> Columns:
     """A block of ticks, only what is needed and no longer than needed."""
-    missing = [name for name in _TICK_FIELDS if name not in columns]
+    missing = [name for name in TICK_FIELDS if name not in columns]
     if missing:
         msg = f"{path}: its ticks lack {', '.join(missing)}; it was recorded by another version of fitctl"
         raise LogError(msg)
     columns["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])
-    return {name: columns[name].astype(dtype) for name, dtype in _TICK_FIELDS.items()}
+    return {name: columns[name].astype(dtype) for name, dtype in TICK_FIELDS.items()}
 
 
 def _joined(blocks: list[Columns]) -> Columns:
     """Blocks end to end; they are used up, so that hours are not held twice."""
     if not blocks:
-        return {name: np.empty(0, dtype) for name, dtype in _TICK_FIELDS.items()}
+        return {name: np.empty(0, dtype) for name, dtype in TICK_FIELDS.items()}
     names = [name for name in blocks[0] if all(name in block for block in blocks)]
     return {name: np.concatenate([block.pop(name) for block in blocks]) for name in names}
 

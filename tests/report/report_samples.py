@@ -4,7 +4,7 @@ import numpy as np
 
 from fitctl.logging.records import FrameRecord, RecorderStatus
 from fitctl.logging.writer import LogWriter
-from fitctl.report.gather import _TICK_FIELDS
+from fitctl.report.gather import TICK_FIELDS
 from fitctl.supervisor.messages import SetTarget
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.run import run_info
@@ -48,7 +48,7 @@ def held_and_jogged(simulation):
 def ticks_of(frames, mode=Mode.VERNIER, **columns):
     """Ticks of a loop that does nothing, 50 a second, but for the columns given."""
     time_s = PERIOD_S * np.arange(frames)
-    made = {name: np.zeros(frames, dtype) for name, dtype in _TICK_FIELDS.items()}
+    made = {name: np.zeros(frames, dtype) for name, dtype in TICK_FIELDS.items()}
     made |= {
         "time_s": time_s,
         "mid_exposure_s": time_s - 0.035,
