@@ -1,8 +1,10 @@
 """`fitctl sequence` as a stranger meets it."""
 
 import json
+from pathlib import Path
 
 import pytest
+import tomli_w
 
 from fitctl.cli import main
 from fitctl.sequences.reading import shipped_sequences
@@ -36,6 +38,23 @@ def test_the_shipped_sequences_are_listed(sequence):
     assert status == 0
     listed = [line.split()[0] for line in out.splitlines()]
     assert listed == [path.stem for path in shipped_sequences()]
+
+
+def test_sequences_are_listed_with_every_key_for_programs(sequence, tmp_path):
+    status, out, _ = sequence("list", "--json")
+    assert status == 0
+    jog = next(each for each in json.loads(out) if each["name"] == "jog")
+    assert Path(jog["file"]).is_file()
+    assert jog["steps"][2]["jog_px"] == 1.0
+    assert jog["steps"][0]["attempts"] == 2  # not in the file
+
+    path = written(tmp_path, WAIT)
+    (mine,) = json.loads(sequence("list", "--json", path)[1])
+    assert (mine["file"], mine["steps"][0]["duration_s"]) == (str(path), 5.0)
+
+    copy = {key: value for key, value in jog.items() if key != "file"}
+    path.write_text(tomli_w.dumps(copy))  # what is listed is a sequence again
+    assert sequence("check", path)[0] == 0
 
 
 def test_check_says_every_mistake_on_a_line(sequence, tmp_path):

@@ -1,5 +1,7 @@
 """The table of interlocks by itself: what trips a row, what it does then, and what ends it."""
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -47,6 +49,26 @@ class Course:
     @property
     def tripped(self):
         return [trip.name for trip in self.interlocks.tripped]
+
+
+def test_rows_are_told_beside_what_is_measured():
+    course = Course(table())
+    (before,) = course.interlocks.watched(0.0, {})
+    assert math.isnan(before.value)
+    assert not before.judged
+
+    course.show([0.5])
+    (row_,) = course.interlocks.watched(course.now_s + 1.0, course.readings)
+    assert (row_.name, row_.quantity, row_.value, row_.low, row_.high) == (
+        "it",
+        FIRST,
+        0.5,
+        None,
+        1.0,
+    )
+    assert row_.age_s == pytest.approx(1.0)
+    assert row_.judged
+    assert row_.action == "warn"
 
 
 def test_a_row_trips_once_it_was_out_of_range_for_its_time():
