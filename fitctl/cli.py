@@ -222,7 +222,7 @@ class _SendCommand(TyperCommand):
             formatter.write_dl([(row.usage, row.help) for row in WORDS.values()])
 
 
-@app.command(cls=_SendCommand)
+@app.command(cls=_SendCommand, context_settings={"ignore_unknown_options": True})  # -1 is a value
 def send(
     command: Annotated[str, typer.Argument(help="One of those below.")],
     values: Annotated[list[str] | None, typer.Argument(help="What it needs.")] = None,

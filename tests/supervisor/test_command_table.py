@@ -4,9 +4,10 @@ from typing import get_args
 
 import pytest
 
+from fitctl.cli import main
 from fitctl.config import ConfigError
 from fitctl.supervisor.command_table import COMMANDS, ROWS, WORDS, command_of
-from fitctl.supervisor.messages import AnyCommand, Reset, SetTarget, Stop
+from fitctl.supervisor.messages import Acquire, AnyCommand, Reset, SetTarget, Stop
 
 
 def test_every_command_is_in_the_table_once():
@@ -46,9 +47,27 @@ def test_a_word_alone_is_a_command():
     assert command_of("stop", [], "") == Stop()
 
 
+def test_what_may_be_left_out_is_given_by_its_name():
+    assert command_of("acquire", [], "") == Acquire()
+    assert command_of("acquire", ["field_overlap=0.3"], "right") == Acquire(
+        field_overlap=0.3, loop="right"
+    )
+
+
+def test_a_value_below_zero_is_no_option(tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["send", "jog", "-1.5", "0", "--set", f"service.folder={tmp_path}"])
+
+    assert end.value.code == 1
+    assert "no supervisor answers" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("word", "values", "complaint"),
     [
+        ("acquire", ["wide"], "needs no values, and may have search_radius_sky_arcsec="),
+        ("acquire", ["field_overlap"], "needs no values"),
+        ("acquire", ["field_overlap=much"], "acquire field_overlap=much"),
         ("explode", [], "is no command; there are stop, "),
         ("target", ["1"], "needs az_px el_px"),
         ("target", ["far", "1"], "target far 1"),
