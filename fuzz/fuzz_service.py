@@ -46,6 +46,14 @@ _DRIVE = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=1.0, 
 _VALUES = {
     "az_px": 21.5,
     "el_px": 19.0,
+    "az_sky_arcsec": 1.5,
+    "el_sky_arcsec": -2.0,
+    "az_urad": 10.0,
+    "el_urad": -5.0,
+    "search_radius_sky_arcsec": 100.0,
+    "field_overlap": 0.3,
+    "expected_az_sky_arcsec": 20.0,
+    "expected_el_sky_arcsec": -20.0,
     "name": "flux_low",
     "drives": [_DRIVE],
     "action": "pause",
@@ -55,7 +63,7 @@ _RECORDER = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_w
 _COMMANDS = [
     msgspec.msgpack.encode(
         {"type": row.name, "loop": "right"}
-        | {name: _RECORDER if row.make is RecorderReport else _VALUES[name] for name in row.values}
+        | {name: _RECORDER if row.make is RecorderReport else _VALUES[name] for name in row.fields}
     )
     for row in COMMANDS
 ]
@@ -67,8 +75,9 @@ class _Door:
     def __init__(self) -> None:
         self.replies: list[Reply] = []
 
-    def answer(self, identity: bytes, tag: bytes, payload: bytes) -> None:
+    def answer(self, identity: bytes, tag: bytes, payload: bytes) -> bool:
         self.replies.append(msgspec.msgpack.decode(payload, type=Reply))
+        return True
 
 
 def _service() -> tuple[Service, Simulation]:
@@ -86,6 +95,8 @@ def _service() -> tuple[Service, Simulation]:
     )
     with tempfile.TemporaryDirectory() as folder:
         service = Service(simulation.supervisor, buffer, Path(folder), state, simulation.clock)
+        service._ending.set()
+        service.run()  # lets go of its sockets, which nothing here needs and which would hold up the end
     return service, simulation
 
 

@@ -17,7 +17,7 @@ def labels(series):
         (["error_*_px"], ["/fit/right/tick.error_az_px", "/fit/right/tick.error_el_px"]),
         (
             ["/fit/*/tick.stack2_v", "stack2_v"],
-            ["/fit/right/tick.stack2_v", "/fit/right/piezo.stack2_v"],
+            [f"/fit/right/{topic}.stack2_v" for topic in ("tick", "opened", "piezo")],
         ),
         (
             ["/fit/right/piezo"],
