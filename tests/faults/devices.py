@@ -102,14 +102,21 @@ STRUCK = (
 )
 # What moves although nobody asks it to.
 BY_ITSELF = {
-    ("right.mdt693", "reboot"): OWN,
-    ("right.mdt693", "saturated_stack"): "the stack goes to its highest voltage",
-    ("right.mdt693", "limit_switch"): "the amplifier gives no more than the switch allows",
+    ("fit-mock", "right.mdt693", "reboot"): OWN,
+    ("fit-mock", "right.mdt693", "saturated_stack"): "the stack goes to its highest voltage",
+    (
+        "fit-mock",
+        "right.mdt693",
+        "limit_switch",
+    ): "the amplifier gives no more than the switch allows",
+} | {
+    ("ensemble", "right.drive", how): "its last velocity goes on: its protocol has no watchdog"
+    for how in ("drop", "disconnect", "freeze")
 }
 
 ENTRIES = tuple(
     Entry(device, how, ends, says, within_s=within_s, rig=rig,
-          moves=BY_ITSELF.get((device, how), ""))
+          moves=BY_ITSELF.get((rig, device, how), ""))
     for rig, device, table in STRUCK
     for how, ends, says, within_s in table
 )  # fmt: skip

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -129,9 +129,15 @@ class Rig:
         return self.follow_to("VERNIER")
 
     def recorder(self):
-        """The recorder process."""
-        children = psutil.Process(self.supervisor.pid).children(recursive=True)
-        return next(child for child in children if "record" in child.cmdline())
+        """The recorder process; one that is just being started is waited for."""
+        end_s = time.monotonic() + START_S
+        while time.monotonic() < end_s:
+            for child in psutil.Process(self.supervisor.pid).children(recursive=True):
+                with suppress(psutil.Error):  # it ends at this moment
+                    if "record" in child.cmdline():
+                        return child
+            time.sleep(0.05)
+        raise AssertionError(f"no recorder within {START_S} s")
 
     def close(self):
         if self.client is not None:
