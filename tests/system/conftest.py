@@ -17,6 +17,9 @@ from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
+signal.signal(
+    signal.SIGINT, signal.default_int_handler
+)  # ignored in a shell's background, also by children
 NEAR = "plant.loops.right.star_offset_sky_arcsec_max=5.0"  # found at once
 
 

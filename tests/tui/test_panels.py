@@ -263,6 +263,18 @@ def test_what_no_console_was_sent_stands_beside_the_other_counts(rows):
     assert "unsent 12!" in " ".join(plain(Timing(shown(supervisor)).draw(60, rows)))
 
 
+def test_a_long_name_of_the_commander_gives_way_to_the_state_of_the_link():
+    supervisor = FakeSupervisor()
+    message = supervisor.messages(1)[-1]
+    for columns in (80, 100, 120):
+        state = shown(supervisor)
+        named = msgspec.structs.replace(message, commander="somebody@" + "far-away." * 9)
+        state.accept(named, state.now_s)
+        head = " ".join(plain(Header(state, "operate").draw(columns, 3)))
+        assert "live" in head
+        assert "UTC" in head
+
+
 def test_the_header_says_how_much_a_slow_console_missed():
     supervisor = FakeSupervisor()
     state = shown(supervisor)

@@ -24,13 +24,16 @@ from fitctl.tui.look import (
     Line,
     clickable,
     duration,
+    shorten,
     spread,
     text,
+    width,
 )
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
 BADGE_COLUMNS = 19
+SHORTEST_NAME = 4  # columns of whoever has the instrument
 WIDE_FROM_COLUMNS = 100
 ASIDE = {"SAFE", "EXPERIMENT"}
 
@@ -91,9 +94,13 @@ class Header(Panel):
             if len(state.loops) > 1:
                 place += f" {list(state.loops).index(state.shown) + 1}/{len(state.loops)}"
             line += [text(place, SKY)]
-            if newest.commander:
-                line += [text(f"  by {newest.commander}", DIM)]
-        return spread(line, [*self._link(), text("  "), text(self._clock(), DIM)], columns)
+        link = [*self._link(), text("  "), text(self._clock(), DIM)]
+        if newest is not None and newest.commander:
+            # Who has the instrument gives way to the state of the link.
+            room = columns - width(line) - width(link) - len("  by ") - 1
+            if room >= SHORTEST_NAME:
+                line += [text(f"  by {shorten(newest.commander, room)}", DIM)]
+        return spread(line, link, columns)
 
     def _link(self) -> Line:
         state = self.state
