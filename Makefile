@@ -93,8 +93,9 @@ bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN serv
 	$(BIN)/python -m benchmarks.can
 	$(BIN)/python -m benchmarks.gvsp
 
-docs: $(READY)  ## The documentation as a site, dist/docs/index.html
+docs: $(READY)  ## The documentation as a site, dist/docs/index.html (needs npm)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/docs.lock
+	@npm --prefix requirements/site ci --silent --no-audit --no-fund
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "dist/docs/index.html"
 
@@ -107,12 +108,13 @@ dist-test: $(READY)  ## Wheel and sdist, installed into a fresh environment and 
 LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
     --custom-compile-command "make lock" --quiet
 
-lock: $(READY)  ## Resolve the requirements anew (needs uv)
+lock: $(READY)  ## Resolve the requirements anew (needs uv and npm)
 	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --extra web --group dev $(LOCK) -o requirements/dev.lock
 	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
 	uv pip compile --group docs $(LOCK) --constraint requirements/dev.lock -o requirements/docs.lock
 	uv pip compile --group bench $(LOCK) --constraint requirements/dev.lock -o requirements/bench.lock
+	npm --prefix requirements/site install --package-lock-only --omit-lockfile-registry-resolved --silent
 
 clean:  ## Remove .venv and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,4 +1,4 @@
-"""What the site needs beyond the pages themselves: made pages, pages from outside docs/, formulas."""
+"""What the site needs beyond the pages themselves: made pages, pages from outside docs/, formulas, scripts."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
+from mkdocs.utils import get_relative_url
 
 sys.path.insert(0, str(Path(__file__).parent))
 import reference
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")
+MODULES = ROOT / "requirements" / "site" / "node_modules"
+MERMAID = "assets/mermaid.js"
+SCRIPTS = {  # which the theme would have from elsewhere
+    MERMAID: MODULES / "@mermaid-js" / "tiny" / "dist" / "mermaid.tiny.js",
+    "assets/iframe-worker.js": MODULES / "iframe-worker" / "shim" / "index.js",
+}
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -25,6 +33,11 @@ def on_files(files: Files, config: Any) -> Files:
         files.append(File.generated(config, name, content=text.replace("](docs/", "](")))
     for name, make in reference.PAGES.items():
         files.append(File.generated(config, name, content=make()))
+    for name, path in SCRIPTS.items():
+        if not path.exists():
+            msg = f"{path} is missing: build the site by `make docs`, which has npm get it"
+            raise PluginError(msg)
+        files.append(File.generated(config, name, abs_src_path=str(path)))
     return files
 
 
@@ -44,6 +57,14 @@ def on_page_content(content: str, **_: Any) -> str:
     return re.sub(
         r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', _block, content, flags=re.DOTALL
     )
+
+
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """Load what draws diagrams, which is large, on the pages that have one, before the theme looks for it."""
+    if 'class="mermaid"' not in output:
+        return output
+    script = f'<script src="{get_relative_url(MERMAID, page.url)}"></script>'
+    return output.replace("</head>", f"{script}</head>", 1)
 
 
 def _inline(found: re.Match[str]) -> str:
