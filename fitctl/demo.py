@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from fitctl.config import ConfigError, Rig, load_rig
@@ -243,11 +242,6 @@ def newest_telemetry(folder: Path) -> Telemetry | None:
         return client.receive(1.0)
     finally:
         client.close()
-
-
-def to_json(result: dict[str, Any]) -> str:
-    """One line; what was not reached is null."""
-    return msgspec.json.encode(result).decode()
 
 
 # ---------------------------------------------------------------- parts

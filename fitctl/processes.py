@@ -68,6 +68,11 @@ def ended_by_signals(end: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, action)
 
 
+def interrupt() -> None:
+    """End as Ctrl-C does, letting go of everything: for :func:`ended_by_signals`."""
+    raise KeyboardInterrupt
+
+
 @contextmanager
 def signals_ignored() -> Iterator[None]:
     """Let nothing interrupt what must be finished, such as letting go of everything."""

@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from fitctl.commands import watch
+from fitctl.commands.printing import to_json
 from fitctl.commands.status import duration, status_document, status_lines, utc
 from fitctl.logging.records import Event
 from fitctl.supervisor.messages import TrippedInterlock
@@ -212,7 +213,7 @@ def test_a_line_of_text_says_what_the_mode_needs(monkeypatch, mode):
 def test_each_line_of_json_says_what_it_is_of(monkeypatch):
     message = told(events=[Event(time_s=1000.0, severity="error", source="x", message="y")])
     lines = [
-        json.loads(watch._json(entry))
+        json.loads(to_json(entry))
         for entry in watched(monkeypatch, [message, *FakeSupervisor().messages(25)])
     ]
 

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from fitctl import demo as demos
+from fitctl.commands.printing import to_json
 from fitctl.config import Rig
 from fitctl.drivers.bal_analog.probe import probe_bal_analog
 from fitctl.drivers.cia402.probe import probe_drive
@@ -68,7 +68,7 @@ def run_doctor(rig: Rig, *, as_json: bool) -> int:
     with ThreadPoolExecutor(len(parts)) as pool:
         findings = list(pool.map(lambda part: examine(*part), parts))
     if as_json:
-        typer.echo(demos.to_json({"rig": rig.name, "devices": [_plain(one) for one in findings]}))
+        typer.echo(to_json({"rig": rig.name, "devices": [_plain(one) for one in findings]}))
     else:
         _print(rig, findings)
     return DISAGREES if any(finding.disagreements for finding in findings) else 0
@@ -127,7 +127,7 @@ def run_discover(broadcast: str, wait_s: float, *, as_json: bool) -> None:
         "can_interfaces": _can_interfaces(),
     }
     if as_json:
-        typer.echo(demos.to_json(found))
+        typer.echo(to_json(found))
         return
     for title, entries in found.items():
         typer.echo(title.replace("_", " ") + ("" if entries else ": none"))

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from fitctl.commands import completing
-from fitctl.commands.options import RigOption, SetOption, rig_of
+from fitctl.commands.choosing import rig_of
+from fitctl.commands.options import RigOption, SetOption
 
 app = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
 

@@ -14,8 +14,9 @@ from typing import NamedTuple
 import typer
 
 from fitctl import demo as demos
-from fitctl.commands.instrument import FAILED, interrupt
-from fitctl.commands.progress import progress_line
+from fitctl.commands.choosing import client_of
+from fitctl.commands.exits import FAILED
+from fitctl.commands.printing import progress_line
 from fitctl.config import ConfigError, Rig
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import (
@@ -28,9 +29,7 @@ from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
-from fitctl.processes import ended_by_signals
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import service_folder
+from fitctl.processes import ended_by_signals, interrupt
 from fitctl.supervisor.modes import Mode
 
 _PLOT_SUFFIXES = (".png", ".svg")
@@ -58,7 +57,7 @@ class Output(NamedTuple):
     plot: Path | None
 
 
-def identify(
+def run_identify(
     rig: Rig,
     rig_path: Path,
     overrides: Sequence[str],
@@ -68,9 +67,6 @@ def identify(
     output: Output,
 ) -> int:
     """Identify one thing of one loop; returns the exit status."""
-    if loop_name not in rig.loops:
-        msg = f"identify: --loop {loop_name!r}: rig {rig.name} has {', '.join(rig.loops)}"
-        raise ConfigError(msg)
     stem = f"{rig.name}-{loop_name}-{what}"
     fragment_path = output.fragment or Path(f"{stem}.toml")
     _insist_on_output(fragment_path)
@@ -140,7 +136,7 @@ def _found(
             _hold_a_star(running, loop_name)
             paths = on_rig(running.client, rig, loop_name, what, drives, progress)
             return _from_logs(experiment, rig, loop_name, paths)
-    client = Client(service_folder(rig))
+    client = client_of(rig)
     try:
         insist_on_vernier(client, loop_name)
         paths = on_rig(client, rig, loop_name, what, drives, progress)

@@ -6,12 +6,11 @@ import sys
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from fitctl.commands.welcome import listed
-from fitctl.config import ConfigError, Rig, rig_from_document
+from fitctl.config import ConfigError, rig_from_document
 from fitctl.config.new_rig import DEVICES, MOCK, Chosen, chosen, forms, new_rig_text
 
 TITLES = {
@@ -20,42 +19,6 @@ TITLES = {
     "dac": "D/A converter of the mirror",
     "mdt693": "MDT693 piezo amplifier",
 }
-_DEVICE_SAID = "KIND:ADDRESS"
-
-
-def init(
-    file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("my-rig.toml"),
-    name: Annotated[str | None, typer.Option(help="Of the rig; by default the file's.")] = None,
-    camera: Annotated[
-        str | None, typer.Option(metavar=_DEVICE_SAID, help="gige:ADDRESS, aravis:ADDRESS or mock.")
-    ] = None,
-    siderostat: Annotated[
-        str | None,
-        typer.Option(
-            metavar=_DEVICE_SAID,
-            help="cia402:INTERFACE:CHANNEL, ensemble:PORT, bal_analog:HOST or mock.",
-        ),
-    ] = None,
-    dac: Annotated[
-        str | None, typer.Option(metavar=_DEVICE_SAID, help="tcp:HOST, rtu:PORT or mock.")
-    ] = None,
-    mdt693: Annotated[
-        str | None, typer.Option(metavar=_DEVICE_SAID, help="mdt693:PORT or mock.")
-    ] = None,
-    mocks: Annotated[
-        bool, typer.Option("--mocks", help="Ask nothing: what is not said is a mock.")
-    ] = False,
-    ask_devices: Annotated[
-        bool, typer.Option("--doctor/--no-doctor", help="Ask the devices at the end.")
-    ] = True,
-) -> None:
-    """Write a rig file of your own: asks what hardware is there, or is told by options.
-
-    Nothing is overwritten. At the end the devices are asked who they are, as `fitctl doctor` does; the exit
-    status is 1 if one disagrees.
-    """
-    said = {"camera": camera, "siderostat": siderostat, "dac": dac, "mdt693": mdt693}
-    raise typer.Exit(run_init(file, name, said, mocks=mocks, ask_devices=ask_devices))
 
 
 def run_init(
@@ -101,7 +64,9 @@ def run_init(
     typer.echo(f"{path}: written; rig {rig.name}, simulated: {', '.join(simulated) or 'nothing'}")
     status = 0
     if ask_devices and len(simulated) < len(devices):
-        status = _doctor(rig)
+        from fitctl.commands.doctor import run_doctor
+
+        status = run_doctor(rig, as_json=False)
     typer.echo(_next(path, simulated))
     return status
 
@@ -139,12 +104,6 @@ def _write(path: Path, text: str) -> None:
     except OSError as error:
         msg = f"{path}: cannot be written: {error.strerror}; name another file"
         raise ConfigError(msg) from None
-
-
-def _doctor(rig: Rig) -> int:
-    from fitctl.commands.doctor import run_doctor
-
-    return run_doctor(rig, as_json=False)
 
 
 def _next(path: Path, simulated: list[str]) -> str:

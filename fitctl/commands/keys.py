@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from fitctl.commands.choosing import rig_of
 from fitctl.commands.options import RigOption, SetOption
-from fitctl.config import default_rig_path, load_rig
 
 app = typer.Typer(
     help="Keys with which others reach the rig from other machines: to command it, or to watch.",
@@ -38,7 +38,7 @@ def new(
     """Allow somebody in, and write the key file that they need: whoever has it is them."""
     from fitctl.supervisor.keys import new_key
 
-    settings = load_rig(rig or default_rig_path(), overrides or ())
+    settings = rig_of(rig, overrides)
     path = out or Path(f"{name}.key.toml")
     key = new_key(settings, name, "viewer" if viewer else "commander", host, path)
     typer.echo(
@@ -53,7 +53,7 @@ def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Print whose keys are allowed, and what each may do."""
     from fitctl.supervisor.keys import allowed_keys
 
-    keys, problems = allowed_keys(load_rig(rig or default_rig_path(), overrides or ()))
+    keys, problems = allowed_keys(rig_of(rig, overrides))
     for key in keys.values():
         typer.echo(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
     for problem in problems:
@@ -66,5 +66,5 @@ def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = Non
     """Let a key in no more; a running supervisor drops its holder at once."""
     from fitctl.supervisor.keys import revoke_key
 
-    revoke_key(load_rig(rig or default_rig_path(), overrides or ()), name)
+    revoke_key(rig_of(rig, overrides), name)
     typer.echo(f"{name} is let in no more")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fitctl.commands.printing import to_json
 from fitctl.config import ConfigError
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def info(
     with one_line():
         found, kept, recording = log_info(log), is_kept(log), in_use(log)
     if as_json:
-        typer.echo(json.dumps(_info_document(found, kept=kept, recording=recording)))
+        typer.echo(to_json(_info_document(found, kept=kept, recording=recording)))
         return
     unfinished = "being recorded" if recording else "cut off; `fitctl log recover` mends it"
     state = "finished" if found.finished else unfinished

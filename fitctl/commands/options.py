@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from fitctl.commands import completing
-from fitctl.config import Rig, default_rig_path, load_rig
 
 RigOption = Annotated[
     Path | None,
@@ -38,14 +37,18 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as on
 LoopOption = Annotated[
     str, typer.Option("--loop", help="One loop by name.", autocompletion=completing.loops)
 ]
-
-
-def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
-    """The rig that the options name.
-
-    Raises
-    ------
-    ConfigError
-        If its file cannot be used.
-    """
-    return load_rig(path or default_rig_path(), overrides or ())
+ControllerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--controller",
+        metavar="NAME",
+        help="eq20, lqg-ltr, minimum-variance, fslq, or a saved file.",
+        autocompletion=completing.controllers,
+    ),
+]
+ParentOption = Annotated[
+    int | None,
+    typer.Option(
+        "--parent-pid", hidden=True, help="End when this process is no longer the parent."
+    ),
+]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from fitctl.commands.instrument import FAILED
+from fitctl.commands.exits import FAILED
 from fitctl.commands.log import one_line, time_ns
 from fitctl.config import ConfigError
 from fitctl.logging.reading import log_info

@@ -10,8 +10,8 @@ from typing import Any
 
 import typer
 
-from fitctl import demo as demos
-from fitctl.commands.progress import progress_line
+from fitctl.commands.choosing import of_controller
+from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_json
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import design_json
@@ -57,7 +57,7 @@ def run_replay(
         raise ConfigError(str(error)) from None
     named = ", ".join(map(str, logs))
     if as_json:
-        typer.echo(demos.to_json(_document(named, info, rig, result)))
+        typer.echo(to_json(_document(named, info, rig, result)))
     else:
         for line in _lines(named, info, rig, result):
             typer.echo(line)
@@ -90,8 +90,7 @@ def _rig(info: LogInfo, path: Path | None, overrides: Sequence[str], controller:
 
     rig = read(overrides)
     if controller is not None:
-        chosen = [f"loops.{name}.vernier.controller={controller}" for name in rig.loops]
-        rig = read([*overrides, *chosen])
+        rig = read([*overrides, *of_controller(rig.loops, controller)])
     then = json.loads(in_log)
     needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
     given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)

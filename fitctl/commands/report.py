@@ -1,4 +1,4 @@
-"""`fitctl report` and `fitctl plot`: what a log tells, as a page and at a glance."""
+"""`fitctl report`: what a log tells, as a page."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from fitctl.commands.instrument import FAILED
+from fitctl.commands.exits import FAILED
 from fitctl.commands.log import one_line
 from fitctl.config import ConfigError, Rig
 from fitctl.report.compare import make_comparison

@@ -6,18 +6,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 import typer
 
 from fitctl.commands import completing
-from fitctl.commands.options import (
-    JsonOption,
-    RemoteOption,
-    RigOption,
-    SeedOption,
-    SetOption,
-    rig_of,
-)
+from fitctl.commands.choosing import client_of, connect, rig_of
+from fitctl.commands.exits import FAILED
+from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SeedOption, SetOption
+from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import Rig
 
 if TYPE_CHECKING:
@@ -25,8 +20,6 @@ if TYPE_CHECKING:
     from fitctl.sequences.links import Link
     from fitctl.sequences.steps import Sequence
     from fitctl.supervisor.messages import SequenceStatus
-
-FAILED = 1
 
 app = typer.Typer(
     help="Run, check and steer sequences of acquisition and experiment steps.",
@@ -86,7 +79,7 @@ def list_(
             {"file": str(path), **sequence.model_dump(exclude_none=True)}
             for path, sequence in listed.items()
         ]
-        typer.echo(msgspec.json.encode(documents).decode())
+        typer.echo(to_json(documents))
         return
     width = max(len(sequence.name) for sequence in listed.values())
     for sequence in listed.values():
@@ -135,12 +128,8 @@ def run(
     out: OutOption = Path(),
 ) -> None:
     """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
-    from fitctl.supervisor.client import Client
-    from fitctl.supervisor.endpoints import service_folder
-    from fitctl.supervisor.keys import read_key_of
-
     settings, sequence = _load(file, rig, overrides)
-    client = Client(service_folder(settings) if remote is None else read_key_of(settings, remote))
+    client = client_of(settings, remote)
     try:
         status = _run(settings, sequence, client, out, as_json=as_json)
     finally:
@@ -172,27 +161,17 @@ def _steer(
     overrides: list[str] | None,
     remote: Path | None,
 ) -> None:
-    from fitctl.commands.connecting import connect
+    from fitctl.commands.send import give
     from fitctl.supervisor.messages import SequenceControl
 
-    client = connect(rig, overrides, remote)
-    try:
-        reply = client.send(SequenceControl(action=action))
-    except ConnectionError as error:
-        typer.echo(f"sequence: {error}", err=True)
-        raise typer.Exit(FAILED) from None
-    finally:
-        client.close()
-    typer.echo(reply.text or "accepted", err=not reply.accepted)
-    raise typer.Exit(0 if reply.accepted else FAILED)
+    command = SequenceControl(action=action)
+    raise typer.Exit(give(connect(rig, overrides, remote), command, "sequence"))
 
 
 def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json: bool) -> int:
     """Run, show progress, print what every attempt gave, write calibrations; returns the exit status."""
-    from fitctl.commands.instrument import interrupt
-    from fitctl.commands.progress import progress_line
     from fitctl.commands.sequence_text import as_json_text, attempts_text, where
-    from fitctl.processes import ended_by_signals
+    from fitctl.processes import ended_by_signals, interrupt
     from fitctl.sequences.calibration import CALIBRATING, insist_on_folder, write_calibration
     from fitctl.sequences.runner import Runner, run_steps
     from fitctl.sequences.view import SequenceError

@@ -6,6 +6,7 @@ import math
 
 import msgspec
 
+from fitctl.commands.printing import to_json
 from fitctl.logging.records import SequenceAttempt
 from fitctl.sequences.stars import StarResult, star_results
 from fitctl.supervisor.messages import SequenceStatus
@@ -69,4 +70,4 @@ def as_json_text(name: str, failure: str, attempts: list[SequenceAttempt]) -> st
     for each in told:
         del each["figures_json"]
     document = {"sequence": name, "failure": failure, "attempts": told}
-    return msgspec.json.encode(document).decode()
+    return to_json(document)

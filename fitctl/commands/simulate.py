@@ -8,11 +8,10 @@ from collections.abc import Sequence
 
 import typer
 
-from fitctl import demo as demos
-from fitctl.commands.instrument import FAILED, check_plant, interrupt
-from fitctl.commands.progress import progress_line
+from fitctl.commands.exits import FAILED
+from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import Rig
-from fitctl.processes import ended_by_signals
+from fitctl.processes import ended_by_signals, interrupt
 from fitctl.supervisor.campaign import (
     PERCENTILES,
     CampaignError,
@@ -28,8 +27,6 @@ from fitctl.supervisor.simulate import SimulationResult, simulate
 
 def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
     """Simulate and print the result; returns the exit status."""
-    rig.mock_parts()
-    check_plant(rig)
     with progress_line() as progress:
         task = progress.add_task("simulating", total=1.0)
         results = simulate(
@@ -38,7 +35,7 @@ def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> 
         progress.update(task, completed=1.0)
     plain = {name: result._asdict() for name, result in results.items()}
     if as_json:
-        typer.echo(demos.to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
+        typer.echo(to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
     else:
         for name, result in results.items():
             typer.echo(_told(name, result))
@@ -62,8 +59,6 @@ def run_many(
     rig: Rig, seeds: Sequence[int], duration_s: float, scheduler: str, *, as_json: bool
 ) -> int:
     """Simulate every seed, here or on a Dask cluster, and print what they say together."""
-    rig.mock_parts()
-    check_plant(rig)
     started = time.perf_counter()
     try:
         with (
@@ -88,7 +83,7 @@ def run_many(
     speed_x = len(seeds) * duration_s / wall_s
     if as_json:
         head = {"duration_s": duration_s, "workers": workers, "wall_s": wall_s, "speed_x": speed_x}
-        typer.echo(demos.to_json(head | {"loops": summaries}))
+        typer.echo(to_json(head | {"loops": summaries}))
     else:
         for name, summary in summaries.items():
             typer.echo(_told_together(name, summary))

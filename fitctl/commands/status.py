@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import typer
 
+from fitctl.commands.printing import to_json
 from fitctl.supervisor import messages
 from fitctl.supervisor.client import REPLY_TIMEOUT_S, Client
 from fitctl.supervisor.messages import Telemetry
@@ -30,7 +31,7 @@ def run_status(client: Client, *, as_json: bool) -> int:
         client.close()
     found = troubles(telemetry)
     if as_json:
-        typer.echo(msgspec.json.encode(status_document(telemetry, found)).decode())
+        typer.echo(to_json(status_document(telemetry, found)))
     else:
         typer.echo("\n".join(status_lines(telemetry, found)))
     return NOT_WELL if found else WELL

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
+from fitctl.commands.printing import to_json
 from fitctl.commands.status import NO_SUPERVISOR, utc
 from fitctl.logging.records import Severity
 from fitctl.processes import ended_by_signals
@@ -75,7 +76,7 @@ def run_watch(client: Client, duration_s: float | None, *, as_json: bool) -> int
 
     It is `NO_SUPERVISOR` where nobody was heard at all.
     """
-    text = _json if as_json else _text
+    text = to_json if as_json else _text
     heard = False
     try:
         with ended_by_signals(_end):
@@ -162,10 +163,6 @@ def _loop(loop: LoopState, tally: Tally) -> LoopSecond:
         late_ticks=tally.late_ticks,
         star_ticks=tally.star_ticks,
     )
-
-
-def _json(entry: Entry) -> str:
-    return msgspec.json.encode(entry).decode()
 
 
 def _text(entry: Entry) -> str:
