@@ -39,8 +39,8 @@ class Bench:
         self.simulation = Simulation(rig, 0, star_offset_px=(10.0, -6.0), record=self.take)
         self.supervisor, self.clock = self.simulation.supervisor, self.simulation.clock
         self.loop = self.supervisor.loops["right"]
-        self.devices = self.supervisor._devices.loops["right"]
-        self.camera = self.supervisor._devices.camera
+        self.devices = self.simulation.devices.loops["right"]
+        self.camera = self.simulation.devices.camera
         self.each_step = lambda: None
         self._healing = []
         self.simulation.acquire()
