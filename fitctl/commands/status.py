@@ -12,7 +12,7 @@ from fitctl.commands.printing import to_json
 from fitctl.supervisor import messages
 from fitctl.supervisor.client import REPLY_TIMEOUT_S, Client
 from fitctl.supervisor.messages import Telemetry
-from fitctl.supervisor.troubles import records_lost, troubles, unsent_of
+from fitctl.supervisor.troubles import troubles
 
 WELL = 0
 NOT_WELL = 1
@@ -90,8 +90,8 @@ def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
         lines.append(_line(f"{timing.loop} last second", told))
     if telemetry.recorder is not None:
         told = f"{telemetry.recorder.path}, {telemetry.recorder.records} records"
-        lines.append(_line("log", f"{told}, {records_lost(telemetry)} lost"))
-    unsent = ", ".join(f"{count} {name}" for name, count in unsent_of(telemetry).items())
+        lines.append(_line("log", f"{told}, {telemetry.records_lost} lost"))
+    unsent = ", ".join(f"{count} {name}" for name, count in telemetry.losses.unsent.items())
     lines.append(_line("unsent", unsent.replace("_", " ")))
     running = telemetry.running_sequence
     if running is not None:

@@ -20,6 +20,7 @@ _SUMS = np.array(
         np.repeat(_LEVER_PX, _LEVER_PX.size),
     ]
 )
+EDGE_PX = HALF_WINDOW_PX - 1.5  # nearer to its edge, the window would cut the spot
 MAX_CANDIDATES = 6
 LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
 
@@ -42,6 +43,16 @@ class Star(NamedTuple):
     flux_dn: float
     window_az_px: int
     window_el_px: int
+
+    @property
+    def position_px(self) -> NDArray[np.float64]:
+        """Centre of gravity, shape (2,)."""
+        return np.array([self.az_px, self.el_px])
+
+    @property
+    def off_centre_px(self) -> float:
+        """How far that is from the window's centre, along the axis on which it is farther."""
+        return max(abs(self.az_px - self.window_az_px), abs(self.el_px - self.window_el_px))
 
 
 class StarSensor:
@@ -67,6 +78,18 @@ class StarSensor:
         """Eq. 7 over the window nearest to the given centre; None when this loop's star is not in it."""
         return self._accepted(self._centroid(image, window_az_px, window_el_px))
 
+    def follow(
+        self, image: NDArray[np.uint16], expected_az_px: float, expected_el_px: float
+    ) -> Star | None:
+        """:meth:`measure` where the star is expected; :meth:`find` it where that does not do.
+
+        What is expected may be half a window off after a jump.
+        """
+        star = self.measure(image, expected_az_px, expected_el_px)
+        if star is None or star.off_centre_px > EDGE_PX:
+            return self.find(image)
+        return star
+
     def find(self, image: NDArray[np.uint16]) -> Star | None:
         """Look over the whole frame, brightest spot first; None when this loop's star is not there."""
         search = self._dark.light(image, 0, 0, *image.shape)
@@ -79,7 +102,8 @@ class StarSensor:
                 # Once more about its own centre, so that the window does not cut the spot.
                 candidate = self._centroid(image, candidate.az_px, candidate.el_px)
             star = self._accepted(candidate)
-            if star is not None and self._is_centred(star):
+            # A spot cut by the frame's edge has its centre of gravity away from the window's centre.
+            if star is not None and star.off_centre_px <= 1.0:
                 return star
             search[
                 max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
@@ -104,10 +128,3 @@ class StarSensor:
         if star is None or not self._flux_low_dn <= star.flux_dn <= self._flux_high_dn:
             return None
         return star
-
-    def _is_centred(self, star: Star) -> bool:
-        """A spot cut by the frame's edge has its centre of gravity away from the window's centre."""
-        return (
-            abs(star.az_px - star.window_az_px) <= 1.0
-            and abs(star.el_px - star.window_el_px) <= 1.0
-        )

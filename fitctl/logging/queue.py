@@ -21,6 +21,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
+from collections.abc import Callable
 
 import msgspec
 import zmq
@@ -82,6 +83,11 @@ class RecordQueue:
         """Records that are not yet confirmed."""
         return len(self._kept)
 
+    @property
+    def unsent(self) -> int:
+        """Those of the waiting that this recorder was not yet sent."""
+        return len(self._kept) - self._sent
+
     def offer(self, record: AnyRecord) -> bool:
         """Take a record for the log, at once.
 
@@ -112,6 +118,15 @@ class RecordQueue:
         self._forget(_STEPS_PER_OFFER)
         self._send(_STEPS_PER_OFFER)
 
+    def pump_while(self, going_on: Callable[[], object], timeout_s: float) -> None:
+        """Hear the recorder and send whatever is there, as long as `going_on`, within the time."""
+        deadline_s = time.monotonic() + timeout_s
+        while going_on() and time.monotonic() < deadline_s:
+            self._socket.poll(_POLL_MS)
+            self._listen()
+            self._forget(len(self._kept))
+            self._send(len(self._kept))
+
     def close(self, timeout_s: float = 0.5) -> None:
         """Send what is still there within the time, and close; safe to call twice.
 
@@ -119,12 +134,8 @@ class RecordQueue:
         """
         if self._socket.closed:
             return
-        deadline_s = time.monotonic() + timeout_s
-        while self._sent < len(self._kept) and time.monotonic() < deadline_s:
-            self._socket.poll(_POLL_MS)
-            self._listen()
-            self._send(len(self._kept))
-        self.lost += len(self._kept) - self._sent
+        self.pump_while(lambda: self.unsent, timeout_s)
+        self.lost += self.unsent
         self._kept.clear()
         self._sent = 0
         self._context.destroy(linger=int(timeout_s * 1000))
@@ -216,7 +227,7 @@ class RecordReceiver:
 
     def close(self) -> None:
         """Disconnect, after a last confirmation has had a moment to leave; safe to call twice."""
-        self._context.destroy(linger=100)
+        self._context.destroy(linger=500)
 
     def _answer(self, number: int) -> None:
         with contextlib.suppress(zmq.Again):  # no supervisor: nobody to tell

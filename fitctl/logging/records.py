@@ -241,6 +241,15 @@ class Losses(Record, frozen=True, kw_only=True):
     mode_changes_unsent: int
     replies_unsent: int
 
+    @property
+    def unsent(self) -> dict[str, int]:
+        """What was let go instead of sent, because somebody was too slow for it; by kind."""
+        return {
+            name.removesuffix("_unsent"): getattr(self, name)
+            for name in self.__struct_fields__
+            if name.endswith("_unsent")
+        }
+
 
 class SequenceAttempt(Record, frozen=True, kw_only=True):
     """One attempt at one step of a sequence, when it ended; figures as JSON, units in their names.

@@ -83,7 +83,7 @@ def judge_search(s: Any, r: Any, exposed_s: float) -> bool:
 
 @jit
 def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
-    """``StellarLoop._judge_tracking``."""
+    """``Following.judge``."""
     if not r.star_visible:
         r.lost += 1
         r.in_reach = r.out_of_reach = 0

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
-from fitctl.controllers.centroid import LARGEST_PEAK, MAX_CANDIDATES
+from fitctl.controllers.centroid import EDGE_PX, LARGEST_PEAK, MAX_CANDIDATES
 from fitctl.model.compiled import jit, jit_inlined
 from fitctl.model.kernels import play_output, render
 
 Floats = NDArray[np.float64]
-_EDGE_PX = HALF_WINDOW_PX - 1.5
 _SIDE_PX = 2 * HALF_WINDOW_PX + 1
 
 
@@ -120,7 +119,7 @@ def see(s: Any, r: Any, az_px: float, el_px: float) -> None:
 
 @jit
 def measure(s: Any, r: Any, w: Any, window_az: int, window_el: int) -> bool:
-    """``StarSensor.measure``; False where the whole frame must decide (``StellarLoop._near_edge``)."""
+    """``StarSensor.measure``; False where the whole frame must decide (``StarSensor.follow``)."""
     first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
     render(
         w.window_dn, first_row, first_column, s.width_px, w.spots_px, s.flux_dn, s.sigma_px, s.spots,
@@ -130,7 +129,7 @@ def measure(s: Any, r: Any, w: Any, window_az: int, window_el: int) -> bool:
     az_px, el_px, flux = centroid(s, w.window_dn, first_row, first_column, window_az, window_el)
     if not accepted(s, flux):
         return False
-    if abs(az_px - window_az) > _EDGE_PX or abs(el_px - window_el) > _EDGE_PX:
+    if abs(az_px - window_az) > EDGE_PX or abs(el_px - window_el) > EDGE_PX:
         return False
     see(s, r, az_px, el_px)
     return True

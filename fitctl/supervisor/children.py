@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -71,10 +70,18 @@ class Child:
         if now_s >= self._again_s:
             self._start()
 
-    def end(self) -> bool:
-        """Let it write what it has and end; False if it had to be killed."""
-        end_process(self._process, END_S)
-        return self._process.returncode != -signal.SIGKILL
+    @property
+    def running(self) -> bool:
+        """It was started and has not ended."""
+        return self._process.poll() is None
+
+    def ask_to_end(self) -> None:
+        """Tell it to end, without waiting for it."""
+        self._process.terminate()
+
+    def end(self, timeout_s: float = END_S) -> None:
+        """Let it write what it has and end; it is killed if it does not within the time."""
+        end_process(self._process, timeout_s)
 
     def _start(self) -> None:
         with self._errors.open("wb") as errors:

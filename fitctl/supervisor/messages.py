@@ -287,5 +287,5 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def records_lost(self) -> int:
-        """Records that the supervisor had to leave out of the log."""
-        return self.losses.records_lost
+        """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
+        return max(self.losses.records_lost, 0 if self.recorder is None else self.recorder.lost)

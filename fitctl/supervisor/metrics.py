@@ -27,7 +27,7 @@ from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Telemetry
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.tally import Tally, add_ticks
-from fitctl.supervisor.troubles import records_lost, troubles, unsent_of
+from fitctl.supervisor.troubles import troubles
 
 HOST = "127.0.0.1"
 STALE_S = 2.0  # nothing is told of an instrument that has been silent for so long, but that it is
@@ -177,9 +177,9 @@ def _of_instrument(newest: Telemetry) -> Iterator[Metric]:
     yield InfoMetricFamily("fitctl_rig", "Which rig this is.", value=about)
     well = not troubles(newest)
     yield GaugeMetricFamily("fitctl_well", "1 while `fitctl status` finds nothing.", value=well)
-    lost = records_lost(newest)
+    lost = newest.records_lost
     yield CounterMetricFamily("fitctl_records_lost", "Records missing from the log.", value=lost)
-    unsent = [([queue], count) for queue, count in unsent_of(newest).items()]
+    unsent = [([queue], count) for queue, count in newest.losses.unsent.items()]
     yield _counters("fitctl_unsent", "Telemetry and replies let go.", ["queue"], unsent)
     recorder = newest.recorder
     if recorder is not None:

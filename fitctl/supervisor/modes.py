@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 
 class Mode(IntEnum):
@@ -68,6 +69,13 @@ COMMANDS = frozenset(
         Trigger.OFF,
     }
 )
+
+
+class Finding(NamedTuple):
+    """What a frame means for the mode; without a trigger it goes on."""
+
+    trigger: Trigger | None
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)

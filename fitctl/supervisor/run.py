@@ -23,7 +23,7 @@ from fitctl.controllers.design.files import design_json
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.processes import ended_by_signals
-from fitctl.supervisor.children import END_S, Child
+from fitctl.supervisor.children import Child
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
     COMMAND_SOCKET,
@@ -32,6 +32,7 @@ from fitctl.supervisor.endpoints import (
     make_service_folder,
     service_folder,
 )
+from fitctl.supervisor.last_records import finish_log
 from fitctl.supervisor.machine import Machine
 from fitctl.supervisor.periodic import PeriodicThread
 from fitctl.supervisor.realtime import (
@@ -56,10 +57,6 @@ _METRICS_ERRORS = "metrics.err"
 _FILES = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, _RECORDER_ERRORS, _METRICS_ERRORS)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
-_CUT = (
-    f"recorder: it did not end within {END_S:g} s and was killed; the last records, up to {{}}, "
-    "are not in the log; mend it with: fitctl log recover"
-)
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
 _VERSIONED = (
     "fitctl",
@@ -196,10 +193,9 @@ def run_supervisor(
             for thread in threads:
                 thread.stop()
             service.stop()
-            unconfirmed = queue.waiting
-            queue.close()  # while the recorder still listens
-            if not children[0].end():
-                print(_CUT.format(unconfirmed), file=sys.stderr)
+            missing = finish_log(queue, children[0])
+            if missing:
+                print(missing, file=sys.stderr)
 
 
 def _children(

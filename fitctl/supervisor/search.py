@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +15,10 @@ from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.model.optics import scales
 from fitctl.supervisor.messages import Acquire
-from fitctl.supervisor.modes import Trigger
+from fitctl.supervisor.modes import Finding, Trigger
 
 Floats = NDArray[np.float64]
 NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
-
-
-class Finding(NamedTuple):
-    """What a frame means for the search; without a trigger it goes on."""
-
-    trigger: Trigger | None
-    reason: str
 
 
 @dataclass

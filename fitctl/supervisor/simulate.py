@@ -267,9 +267,8 @@ class Simulation:
         self.ticks: list[Tick] = []
         self.mode_changes: list[ModeChange] = []
         self._also = record
-        self.supervisor = Supervisor(
-            rig, Devices(self.camera, loops), self.clock, InlineExecutor(), self._take
-        )
+        self.devices = Devices(self.camera, loops)
+        self.supervisor = Supervisor(rig, self.devices, self.clock, InlineExecutor(), self._take)
         self.camera.on_servo_period = [
             (work.period_s, work.period) for work in self.supervisor.periodic
         ]

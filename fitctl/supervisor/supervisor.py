@@ -7,7 +7,6 @@ may take longer than a tick (opening, closing and polling devices) is handed to 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -17,22 +16,18 @@ from typing import NamedTuple
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
-from fitctl.drivers.interface import (
-    DeviceError,
-    DeviceIdentity,
-    Devices,
-    Frame,
-)
+from fitctl.drivers.interface import DeviceError, Devices
 from fitctl.logging.records import (
     AnyRecord,
-    DevicesOpened,
     Event,
     FrameRecord,
     LoopTiming,
     QuantityReading,
     Severity,
 )
+from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.command_table import ROWS, command_record
+from fitctl.supervisor.device_jobs import DeviceJobs, Job
 from fitctl.supervisor.health import camera_health, loop_health
 from fitctl.supervisor.loop import StellarLoop
 from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
@@ -53,13 +48,11 @@ from fitctl.supervisor.messages import (
 from fitctl.supervisor.modes import Mode, Trigger, usable_commands
 from fitctl.supervisor.periodic import Periodic
 from fitctl.supervisor.piezo import PiezoWatch
-from fitctl.supervisor.power import CAMERA, Opened, close_devices, open_devices, told
+from fitctl.supervisor.power import CAMERA, told
 from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
-_CLOSE_TIMEOUT_S = 30.0
-_SILENT_FRAMES = 10  # fewer may be missing when the machine stands still
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Standby: Trigger.STANDBY,
     Acquire: Trigger.ACQUIRE,
@@ -69,13 +62,6 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
-
-
-class Job(NamedTuple):
-    """Device work under way, and what is to be done when it ends."""
-
-    future: Future
-    done: Callable[[Future], None]
 
 
 class Posted(NamedTuple):
@@ -122,25 +108,31 @@ class Supervisor:
         }
         self.sequences = SequenceBoard(clock, record)
         self.shutdown_wanted = False
-        self._devices = devices
         self._clock = clock
         self._executor = executor
         self._record = record
         self._commands: deque[Posted] = deque()
         self._left: deque[AnyRecord] = deque()
         self._measured: deque[QuantityReading] = deque()
-        self._job: Job | None = None
-        self._opening: set[str] = set()
-        self._abandoned: set[str] = set()
         self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
         self.piezos = {
             name: PiezoWatch(loop, devices.loops[name].piezo, clock, executor, record)
             for name, loop in self.loops.items()
         }
-        self._camera_ready = False
-        self._last_frame_s = clock.now_s()
-        self._identities: dict[str, DeviceIdentity] = {}
+        self._camera = CameraWatch(rig, devices.camera, clock, self._camera_failed)
+        self._device_jobs = DeviceJobs(
+            devices,
+            self.loops,
+            self.servos,
+            self.piezos,
+            self._camera,
+            clock,
+            executor,
+            record,
+            self._event,
+            self.note,
+        )
         self._timing = TimingBook(clock, rig, self._timed)
 
     # ------------------------------------------------------------ from any thread
@@ -184,18 +176,13 @@ class Supervisor:
 
     def step(self) -> None:
         """Wait for the next frame, no longer than two frame periods, and act on it."""
-        frame = self._next_frame()
+        frame = self._camera.next_frame()
         self._finish_jobs()
-        while self._commands:
-            posted = self._commands.popleft()
-            answer = self._obey(posted.command)
-            self._log_command(posted, answer)
-            posted.reply(answer)
-        while self._left:
-            self._record(self._left.popleft())
+        self._obey_posted()
+        self._take_left()
         while self._measured:
             self._take_measured(self._measured.popleft())
-        lost = self._devices.camera.counts().lost if self._camera_ready else 0
+        lost = self._camera.counts.lost if self._camera.ready else 0
         for loop in self.loops.values():
             was_safe = loop.mode is Mode.SAFE
             tick = loop.tick(frame, lost)
@@ -215,7 +202,7 @@ class Supervisor:
                     data=frame.image.tobytes(),
                 )
             )
-        if self._job is None:
+        if not self._device_jobs.busy:
             for name, piezo in self.piezos.items():
                 if self.loops[name].stages.ready:
                     piezo.ask()
@@ -238,56 +225,37 @@ class Supervisor:
         return not loop.stages.ready or loop.stages.at_bias()
 
     def close(self) -> None:
-        """Disable and let go of everything, whatever state it is in."""
-        for loop in self.loops.values():
-            loop.stages.ready = False
-        self._camera_ready = False
-        self._submit(close_devices, list(self.loops), True).result(timeout=_CLOSE_TIMEOUT_S)
+        """Disable and let go of everything, whatever state it is in; nothing is asked of it any more."""
+        self.shutdown_wanted = True
+        self._device_jobs.close_all()
+        self._obey_posted()
+        self._take_left()
 
-    # ------------------------------------------------------------ frames
-
-    def _next_frame(self) -> Frame | None:
-        period_s = self.rig.camera.period_s
-        if not self._camera_ready:
-            self._clock.sleep_until(self._clock.now_s() + period_s)
-            return None
-        try:
-            frame = self._devices.camera.next_frame(2 * period_s)
-        except DeviceError as error:
-            self._camera_lost(error)
-            return None
-        if frame is not None:
-            self._last_frame_s = self._clock.now_s()
-        return frame
-
-    @property
-    def _camera_well(self) -> bool:
-        """It is open, and frames come."""
-        camera = self.rig.camera
-        silent_s = self._clock.now_s() - self._last_frame_s
-        return (
-            self._camera_ready
-            and silent_s <= camera.frame_delay_s + _SILENT_FRAMES * camera.period_s
-        )
-
-    def _camera_lost(self, error: DeviceError) -> None:
-        self._camera_ready = False
+    def _camera_failed(self, error: DeviceError) -> None:
         for loop in self.loops.values():
             loop.device_failed(CAMERA, error)
 
-    # ------------------------------------------------------------ commands
-
-    def _log_command(self, posted: Posted, reply: Reply) -> None:
-        if ROWS[type(posted.command)].logged:
-            now_s = self._clock.now_s()
-            self._record(
-                command_record(posted.command, reply, posted.sender, posted.address, now_s)
-            )
+    def _take_left(self) -> None:
+        while self._left:
+            self._record(self._left.popleft())
 
     def _take_measured(self, reading: QuantityReading) -> None:
         for loop in self.loops.values():
             loop.measured.put(reading.name, reading.value, reading.time_s)
         self._record(reading)
+
+    # ------------------------------------------------------------ commands
+
+    def _obey_posted(self) -> None:
+        while self._commands:
+            posted = self._commands.popleft()
+            reply = self._obey(posted.command)
+            if ROWS[type(posted.command)].logged:
+                now_s = self._clock.now_s()
+                self._record(
+                    command_record(posted.command, reply, posted.sender, posted.address, now_s)
+                )
+            posted.reply(reply)
 
     def _named(self, command: AnyCommand) -> list[str]:
         return [name for name in self.loops if command.loop in {"", name}]
@@ -327,20 +295,20 @@ class Supervisor:
         usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
         if not usable:
             return _refusal(self._why_not(trigger, names))
-        if self._job is not None and trigger is not Trigger.STOP:
+        if self._device_jobs.busy and trigger is not Trigger.STOP:
             return _refusal("devices are being opened or closed; wait for the event that says so")
         if trigger in _POWER_UP:
-            self._open(usable, trigger)
+            self._device_jobs.open(usable, trigger)
         elif trigger is Trigger.OFF:
             moving = [name for name in usable if not self._at_bias(name)]
             for name in moving:
                 self.loops[name].stages.mirror_to_bias()  # where it rested off its bias
             if moving:
                 return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
-            self._turn_off(usable)
+            self._device_jobs.turn_off(usable)
         else:
             if trigger is Trigger.STOP:
-                self._abandoned |= self._opening & set(usable)
+                self._device_jobs.abandon(usable)
             for name in usable:
                 if isinstance(command, Acquire):
                     self.loops[name].search.ask(command)
@@ -367,93 +335,14 @@ class Supervisor:
         else:
             self._event("error", name, f"no design {controller}: {told(error)}")
 
-    # ------------------------------------------------------------ device work
-
-    def _open(self, names: list[str], trigger: Trigger) -> None:
-        for name in names:
-            self.loops[name].stages.ready = False
-            self.piezos[name].forget()
-        self._opening, self._abandoned = set(names), set()
-        self._event("info", "supervisor", "opening and checking all devices")
-        with_camera = not self._camera_well
-        self._camera_ready = not with_camera  # nobody asks it for frames while it is opened
-        future = self._submit(open_devices, names, with_camera)
-        self._job = Job(future, partial(self._opened, names, with_camera, trigger))
-        self._finish_jobs()
-
-    def _opened(
-        self, names: list[str], with_camera: bool, trigger: Trigger, future: Future
-    ) -> None:
-        abandoned, self._opening, self._abandoned = bool(self._abandoned), set(), set()
-        error = future.exception()
-        self._log_opened(names, None if error else future.result(), told(error) if error else "")
-        if error is not None:
-            self._event("error", "supervisor", f"{trigger.name.lower()} failed: {told(error)}")
-            self._close(names, with_camera)
-            return
-        if abandoned:
-            # A stop while devices are being opened has the last word.
-            self._event("warning", "supervisor", "stopped while opening; devices let go")
-            self._close(names, with_camera)
-            return
-        opened: Opened = future.result()
-        self._identities.update(opened.identities)
-        self._camera_ready = True
-        self._last_frame_s = self._clock.now_s()
-        for name in names:
-            loop = self.loops[name]
-            loop.start_from(opened.stack_v[name])
-            self.piezos[name].begin()
-            # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
-            self.servos[name].take_timing()
-            loop.fire(trigger, "all devices open, checked and enabled")
-
-    def _log_opened(self, names: list[str], opened: Opened | None, error: str) -> None:
-        for name in names:
-            v1, v2, v3 = [math.nan] * 3 if opened is None else opened.stack_v[name].tolist()
-            self._record(
-                DevicesOpened(
-                    time_s=self._clock.now_s(),
-                    loop=name,
-                    stack1_v=v1,
-                    stack2_v=v2,
-                    stack3_v=v3,
-                    encoders_jumped=self.servos[name].encoders_jumped,
-                    error=error,
-                )
-            )
-
-    def _turn_off(self, names: list[str]) -> None:
-        for name in names:
-            self.loops[name].stages.ready = False
-            self.loops[name].fire(Trigger.OFF, "operator")
-        # The camera serves all loops; the last one out turns it off.
-        with_camera = all(loop.mode is Mode.OFF for loop in self.loops.values())
-        self._camera_ready = self._camera_ready and not with_camera
-        self._close(names, with_camera)
-
-    def _close(self, names: list[str], with_camera: bool) -> None:
-        self._job = Job(self._submit(close_devices, names, with_camera), lambda _: None)
-
-    def _submit(
-        self, work: Callable[..., Opened | None], names: list[str], with_camera: bool
-    ) -> Future:
-        return self._executor.submit(
-            work, self._devices, self.servos, names, with_camera, self._closed_badly
-        )
-
-    def _closed_badly(self, device: str, error: Exception) -> None:
-        self.note("warning", "supervisor", f"{device} did not close well: {told(error)}")
+    # ------------------------------------------------------------ beside the ticks
 
     def _make_safer(self, loop: StellarLoop) -> None:
         if self._clock.now_s() - loop.mode_since_s > self.rig.supervisor.safe_disable_after_s:
             loop.servo.disable()
 
     def _finish_jobs(self) -> None:
-        job = self._job
-        if job is not None and job.future.done():
-            self._job = None
-            job.done(job.future)
+        self._device_jobs.finish()
         while self._designs and self._designs[0].future.done():
             design = self._designs.popleft()
             design.done(design.future)
@@ -465,7 +354,7 @@ class Supervisor:
     def _once_a_second(self) -> None:
         now_s = self._reported_s = self._clock.now_s()
         # Nothing is timed while devices are let go or being opened: imports and parsing hold everything.
-        if self._job is None:
+        if not self._device_jobs.busy:
             self._timing.report(
                 {
                     name: self.servos[name]
@@ -473,12 +362,12 @@ class Supervisor:
                     if self.loops[name].mode is not Mode.OFF
                 }
             )
-        counts = self._devices.camera.counts()
-        self._record(camera_health(self.rig, counts, self._camera_well, self._identities, now_s))
+        camera, identities = self._camera, self._device_jobs.identities
+        self._record(camera_health(self.rig, camera.counts, camera.well, identities, now_s))
         for name, loop in self.loops.items():
             trouble = self.piezos[name].error
             loop.measured.of_piezo_error(trouble, now_s)
-            for row in loop_health(loop, trouble, self._identities, now_s):
+            for row in loop_health(loop, trouble, identities, now_s):
                 self._record(row)
 
     def _timed(self, record: LoopTiming) -> None:

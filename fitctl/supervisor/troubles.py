@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from fitctl.supervisor.messages import Telemetry
 from fitctl.supervisor.modes import Mode
 
@@ -31,22 +29,6 @@ def troubles(telemetry: Telemetry) -> list[str]:
     return found
 
 
-def records_lost(telemetry: Telemetry) -> int:
-    """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
-    recorder = telemetry.recorder
-    return max(telemetry.records_lost, 0 if recorder is None else recorder.lost)
-
-
-def unsent_of(telemetry: Telemetry) -> dict[str, int]:
-    """How many of what the supervisor let go instead of sending, because somebody was too slow for it."""
-    losses = msgspec.structs.asdict(telemetry.losses)
-    return {
-        name.removesuffix("_unsent"): count
-        for name, count in losses.items()
-        if name.endswith("_unsent")
-    }
-
-
 def _of_recording(telemetry: Telemetry) -> list[str]:
     found = []
     recorder = telemetry.recorder
@@ -55,7 +37,6 @@ def _of_recording(telemetry: Telemetry) -> list[str]:
     elif telemetry.time_s - recorder.time_s > RECORDER_SILENT_S:
         silent_s = telemetry.time_s - recorder.time_s
         found.append(f"the recorder has said nothing for {silent_s:.0f} s")
-    lost = records_lost(telemetry)
-    if lost:
-        found.append(f"{lost} records are missing from the log of this run")
+    if telemetry.records_lost:
+        found.append(f"{telemetry.records_lost} records are missing from the log of this run")
     return found

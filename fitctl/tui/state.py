@@ -188,24 +188,13 @@ class ConsoleState:
 
     @property
     def records_lost(self) -> int:
-        """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
-        if self.newest is None:
-            return 0
-        recorder = self.newest.recorder
-        return max(self.newest.records_lost, recorder.lost if recorder else 0)
+        """Records missing from the log of this run."""
+        return self.newest.records_lost if self.newest else 0
 
     @property
     def unsent(self) -> int:
         """Ticks, events, mode changes and replies that the supervisor could give to no console."""
-        if self.newest is None:
-            return 0
-        losses = self.newest.losses
-        return (
-            losses.ticks_unsent
-            + losses.events_unsent
-            + losses.mode_changes_unsent
-            + losses.replies_unsent
-        )
+        return sum(self.newest.losses.unsent.values()) if self.newest else 0
 
     def show_next_loop(self) -> None:
         """Cycle through the loops."""

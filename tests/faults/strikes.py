@@ -199,7 +199,7 @@ def writes_again(rig, lost_before):
 
 def lost_so_far(rig):
     """By the supervisor's count."""
-    return rig.telemetry[-1].records_lost
+    return rig.telemetry[-1].losses.records_lost
 
 
 @contextmanager

@@ -72,7 +72,7 @@ class WatchedRig(Rig):
         if telemetry is not None:
             self.telemetry.append(telemetry)
             self.shown.update(tick.time_s for tick in telemetry.ticks)
-            self.lost_of[telemetry.pid] = telemetry.records_lost
+            self.lost_of[telemetry.pid] = telemetry.losses.records_lost
         self.look()
         return telemetry
 

@@ -12,7 +12,7 @@ from fitctl.sequences.reading import load_sequence, read_stars
 from fitctl.sequences.stars import star_results
 from fitctl.sequences.steps import Star
 from fitctl.sequences.view import SequenceError
-from fitctl.supervisor.supervisor import Job
+from fitctl.supervisor.device_jobs import Job
 
 SKY = load_rig(default_rig_path().parent / "star-field.toml", ["supervisor.telemetry_hz=10.0"])
 QUICK = {"duration_s": 2.0, "settle_s": 3.0, "search_radius_sky_arcsec": 60.0}
@@ -69,7 +69,7 @@ def test_too_few_held_stars_fail_the_step():
 
 def test_devices_that_are_not_ready_end_the_list_and_no_star_is_skipped(tried):
     run = tried()
-    run.link._simulation.supervisor._job = Job(Future(), lambda _: None)  # that never ends
+    run.link._simulation.supervisor._device_jobs._job = Job(Future(), lambda _: None)  # never ends
 
     run({"step": "stars", "stars": [ALPHA, BETA], **QUICK})
 

@@ -10,6 +10,7 @@ from fitctl.drivers.interface import DeviceTimeout
 from fitctl.identify.record import gather
 from fitctl.logging.records import Event, ExperimentStart, InjectionRecord
 from fitctl.model.drives import Drive, drive_value, experiment_s
+from fitctl.model.optics import scales
 from fitctl.supervisor.drives import refused_drives
 from fitctl.supervisor.messages import Acquire, Experiment, Hold, SetController, Standby, Stop
 from fitctl.supervisor.modes import Mode
@@ -70,9 +71,10 @@ def test_the_siderostat_moves_as_told_and_returns(held):
     while loop.mode is Mode.EXPERIMENT:
         simulation.run(0.02)
 
-    assert away_rad[1] * loop._scale.motor_px_per_rad == pytest.approx(0.0, abs=0.3)
+    motor_px_per_rad = scales(simulation.rig, loop.settings).motor_px_per_rad
+    assert away_rad[1] * motor_px_per_rad == pytest.approx(0.0, abs=0.3)
     seen = gather(records, "right", "try")
-    swing_px = np.ptp(seen.motor_rad, axis=0) * loop._scale.motor_px_per_rad
+    swing_px = np.ptp(seen.motor_rad, axis=0) * motor_px_per_rad
     assert swing_px == pytest.approx([0.0, 4.0], abs=0.1)
     after_rad = simulation.supervisor.servos["right"].position_rad
     assert after_rad == pytest.approx(before_rad, abs=0.1)

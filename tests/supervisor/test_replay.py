@@ -120,7 +120,7 @@ def a_star_that_is_lost(simulation):
 
 
 def nothing_that_opens(simulation):
-    amplifiers = simulation.supervisor._devices.loops["right"].amplifiers
+    amplifiers = simulation.devices.loops["right"].amplifiers
     opening, amplifiers.open = amplifiers.open, failing(TIMEOUT)
     for _ in range(2):
         simulation.command(Standby())
@@ -134,7 +134,7 @@ def _fails(part, method, error=TIMEOUT):
 
     def course(simulation):
         hold_a_star(simulation)
-        devices = simulation.supervisor._devices
+        devices = simulation.devices
         device = devices.camera if part == "camera" else getattr(devices.loops["right"], part)
         well = getattr(device, method)
         setattr(device, method, failing(error))
@@ -151,7 +151,7 @@ def off_and_on_in_one_breath(simulation):
     """Without a camera no tick is logged between the two."""
     hold_a_star(simulation)
     simulation.command(Stop())
-    camera = simulation.supervisor._devices.camera
+    camera = simulation.devices.camera
     well, camera.next_frame = camera.next_frame, failing(TIMEOUT)
     simulation.run(0.5)
     camera.next_frame = well

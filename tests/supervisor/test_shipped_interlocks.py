@@ -39,8 +39,8 @@ class Bench:
         self.simulation = Simulation(rig, 0, star_offset_px=(10.0, -6.0), record=self.take)
         self.supervisor, self.clock = self.simulation.supervisor, self.simulation.clock
         self.loop = self.supervisor.loops["right"]
-        self.devices = self.supervisor._devices.loops["right"]
-        self.camera = self.supervisor._devices.camera
+        self.devices = self.simulation.devices.loops["right"]
+        self.camera = self.simulation.devices.camera
         self.each_step = lambda: None
         self._healing = []
         self.simulation.acquire()
@@ -97,7 +97,7 @@ def mirror_at_its_edge(bench):
     edge_rad = np.array([0.95 * bench.loop.settings.fsm.range_rad, 0.0])
     move = bench.loop.stages.mirror_to
     bench.laws(lambda _seen: move(edge_rad, hysteresis_inverse=False))
-    bench.replace(bench.loop, "_judge_tracking", lambda *_: None)  # else it goes back to COARSE
+    bench.replace(bench.loop.following, "judge", lambda *_: None)  # else it goes back to COARSE
 
 
 def set_point_beyond_the_travel(bench):

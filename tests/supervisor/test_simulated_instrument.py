@@ -242,7 +242,7 @@ def test_stopping_again_in_safe_does_not_keep_the_amplifiers_on(vernier):
 def test_a_fault_in_safe_is_told_once(vernier, monkeypatch):
     vernier.command(Stop())
     error = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
-    piezo = vernier.supervisor._devices.loops["right"].piezo
+    piezo = vernier.devices.loops["right"].piezo
     monkeypatch.setattr(piezo, "stack_volts", fail("stack_volts", error))
     vernier.run(5.0)
 
@@ -251,7 +251,7 @@ def test_a_fault_in_safe_is_told_once(vernier, monkeypatch):
 
 
 def test_one_bad_answer_of_the_piezo_amplifier_is_asked_for_again(vernier, monkeypatch):
-    piezo = vernier.supervisor._devices.loops["right"].piezo
+    piezo = vernier.devices.loops["right"].piezo
     answers = iter(
         [fail("stack_volts", DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none"))]
     )
@@ -270,7 +270,7 @@ def test_one_bad_answer_of_the_piezo_amplifier_is_asked_for_again(vernier, monke
 
 @pytest.mark.parametrize("stack", [0, 1, 2])
 def test_a_stack_that_is_not_where_it_was_told_makes_the_loop_safe(vernier, monkeypatch, stack):
-    piezo = vernier.supervisor._devices.loops["right"].piezo
+    piezo = vernier.devices.loops["right"].piezo
     measured = piezo.stack_volts
 
     def saturated():
@@ -286,7 +286,7 @@ def test_a_stack_that_is_not_where_it_was_told_makes_the_loop_safe(vernier, monk
 
 
 def test_a_device_that_cannot_be_closed_keeps_no_other_from_being_closed(vernier, monkeypatch):
-    devices = vernier.supervisor._devices
+    devices = vernier.devices
     closed = []
     monkeypatch.setattr(devices.loops["right"].piezo, "close", fail("close", OSError("stuck")))
     monkeypatch.setattr(devices.camera, "close", lambda: closed.append("camera"))
@@ -316,7 +316,7 @@ def test_off_waits_for_the_mirror(simulate_with):
 
 
 def test_an_error_that_is_no_devices_leads_to_safe_and_not_to_a_crash(vernier, monkeypatch):
-    amplifiers = vernier.supervisor._devices.loops["right"].amplifiers
+    amplifiers = vernier.devices.loops["right"].amplifiers
     monkeypatch.setattr(amplifiers, "exchange", fail("exchange", KeyError("nobody knows")))
 
     until(vernier, Mode.SAFE, limit_s=0.5)
@@ -380,7 +380,7 @@ def test_a_fault_of_any_device_leads_to_safe_with_an_event_that_names_it(
     vernier, monkeypatch, device
 ):
     part, method = FAULTS[device]
-    devices = vernier.supervisor._devices
+    devices = vernier.devices
     target = devices.camera if part == "camera" else getattr(devices.loops["right"], part)
     error = DeviceUnreachable(device, "127.0.0.1:1", "an answer", "nothing", "look at the cable")
     monkeypatch.setattr(target, method, fail(method, error))
@@ -394,7 +394,7 @@ def test_a_fault_of_any_device_leads_to_safe_with_an_event_that_names_it(
 
 
 def test_a_frame_that_does_not_come_is_a_fault_in_time(vernier, monkeypatch):
-    clock, camera = vernier.clock, vernier.supervisor._devices.camera
+    clock, camera = vernier.clock, vernier.devices.camera
 
     def nothing(timeout_s):
         camera._go_on_to(clock.now_s() + timeout_s)
@@ -412,9 +412,7 @@ def test_devices_that_do_not_open_leave_the_instrument_off_and_say_why(simulate_
     simulation = simulate_with(record=records.append)
     simulation.records = records
     error = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
-    monkeypatch.setattr(
-        simulation.supervisor._devices.loops["right"].piezo, "open", fail("open", error)
-    )
+    monkeypatch.setattr(simulation.devices.loops["right"].piezo, "open", fail("open", error))
 
     simulation.command(Standby())
 
@@ -509,3 +507,15 @@ def test_the_whole_run_is_judged_however_short_the_rigs_history():
     results = [simulate(rig, 3, 40.0)["right"] for rig in (load_rig(default_rig_path()), short)]
 
     assert results[0].rms_px == results[1].rms_px
+
+
+def test_what_happens_while_the_instrument_is_closed_is_recorded(vernier, monkeypatch):
+    replies = []
+    piezo = vernier.devices.loops["right"].piezo
+    monkeypatch.setattr(piezo, "close", fail("close", OSError("stuck")))
+    vernier.supervisor.stop("shutting down")
+    vernier.supervisor.post(Acquire(), replies.append)
+    vernier.supervisor.close()
+
+    assert any("right piezo did not close well" in e.message for e in events_of(vernier))
+    assert [(reply.accepted, reply.text) for reply in replies] == [(False, "shutting down")]

@@ -1,0 +1,59 @@
+"""Whether a star that is followed is still there, and within the mirror's reach."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Loop
+from fitctl.controllers.centroid import Star
+from fitctl.supervisor.modes import Finding, Mode, Trigger
+
+
+class Following:
+    """One loop's; :meth:`begin` begins it anew.
+
+    Parameters
+    ----------
+    loop : Loop
+    range_px : float
+        The mirror's range, as it moves the star.
+
+    Attributes
+    ----------
+    lost, in_reach, out_of_reach : int
+        Frames in a row without the star; with an error that the mirror has room for; with one that it has not.
+    """
+
+    def __init__(self, loop: Loop, range_px: float) -> None:
+        self._lost_frames = loop.acquisition.lost_frames
+        self._reach_frames = loop.coarse.reach_frames
+        self._reach_fraction = loop.coarse.reach_fraction
+        self._range_px = range_px
+        self.begin()
+
+    def begin(self) -> None:
+        """Count anew."""
+        self.lost = self.in_reach = self.out_of_reach = 0
+
+    def judge(
+        self, mode: Mode, star: Star | None, target_px: NDArray[np.float64]
+    ) -> Finding | None:
+        """What a frame showed, if it leads to another mode; `target_px` has shape (2,)."""
+        if star is None:
+            self.lost += 1
+            self.in_reach = self.out_of_reach = 0
+            if self.lost >= self._lost_frames:
+                return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")
+            return None
+        self.lost = 0
+        target_az_px, target_el_px = target_px.tolist()
+        error_px = abs(star.az_px - target_az_px) + abs(star.el_px - target_el_px)
+        need = error_px / self._range_px
+        self.in_reach = self.in_reach + 1 if need <= self._reach_fraction else 0
+        self.out_of_reach = self.out_of_reach + 1 if need > 1.0 else 0
+        if mode is Mode.COARSE and self.in_reach >= self._reach_frames:
+            return Finding(Trigger.IN_REACH, f"error needs {need:.0%} of the mirror's range")
+        if mode is Mode.VERNIER and self.out_of_reach >= self._reach_frames:
+            return Finding(Trigger.OUT_OF_REACH, f"error needs {need:.0%} of the mirror's range")
+        return None
