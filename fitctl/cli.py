@@ -529,6 +529,16 @@ def metrics(
     run_metrics(rig_of(rig, overrides), parent_pid=parent_pid)
 
 
+@app.command(hidden=True)
+def gateway(
+    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+) -> None:
+    """Let keys in by TCP; the supervisor starts this by itself."""
+    from fitctl.commands.instrument import run_gateway
+
+    run_gateway(rig_of(rig, overrides), parent_pid=parent_pid)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
     given = sys.argv[1:] if arguments is None else arguments

@@ -15,6 +15,7 @@ import zmq
 from numpy.typing import NDArray
 
 from fitctl import demo as demos
+from fitctl.clock import MonotonicClock
 from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, LoopMocks, Rig
 from fitctl.logging.errors import LogError
@@ -288,6 +289,17 @@ def run_metrics(rig: Rig, *, parent_pid: int | None) -> None:
             serve_metrics(client, rig.service.metrics_port, rig.name, stop)
     finally:
         client.close()
+
+
+def run_gateway(rig: Rig, *, parent_pid: int | None) -> None:
+    """Let the allowed keys in until the supervisor ends us, or is gone."""
+    from fitctl.supervisor.gateway import Gateway, be_modest
+
+    be_modest()
+    end_with_parent(parent_pid)
+    stop = threading.Event()
+    with ended_by_signals(stop.set):
+        Gateway(rig, service_folder(rig), MonotonicClock()).run(stop)
 
 
 # ---------------------------------------------------------------- a running instrument
