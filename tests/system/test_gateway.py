@@ -56,10 +56,10 @@ def gateway_of(rig):
     """The gateway's process, once it listens."""
     end_s = time.monotonic() + START_S
     while time.monotonic() < end_s:
-        for child in psutil.Process(rig.supervisor.pid).children(recursive=True):
-            with suppress(psutil.Error):  # it ends at this moment
-                if "gateway" in child.cmdline() and listening(child):
-                    return child
+        gateway = rig.child("gateway")
+        with suppress(psutil.Error):  # it ends at this moment
+            if listening(gateway):
+                return gateway
         time.sleep(0.05)
     raise AssertionError(f"no gateway within {START_S} s")
 
