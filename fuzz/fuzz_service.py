@@ -1,9 +1,10 @@
-"""Coverage-guided fuzzing of the service: any payload from anybody, up to the supervisor and back.
+"""Coverage-guided fuzzing of gateway and service: any payload from anybody, up to the supervisor and back.
 
-The first byte chooses who sends: somebody on this machine, a commander's key, a viewer's, or a revoked one.
-The second chooses one of the commands, the third a place in it, and the rest is written over what is there;
-or the rest is all. Only ZeroMQ is left out: see ``tests/supervisor/test_service_garbage.py``. The instrument is
-simulated and lives on from one input to the next, so that commands meet it in every mode.
+The first byte chooses who sends: somebody on this machine, a commander's key, a viewer's, a revoked one, or the
+gateway itself. The second chooses one of the commands, of the gateway one of its envelopes, the third a place
+in it, and the rest is written over what is there; or the rest is all. Only ZeroMQ is left out: see
+``tests/supervisor/test_service_garbage.py``. The instrument is simulated and lives on from one input to the
+next, so that commands meet it in every mode.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from fitctl.logging.records import RecorderStatus
 from fitctl.model.drives import Drive
 from fitctl.supervisor.admission import Sender
 from fitctl.supervisor.command_table import COMMANDS
-from fitctl.supervisor.doors import Parcel
+from fitctl.supervisor.envelope import Passed, Report, decode_envelope
+from fitctl.supervisor.gateway import judge
+from fitctl.supervisor.intake import Intake
+from fitctl.supervisor.keys import AllowedKey
 from fitctl.supervisor.messages import (
     RecorderReport,
     Reply,
@@ -34,12 +38,15 @@ from fitctl.supervisor.service import Service, Waiting
 from fitctl.supervisor.simulate import Simulation
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
-_SENDERS = (
-    Sender("owner@here", "process 1", "commander", is_local=True),
-    Sender("anna", "10.0.0.1", "commander", is_local=False),
-    Sender("bob", "10.0.0.2", "viewer", is_local=False),
-    None,
+_OWNER = Sender("owner@here", "process 1", "commander", is_local=True)
+_KEYS = (
+    AllowedKey(name="anna", role="commander", public="a" * 40),
+    AllowedKey(name="bob", role="viewer", public="b" * 40),
+    None,  # revoked
 )
+_GATEWAY = "the gateway"
+_SENDERS = (_OWNER, *_KEYS, _GATEWAY)
+_COMMANDS_PER_S = 1000.0
 _SLOW = SetController | Shutdown  # a design takes seconds; after a shutdown nothing is obeyed
 _STATUS = SequenceStatus(run="a", name="night", state="running", steps=3)
 _DRIVE = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=1.0, duration_s=2.0)
@@ -67,6 +74,15 @@ _COMMANDS = [
     )
     for row in COMMANDS
 ]
+_ENVELOPES = [
+    msgspec.msgpack.encode(envelope)
+    for envelope in (
+        *(Passed(name="anna", role="commander", address="", payload=one) for one in _COMMANDS),
+        Passed(name="bob", role="viewer", address="", payload=_COMMANDS[0]),
+        Report(keys=[key for key in _KEYS if key], told=[("info", "listening")]),
+        Report(keys=[], told=[]),
+    )
+]
 
 
 class _Door:
@@ -81,7 +97,7 @@ class _Door:
 
 
 def _service() -> tuple[Service, Simulation]:
-    rig = load_rig(default_rig_path(), ["service.commands_per_s=1000.0"])
+    rig = load_rig(default_rig_path(), [f"service.commands_per_s={_COMMANDS_PER_S}"])
     buffer = TelemetryBuffer()
     simulation = Simulation(
         rig, 0, star_offset_px=np.array([3.0, 1.0]), record=buffer.add, history_s=1.0
@@ -101,24 +117,35 @@ def _service() -> tuple[Service, Simulation]:
 
 
 _SERVICE, _SIMULATION = _service()
+_INTAKE = Intake(_COMMANDS_PER_S)
 
 
 def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
     """Every payload is answered once, a stop at the latest with the next step; who may not, does not."""
-    sender, payload = _SENDERS[data[0] % len(_SENDERS)] if data else None, _payload(data[1:])
-    if isinstance(decode_command(payload), _SLOW):
+    sender = _SENDERS[data[0] % len(_SENDERS)] if data else None
+    payload = _payload(data[1:], _ENVELOPES if sender == _GATEWAY else _COMMANDS)
+    envelope = decode_envelope(payload) if sender == _GATEWAY else None
+    said = envelope.payload if isinstance(envelope, Passed) else payload
+    if isinstance(decode_command(said), _SLOW):
         return
     door = _Door()
-    _SERVICE._receive(Waiting(door, Parcel(b"identity", b"tag", payload, sender)))  # type: ignore[arg-type]
+    _SERVICE._gateway = door  # type: ignore[assignment]
+    if sender == _GATEWAY:
+        _SERVICE._open(b"gateway", b"route", payload)
+        role, replies = (envelope.role, 1) if isinstance(envelope, Passed) else ("", 0)
+    elif isinstance(sender, Sender):
+        _SERVICE._receive(Waiting(door, b"identity", b"tag", sender), payload)  # type: ignore[arg-type]
+        role, replies = sender.role, 1
+    else:
+        _through_the_gateway(sender, payload, door)
+        role, replies = sender.role if sender else "", 1
     _SIMULATION.supervisor.step()
     _SIMULATION.ticks.clear()
     _SERVICE._send_replies()
-    if len(door.replies) != 1:
-        raise AssertionError(f"{payload!r} has {len(door.replies)} replies")
-    may = sender is not None and (
-        sender.role == "commander" or isinstance(decode_command(payload), Status)
-    )
-    if door.replies[0].accepted and not may:
+    if len(door.replies) != replies:
+        raise AssertionError(f"{payload!r} has {len(door.replies)} replies, not {replies}")
+    may = role == "commander" or (role and isinstance(decode_command(said), Status))
+    if any(reply.accepted for reply in door.replies) and not may:
         raise AssertionError(f"{payload!r} of {sender} was accepted")
     for name, loop in _SIMULATION.supervisor.loops.items():
         place_rad = _SIMULATION.supervisor.servos[name].setpoint_rad
@@ -126,11 +153,19 @@ def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
             raise AssertionError(f"{payload!r} makes {place_rad} rad, {loop.target_px} px")
 
 
-def _payload(data: bytes) -> bytes:
-    if len(data) < 2 or data[0] >= len(_COMMANDS):
+def _through_the_gateway(key: AllowedKey | None, payload: bytes, door: _Door) -> None:
+    judged = judge(key, "10.0.0.1", payload, _INTAKE, _SIMULATION.clock.now_s())
+    if isinstance(judged, Passed):
+        _SERVICE._open(b"gateway", b"route", msgspec.msgpack.encode(judged))
+    else:
+        door.answer(b"identity", b"tag", msgspec.msgpack.encode(judged))
+
+
+def _payload(data: bytes, whole: list[bytes]) -> bytes:
+    if len(data) < 2 or data[0] >= len(whole):
         return data[1:]
-    command, place = _COMMANDS[data[0]], data[1]
-    return command[:place] + data[2:] + command[place + len(data) - 2 :]
+    message, place = whole[data[0]], data[1]
+    return message[:place] + data[2:] + message[place + len(data) - 2 :]
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import CommandRecord, Event
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import COMMAND_SOCKET, make_service_folder
+from fitctl.supervisor.gateway import Gateway
 from fitctl.supervisor.keys import new_key
 from fitctl.supervisor.messages import Reply
 from fitctl.supervisor.service import Service
@@ -41,7 +42,7 @@ def rig_in(folder, *settings):
 
 
 class Served:
-    """Stepped by a thread; with `tcp` it has keys too."""
+    """Stepped by a thread; with `tcp` it has keys too, and a gateway on a thread."""
 
     def __init__(self, folder, *settings, tcp=False, clock=None):
         tcp_settings = ["service.tcp_address=127.0.0.1"] if tcp else []
@@ -61,6 +62,7 @@ class Served:
         self.service = Service(
             self.simulation.supervisor, self.buffer, self.folder, state, clock or MonotonicClock()
         )
+        self.tcp = tcp
         self.ending = threading.Event()
         self.stepper = threading.Thread(target=self.step)
         self.clients = []
@@ -69,6 +71,18 @@ class Served:
     def start(self):
         self.service.start()
         self.stepper.start()
+        if self.tcp:
+            self.start_gateway()
+
+    def start_gateway(self, clock=None):
+        self.gateway_ending = threading.Event()
+        self.gateway = Gateway(self.rig, self.folder, clock or MonotonicClock())
+        self.gateway_thread = threading.Thread(target=self.gateway.run, args=[self.gateway_ending])
+        self.gateway_thread.start()
+
+    def stop_gateway(self):
+        self.gateway_ending.set()
+        self.gateway_thread.join()
 
     def record(self, record):
         self.buffer.add(record)
@@ -82,6 +96,8 @@ class Served:
     def close(self):
         for client in self.clients:
             client.close()
+        if self.tcp:
+            self.stop_gateway()
         self.ending.set()
         if self.stepper.is_alive():
             self.stepper.join()

@@ -125,3 +125,20 @@ def metrics(
             serve_metrics(client, settings.service.metrics_port, settings.name, stop)
     finally:
         client.close()
+
+
+def gateway(
+    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+) -> None:
+    """Let keys in by TCP; the supervisor starts this by itself."""
+    from fitctl.clock import MonotonicClock
+    from fitctl.processes import end_with_parent, ended_by_signals
+    from fitctl.supervisor.endpoints import service_folder
+    from fitctl.supervisor.gateway import Gateway, be_modest
+
+    settings = rig_of(rig, overrides)
+    be_modest()
+    end_with_parent(parent_pid)
+    stop = threading.Event()
+    with ended_by_signals(stop.set):
+        Gateway(settings, service_folder(settings), MonotonicClock()).run(stop)

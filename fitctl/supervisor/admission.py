@@ -1,4 +1,4 @@
-"""Who may command: roles, the lease that one person has at a time, and how often anybody may speak."""
+"""Who may command: roles, and the lease that one person has at a time."""
 
 from __future__ import annotations
 
@@ -38,16 +38,12 @@ class Admission:
     ----------
     lease_s : float
         Its holder loses it after this silence.
-    commands_per_s : float
-        From one person; as many may come at once.
     """
 
-    def __init__(self, lease_s: float, commands_per_s: float) -> None:
+    def __init__(self, lease_s: float) -> None:
         self._lease_s = lease_s
-        self._rate = commands_per_s
         self._holder = ""
         self._heard_s = 0.0
-        self._buckets: dict[str, tuple[float, float]] = {}
 
     def commander(self, now_s: float) -> str:
         """Who has the instrument; empty when nobody has."""
@@ -57,13 +53,6 @@ class Admission:
         """Take the lease from somebody who is no longer let in."""
         if self._holder == name:
             self._holder = ""
-
-    def within_rate(self, sender: Sender, now_s: float) -> bool:
-        """Count one message; whether its sender may send so many."""
-        left, since_s = self._buckets.get(sender.name, (self._rate, now_s))
-        left = min(self._rate, left + (now_s - since_s) * self._rate)
-        self._buckets[sender.name] = (max(0.0, left - 1.0), now_s)
-        return left >= 1.0
 
     def refusal(self, sender: Sender, command: AnyCommand, now_s: float) -> str:
         """Why this command is not taken; empty when it is, and then the sender has what it needs."""

@@ -1,4 +1,4 @@
-"""Processes beside the supervisor, started again when they die: the recorder, and the metrics."""
+"""Processes beside the supervisor, started again when they die: the recorder, the metrics, the gateway."""
 
 from __future__ import annotations
 

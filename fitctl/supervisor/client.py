@@ -87,9 +87,13 @@ class Client:
             text = f"{name} takes {len(payload)} bytes; a command may take {MAX_COMMAND_BYTES}: make it shorter"
             return Reply(accepted=False, text=text)
         dealer = self._dealer()
+        timeout_ms = int(timeout_s * 1000)
         try:
-            dealer.send_multipart([next(self._tags).to_bytes(8, "big"), payload])
-            if not dealer.poll(int(timeout_s * 1000)):
+            # A socket that was refused since its last command has no way out: sending would wait for ever.
+            can_send = dealer.poll(timeout_ms, zmq.POLLOUT)
+            if can_send:
+                dealer.send_multipart([next(self._tags).to_bytes(8, "big"), payload])
+            if not can_send or not dealer.poll(timeout_ms):
                 raise ConnectionError(self._why_silent(timeout_s))
             _, answer = dealer.recv_multipart()
         except BaseException:  # also Ctrl-C: a socket left open would hold up close()

@@ -14,6 +14,7 @@ from fitctl.config import ConfigError, Rig
 COMMAND_SOCKET = "command"
 TELEMETRY_SOCKET = "telemetry"
 RECORDS_SOCKET = "records"
+GATEWAY_SOCKET = "gateway"
 _LONGEST_SOCKET_PATH = 100  # sun_path holds 108 bytes
 
 

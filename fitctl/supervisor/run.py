@@ -27,11 +27,13 @@ from fitctl.supervisor.children import Child
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
     COMMAND_SOCKET,
+    GATEWAY_SOCKET,
     RECORDS_SOCKET,
     TELEMETRY_SOCKET,
     make_service_folder,
     service_folder,
 )
+from fitctl.supervisor.keyed_door import check_keyed_door
 from fitctl.supervisor.last_records import finish_log
 from fitctl.supervisor.machine import Machine
 from fitctl.supervisor.periodic import PeriodicThread
@@ -54,7 +56,16 @@ from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 _RECORDER_ERRORS = "recorder.err"
 _METRICS_ERRORS = "metrics.err"
-_FILES = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, _RECORDER_ERRORS, _METRICS_ERRORS)
+_GATEWAY_ERRORS = "gateway.err"
+_FILES = (
+    COMMAND_SOCKET,
+    TELEMETRY_SOCKET,
+    RECORDS_SOCKET,
+    GATEWAY_SOCKET,
+    _RECORDER_ERRORS,
+    _METRICS_ERRORS,
+    _GATEWAY_ERRORS,
+)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
@@ -126,14 +137,14 @@ def run_supervisor(
     ----------
     rig : Rig
     rig_arguments : sequence of str
-        ``fitctl`` options that describe the same rig to the recorder and the metrics.
+        ``fitctl`` options that describe the same rig to the processes beside the supervisor.
     on_ready : callable
         Called with the socket folder once commands are answered.
 
     Raises
     ------
     ConfigError
-        If the socket folder cannot be used, or another supervisor has this rig.
+        If the socket folder, the TCP ports or the keys cannot be used, or another supervisor has this rig.
     """
     service_folder(rig)  # refused before anything is made
     log_folder = Path(rig.logging.folder).expanduser()
@@ -143,6 +154,7 @@ def run_supervisor(
         ending = threading.Event()
         stack.enter_context(ended_by_signals(ending.set))
         stack.enter_context(only_supervisor(folder))
+        check_keyed_door(rig)  # what the gateway will need
         for name in _FILES:
             stack.callback((folder / name).unlink, missing_ok=True)
         clock = MonotonicClock()
@@ -212,6 +224,11 @@ def _children(
         serve = ["metrics", *rig_arguments]
         children.append(
             Child("metrics server", serve, folder / _METRICS_ERRORS, "a new one is started", note)
+        )
+    if rig.service.tcp_address:
+        admit = ["gateway", *rig_arguments]
+        children.append(
+            Child("gateway", admit, folder / _GATEWAY_ERRORS, "a new one is started", note)
         )
     return children
 

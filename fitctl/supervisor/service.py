@@ -1,13 +1,16 @@
 """The supervisor's service: commands come in by its doors, are admitted or refused, and telemetry goes out.
 
 One thread, so that nothing here can hold the loop: records are left in bounded buffers and picked up
-from there, replies likewise. However much comes in, it takes a bounded part of the interpreter.
+from there, replies likewise. However much comes in, it takes a bounded part of the interpreter. Everything
+here is a Unix socket: what comes by TCP is brought by the gateway (:mod:`fitctl.supervisor.gateway`), in
+envelopes that are taken from its socket alone.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -19,33 +22,30 @@ import zmq
 from fitctl.clock import Clock
 from fitctl.supervisor.admission import Admission, Sender
 from fitctl.supervisor.command_table import ROWS, command_record
-from fitctl.supervisor.doors import FRAMES, Door, KeyedDoor, Parcel, local_door
-from fitctl.supervisor.messages import (
-    AnyCommand,
-    RecorderReport,
-    Reply,
-    Status,
-    Stop,
-    TakeOver,
-    decode_command,
-)
+from fitctl.supervisor.doors import Door, local_sender, publisher_socket, router_socket
+from fitctl.supervisor.endpoints import COMMAND_SOCKET, GATEWAY_SOCKET, TELEMETRY_SOCKET
+from fitctl.supervisor.envelope import MAX_ENVELOPE_BYTES, Passed, Report, decode_envelope
+from fitctl.supervisor.intake import Intake
+from fitctl.supervisor.keys import AllowedKey
+from fitctl.supervisor.messages import AnyCommand, RecorderReport, Reply, Status, Stop, TakeOver
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
 SOURCE = "service"  # of its events
+GATEWAY = "gateway"  # of what that tells
 _ROUND_MS = 5
-_FRAMES_A_ROUND = 8 * FRAMES
-_HANDSHAKES_A_ROUND = 4
+_MESSAGES_A_ROUND = 8
 _JOINED_STOPS = 1000
-_LOOK_S = 0.25
-_TELL_S = 5.0
+_TELL_S = 0.25
 
 
 class Waiting(NamedTuple):
     """Whom an answer is for."""
 
     door: Door
-    parcel: Parcel
+    identity: bytes
+    tag: bytes
+    sender: Sender
 
 
 class Service(threading.Thread):
@@ -59,11 +59,6 @@ class Service(threading.Thread):
         Where the Unix sockets are made.
     state : ServiceState
     clock : Clock
-
-    Raises
-    ------
-    ConfigError
-        If the rig's TCP address or its keys cannot be used.
     """
 
     def __init__(
@@ -84,23 +79,18 @@ class Service(threading.Thread):
         self._ending = threading.Event()
         self._replies: SimpleQueue[tuple[Waiting, Reply, str | None]] = SimpleQueue()
         self._stops: dict[str, deque[Waiting]] = {}  # by loop: who waits with one that is under way
-        self._dropped: Counter[tuple[str, str]] = Counter()
-        self._tell_s = 0.0
         self._encode = msgspec.msgpack.Encoder().encode
-        self._admission = Admission(settings.lease_s, settings.commands_per_s)
-        self._too_many = Reply(
-            accepted=False,
-            text=f"more than {settings.commands_per_s:g} commands a second; wait, then try again",
-        )
-        self._keyed: KeyedDoor | None = None
-        if settings.tcp_address:
-            self._keyed = KeyedDoor(
-                supervisor.rig, lambda problem: supervisor.note("warning", SOURCE, problem)
-            )
+        self._intake = Intake(settings.commands_per_s)
+        self._admission = Admission(settings.lease_s)
+        self._keys: dict[str, AllowedKey] = {}  # by name, as the gateway last reported
         self._context = zmq.Context()
-        self._doors = [local_door(self._context, folder)]
-        if self._keyed is not None:
-            self._doors.append(self._keyed.door)
+        self._local = Door(router_socket(self._context))
+        self._local.router.bind(f"ipc://{folder / COMMAND_SOCKET}")
+        self._gateway = Door(router_socket(self._context, MAX_ENVELOPE_BYTES))
+        if settings.tcp_address:
+            self._gateway.router.bind(f"ipc://{folder / GATEWAY_SOCKET}")
+        self._publisher = publisher_socket(self._context)
+        self._publisher.bind(f"ipc://{folder / TELEMETRY_SOCKET}")
 
     def stop(self) -> None:
         """Publish once more, send what replies there are, and end."""
@@ -110,11 +100,9 @@ class Service(threading.Thread):
     def run(self) -> None:
         """Serve; this is the thread."""
         poller = zmq.Poller()
-        for door in self._doors:
+        for door in (self._local, self._gateway):
             poller.register(door.router, zmq.POLLIN)
-        if self._keyed is not None:
-            poller.register(self._keyed.zap, zmq.POLLIN)
-        publish_s = look_s = self._clock.now_s()
+        publish_s = tell_s = self._clock.now_s()
         try:
             while not self._ending.is_set():
                 if poller.poll(_ROUND_MS):
@@ -126,54 +114,69 @@ class Service(threading.Thread):
                 if now_s >= publish_s:
                     self._publish(now_s)
                     publish_s = max(publish_s + self._period_s, now_s)
-                if now_s >= look_s:
-                    self._look_after_keys()
-                    self._tell_dropped(now_s)
-                    look_s = now_s + _LOOK_S
+                if now_s >= tell_s:
+                    for line in self._intake.dropped(now_s):
+                        self._supervisor.note("warning", SOURCE, line)
+                    tell_s = now_s + _TELL_S
             self._send_replies()
             self._publish(self._clock.now_s())
         finally:
-            self._doors[0].close()
+            for socket in (self._local.router, self._gateway.router, self._publisher):
+                socket.close()
             self._context.term()
-            if self._keyed is not None:
-                self._keyed.close()
 
     # ------------------------------------------------------------ commands
 
     def _serve(self) -> None:
         """Take a bounded number of messages from each door."""
-        if self._keyed is not None:
-            self._keyed.admit(_HANDSHAKES_A_ROUND)
-        for door in self._doors:
-            for parcel in door.take(_FRAMES_A_ROUND):
-                self._receive(Waiting(door, parcel))
+        for parcel in self._local.take(_MESSAGES_A_ROUND):
+            waiting = Waiting(
+                self._local, parcel.identity, parcel.tag, local_sender(parcel.payload)
+            )
+            self._receive(waiting, bytes(parcel.payload.buffer))
+        for parcel in self._gateway.take(_MESSAGES_A_ROUND):
+            self._open(parcel.identity, parcel.tag, bytes(parcel.payload.buffer))
 
-    def _receive(self, waiting: Waiting) -> None:
-        sender, now_s = waiting.parcel.sender, self._clock.now_s()
-        if sender is None:
-            self._answer(waiting, Reply(accepted=False, text="this key has been revoked"))
-            return
-        command = decode_command(waiting.parcel.payload)
-        within_rate = self._admission.within_rate(sender, now_s)
-        if not within_rate and not isinstance(command, Stop):
-            self._drop(sender, "over the rate limit")
-            self._answer(waiting, self._too_many)
-        elif isinstance(command, Reply):
-            self._drop(sender, "no commands")
-            self._answer(waiting, command)
-        elif not within_rate and self._joins_a_stop(waiting, command, sender):
-            self._drop(sender, "stops besides one under way")
+    def _open(self, identity: bytes, tag: bytes, payload: bytes) -> None:
+        """Take an envelope of the gateway."""
+        match decode_envelope(payload):
+            case Passed() as passed:
+                sender = Sender(passed.name, passed.address, passed.role, is_local=False)
+                self._receive(Waiting(self._gateway, identity, tag, sender), passed.payload)
+            case Report() as report:
+                self._heed(report)
+            case None:
+                self._intake.drop(GATEWAY, "no envelopes")
+
+    def _heed(self, report: Report) -> None:
+        """Take the instrument from whoever is no longer let in, and tell what the gateway has to say."""
+        before, self._keys = self._keys, {key.name: key for key in report.keys}
+        for name, key in before.items():
+            if self._keys.get(name) != key:
+                self._admission.release(name)
+                self._supervisor.note("warning", SOURCE, f"the key {name} was revoked or changed")
+        for severity, text in report.told:
+            self._supervisor.note(severity, GATEWAY, text)
+
+    def _receive(self, waiting: Waiting, payload: bytes) -> None:
+        sender, now_s = waiting.sender, self._clock.now_s()
+        taken = self._intake.take(sender.name, payload, now_s)
+        if isinstance(taken, Reply):
+            self._answer(waiting, taken)
+        elif taken.is_too_many and self._joins_a_stop(waiting, taken.command):
+            self._intake.drop(sender.name, "stops besides one under way")
         else:
-            self._obey(waiting, command, sender, now_s)
+            self._obey(waiting, taken.command, now_s)
 
-    def _joins_a_stop(self, waiting: Waiting, command: AnyCommand, sender: Sender) -> bool:
+    def _joins_a_stop(self, waiting: Waiting, command: AnyCommand) -> bool:
         """Whether this stop, of too many, waits for the answer to one that is under way."""
-        if sender.role != "commander" or command.loop not in self._stops:
+        if waiting.sender.role != "commander" or command.loop not in self._stops:
             return False
         self._stops[command.loop].append(waiting)
         return True
 
-    def _obey(self, waiting: Waiting, command: AnyCommand, sender: Sender, now_s: float) -> None:
+    def _obey(self, waiting: Waiting, command: AnyCommand, now_s: float) -> None:
+        sender = waiting.sender
         commander = self._admission.commander(now_s)
         refusal = self._admission.refusal(sender, command, now_s)
         match command:
@@ -208,9 +211,8 @@ class Service(threading.Thread):
 
     def _answer_here(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
         """Answer what does not reach the supervisor, and keep who asked."""
-        sender = waiting.parcel.sender
-        if sender is not None and ROWS[type(command)].logged:
-            now_s = self._clock.now_s()
+        if ROWS[type(command)].logged:
+            sender, now_s = waiting.sender, self._clock.now_s()
             self._supervisor.leave(
                 command_record(command, reply, sender.name, sender.address, now_s)
             )
@@ -233,31 +235,14 @@ class Service(threading.Thread):
 
     def _answer(self, waiting: Waiting, reply: Reply) -> None:
         timed = msgspec.structs.replace(reply, time_s=self._clock.now_s())
-        parcel = waiting.parcel
-        if not waiting.door.answer(parcel.identity, parcel.tag, self._encode(timed)):
+        if not waiting.door.answer(waiting.identity, waiting.tag, self._encode(timed)):
             self._state.replies_unsent += 1
 
-    # ------------------------------------------------------------ telemetry and housekeeping
+    # ------------------------------------------------------------ telemetry
 
     def _publish(self, now_s: float) -> None:
         self._state.sequence += 1
         self._state.commander = self._admission.commander(now_s)
         payload = self._encode(self._buffer.telemetry(self._supervisor, self._state, now_s))
-        for door in self._doors:
-            door.publish(payload)
-
-    def _look_after_keys(self) -> None:
-        for name in self._keyed.refresh() if self._keyed is not None else ():
-            self._admission.release(name)
-            self._supervisor.note("warning", SOURCE, f"the key {name} was revoked or changed")
-
-    def _drop(self, sender: Sender, why: str) -> None:
-        self._dropped[sender.name, why] += 1
-
-    def _tell_dropped(self, now_s: float) -> None:
-        """Say how many messages were not taken, now and then."""
-        if self._dropped and now_s >= self._tell_s:
-            for (name, why), count in self._dropped.items():
-                self._supervisor.note("warning", SOURCE, f"{name}: {count} messages, {why}")
-            self._dropped.clear()
-            self._tell_s = now_s + _TELL_S
+        with suppress(zmq.Again):
+            self._publisher.send(payload, zmq.NOBLOCK)

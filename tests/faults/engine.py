@@ -13,9 +13,9 @@ SETTLE_S = 0.4  # from entering a mode of rest to standing still
 DEAD_SETTLE_S = (
     1.6  # without a supervisor: the drive's heartbeat and the D/A's watchdog, and what they take
 )
-BESIDE = {"recorder", "console", "command", "disk", "log folder", "clock"}
+BESIDE = {"recorder", "gateway", "console", "command", "disk", "log folder", "clock"}
 """What stands beside the tick, which goes on whatever becomes of them."""
-PROCESSES = {"mocks", "supervisor", "recorder", "console"}
+PROCESSES = {"mocks", "supervisor", "recorder", "gateway", "console"}
 REST = {"OFF", "STANDBY", "SAFE"}
 STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
 STILL_V = 0.1

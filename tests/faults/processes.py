@@ -39,4 +39,7 @@ ENTRIES = (
                   STAYS, "the recorder was killed by signal 9"),
     *in_each_mode("recorder", "stopped", 2.0, STAYS, ""),
     *in_each_mode("recorder", "slowed", 2.0, STAYS, ""),
+    Entry("gateway", "killed", STAYS, "the gateway was killed by signal 9", within_s=5.0, rig="by TCP"),
+    Entry("gateway", "stopped", STAYS, rig="by TCP"),
+    Entry("gateway", "slowed", STAYS, rig="by TCP"),
 )  # fmt: skip

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from served import free_port
 from system.conftest import NEAR, end, running
 
 from fitctl.config import default_rig_path
@@ -45,7 +46,10 @@ def by_a_clock_of_its_own(_stack, folder):
 
 
 class Setup(NamedTuple):
-    """One rig; `home` is the mode to which it comes back, `where` says what it runs in."""
+    """One rig; `home` is the mode to which it comes back, `where` says what it runs in.
+
+    In settings, ``{folder}`` is a folder of its own.
+    """
 
     file: str = "fit-mock"
     settings: tuple[str, ...] = ()
@@ -59,6 +63,14 @@ SETUPS = {
     "ensemble": Setup(file="ensemble"),
     "fit-bal-analog": Setup(file="fit-bal-analog"),
     "fast telemetry": Setup(settings=("supervisor.telemetry_hz=100.0",)),
+    "by TCP": Setup(
+        settings=(
+            "service.tcp_address=127.0.0.1",
+            f"service.command_port={free_port()}",
+            f"service.telemetry_port={free_port()}",
+            "service.keys_folder={folder}/keys",
+        )
+    ),
     "small disk": Setup(
         settings=("logging.queue_records=300", "logging.rotate_s=8.0"), where=on_a_disk_of_its_own
     ),
@@ -73,9 +85,8 @@ def started(name, folder, account):
     file = default_rig_path().parent / f"{setup.file}.toml"
     with ExitStack() as stack:
         before, root = setup.where(stack, folder)
-        with running(
-            folder, NEAR, SOON, *setup.settings, file=file, kind=WatchedRig, before=before
-        ) as rig:
+        settings = [setting.format(folder=folder) for setting in (NEAR, SOON, *setup.settings)]
+        with running(folder, *settings, file=file, kind=WatchedRig, before=before) as rig:
             rig.logs = root / folder.relative_to("/") if root else folder
             yield rig
         account[f"records: {name}"] = settle(rig)

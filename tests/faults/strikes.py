@@ -33,7 +33,7 @@ def device(rig, entry):
 
 @contextmanager
 def killed(rig, entry):
-    """SIGKILL; then started again by whoever started it, the recorder by its supervisor."""
+    """SIGKILL; then started again by whoever started it, recorder and gateway by their supervisor."""
     rig.process(entry.struck).kill()
     if entry.struck == "mocks":
         rig.bench_answers = False
@@ -48,6 +48,8 @@ def killed(rig, entry):
             rig.restart_mocks()
         if entry.struck == "supervisor":
             rig.start_supervisor()
+    if entry.struck == "gateway":
+        goes_on(rig, entry)
 
 
 @contextmanager
@@ -101,7 +103,9 @@ def repeated(action, every_s):
 
 
 def goes_on(rig, entry):
-    """A console draws again."""
+    """A console draws again; who is elsewhere is answered again."""
+    if entry.struck == "gateway":
+        rig.is_reached_from_elsewhere()
     if entry.struck == "console":
         drawn, end_s = rig.console.drawn, time.monotonic() + DRAWS_WITHIN_S
         while rig.console.drawn == drawn:

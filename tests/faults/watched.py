@@ -2,14 +2,27 @@
 
 import time
 from contextlib import suppress
+from pathlib import Path
 from typing import NamedTuple
 
 import psutil
 from system.conftest import Rig
 
+from fitctl.config import load_rig
 from fitctl.mocks.bench import ClearFaults, SetFault, StagesQuestion, ask_faults, ask_stages
 from fitctl.model.drives import Drive
-from fitctl.supervisor.messages import Acquire, Experiment, Hold, Off, Recover, Standby, Stop
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.keys import new_key
+from fitctl.supervisor.messages import (
+    Acquire,
+    Experiment,
+    Hold,
+    Off,
+    Recover,
+    Standby,
+    Status,
+    Stop,
+)
 
 from .console import Console
 
@@ -62,6 +75,7 @@ class WatchedRig(Rig):
         self.logs = folder
         self.errors = (folder / "errors.txt").open("a")
         self.console = None
+        self.elsewhere = None  # a client by TCP
         self.heard = []  # what was answered to strange commands
         self.shown = set()  # times of all ticks in telemetry
         self.lost_of = {}  # records lost, by each supervisor's own count
@@ -105,14 +119,31 @@ class WatchedRig(Rig):
         """The process of a name, once it is there."""
         if name == "console":
             return self._open_console()
-        if name != "recorder":
-            return psutil.Process({"supervisor": self.supervisor, "mocks": self.mocks}[name].pid)
-        end_s = time.monotonic() + ANSWER_S
-        while time.monotonic() < end_s:
-            with suppress(StopIteration):
-                return self.recorder()
+        if name == "recorder":
+            return self.recorder()
+        if name == "gateway":
+            self.is_reached_from_elsewhere()
+            return self.child("gateway")
+        return psutil.Process({"supervisor": self.supervisor, "mocks": self.mocks}[name].pid)
+
+    def is_reached_from_elsewhere(self):
+        """Somebody with a key, who was there all the time, sees telemetry and is answered."""
+        if self.elsewhere is None:
+            path, *settings = (part for part in self.common[1:] if part != "--set")
+            file = self.folder / "anna.key.toml"
+            self.elsewhere = Client(
+                new_key(load_rig(Path(path), settings), "anna", "commander", "", file)
+            )
+        while self.elsewhere.receive(0.0) is not None:
+            pass  # what came before
+        answered = seen = False
+        end_s = time.monotonic() + REACH_S
+        while not (answered and seen):
+            assert time.monotonic() < end_s, f"by TCP: answered {answered}, seen {seen}"
+            with suppress(ConnectionError):
+                answered = answered or self.elsewhere.send(Status()).accepted
+            seen = seen or self.elsewhere.receive(LOOK_S) is not None
             self.receive(LOOK_S)
-        return self.recorder()
 
     def _open_console(self):
         """The console's process, once it has drawn something."""
@@ -127,6 +158,8 @@ class WatchedRig(Rig):
     def close(self):
         if self.console is not None:
             self.console.close()
+        if self.elsewhere is not None:
+            self.elsewhere.close()
         super().close()
         self.errors.close()
 

@@ -7,11 +7,13 @@ import pytest
 import zmq
 from served import Served, until
 
+from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError
 from fitctl.sequences.instrument import Instrument
 from fitctl.supervisor.client import Client
-from fitctl.supervisor.doors import KeyedDoor
 from fitctl.supervisor.endpoints import tcp_endpoint
+from fitctl.supervisor.gateway import Gateway
+from fitctl.supervisor.keyed_door import check_keyed_door
 from fitctl.supervisor.keys import revoke_key
 from fitctl.supervisor.messages import (
     Hold,
@@ -102,7 +104,7 @@ def test_revoking_refuses_commands_and_cuts_telemetry_of_who_is_connected(served
 def test_a_key_that_is_unknown_is_told_that_it_is(served):
     stranger = served.person("stranger")
     revoke_key(served.rig, "stranger")
-    until(lambda: not any(k.name == "stranger" for k in served.service._keyed._allowed.values()))
+    until(lambda: not any(k.name == "stranger" for k in served.gateway._keyed.allowed.values()))
 
     with pytest.raises(ConnectionError, match="does not let the key stranger in"):
         stranger.send(Status(), timeout_s=0.5)
@@ -175,7 +177,9 @@ def test_a_python_program_elsewhere_has_the_instrument(served):
 
 def test_ports_that_are_taken_are_named(served):
     with pytest.raises(ConfigError, match=r"service\.tcp_address.*choose others"):
-        KeyedDoor(served.rig, lambda problem: None)
+        Gateway(served.rig, served.folder, MonotonicClock())
+    with pytest.raises(ConfigError, match=r"service\.tcp_address.*choose others"):
+        check_keyed_door(served.rig)
 
 
 def test_a_client_that_is_closed_lets_go_of_everything(served):

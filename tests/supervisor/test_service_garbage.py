@@ -70,10 +70,9 @@ def test_any_bytes_on_the_wire_leave_it_well(served, streams, keyed):
 
 def test_a_flood_of_commands_is_held_back_and_a_stop_comes_through(served, monkeypatch):
     """More than it takes: what is too much waits with its sender, and hinders nobody else."""
-    taken, take = [], served.service._doors[0].take
-    monkeypatch.setattr(
-        served.service._doors[0], "take", lambda frames: taken.append(take(frames)) or taken[-1]
-    )
+    door, taken = served.service._local, []
+    take = door.take
+    monkeypatch.setattr(door, "take", lambda messages: taken.append(take(messages)) or taken[-1])
     begun_s = time.monotonic()
     with zmq.Context() as context, context.socket(zmq.DEALER) as flood:
         flood.setsockopt(zmq.LINGER, 0)

@@ -133,14 +133,18 @@ class Rig:
 
     def recorder(self):
         """The recorder process; one that is just being started is waited for."""
+        return self.child("record")
+
+    def child(self, command):
+        """The process of ``fitctl COMMAND`` beside the supervisor; one that is being started is waited for."""
         end_s = time.monotonic() + START_S
         while time.monotonic() < end_s:
             for child in psutil.Process(self.supervisor.pid).children(recursive=True):
                 with suppress(psutil.Error):  # it ends at this moment
-                    if "record" in child.cmdline():
+                    if command in child.cmdline():
                         return child
             time.sleep(0.05)
-        raise AssertionError(f"no recorder within {START_S} s")
+        raise AssertionError(f"no fitctl {command} within {START_S} s")
 
     def close(self):
         if self.client is not None:

@@ -1,0 +1,154 @@
+"""A real supervisor that is reached by TCP: the network is its gateway's, and so are the network's troubles."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import psutil
+import pytest
+import zmq
+from served import free_port
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.supervisor.client import Client
+from fitctl.supervisor.endpoints import tcp_endpoint
+from fitctl.supervisor.keys import new_key
+from fitctl.supervisor.messages import Status
+
+from .conftest import START_S, Rig
+
+_HEARTBEAT_MS = 2
+_ROUNDS = 40
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """One without devices, in OFF, with keys for anna and bob, and a client of anna's."""
+    folder = tmp_path_factory.mktemp("gateway")
+    rig = Rig(folder)
+    rig.endpoints = {}
+    rig.settings = [
+        "interlocks.disk_space.low=0.0",
+        "service.tcp_address=127.0.0.1",
+        f"service.keys_folder={folder / 'keys'}",
+        f"service.command_port={free_port()}",
+        f"service.telemetry_port={free_port()}",
+    ]
+    rig.common += [part for setting in rig.settings for part in ("--set", setting)]
+    loaded = load_rig(default_rig_path(), rig.settings)
+    rig.key, rig.other_key = (
+        new_key(loaded, name, "commander", "", folder / f"{name}.key.toml")
+        for name in ("anna", "bob")
+    )
+    rig.start_supervisor()
+    rig.anna = Client(rig.key)
+    try:
+        yield rig
+    finally:
+        rig.anna.close()
+        rig.close()
+
+
+def gateway_of(rig):
+    """The gateway's process, once it listens."""
+    end_s = time.monotonic() + START_S
+    while time.monotonic() < end_s:
+        gateway = rig.child("gateway")
+        with suppress(psutil.Error):  # it ends at this moment
+            if listening(gateway):
+                return gateway
+        time.sleep(0.05)
+    raise AssertionError(f"no gateway within {START_S} s")
+
+
+def listening(process):
+    return {c.laddr.port for c in process.net_connections("tcp") if c.status == "LISTEN"}
+
+
+def answered(client):
+    """A client is answered, sooner or later."""
+    end_s = time.monotonic() + START_S
+    while time.monotonic() < end_s:
+        with suppress(ConnectionError):
+            return client.send(Status())
+    raise AssertionError(f"no answer within {START_S} s")
+
+
+def test_the_supervisor_has_no_socket_on_the_network_and_its_gateway_gives_way(rig):
+    gateway = gateway_of(rig)
+    assert answered(rig.anna).text == "right OFF"
+
+    assert listening(gateway) == {rig.key.command_port, rig.key.telemetry_port}
+    assert psutil.Process(rig.supervisor.pid).net_connections("inet") == []
+    modest = min(19, os.getpriority(os.PRIO_PROCESS, rig.supervisor.pid) + 10)
+    for thread in (thread.id for thread in gateway.threads()):
+        assert os.getpriority(os.PRIO_PROCESS, thread) == modest
+        assert os.sched_getscheduler(thread) == os.SCHED_OTHER
+
+
+def test_a_gateway_that_is_killed_is_told_of_and_clients_come_back_by_themselves(rig):
+    assert answered(rig.anna).accepted
+    before = gateway_of(rig)
+
+    before.kill()
+
+    rig.follow(lambda t: any("the gateway was killed by signal 9" in e.message for e in t.events))
+    assert gateway_of(rig).pid != before.pid
+    assert answered(rig.anna).text == "right OFF"
+    while rig.anna.receive(0.0) is not None:
+        pass
+    assert rig.anna.receive(START_S).loops[0].mode == "OFF"
+    assert rig.supervisor.poll() is None
+
+
+def test_heartbeats_by_an_allowed_key_are_the_gateways_affair_alone(rig):
+    """Whatever libzmq makes of them: a client that pings, does not read, and hangs up."""
+    sequence = rig.follow(lambda _: True)[-1].sequence
+    with zmq.Context() as context:
+        for _ in range(_ROUNDS):
+            some = [pinging(context, rig.other_key) for _ in range(3)]
+            time.sleep(0.02)
+            for one in some:
+                one.close(linger=0)
+
+    assert rig.follow(lambda t: t.sequence > sequence)
+    assert rig.supervisor.poll() is None
+    assert answered(rig.anna).text == "right OFF"
+
+
+def pinging(context, key):
+    dealer = context.socket(zmq.DEALER)
+    dealer.curve_serverkey = key.server_public.encode()
+    dealer.curve_publickey, dealer.curve_secretkey = key.public.encode(), key.secret.encode()
+    dealer.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+    dealer.setsockopt(zmq.HEARTBEAT_TTL, 100)
+    dealer.setsockopt(zmq.RCVHWM, 1)
+    dealer.connect(tcp_endpoint(key.host, key.command_port))
+    with suppress(zmq.Again):
+        for _ in range(200):
+            dealer.send_multipart([b"tag", b"garbage"], zmq.NOBLOCK)
+    return dealer
+
+
+def test_a_port_that_somebody_else_has_is_one_line_and_status_2(rig, tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        changed = [f"service.command_port={port}", f"service.folder={tmp_path / 's'}"]
+        options = [part for setting in changed for part in ("--set", setting)]
+        done = subprocess.run(
+            [sys.executable, "-m", "fitctl", "run", *rig.common, *options],
+            capture_output=True,
+            text=True,
+            timeout=START_S,
+            check=False,
+        )
+
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith(f"service.tcp_address: 127.0.0.1, ports {port} and ")
+    assert done.stderr.count("\n") == 1
