@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from fitctl.config import Fsm, Rig
-from fitctl.controllers.mirror import Mirror
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.records import Tick
-from fitctl.model.optics import mirror_angles, scales
+from fitctl.model.hysteresis import displacement_series
+from fitctl.model.optics import mirror_angles, mirror_from_stacks, scales
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.simulate import SETTLE_S
 
@@ -107,16 +107,13 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
 def _mirror_angles_rad(fsm: Fsm, ticks: Ticks) -> Floats:
     """After each tick's command, shape (ticks, 2)."""
     volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
-    if fsm.hysteresis is None:
+    known = fsm.hysteresis
+    if known is None:
         return mirror_angles(volts, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
-    mirror = Mirror(fsm)
-    if len(volts):
-        mirror.assume(volts[0])
-    angles_rad = np.empty((len(volts), 2))
-    for row, stack_v in enumerate(volts):
-        mirror.written(stack_v)
-        angles_rad[row] = mirror.angles_rad
-    return angles_rad
+    half_width_v, gains = np.asarray(known.half_widths_v), np.asarray(known.gains_m_per_v)
+    moved_m = displacement_series(volts, half_width_v, gains)
+    moved_m -= gains @ np.maximum(fsm.bias_v - half_width_v, 0.0)
+    return mirror_from_stacks(moved_m, fsm.stack_radius_m)
 
 
 def _last_vernier(ticks: Ticks) -> NDArray[np.intp]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.files import opened, up_to_the_tear
+from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import Tick
 from fitctl.logging.schemas import TOPICS
 
@@ -105,7 +106,7 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
         If the file is missing, no MCAP log, or finished and yet damaged.
     """
     with opened(path) as (stream, finished), up_to_the_tear(path, finished):
-        kind = SeekingReader if finished else NonSeekingReader
+        kind = IndexedReader if finished else NonSeekingReader
         reader = kind(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         # Not ordered by log time: it is already, and sorting a cut file gives nothing at all.
         for _, channel, header, message in reader.iter_decoded_messages(
@@ -117,9 +118,21 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
 
 
 def column_blocks(
-    path: Path, topics: Collection[str] | None = None, rows: float = math.inf
+    path: Path,
+    topics: Collection[str] | None = None,
+    rows: float = math.inf,
+    fields: Mapping[str, Collection[str]] | None = None,
 ) -> Iterator[tuple[str, Columns]]:
     """Messages as columns, a block of at most so many rows of one topic at a time.
+
+    Parameters
+    ----------
+    path : Path
+    topics : collection of str, optional
+        All, unless named.
+    rows : int, optional
+    fields : mapping of str to collection of str, optional
+        Of a topic that is named here only these of its fields: the others cost time and room.
 
     Yields
     ------
@@ -134,11 +147,12 @@ def column_blocks(
     LogError
         If the log cannot be read.
     """
+    chosen = fields or {}
     blocks: dict[str, _Block] = {}
     for entry in read_records(path, topics):
         block = blocks.get(entry.topic)
         if block is None:
-            block = blocks[entry.topic] = _Block(entry.message)
+            block = blocks[entry.topic] = _Block(entry.message, chosen.get(entry.topic))
         block.add(entry)
         if len(block) >= rows:
             yield entry.topic, block.columns()
@@ -170,8 +184,14 @@ def tick_arrays(path: Path, loop: str) -> Columns:
 class _Block:
     """Messages of one topic, field by field; the file says which fields, it may be older than we are."""
 
-    def __init__(self, message: google.protobuf.message.Message) -> None:
-        fields = [field for field in message.DESCRIPTOR.fields if field.cpp_type in _COLUMNS]
+    def __init__(
+        self, message: google.protobuf.message.Message, chosen: Collection[str] | None
+    ) -> None:
+        fields = [
+            field
+            for field in message.DESCRIPTOR.fields
+            if field.cpp_type in _COLUMNS and (chosen is None or field.name in chosen)
+        ]
         kinds = dict.fromkeys(HEADER, _COLUMNS[FieldDescriptor.CPPTYPE_INT64])
         for field in fields:
             # Text and bytes are told apart by their type alone.

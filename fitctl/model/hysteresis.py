@@ -6,6 +6,8 @@ dot product. Arrays may have any leading axes (runs, stacks).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,6 +45,44 @@ def half_widths_v(settings: Hysteresis) -> Floats:
 def play(state: Floats, value: Floats, half_width: Floats) -> Floats:
     """One evaluation of the play (backlash) operator: the new output, shapes broadcast."""
     return np.maximum(value - half_width, np.minimum(value + half_width, state))
+
+
+def displacement_series(volts: Floats, half_width_v: Floats, gains: Floats) -> Floats:
+    """Displacements of stacks that were relaxed before a series of voltages, as play by play gives them.
+
+    A play limits what it was, and a series of limits is one limit again: what a whole piece of the series does
+    follows from playing the two extremes through it. So all pieces are gone through side by side, once for what
+    they do and, when it is known where each begins, once more for their output.
+
+    Parameters
+    ----------
+    volts : array, shape (times, stacks)
+    half_width_v : array, shape (n,)
+    gains : array, shape (stacks, n)
+
+    Returns
+    -------
+    array, shape (times, stacks)
+        Metres.
+    """
+    times, stacks = volts.shape
+    pieces = math.isqrt(times) + 1
+    steps = -(-times // pieces)
+    by_step = np.zeros((pieces * steps, stacks))
+    by_step[:times] = volts
+    by_step = by_step.reshape(pieces, steps, stacks).swapaxes(0, 1)
+    low = np.full((pieces, *gains.shape), -np.inf)
+    high = -low
+    for value in by_step[..., None]:
+        low, high = play(low, value, half_width_v), play(high, value, half_width_v)
+    state = np.zeros_like(low)
+    for piece in range(1, pieces):
+        state[piece] = np.clip(state[piece - 1], low[piece - 1], high[piece - 1])
+    moved_m = np.empty((steps, pieces, stacks))
+    for step, value in enumerate(by_step[..., None]):
+        state = play(state, value, half_width_v)
+        moved_m[step] = hysteresis_output(state, gains)
+    return moved_m.swapaxes(0, 1).reshape(-1, stacks)[:times]
 
 
 def hysteresis_output(state: Floats, gains: Floats) -> Floats:

@@ -20,7 +20,6 @@ from fitctl.report.stages import Stacks, Stages, stacks, stages
 from fitctl.supervisor.modes import Mode
 
 AXES = ("az", "el")
-_TIMES = ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s")
 
 
 @dataclass(frozen=True)
@@ -97,12 +96,8 @@ def _loop(gathered: Gathered, name: str) -> LoopFindings:
     rig: Rig = gathered.run.rig
     ticks, settings = gathered.ticks[name], rig.loops[name]
     judged = judge_by(ticks, rig.camera.period_s, settings.requirement_px)
-    residual = {
-        axis: rms_estimate(
-            [ticks[f"error_{axis}_px"][piece] for piece in judged.pieces], rig.camera.period_s
-        )
-        for axis in AXES
-    }
+    rows = judged.rows
+    residual = {axis: rms_estimate(ticks[f"error_{axis}_px"][rows]) for axis in AXES}
     found = stacks(rig, name, ticks)
     return LoopFindings(
         name=name,

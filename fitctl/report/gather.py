@@ -117,8 +117,9 @@ def gather(run: Run) -> Gathered:
     blocks: dict[tuple[str, str], list[Columns]] = defaultdict(list)
     health: list[dict[str, Any]] = []
     states: dict[str, str] = {}
+    fields = {TOPICS[Tick].format(loop=loop): TICK_FIELDS for loop in loops}
     for log in run.logs:
-        for topic, columns in column_blocks(log.path, list(places), _ROWS):
+        for topic, columns in column_blocks(log.path, list(places), _ROWS, fields):
             place = places[topic]
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
             kept = _small(columns, time_s, str(log.path)) if place[0] == "ticks" else columns

@@ -20,8 +20,9 @@ SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
 JUDGED = (
     f"Judged is VERNIER, from {SETTLE_S:g} s after it began and {TARGET_SETTLE_S:g} s after the target last "
     "moved, on frames with a star. The error is the measured one: the camera's noise is in it. The interval "
-    "knows that neighbouring frames are alike (batch means). Met: all of both axes' intervals is within the "
-    "requirement. Not met: all of one is above. Else, or without enough data: not known."
+    "knows that neighbouring frames are alike: so many independent values would leave the RMS as uncertain. "
+    "Met: all of both axes' intervals is within the requirement. Not met: all of one is above. Else, or where "
+    "the record is too short: not known."
 )
 
 

@@ -77,7 +77,7 @@ def read_series(
         raise LogError(msg)
     parts: dict[tuple[str, str], list[Floats]] = defaultdict(list)
     start_ns = round(info.start_s * 1e9)
-    for topic, columns in column_blocks(path, list(chosen), _ROWS):
+    for topic, columns in column_blocks(path, list(chosen), _ROWS, chosen):
         utc_ns = columns["publish_time_ns"]
         inside = (utc_ns >= from_ns) & (utc_ns < to_ns)
         parts[topic, ""].append((utc_ns[inside] - start_ns) / 1e9)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating]
 
 CONFIDENCE = 0.95
-FIRST_BLOCK_S = 1.0
-LEAST_BLOCKS = 10
+WIDEST = 3.0
+"""No interval is told whose ends differ by more than this: so short a record may not have seen all there is."""
 LEAST_STAR_FRACTION = 0.98
-_LEAST_INDEPENDENT = 2.0
-_MOST_ALIKE = 0.99
-_Z_ONE_SIDED = 1.645  # a correlation of blocks beyond this is none of chance
+BATCHES = 10
+_LEAST_FRAMES = 2 * BATCHES
+_AT_REST_BINS = 4  # the lowest frequencies, which tell what noise there is at none
 
 Word = Literal["met", "not met", "not known"]
 
@@ -30,18 +30,15 @@ class Estimate(NamedTuple):
     rms_px : float
         nan without data.
     low_px, high_px : float
-        nan where there are too few independent blocks to tell.
-    blocks : float
-        Independent ones,
-    block_s : float
-        and how long each is.
+        nan where the record is too short to tell.
+    independent : float
+        So many independent values would leave the RMS as uncertain; nan without data.
     """
 
     rms_px: float
     low_px: float
     high_px: float
-    blocks: float
-    block_s: float
+    independent: float
 
     @property
     def known(self) -> bool:
@@ -56,57 +53,64 @@ class Verdict(NamedTuple):
     why: str
 
 
-def rms_estimate(pieces: Sequence[Floats], period_s: float) -> Estimate:
-    """RMS of one axis' error with an interval that knows that neighbouring frames are alike.
+def rms_estimate(error_px: Floats) -> Estimate:
+    """RMS about zero of one axis' error, with an interval that knows that neighbouring frames are alike.
 
-    Method of batch means: the mean squares of blocks, at first of `FIRST_BLOCK_S`, are doubled in length until
-    neighbouring blocks no longer correlate, or too few would be left; then they count for fewer. Their spread
-    tells the uncertainty of their mean, by Student's t on the logarithm, which keeps the interval positive.
-    (Law, Simulation Modeling and Analysis, "batch means"; the doubling is Fishman's, 1978.)
+    Two methods say how uncertain the mean square is, and the wider one counts, by Student's t on the logarithm,
+    which keeps the interval positive: :func:`_by_spectrum`, which sees slow motion but takes it for Gaussian
+    and steady, and :func:`_by_batches`, which takes nothing for granted but sees nothing slower than a batch.
 
     Parameters
     ----------
-    pieces : sequence of array, shape (frames,)
-        px; frames within a piece follow each other. What fills no block does not count for the interval.
+    error_px : array, shape (frames,)
+        Evenly sampled; pieces of a record end to end.
     """
     from scipy.stats import t  # half a second of import
 
-    pieces = [np.asarray(piece, dtype=float) ** 2 for piece in pieces if len(piece)]
-    if not pieces:
-        return Estimate(math.nan, math.nan, math.nan, 0, FIRST_BLOCK_S)
-    rms_px = math.sqrt(np.concatenate(pieces).mean())
-    block_s = FIRST_BLOCK_S
-    means, alike = _block_means(pieces, block_s, period_s)
-    while alike > _Z_ONE_SIDED / math.sqrt(max(1, len(means))):
-        longer = _block_means(pieces, 2 * block_s, period_s)
-        if len(longer[0]) < LEAST_BLOCKS:
-            break
-        block_s, (means, alike) = 2 * block_s, longer
-    # What resemblance is left, though it may be chance, takes away from what the blocks tell.
-    alike = min(max(alike, 0.0), _MOST_ALIKE)
-    independent = len(means) * (1 - alike) / (1 + alike)
-    if len(means) < LEAST_BLOCKS or independent < _LEAST_INDEPENDENT or not means.mean() > 0:
-        return Estimate(rms_px, math.nan, math.nan, independent, block_s)
-    spread = float(means.std(ddof=1) / means.mean()) / math.sqrt(independent)
-    half = (
-        float(t.ppf((1 + CONFIDENCE) / 2, independent - 1)) * spread / 2
-    )  # ln RMS is half of ln square
-    return Estimate(rms_px, rms_px * math.exp(-half), rms_px * math.exp(half), independent, block_s)
+    error_px = np.asarray(error_px, dtype=float)
+    if len(error_px) == 0:
+        return Estimate(math.nan, math.nan, math.nan, math.nan)
+    rms_px = math.sqrt(np.mean(error_px**2))
+    if len(error_px) < _LEAST_FRAMES or error_px.min() == error_px.max():
+        return Estimate(rms_px, math.nan, math.nan, math.nan)
+    found = (_by_spectrum(error_px), _by_batches(error_px))
+    independent = 2 / max(variance for variance, _ in found)
+    # ln RMS is half of ln square.
+    half = max(t.ppf((1 + CONFIDENCE) / 2, freedom) * math.sqrt(v) / 2 for v, freedom in found)
+    if 2 * half > math.log(WIDEST):
+        return Estimate(rms_px, math.nan, math.nan, independent)
+    factor = math.exp(half)
+    return Estimate(rms_px, rms_px / factor, rms_px * factor, independent)
 
 
-def _block_means(pieces: Sequence[Floats], block_s: float, period_s: float) -> tuple[Floats, float]:
-    """Means of whole blocks, and by how much neighbours in one piece correlate."""
-    frames = max(1, round(block_s / period_s))
-    of_pieces = [
-        piece[: len(piece) // frames * frames].reshape(-1, frames).mean(axis=1) for piece in pieces
-    ]
-    means = np.concatenate(of_pieces)
-    if len(means) < LEAST_BLOCKS:
-        return means, 0.0
-    deviations = [one - means.mean() for one in of_pieces]
-    variance = float(np.mean(np.concatenate(deviations) ** 2))
-    products = np.concatenate([one[1:] * one[:-1] for one in deviations])
-    return means, float(products.mean()) / variance if len(products) and variance > 0 else 0.0
+def _by_spectrum(error_px: Floats) -> tuple[float, float]:
+    """Relative variance of the mean square, and the degrees of freedom with which it is known.
+
+    Each frequency of the periodogram is an independent chi-square of two degrees of freedom, so that half its
+    square estimates its variance, and five times the sum of the fourth powers over 24 the variance of that.
+    (Bendat and Piersol, Random Data, section 8.2: the mean square's error goes with the integral of the squared
+    spectrum; the degrees are Satterthwaite's.) At frequency zero noise cannot be told from a steady offset: its
+    noise is taken from the lowest frequencies, and adds with what is there as in a product of the two.
+
+    The degrees of freedom are halved. From one record alone slow motion looks quicker than it is, and by as
+    much did trials fall short (tests/report/test_residual.py, docs/measurements.md).
+    """
+    from scipy.fft import rfft
+
+    power = np.abs(rfft(error_px) / len(error_px)) ** 2
+    at_rest, moving = float(power[0]), 2 * power[1:]
+    noise_at_rest = float(moving[:_AT_REST_BINS].mean()) / 2
+    squares = float(np.sum(moving**2)) / 2
+    variance = (squares + 4 * at_rest * noise_at_rest) / (at_rest + float(moving.sum())) ** 2
+    freedom = 2 * squares**2 / (5 * float(np.sum(moving**4)) / 24)
+    return variance, max(1.0, freedom / 2)
+
+
+def _by_batches(error_px: Floats) -> tuple[float, float]:
+    """The same from the spread of the mean squares of a few long batches."""
+    length = len(error_px) // BATCHES
+    means = np.mean(error_px[: BATCHES * length].reshape(BATCHES, length) ** 2, axis=1)
+    return float(means.var(ddof=1) / means.mean() ** 2) / BATCHES, BATCHES - 1.0
 
 
 def verdict(
@@ -127,8 +131,8 @@ def verdict(
     if few:
         return Verdict(
             "not known",
-            f"{judged_s:.0f} s count, which is too little: an interval needs {LEAST_BLOCKS} blocks of "
-            f"{FIRST_BLOCK_S:g} s or more that do not all resemble their neighbours",
+            f"too short to judge: the {judged_s:.0f} s that count hold too few independent values of the "
+            f"error in {' and '.join(few)} for an interval",
         )
     if all(found.high_px <= requirement_px for found in axes.values()):
         return Verdict("met", "both axes: all of the interval is within it")

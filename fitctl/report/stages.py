@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.logging.reading import Columns
-from fitctl.model.hysteresis import half_widths_v, play, stack_gains
+from fitctl.model.hysteresis import displacement_series, half_widths_v, stack_gains
 from fitctl.model.optics import piston_m, scales
 
 Floats = NDArray[np.float64]
@@ -113,11 +113,7 @@ def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
     else:
         return None
     volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
-    displacement_m = np.empty_like(volts)
-    plays_v = np.zeros_like(gains)
-    for row, stack_v in enumerate(volts):
-        plays_v = play(plays_v, stack_v[:, None], half_v)
-        displacement_m[row] = np.vecdot(plays_v, gains)
+    displacement_m = displacement_series(volts, half_v, gains)
     displacement_m -= gains @ np.maximum(fsm.bias_v - half_v, 0.0)
     # Piece by piece: its vectors would take ten times the room of what comes of them.
     pieces = np.array_split(displacement_m, 1 + len(volts) // _PIECE)

@@ -69,7 +69,7 @@ def residual(loop: LoopFindings) -> Table:
             "interval, px",
             "arcsec on the sky",
             "of the requirement",
-            "independent blocks",
+            "independent values",
         ],
         [
             [
@@ -78,7 +78,7 @@ def residual(loop: LoopFindings) -> Table:
                 interval(found),
                 number(found.rms_px * loop.sky_arcsec_per_px, ".4f"),
                 number(100 * found.rms_px / loop.requirement_px, ".0f", "%"),
-                f"{found.blocks:.0f} of {found.block_s:g} s" if found.blocks else "none",
+                number(found.independent, ".0f"),
             ]
             for axis, found in loop.residual.items()
         ],

@@ -1,3 +1,4 @@
+import io
 import os
 import tempfile
 import time
@@ -18,9 +19,11 @@ from log_samples import (
     tick,
     write_log,
 )
+from mcap.reader import SeekingReader
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import log_info, read_records, tick_arrays
+from fitctl.logging.indexed import IndexedReader
+from fitctl.logging.reading import HEADER, column_blocks, log_info, read_records, tick_arrays
 from fitctl.logging.schemas import to_message, topic_of
 from fitctl.logging.writer import LogWriter
 
@@ -58,6 +61,29 @@ def test_topics_can_be_chosen(tmp_path):
     path = write_log(tmp_path / "a.mcap", one_of_each())
     topics = ["/fit/events", "/fit/right/piezo"]
     assert [entry.topic for entry in read_records(path, topics)] == topics
+
+
+def test_of_a_topic_only_some_fields_can_be_had(tmp_path):
+    path = write_log(tmp_path / "a.mcap", [tick(7), frame(1), *one_of_each()[2:3]])
+    blocks = dict(column_blocks(path, fields={"/fit/right/tick": ["late", "number", "colour"]}))
+    assert set(blocks["/fit/right/tick"]) == {*HEADER, "number", "late"}
+    assert blocks["/fit/right/tick"]["number"].tolist() == [7]
+    assert "width" in blocks["/fit/camera/frame"]
+
+
+@pytest.mark.parametrize(
+    "topics", [None, ["/fit/right/tick"], ["/fit/camera/frame", "/fit/events"], []]
+)
+def test_a_log_is_read_as_the_library_s_own_reader_reads_it(tmp_path, topics):
+    records = [record for n in range(40) for record in (tick(n), frame(n))]
+    small = SETTINGS.model_copy(update={"chunk_bytes": 10_000})
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, *records, *one_of_each()[2:]], small)
+    ours, whole = (
+        list(reader(io.BytesIO(path.read_bytes())).iter_messages(topics, log_time_order=False))
+        for reader in (IndexedReader, SeekingReader)
+    )
+    assert ours == whole
+    assert bool(ours) == (topics != [])
 
 
 def test_before_the_run_info_the_writer_measures_the_wall_time_itself(tmp_path):

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from fitctl.config import Hysteresis
 from fitctl.model import hysteresis
 from fitctl.model.hysteresis import (
+    displacement_series,
     gains_from_slopes,
     half_widths_v,
     hysteresis_output,
@@ -34,6 +35,17 @@ def states(voltages, start=None, half_width=HALF_WIDTH_V):
 
 def ramp(low_v, high_v, points=1001):
     return np.linspace(low_v, high_v, points)
+
+
+@given(st.lists(st.tuples(volts, volts), max_size=60))
+def test_a_series_at_once_is_play_by_play(history):
+    series = np.array(history).reshape(-1, 2)
+    gains = np.random.default_rng(2).random((2, len(HALF_WIDTH_V)))
+
+    at_once = displacement_series(series, HALF_WIDTH_V, gains)
+
+    one_by_one = [hysteresis_output(states(series[:, n]), gains[n]) for n in range(2) if history]
+    assert at_once.T.tolist() == [stack.tolist() for stack in one_by_one] or not history
 
 
 # ---------------------------------------------------------------- the play operator
