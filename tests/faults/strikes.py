@@ -6,8 +6,10 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 
+from fitctl.config import default_rig_path, load_rig
 from fitctl.mocks.bench import ClearFaults, SetFault
-from fitctl.supervisor.messages import Reset, Shutdown, Stop
+from fitctl.model.optics import scales
+from fitctl.supervisor.messages import Jog, Reset, Shutdown, Stop
 
 from .commands import FLOOD, FLOODED, SENT, answers
 
@@ -15,6 +17,10 @@ SLOW_S = 0.015  # stopped for so long, then running for so long: half of its tim
 ENDS_WITHIN_S = 10.0
 DRAWS_WITHIN_S = 10.0
 RECORDER_BACK_S = 60.0  # its supervisor waits longer from try to try
+RIG = load_rig(default_rig_path())
+JOG_SKY_ARCSEC = 90.0  # nearly as far as one jog goes
+JOG_RAD = JOG_SKY_ARCSEC / scales(RIG, RIG.loops["right"]).motor_sky_arcsec_per_rad
+MOVED_RAD = 0.1  # of a motor
 
 
 @contextmanager
@@ -62,6 +68,21 @@ def stopped(rig, entry):
         process.resume()
         rig.bench_answers = True
     goes_on(rig, entry)
+
+
+def on_its_way(strike_supervisor):
+    """Strike while the siderostat jogs: it must have moved, and come to rest before it is there."""
+
+    @contextmanager
+    def struck(rig, entry):
+        before_rad = rig.place().motor_rad[0]
+        assert rig.client.send(Jog(az_sky_arcsec=JOG_SKY_ARCSEC, el_sky_arcsec=0.0)).accepted
+        with strike_supervisor(rig, entry):
+            yield
+            went_rad = rig.places[-1].motor_rad[0] - before_rad
+            assert MOVED_RAD < went_rad < JOG_RAD - MOVED_RAD, f"{went_rad} rad of {JOG_RAD}"
+
+    return struck
 
 
 @contextmanager
@@ -230,7 +251,9 @@ def clock(rig, entry):
 
 STRIKES = {
     "killed": killed,
+    "killed while it jogs": on_its_way(killed),
     "stopped": stopped,
+    "stopped while it jogs": on_its_way(stopped),
     "stuck": stuck,
     "slowed": slowed,
     "told to end while its recorder is stopped": told_to_end,
