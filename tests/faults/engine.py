@@ -88,7 +88,7 @@ def watch(rig, entry, since_s, stalled):
     limit_s = max(entry.within_s, STAYS_S) + 1.0 + stalled.total_s
     with suppress(AssertionError):
         rig.follow(over, limit_s)
-    seen = f"{entry.name}: {sorted(set(modes))}, {texts}"
+    seen = f"{entry.name}: {sorted(set(modes))}, {list(dict.fromkeys(texts))}"
     assert done_s, f"not {entry.modes} and {entry.says!r} within {limit_s:.1f} s; {seen}"
     if stays:
         assert set(modes) <= entry.modes, seen

@@ -65,13 +65,13 @@ def wrong_table():
 
 
 def records_table(results):
-    """What each rig was shown and what it lost."""
+    """What the console of each instrument was shown, and what was lost."""
     rows = [
         [name.removeprefix("records: "), *(str(result[key]) for key in RECORDS)]
         for name, result in results.items()
         if name.startswith("records: ")
     ]
-    return table(["rig", *RECORDS], rows)
+    return table(["rig, entries", *RECORDS], rows)
 
 
 def run_line(results):
