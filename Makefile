@@ -9,6 +9,8 @@ PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
 SOAK_S ?= 3600
 FAULT_RESULTS ?= .fault-results.json
+# Two instruments side by side: one takes less than half a core.
+FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint types contract pytest test-slow test-faults reliability test-peers bench-console bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
@@ -53,10 +55,10 @@ test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten lon
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
 test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
-	$(BIN)/pytest -m fault tests/faults $(ARGS)
+	$(BIN)/pytest $(FAULTS) $(ARGS)
 
 reliability: $(READY)  ## The fault catalogue, and its results into docs/reliability.md
-	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault tests/faults $(ARGS)
+	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest $(FAULTS) $(ARGS)
 	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
 
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs

@@ -1,7 +1,6 @@
 """All entries, by the tables of docs/reliability.md."""
 
 from . import commands, devices, processes, surroundings
-from .setups import SETUPS
 
 GROUPS = {
     "devices": devices.ENTRIES,
@@ -9,8 +8,15 @@ GROUPS = {
     "processes": processes.ENTRIES,
     "surroundings": surroundings.ENTRIES,
 }
-# One rig after the other, for each is started once.
-RUNNING = sorted(
-    (entry for entries in GROUPS.values() for entry in entries),
-    key=lambda entry: list(SETUPS).index(entry.rig),
-)
+
+
+def by_instrument():
+    """What is struck on one instrument, started once: the entries of a table that have the same rig."""
+    instruments = {}
+    for table, entries in GROUPS.items():
+        for entry in entries:
+            instruments.setdefault((entry.rig, table), []).append(entry)
+    return instruments
+
+
+INSTRUMENTS = by_instrument()

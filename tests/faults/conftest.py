@@ -10,25 +10,38 @@ import pytest
 from .setups import started
 
 RESULTS = {}
+"""What was measured since the last report of a test."""
+BEGUN_S = time.monotonic()
 
 
 @pytest.fixture(scope="module")
 def rig(request, tmp_path_factory):
-    """The running rig of a name; all entries of it follow each other."""
-    with started(request.param, tmp_path_factory.mktemp("faults"), RESULTS) as rig:
+    """A running instrument, by its rig and its table; all entries of it follow each other."""
+    name, table = request.param
+    with started(name, tmp_path_factory.mktemp("faults")) as rig:
         yield rig
+    RESULTS[f"records: {name}, {table}"] = rig.records
 
 
-def pytest_runtest_logfinish():
+def pytest_runtest_makereport(item):
+    """Reports carry what was measured: a worker's, too, come to the process that writes the file."""
+    item.user_properties += RESULTS.items()
+    RESULTS.clear()
+
+
+def pytest_runtest_logreport(report):
     """Add what was measured to the file that FITCTL_FAULT_RESULTS names, entry by entry."""
     path = os.environ.get("FITCTL_FAULT_RESULTS")
-    if not path or not RESULTS:
+    if not path or report.when != "teardown" or "PYTEST_XDIST_WORKER" in os.environ:
         return
     file = Path(path)
-    RESULTS["run"] = {
+    before = json.loads(file.read_text()) if file.exists() else {}
+    run = {
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load": round(os.getloadavg()[2], 1),
         "cores": os.cpu_count(),
+        "took_min": round((time.monotonic() - BEGUN_S) / 60, 1),
     }
-    before = json.loads(file.read_text()) if file.exists() else {}
-    file.write_text(json.dumps(before | RESULTS, indent=1) + "\n")
+    file.write_text(
+        json.dumps(before | dict(report.user_properties) | {"run": run}, indent=1) + "\n"
+    )

@@ -27,14 +27,19 @@ def in_each_mode(struck, how, within_s, ends, says, ends_at_rest=STAYS, says_at_
         )
 
 
-ANY = (STAYED, "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE")
+# It stays, unless the machine has so much else to do that of half its time too little is left: then the servo
+# has no young reading for its 0.25 s, or is too late for the siderostat of a search.
+SLOW = (STAYED, "SAFE")
 ENTRIES = (
     *in_each_mode("mocks", "killed", 2.0, ("SAFE",), "expected"),
     *in_each_mode("mocks", "stopped", 3.0, ("SAFE",), "expected"),
-    *in_each_mode("mocks", "slowed", 2.0, ANY, ""),
+    *in_each_mode("mocks", "slowed", 2.0, SLOW, ""),
     *in_each_mode("supervisor", "killed", 5.0, ("OFF",), "", ("OFF",)),
     *in_each_mode("supervisor", "stopped", 5.0, ("SAFE",), "expected"),
-    *in_each_mode("supervisor", "slowed", 2.0, ANY, ""),
+    # In EXPERIMENT both stages move when it is struck; the siderostat alone, and far, when it jogs.
+    Entry("supervisor", "killed while it jogs", ("OFF",), mode="STANDBY", within_s=5.0),
+    Entry("supervisor", "stopped while it jogs", ("SAFE",), "expected", mode="STANDBY", within_s=5.0),
+    *in_each_mode("supervisor", "slowed", 2.0, SLOW, ""),
     *in_each_mode("recorder", "killed", 5.0, STAYS, "the recorder was killed by signal 9",
                   STAYS, "the recorder was killed by signal 9"),
     *in_each_mode("recorder", "stopped", 2.0, STAYS, ""),

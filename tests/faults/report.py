@@ -47,7 +47,9 @@ def measured(entry, result):
         return ["no result", ""]
     again = f", try {result['attempts']}" if result["attempts"] > 1 else ""
     nothing_to_wait_for = STAYED in entry.ends and not entry.says
-    took = "stayed" if nothing_to_wait_for else f"{result['took_s']:.2f} s"
+    took = f"{result['took_s']:.2f} s"
+    if nothing_to_wait_for:
+        took = "stayed" if result["ended"] == entry.mode else result["ended"]
     return [took + again, f"{result['back_s']:.0f} s"]
 
 
@@ -63,23 +65,24 @@ def wrong_table():
 
 
 def records_table(results):
-    """What each rig was shown and what it lost."""
+    """What the console of each instrument was shown, and what was lost."""
     rows = [
         [name.removeprefix("records: "), *(str(result[key]) for key in RECORDS)]
         for name, result in results.items()
         if name.startswith("records: ")
     ]
-    return table(["rig", *RECORDS], rows)
+    return table(["rig, entries", *RECORDS], rows)
 
 
 def run_line(results):
-    """When and where."""
+    """When and where, and how long the last of several runs took."""
     run = results["run"]
     entries = [entry for group in GROUPS.values() for entry in group]
     known = [results[entry.name] for entry in entries if entry.name in results]
     first = sum(result["attempts"] == 1 for result in known)
     return (
         f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g}. "
+        f"The run took {run['took_min']:g} min. "
         f"{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
         "another is made only where the machine itself stood still.*"
     )

@@ -6,8 +6,10 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 
+from fitctl.config import default_rig_path, load_rig
 from fitctl.mocks.bench import ClearFaults, SetFault
-from fitctl.supervisor.messages import Reset, Shutdown, Stop
+from fitctl.model.optics import scales
+from fitctl.supervisor.messages import Jog, Reset, Shutdown, Stop
 
 from .commands import FLOOD, FLOODED, SENT, answers
 
@@ -15,6 +17,10 @@ SLOW_S = 0.015  # stopped for so long, then running for so long: half of its tim
 ENDS_WITHIN_S = 10.0
 DRAWS_WITHIN_S = 10.0
 RECORDER_BACK_S = 60.0  # its supervisor waits longer from try to try
+RIG = load_rig(default_rig_path())
+JOG_SKY_ARCSEC = 90.0  # nearly as far as one jog goes
+JOG_RAD = JOG_SKY_ARCSEC / scales(RIG, RIG.loops["right"]).motor_sky_arcsec_per_rad
+MOVED_RAD = 0.1  # of a motor
 
 
 @contextmanager
@@ -64,6 +70,23 @@ def stopped(rig, entry):
         process.resume()
         rig.bench_answers = True
     goes_on(rig, entry)
+
+
+def on_its_way(strike_supervisor):
+    """Strike while the siderostat jogs: it must have moved, and not have come where it was sent."""
+
+    @contextmanager
+    def struck(rig, entry):
+        before_rad = rig.place().motor_rad[0]
+        assert rig.client.send(Jog(az_sky_arcsec=JOG_SKY_ARCSEC, el_sky_arcsec=0.0)).accepted
+        with strike_supervisor(rig, entry):
+            yield
+            # Short of the jog's end or, if the drive missed its commands late, beyond; there, nothing was struck.
+            went_rad = rig.places[-1].motor_rad[0] - before_rad
+            assert went_rad > MOVED_RAD, "it had not begun to jog"
+            assert abs(went_rad - JOG_RAD) > MOVED_RAD, "it had ended its jog"
+
+    return struck
 
 
 @contextmanager
@@ -234,7 +257,9 @@ def clock(rig, entry):
 
 STRIKES = {
     "killed": killed,
+    "killed while it jogs": on_its_way(killed),
     "stopped": stopped,
+    "stopped while it jogs": on_its_way(stopped),
     "stuck": stuck,
     "slowed": slowed,
     "told to end while its recorder is stopped": told_to_end,

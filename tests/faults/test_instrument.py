@@ -2,7 +2,7 @@
 
 import pytest
 
-from .catalogue import RUNNING
+from .catalogue import INSTRUMENTS
 from .conftest import RESULTS
 from .engine import run
 from .setups import SETUPS
@@ -12,9 +12,16 @@ pytestmark = [pytest.mark.fault, pytest.mark.timeout(200)]
 
 @pytest.mark.parametrize(
     ("rig", "entry"),
-    [pytest.param(entry.rig, entry, id=entry.name) for entry in RUNNING],
+    [
+        # One worker has them all, one after the other: another has another instrument meanwhile.
+        pytest.param(
+            instrument, entry, id=entry.name, marks=pytest.mark.xdist_group(", ".join(instrument))
+        )
+        for instrument, entries in INSTRUMENTS.items()
+        for entry in entries
+    ],
     indirect=["rig"],
-    scope="module",  # the rig of one name goes on from entry to entry
+    scope="module",  # the instrument goes on from entry to entry
 )
 def test_it_ends_as_the_catalogue_says(rig, entry):
     RESULTS[entry.name] = run(rig, entry, SETUPS[entry.rig].home)

@@ -37,9 +37,18 @@ TRACKING = ("ACQUISITION", "COARSE", "VERNIER", "EXPERIMENT")
 
 
 def experiment():
-    """A mirror that moves a little for longer than any entry takes."""
-    drive = Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=0.5, duration_s=120.0)
-    return Experiment(name="fault catalogue", drives=[drive])
+    """Both stages move for longer than any entry takes, the siderostat without a rest."""
+    drives = [
+        Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=0.5, duration_s=120.0),
+        Drive(
+            channel="siderostat_el",
+            shape="triangle",
+            amplitude=3.0,
+            frequency_hz=0.5,
+            duration_s=120.0,
+        ),
+    ]
+    return Experiment(name="fault catalogue", drives=drives)
 
 
 _UP = {"OFF": Standby, "SAFE": Recover, "STANDBY": Acquire}
@@ -94,8 +103,12 @@ class WatchedRig(Rig):
         now_s = time.monotonic()
         if self.bench_answers and now_s >= self._looked_s + LOOK_S:
             self._looked_s = now_s
-            stages = ask_stages(self.endpoints["mocks.bench_port"], StagesQuestion("right"))
-            self.places.append(Place(time.monotonic(), stages.motor_rad, stages.stack_v))
+            self.places.append(self.place())
+
+    def place(self):
+        """Where the stages truly are."""
+        stages = ask_stages(self.endpoints["mocks.bench_port"], StagesQuestion("right"))
+        return Place(time.monotonic(), stages.motor_rad, stages.stack_v)
 
     def start_supervisor(self):
         if self.client is not None:
@@ -175,18 +188,25 @@ class WatchedRig(Rig):
         self.tell(ClearFaults())
         if wanted == "ACQUISITION":
             self.tell(HIDDEN)
-        end_s = time.monotonic() + limit_s
-        while (mode := self.mode()) != wanted:
+        end_s, calm_s = time.monotonic() + limit_s, time.monotonic() + CALM_S
+        while (mode := self.mode()) != wanted or (self.is_busy() and time.monotonic() < calm_s):
             assert time.monotonic() < end_s, f"{mode} instead of {wanted} after {limit_s} s"
-            make = TOWARDS[wanted].get(mode)
-            accepted = make is None or self.client.send(make()).accepted
-            with suppress(AssertionError):
-                self.follow(
-                    lambda t, mode=mode: t.loops[0].mode != mode or failed(t),
-                    (OPENING_S if make in {Standby, Recover} else ANSWER_S) if accepted else 0.2,
-                )
+            if mode != wanted:
+                self._go_towards(wanted, mode)
+
+    def _go_towards(self, wanted, mode):
+        """Give the command that leads there, if there is one, and wait for what comes of it."""
+        make = TOWARDS[wanted].get(mode)
+        accepted = make is None or self.client.send(make()).accepted
         with suppress(AssertionError):
-            self.follow(lambda t: not {trip.name for trip in t.loops[0].interlocks} & BUSY, CALM_S)
+            self.follow(
+                lambda t: t.loops[0].mode != mode or failed(t),
+                (OPENING_S if make in {Standby, Recover} else ANSWER_S) if accepted else 0.2,
+            )
+
+    def is_busy(self):
+        """The machine has no time for the loop just now."""
+        return bool({trip.name for trip in self.telemetry[-1].loops[0].interlocks} & BUSY)
 
 
 def failed(telemetry):

@@ -17,6 +17,7 @@ from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
+WITH_US = ("--parent-pid", os.getpid())  # they end when the tests are killed
 signal.signal(
     signal.SIGINT, signal.default_int_handler
 )  # ignored in a shell's background, also by children
@@ -66,7 +67,13 @@ class Rig:
 
     def start_mocks(self, *arguments):
         self.mocks = fitctl(
-            "mocks", *self.common, "--json", *arguments, stdout=subprocess.PIPE, stderr=self.errors
+            "mocks",
+            *self.common,
+            *WITH_US,
+            "--json",
+            *arguments,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
         )
         self.endpoints = json.loads(self.mocks.stdout.readline())
 
@@ -96,6 +103,7 @@ class Rig:
         self.supervisor = fitctl(
             "run",
             *self.common,
+            *WITH_US,
             *devices,
             before=self.before,
             stdout=subprocess.PIPE,
