@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from fitctl.commands.progress import progress_line
 from fitctl.config import ConfigError, LoopMocks, Rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.pictures import LoggedPictures
-from fitctl.logging.records import RecorderStatus
+from fitctl.logging.records import Event, RecorderStatus
 from fitctl.model.plant_constants import plant_constants
 from fitctl.processes import (
     ENDING_SIGNALS,
@@ -323,9 +325,16 @@ def send_command(client: Client, command: messages.AnyCommand) -> int:
         return FAILED
     finally:
         client.close()
+    for event in reply.events:
+        typer.echo(_event_line(event, time.time() - reply.time_s))
     answer = reply.text or ("accepted" if reply.accepted else "refused")
     typer.echo(answer, err=not reply.accepted)
     return 0 if reply.accepted else FAILED
+
+
+def _event_line(event: Event, wall_minus_monotonic_s: float) -> str:
+    stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)
+    return f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}"
 
 
 # ---------------------------------------------------------------- without an instrument

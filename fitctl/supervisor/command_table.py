@@ -104,6 +104,7 @@ COMMANDS = (
     CommandRow(messages.SetController, "the instrument", "controller"),
     CommandRow(messages.Reset, "the instrument", "reset"),
     CommandRow(messages.Status, "any key", "status", logged=False),
+    CommandRow(messages.RecentEvents, "any key", "events", logged=False),
     CommandRow(messages.TakeOver, "a commander's key", "take-over"),
     CommandRow(messages.Shutdown, "the instrument", "shutdown"),
     CommandRow(messages.Experiment, "the instrument"),

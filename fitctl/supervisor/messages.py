@@ -119,6 +119,10 @@ class Status(Command, frozen=True, kw_only=True):
     """Tell the mode of every loop; from whoever has the instrument, keep it."""
 
 
+class RecentEvents(Command, frozen=True, kw_only=True):
+    """Tell the last events, also those from before you were there."""
+
+
 class TakeOver(Command, frozen=True, kw_only=True):
     """Take the instrument over from whoever has it."""
 
@@ -175,6 +179,7 @@ AnyCommand = (
     | Reset
     | Experiment
     | Status
+    | RecentEvents
     | TakeOver
     | Shutdown
     | RecorderReport
@@ -184,11 +189,15 @@ AnyCommand = (
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to every command; ``text`` says why not, and what to do."""
+    """The answer to every command; ``text`` says why not, and what to do.
+
+    ``events`` are those that were asked for, oldest first.
+    """
 
     accepted: bool
     text: str = ""
     time_s: float = 0.0  # the supervisor's monotonic clock, for a client on another machine
+    events: list[Event] = []
 
 
 def decode_command(payload: bytes) -> AnyCommand | Reply:

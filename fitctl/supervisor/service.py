@@ -22,6 +22,7 @@ from fitctl.supervisor.command_table import ROWS, command_record
 from fitctl.supervisor.doors import FRAMES, Door, KeyedDoor, Parcel, local_door
 from fitctl.supervisor.messages import (
     AnyCommand,
+    RecentEvents,
     RecorderReport,
     Reply,
     Status,
@@ -182,6 +183,11 @@ class Service(threading.Thread):
             case Status():
                 text = self._status_text()
                 self._answer_here(waiting, command, Reply(accepted=True, text=text))
+            case RecentEvents():
+                events = self._buffer.recent_events()
+                text = f"the last {len(events)} events"
+                told = Reply(accepted=True, text=text, events=events)
+                self._answer_here(waiting, command, told)
             case RecorderReport():
                 self._buffer.recorder = command.status
                 self._answer_here(waiting, command, Reply(accepted=True))
