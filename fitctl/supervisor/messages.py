@@ -256,6 +256,14 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     since_s: float
     requirement_px: float
     sky_arcsec_per_px: float
+class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
+    """A spot that moves with a loop's star, and how far from it, by the rig file."""
+
+    name: str
+    az_offset_px: float
+    el_offset_px: float
+
+
     usable_commands: list[str]
     controller: str = ""
     last_change: ModeChange | None = None
@@ -272,6 +280,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     Ticks, events and mode changes are those since the last message; of everything else it has the newest.
     ``commander`` is who has the instrument, empty while nobody has.
     ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
+    other_spots: list[SpotPlace] = []
     """
 
     version: int = PROTOCOL_VERSION

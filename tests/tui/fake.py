@@ -31,6 +31,7 @@ from fitctl.supervisor.messages import (
     RecentEvents,
     Reply,
     SequenceStatus,
+    SpotPlace,
     Status,
     Telemetry,
     TrippedInterlock,
@@ -195,6 +196,7 @@ class FakeSupervisor:
             watched=[self._watched(*row) for row in WATCHED],
             bias_offset_urad=self.bias_offset_urad,
             search_centre_sky_arcsec=(100.0, -40.0) if self.mode == "ACQUISITION" else None,
+            other_spots=[SpotPlace(name="fringe", az_offset_px=-12.0, el_offset_px=0.0)],
         )
 
     def _watched(self, name, quantity, value, low, high, action, modes) -> Watched:

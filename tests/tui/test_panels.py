@@ -17,7 +17,7 @@ from fitctl.tui.palette import parse_target
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.events import Events, event_lines
-from fitctl.tui.widgets.focalplane import FocalPlane, tick_marks
+from fitctl.tui.widgets.focalplane import FocalPlane, spot_marks, tick_marks
 from fitctl.tui.widgets.hand import Hand
 from fitctl.tui.widgets.header import Header
 from fitctl.tui.widgets.health import Devices, Timing
@@ -223,6 +223,32 @@ def test_without_a_star_only_the_target_is_marked():
         mark.character for mark in tick_marks(state.loop.tick, place(40, 40, 40, 20)).values()
     }
     assert characters == {"▔", "│"}
+
+
+def test_a_fringe_spot_is_marked_on_its_light_and_named_in_the_caption():
+    state = shown(FakeSupervisor())
+    frame, placing = state.newest.frame, place(40, 40, 40, 20)
+    ((column, row),) = spot_marks(state.loop, placing)
+    az_px, el_px = placing.pixel(column, row)
+    image = np.frombuffer(frame.data, "<u2").reshape(40, 40).astype(int)
+    near = image[round(el_px) - 1 : round(el_px) + 2, round(az_px) - 1 : round(az_px) + 2]
+    assert near.sum() - 9 * np.median(image) > 0.5 * 11_000
+
+    caption = plain(FocalPlane(state).draw(40, 21))[-1]
+    assert "◦ fringe" in caption
+    assert "star" in caption
+
+
+def test_without_a_star_no_other_spot_is_marked():
+    assert not spot_marks(shown(FakeSupervisor("ACQUISITION")).loop, place(40, 40, 40, 20))
+
+
+def test_what_has_no_room_in_the_caption_is_the_light_and_not_a_spots_name():
+    state = shown(FakeSupervisor())
+    changed_tick(state, star_flux_dn=1_234_567.0)
+    caption = plain(FocalPlane(state).draw(40, 21))[-1]
+    assert "◦ fringe" in caption
+    assert "DN" not in caption
 
 
 def test_an_ill_device_keeps_a_row_of_its_own_and_comes_first():
