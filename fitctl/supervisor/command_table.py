@@ -99,6 +99,7 @@ COMMANDS = (
         question="Disable the amplifiers and let go of all devices?",
     ),
     CommandRow(messages.SetTarget, "the instrument", "target"),
+    CommandRow(messages.Look, "the instrument", "look"),
     CommandRow(messages.Jog, "the instrument", "jog"),
     CommandRow(messages.SetBiasOffset, "the instrument", "bias-offset"),
     CommandRow(messages.SetController, "the instrument", "controller"),

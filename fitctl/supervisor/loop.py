@@ -37,7 +37,7 @@ from fitctl.logging.records import (
 from fitctl.model.drives import SIDEROSTAT, Drive, channel_values, experiment_s
 from fitctl.model.optics import scales
 from fitctl.supervisor.interlocks import Interlocks
-from fitctl.supervisor.modes import FOLLOWING, TRACKING, Mode, Trigger, transition
+from fitctl.supervisor.modes import FOLLOWING, TRACKING, WITH_WINDOW, Mode, Trigger, transition
 from fitctl.supervisor.power import failure_record
 from fitctl.supervisor.quantities import Quantities, places
 from fitctl.supervisor.search import Search
@@ -118,6 +118,7 @@ class StellarLoop:
         self.last_change: ModeChange | None = None
         self._last_failure = ""
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
+        self.look_at_px: tuple[float, float] | None = None  # on the next frame, and then no more
         self._clock = clock
         self._report = report
         self._scale = scales(rig, loop)
@@ -189,18 +190,34 @@ class StellarLoop:
         return Seen(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        star = self._looked_for(frame) or self._expected(frame, mirror_rad, motor_rad)
+        if star is not None and self.mode in TRACKING:
+            self._estimator.observe(_position(star), motor_rad, mirror_rad)
+        return star
+
+    def _expected(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        """The star where it should be, or else anywhere on the frame."""
         if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
             return None  # what is seen on the way is another star
         if self.mode in FOLLOWING and self._findings.lost == 0:
             predicted = self._estimator.predict_px(motor_rad, mirror_rad)
             star = self._sensor.measure(frame.image, *predicted.tolist())
             # The estimate may be half a window off after a jump; then the whole frame decides.
-            if star is None or self._near_edge(star):
-                star = self._sensor.find(frame.image)
+            if star is not None and not self._near_edge(star):
+                return star
+        return self._sensor.find(frame.image)
+
+    def _looked_for(self, frame: Frame) -> Star | None:
+        """The star where somebody told the loop to look, if there is one."""
+        look_px, self.look_at_px = self.look_at_px, None
+        if look_px is None or self.mode not in WITH_WINDOW:
+            return None
+        star = self._sensor.find_at(frame.image, *look_px)
+        place = f"az {look_px[0]:g}, el {look_px[1]:g} px"
+        if star is None:
+            self._event("warning", f"no star in the window at {place}; nothing changes")
         else:
-            star = self._sensor.find(frame.image)
-        if star is not None and self.mode in TRACKING:
-            self._estimator.observe(_position(star), motor_rad, mirror_rad)
+            self._event("info", f"the star at {place} is followed from now on")
         return star
 
     def _judge(self, frame: Frame | None, seen: Seen) -> None:

@@ -82,6 +82,13 @@ class SetTarget(Command, frozen=True, kw_only=True):
     el_px: float
 
 
+class Look(Command, frozen=True, kw_only=True):
+    """In COARSE and VERNIER: put the window on another place, and follow the star there from now on."""
+
+    az_px: float
+    el_px: float
+
+
 class Jog(Command, frozen=True, kw_only=True):
     """In STANDBY: move the siderostat from where it is held, by angles on the sky."""
 
@@ -173,6 +180,7 @@ AnyCommand = (
     | Recover
     | Off
     | SetTarget
+    | Look
     | Jog
     | SetBiasOffset
     | SetController
@@ -248,14 +256,6 @@ class LoopLimits(msgspec.Struct, frozen=True, kw_only=True):
     spiral_pitch_sky_arcsec: float
 
 
-class LoopState(msgspec.Struct, frozen=True, kw_only=True):
-    """One loop as consoles show it."""
-
-    name: str
-    mode: str
-    since_s: float
-    requirement_px: float
-    sky_arcsec_per_px: float
 class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
     """A spot that moves with a loop's star, and how far from it, by the rig file."""
 
@@ -264,6 +264,14 @@ class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
     el_offset_px: float
 
 
+class LoopState(msgspec.Struct, frozen=True, kw_only=True):
+    """One loop as consoles show it."""
+
+    name: str
+    mode: str
+    since_s: float
+    requirement_px: float
+    sky_arcsec_per_px: float
     usable_commands: list[str]
     controller: str = ""
     last_change: ModeChange | None = None
@@ -272,6 +280,7 @@ class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
     watched: list[Watched] = []
     bias_offset_urad: tuple[float, float] = (0.0, 0.0)
     search_centre_sky_arcsec: tuple[float, float] | None = None
+    other_spots: list[SpotPlace] = []
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
@@ -280,7 +289,6 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     Ticks, events and mode changes are those since the last message; of everything else it has the newest.
     ``commander`` is who has the instrument, empty while nobody has.
     ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
-    other_spots: list[SpotPlace] = []
     """
 
     version: int = PROTOCOL_VERSION

@@ -31,7 +31,7 @@ from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
 from fitctl.tui.jobs import Job
 from fitctl.tui.link import Link
 from fitctl.tui.pace import Pace
-from fitctl.tui.palette import ControllerProvider, ResetProvider, TargetProvider
+from fitctl.tui.palette import ControllerProvider, PlaceProvider, ResetProvider
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.views.devices import DevicesView
 from fitctl.tui.views.help import HelpView
@@ -95,7 +95,7 @@ class ConsoleApp(App[None]):
     CSS_PATH = Path(__file__).with_name("console.tcss")
     TITLE = "fitctl"
     ENABLE_COMMAND_PALETTE = True
-    COMMANDS = App.COMMANDS | {TargetProvider, ControllerProvider, ResetProvider}
+    COMMANDS = App.COMMANDS | {PlaceProvider, ControllerProvider, ResetProvider}
     MODES: ClassVar[dict[str, type[View]]] = {  # type: ignore[assignment]  # of str or callable to Screen
         "operate": OperateView,
         "devices": DevicesView,

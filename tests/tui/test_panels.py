@@ -8,12 +8,12 @@ import pytest
 import scipy.signal
 
 from fitctl.logging.records import Event
-from fitctl.supervisor.messages import SequenceStatus, TrippedInterlock
+from fitctl.supervisor.messages import Look, SequenceStatus, SetTarget, TrippedInterlock
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import VIEWS, keys_of
 from fitctl.tui.draw.frame import place
 from fitctl.tui.jog import JogPad
-from fitctl.tui.palette import parse_target
+from fitctl.tui.palette import parse_place
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.events import Events, event_lines
@@ -466,15 +466,16 @@ def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():
 
 
 @pytest.mark.parametrize(
-    ("query", "target"),
+    ("query", "command"),
     [
-        ("target 24 19.5", (24.0, 19.5)),
-        ("TARGET -1,+2.25 ", (-1.0, 2.25)),
+        ("target 24 19.5", SetTarget(az_px=24.0, el_px=19.5)),
+        ("TARGET -1,+2.25 ", SetTarget(az_px=-1.0, el_px=2.25)),
+        ("look 12 20", Look(az_px=12.0, el_px=20.0)),
         ("target 24", None),
-        ("target nan 3", None),
+        ("look nan 3", None),
         ("standby", None),
     ],
 )
-def test_a_target_is_read_from_the_palette(query, target):
-    command = parse_target(query)
-    assert (command and (command.az_px, command.el_px)) == target
+def test_a_place_is_read_from_the_palette(query, command):
+    found = parse_place(query)
+    assert (found and found[1]) == command
