@@ -120,6 +120,11 @@ def test_a_number_in_quotes_or_a_truth_value_is_not_a_number(path):
     ("key", "value", "line"),
     [
         ("camera.frame_rate_hz", 0.5, "must be greater than or equal to 1 (is 0.5)"),
+        (
+            "loops.right.other_spots",
+            [{"name": "fringe", "offset_px": {"az": 1.0, "el": 0.0}, "flux_dn": 20000.0}],
+            "fringe with 20000 DN would be taken for the star, which may have 16800 to 44800",
+        ),
         ("camera.width_px", 15, "must be greater than or equal to 16 (is 15)"),
         ("camera.pixel_noise_dn", 0.0, "must be greater than 0 (is 0.0)"),
         ("camera.device.gvcp_port", 70000, "must be less than or equal to 65535 (is 70000)"),

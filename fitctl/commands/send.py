@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import time
+from datetime import UTC, datetime
+
 import typer
 
 from fitctl.commands.exits import FAILED
+from fitctl.logging.records import Event
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import AnyCommand
 
@@ -18,6 +22,13 @@ def give(client: Client, command: AnyCommand, said_by: str) -> int:
         return FAILED
     finally:
         client.close()
+    for event in reply.events:
+        typer.echo(_event_line(event, time.time() - reply.time_s))
     answer = reply.text or ("accepted" if reply.accepted else "refused")
     typer.echo(answer, err=not reply.accepted)
     return 0 if reply.accepted else FAILED
+
+
+def _event_line(event: Event, wall_minus_monotonic_s: float) -> str:
+    stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)
+    return f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}"

@@ -105,12 +105,21 @@ class Prefilter(Settings):
     time_constant_s: Positive
 
 
+class OtherSpot(Settings):
+    """A spot that moves with the loop's star and is not the one to point, such as its fringe spot."""
+
+    name: Annotated[str, Field(min_length=1, max_length=20)]
+    offset_px: AxisPair
+    flux_dn: Positive
+
+
 class Loop(Settings):
     """One stellar loop."""
 
     target_px: AxisPair
     star_flux_dn: Positive
     flux_range: Range
+    other_spots: Annotated[tuple[OtherSpot, ...], Field(strict=False)]
     requirement_px: Positive
     siderostat: AnySiderostat
     fsm: Fsm
@@ -118,6 +127,19 @@ class Loop(Settings):
     coarse: Coarse
     vernier: Vernier
     prefilter: Prefilter
+
+    @model_validator(mode="after")
+    def _one_spot_is_the_star(self) -> Loop:
+        low_dn = self.flux_range.low * self.star_flux_dn
+        high_dn = self.flux_range.high * self.star_flux_dn
+        for spot in self.other_spots:
+            if low_dn <= spot.flux_dn <= high_dn:
+                msg = (
+                    f"other_spots: {spot.name} with {spot.flux_dn:g} DN would be taken for the star, which "
+                    f"may have {low_dn:g} to {high_dn:g}; narrow flux_range"
+                )
+                raise ValueError(msg)
+        return self
 
 
 class Supervisor(Settings):

@@ -97,19 +97,24 @@ class StarSensor:
             el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
             if search[el_px, az_px] < self._threshold_dn:
                 return None
-            candidate = self._centroid(image, az_px, el_px)
-            if candidate is not None:
-                # Once more about its own centre, so that the window does not cut the spot.
-                candidate = self._centroid(image, candidate.az_px, candidate.el_px)
-            star = self._accepted(candidate)
-            # A spot cut by the frame's edge has its centre of gravity away from the window's centre.
-            if star is not None and star.off_centre_px <= 1.0:
+            star = self.find_at(image, az_px, el_px)
+            if star is not None:
                 return star
             search[
                 max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
                 max(0, az_px - HALF_WINDOW_PX) : az_px + HALF_WINDOW_PX + 1,
             ] = -math.inf
         return None
+
+    def find_at(self, image: NDArray[np.uint16], az_px: float, el_px: float) -> Star | None:
+        """Measure this loop's star about a place; None when it is not there, or the frame cuts it."""
+        candidate = self._centroid(image, az_px, el_px)
+        if candidate is not None:
+            # Once more about its own centre, so that the window does not cut the spot.
+            candidate = self._centroid(image, candidate.az_px, candidate.el_px)
+        star = self._accepted(candidate)
+        # A spot cut by the frame's edge has its centre of gravity away from the window's centre.
+        return star if star is not None and star.off_centre_px <= 1.0 else None
 
     def _centroid(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float

@@ -31,7 +31,15 @@ from fitctl.model.optics import scales
 from fitctl.supervisor.experiments import Experiments
 from fitctl.supervisor.following import Following
 from fitctl.supervisor.interlocks import Interlocks
-from fitctl.supervisor.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger, transition
+from fitctl.supervisor.modes import (
+    FOLLOWING,
+    TRACKING,
+    WITH_WINDOW,
+    Finding,
+    Mode,
+    Trigger,
+    transition,
+)
 from fitctl.supervisor.pointing import Pointing
 from fitctl.supervisor.power import failure_record
 from fitctl.supervisor.quantities import Quantities, places
@@ -81,6 +89,7 @@ class StellarLoop:
         self.last_change: ModeChange | None = None
         self._last_failure = ""
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
+        self.look_at_px: tuple[float, float] | None = None  # on the next frame, and then no more
         self._clock = clock
         self._report = report
         scale = scales(rig, loop)
@@ -150,15 +159,31 @@ class StellarLoop:
         return Seen(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        star = self._looked_for(frame) or self._expected(frame, mirror_rad, motor_rad)
+        if star is not None and self.mode in TRACKING:
+            self._estimator.observe(star.position_px, motor_rad, mirror_rad)
+        return star
+
+    def _expected(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        """The star where it should be, or else anywhere on the frame."""
         if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
             return None  # what is seen on the way is another star
         if self.mode in FOLLOWING and self.following.lost == 0:
             expected_px = self._estimator.predict_px(motor_rad, mirror_rad)
-            star = self._sensor.follow(frame.image, *expected_px.tolist())
+            return self._sensor.follow(frame.image, *expected_px.tolist())
+        return self._sensor.find(frame.image)
+
+    def _looked_for(self, frame: Frame) -> Star | None:
+        """The star where somebody told the loop to look, if there is one."""
+        look_px, self.look_at_px = self.look_at_px, None
+        if look_px is None or self.mode not in WITH_WINDOW:
+            return None
+        star = self._sensor.find_at(frame.image, *look_px)
+        place = f"az {look_px[0]:g}, el {look_px[1]:g} px"
+        if star is None:
+            self._event("warning", f"no star in the window at {place}; nothing changes")
         else:
-            star = self._sensor.find(frame.image)
-        if star is not None and self.mode in TRACKING:
-            self._estimator.observe(star.position_px, motor_rad, mirror_rad)
+            self._event("info", f"the star at {place} is followed from now on")
         return star
 
     def _judge(self, frame: Frame | None, seen: Seen) -> None:

@@ -16,11 +16,12 @@ from fitctl.supervisor.messages import (
     AnyCommand,
     Experiment,
     Jog,
+    Look,
     Reset,
     SetBiasOffset,
     SetTarget,
 )
-from fitctl.supervisor.modes import Trigger, transition
+from fitctl.supervisor.modes import WITH_WINDOW, Trigger, transition
 from fitctl.supervisor.search import refused_search
 
 Loops = Sequence[StellarLoop]
@@ -32,6 +33,19 @@ def set_target(rig: Rig, loops: Loops, command: SetTarget) -> str:
         return f"target {rig.camera.window_range_text}"
     for loop in loops:
         loop.target_px = np.array([command.az_px, command.el_px])
+    return ""
+
+
+def look(rig: Rig, loops: Loops, command: Look) -> str:
+    """Measure one loop's star elsewhere on the next frame; empty, or why not."""
+    if len(loops) != 1:
+        return f"one loop looks at a place; name it: {', '.join(loop.name for loop in loops)}"
+    (loop,) = loops
+    if loop.mode not in WITH_WINDOW:
+        return f"look means nothing in {loop.mode.name}; a star is followed in COARSE and VERNIER"
+    if not rig.camera.window_fits(command.az_px, command.el_px):
+        return f"look {rig.camera.window_range_text}"
+    loop.look_at_px = (command.az_px, command.el_px)
     return ""
 
 
@@ -63,6 +77,7 @@ def why_no_search(rig: Rig, loops: Loops, command: Acquire) -> str:
 
 LOOP_COMMANDS: dict[type[AnyCommand], Callable[[Rig, Loops, Any], str]] = {
     SetTarget: set_target,
+    Look: look,
     Jog: move_by_hand,
     SetBiasOffset: move_by_hand,
     Reset: reset_interlock,

@@ -6,7 +6,7 @@ from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.model.optics import scales
 from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.messages import LoopLimits, LoopState
+from fitctl.supervisor.messages import LoopLimits, LoopState, SpotPlace
 from fitctl.supervisor.modes import Mode, usable_commands
 
 
@@ -30,6 +30,12 @@ def loop_state(rig: Rig, loop: StellarLoop, now_s: float) -> LoopState:
         watched=loop.interlocks.watched(now_s, loop.measured.readings),
         bias_offset_urad=(az_urad, el_urad),
         search_centre_sky_arcsec=tuple(centre_sky_arcsec) if mode is Mode.ACQUISITION else None,
+        other_spots=[
+            SpotPlace(
+                name=spot.name, az_offset_px=spot.offset_px.az, el_offset_px=spot.offset_px.el
+            )
+            for spot in loop.settings.other_spots
+        ],
     )
 
 

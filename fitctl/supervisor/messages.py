@@ -82,6 +82,13 @@ class SetTarget(Command, frozen=True, kw_only=True):
     el_px: float
 
 
+class Look(Command, frozen=True, kw_only=True):
+    """In COARSE and VERNIER: put the window on another place, and follow the star there from now on."""
+
+    az_px: float
+    el_px: float
+
+
 class Jog(Command, frozen=True, kw_only=True):
     """In STANDBY: move the siderostat from where it is held, by angles on the sky."""
 
@@ -117,6 +124,10 @@ class Experiment(Command, frozen=True, kw_only=True):
 
 class Status(Command, frozen=True, kw_only=True):
     """Tell the mode of every loop; from whoever has the instrument, keep it."""
+
+
+class RecentEvents(Command, frozen=True, kw_only=True):
+    """Tell the last events, also those from before you were there."""
 
 
 class TakeOver(Command, frozen=True, kw_only=True):
@@ -169,12 +180,14 @@ AnyCommand = (
     | Recover
     | Off
     | SetTarget
+    | Look
     | Jog
     | SetBiasOffset
     | SetController
     | Reset
     | Experiment
     | Status
+    | RecentEvents
     | TakeOver
     | Shutdown
     | RecorderReport
@@ -184,11 +197,15 @@ AnyCommand = (
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to every command; ``text`` says why not, and what to do."""
+    """The answer to every command; ``text`` says why not, and what to do.
+
+    ``events`` are those that were asked for, oldest first.
+    """
 
     accepted: bool
     text: str = ""
     time_s: float = 0.0  # the supervisor's monotonic clock, for a client on another machine
+    events: list[Event] = []
 
 
 def decode_command(payload: bytes) -> AnyCommand | Reply:
@@ -239,6 +256,14 @@ class LoopLimits(msgspec.Struct, frozen=True, kw_only=True):
     spiral_pitch_sky_arcsec: float
 
 
+class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
+    """A spot that moves with a loop's star, and how far from it, by the rig file."""
+
+    name: str
+    az_offset_px: float
+    el_offset_px: float
+
+
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it."""
 
@@ -255,6 +280,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     watched: list[Watched] = []
     bias_offset_urad: tuple[float, float] = (0.0, 0.0)
     search_centre_sky_arcsec: tuple[float, float] | None = None
+    other_spots: list[SpotPlace] = []
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):

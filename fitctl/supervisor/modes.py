@@ -36,6 +36,9 @@ MEANING = {
 FOLLOWING = frozenset({Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
 """The star is known, and looked for where it should be."""
 
+WITH_WINDOW = FOLLOWING - {Mode.EXPERIMENT}
+"""The window may be put on another star: both stages follow what is in it."""
+
 TRACKING = FOLLOWING | {Mode.ACQUISITION}
 
 

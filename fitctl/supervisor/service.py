@@ -27,7 +27,15 @@ from fitctl.supervisor.endpoints import COMMAND_SOCKET, GATEWAY_SOCKET, TELEMETR
 from fitctl.supervisor.envelope import MAX_ENVELOPE_BYTES, Passed, Report, decode_envelope
 from fitctl.supervisor.intake import Intake
 from fitctl.supervisor.keys import AllowedKey
-from fitctl.supervisor.messages import AnyCommand, RecorderReport, Reply, Status, Stop, TakeOver
+from fitctl.supervisor.messages import (
+    AnyCommand,
+    RecentEvents,
+    RecorderReport,
+    Reply,
+    Status,
+    Stop,
+    TakeOver,
+)
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
@@ -185,6 +193,11 @@ class Service(threading.Thread):
             case Status():
                 text = self._status_text()
                 self._answer_here(waiting, command, Reply(accepted=True, text=text))
+            case RecentEvents():
+                events = self._buffer.recent_events()
+                text = f"the last {len(events)} events"
+                told = Reply(accepted=True, text=text, events=events)
+                self._answer_here(waiting, command, told)
             case RecorderReport():
                 self._buffer.recorder = command.status
                 self._answer_here(waiting, command, Reply(accepted=True))

@@ -27,6 +27,8 @@ from fitctl.supervisor.supervisor import Supervisor
 
 _BUFFERED_TICKS = 2000
 _BUFFERED_EVENTS = 500
+_REMEMBERED_EVENTS = 300
+_REMEMBERED_BYTES = 64 * 1024  # of what one answer may take of the service's time
 
 T = TypeVar("T")
 
@@ -68,6 +70,7 @@ class TelemetryBuffer:
         self._ticks = CountingBuffer[Tick](_BUFFERED_TICKS)
         self._events = CountingBuffer[Event](_BUFFERED_EVENTS)
         self._changes = CountingBuffer[ModeChange](_BUFFERED_EVENTS)
+        self._published = deque[Event](maxlen=_REMEMBERED_EVENTS)  # the service's thread alone
         self._devices: dict[str, DeviceHealth] = {}
         self._piezo: dict[str, PiezoReading] = {}
         self._timing: dict[str, LoopTiming] = {}
@@ -94,6 +97,8 @@ class TelemetryBuffer:
 
     def telemetry(self, supervisor: Supervisor, state: ServiceState, now_s: float) -> Telemetry:
         """Everything since the last call."""
+        events = self._events.drain()
+        self._published.extend(events)
         return Telemetry(
             sequence=state.sequence,
             time_s=now_s,
@@ -102,7 +107,7 @@ class TelemetryBuffer:
             pid=state.pid,
             loops=[loop_state(supervisor.rig, loop, now_s) for loop in supervisor.loops.values()],
             ticks=self._ticks.drain(),
-            events=self._events.drain(),
+            events=events,
             mode_changes=self._changes.drain(),
             frame=self.frame,
             devices=list(self._devices.values()),
@@ -114,6 +119,17 @@ class TelemetryBuffer:
             running_sequence=supervisor.sequences.status(),
             commander=state.commander,
         )
+
+    def recent_events(self) -> list[Event]:
+        """The newest that were published, oldest first, as many as one answer may hold."""
+        told: deque[Event] = deque()
+        room_bytes = _REMEMBERED_BYTES
+        for event in reversed(self._published):
+            room_bytes -= len(msgspec.msgpack.encode(event))
+            if room_bytes < 0:
+                break
+            told.appendleft(event)
+        return list(told)
 
     def losses(self, state: ServiceState, now_s: float) -> Losses:
         """What every queue has let go so far."""

@@ -17,6 +17,7 @@ from textual.screen import Screen
 from fitctl.supervisor.command_table import ROWS, command_of
 from fitctl.supervisor.messages import (
     AnyCommand,
+    RecentEvents,
     Reply,
     Shutdown,
     Status,
@@ -30,7 +31,7 @@ from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
 from fitctl.tui.jobs import Job
 from fitctl.tui.link import Link
 from fitctl.tui.pace import Pace
-from fitctl.tui.palette import ControllerProvider, ResetProvider, TargetProvider
+from fitctl.tui.palette import ControllerProvider, PlaceProvider, ResetProvider
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.views.devices import DevicesView
 from fitctl.tui.views.help import HelpView
@@ -94,7 +95,7 @@ class ConsoleApp(App[None]):
     CSS_PATH = Path(__file__).with_name("console.tcss")
     TITLE = "fitctl"
     ENABLE_COMMAND_PALETTE = True
-    COMMANDS = App.COMMANDS | {TargetProvider, ControllerProvider, ResetProvider}
+    COMMANDS = App.COMMANDS | {PlaceProvider, ControllerProvider, ResetProvider}
     MODES: ClassVar[dict[str, type[View]]] = {  # type: ignore[assignment]  # of str or callable to Screen
         "operate": OperateView,
         "devices": DevicesView,
@@ -149,7 +150,7 @@ class ConsoleApp(App[None]):
     def on_mount(self) -> None:
         """Begin to read and to draw."""
         self.set_interval(BEAT_S, self._draw_due)
-        self.set_interval(KEEP_S, partial(self.give, Status()))
+        self.set_interval(KEEP_S, self._keep)
         self._wire.start()
 
     def on_unmount(self) -> None:
@@ -162,7 +163,10 @@ class ConsoleApp(App[None]):
         """Remember; draw at once only what must not wait."""
         self._wire.taken()
         before, was_stale = self.state.mode, self.state.stale
+        known = self.state.newest
         self.state.accept(message.telemetry, self.clock())
+        if known is None or known.pid != message.telemetry.pid:
+            self._ask_for_events()
         if before != self.state.mode or was_stale:
             self.draw_all()
 
@@ -206,6 +210,16 @@ class ConsoleApp(App[None]):
         loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
         self._wire.send(msgspec.structs.replace(command, loop=loop))
 
+    def _keep(self) -> None:
+        """Keep the instrument; hear what was missed."""
+        self.give(Status())
+        if self.state.events_missing:
+            self._ask_for_events()
+
+    def _ask_for_events(self) -> None:
+        self.state.events_missing = False
+        self.give(RecentEvents())
+
     def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
         """Do something once the operator has said yes."""
 
@@ -220,6 +234,9 @@ class ConsoleApp(App[None]):
         name = type(message.command).__name__
         if name == "Status":
             return  # which only keeps the instrument; a lost link is in the header
+        if name == "RecentEvents":
+            self._recall(message.reply)
+            return
         if message.reply is None:
             text = message.problem
             if name == "Stop":
@@ -239,6 +256,13 @@ class ConsoleApp(App[None]):
             self.notify("all loops go to SAFE", title="■ STOP confirmed", timeout=3)
         elif name == "TakeOver":
             self.notify(message.reply.text, title="Taken over", timeout=5, markup=False)
+
+    def _recall(self, reply: Reply | None) -> None:
+        if reply is None or not reply.accepted:
+            self.state.events_missing = True  # they are asked for again
+        else:
+            self.state.recall(reply.events)
+            self.draw_all()
 
     def action_command(self, name: str) -> None:
         """Give the command of a key, at once or after its question."""

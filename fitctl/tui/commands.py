@@ -88,6 +88,7 @@ def _sequence(state: ConsoleState) -> bool:
 
 KEYS = (
     Key("t", "t", "Target", "screen.aim", "put a cursor on the focal plane", "operate", _has_star),
+    Key("i", "i", "Look", "screen.look", "follow the star at the cursor", "operate", _has_star),
     Key("j", "j", "Jog", "screen.jog", "move a stage by the arrow keys", "operate", _by_hand),
     Key("w", "w", "Window", "app.window", "RMS and traces over 10, 60 or 1 s", "operate"),
     Key("x", "x", "Stretch", "screen.stretch", "grey scale: asinh, square root, linear", "operate"),

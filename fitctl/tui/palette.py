@@ -1,4 +1,4 @@
-"""The command palette's commands beyond the keys: ``target AZ EL``, controllers, and tripped interlocks."""
+"""The command palette's commands beyond the keys: places on the frame, controllers, tripped interlocks."""
 
 from __future__ import annotations
 
@@ -12,42 +12,48 @@ from typing import TYPE_CHECKING, cast
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 
 from fitctl.config import CONTROLLERS
-from fitctl.supervisor.messages import AnyCommand, Reset, SetController, SetTarget
+from fitctl.supervisor.command_table import ROWS
+from fitctl.supervisor.messages import AnyCommand, Look, Reset, SetController, SetTarget
 
 if TYPE_CHECKING:
     from fitctl.tui.app import ConsoleApp
 
 _NUMBER = r"[+-]?\d+(?:\.\d*)?"
-_TARGET = re.compile(rf"\s*target\s+({_NUMBER})[\s,]+({_NUMBER})\s*", re.IGNORECASE)
+_PLACES: dict[str, tuple[type[SetTarget | Look], str]] = {
+    "target": (SetTarget, "Move the target to"),
+    "look": (Look, "Put the window on"),
+}
+_PLACE = re.compile(rf"\s*({'|'.join(_PLACES)})\s+({_NUMBER})[\s,]+({_NUMBER})\s*", re.IGNORECASE)
 
 
-def parse_target(query: str) -> SetTarget | None:
-    """The command in a text such as ``target 24 19.5``, in px; None when it is something else."""
-    match = _TARGET.fullmatch(query)
+def parse_place(query: str) -> tuple[str, SetTarget | Look] | None:
+    """What a text such as ``target 24 19.5``, in px, does, and its command; None when it is something else."""
+    match = _PLACE.fullmatch(query)
     if match is None:
         return None
-    az_px, el_px = (float(group) for group in match.groups())
+    make, does = _PLACES[match[1].lower()]
+    az_px, el_px = float(match[2]), float(match[3])
     if not (math.isfinite(az_px) and math.isfinite(el_px)):
         return None
-    return SetTarget(az_px=az_px, el_px=el_px)
+    return f"{does} az {az_px:g}, el {el_px:g} px", make(az_px=az_px, el_px=el_px)
 
 
-class TargetProvider(Provider):
-    """Offers to move the shown loop's target as soon as two numbers are typed."""
+class PlaceProvider(Provider):
+    """Offers to move the shown loop's target or window as soon as two numbers are typed."""
 
     async def discover(self) -> Hits:
-        """Tell that the command exists."""
-        yield DiscoveryHit(
-            "target AZ EL", lambda: None, help="Type it with two numbers, in px: target 24 19.5"
-        )
+        """Tell that the commands exist."""
+        for word, (make, _) in _PLACES.items():
+            told = f"Type it with two numbers, in px: {word} 24 19.5. {ROWS[make].help}"
+            yield DiscoveryHit(f"{word} AZ EL", lambda: None, help=told)
 
     async def search(self, query: str) -> Hits:
-        """Match a complete target."""
-        command = parse_target(query)
-        if command is not None:
-            label = f"Move the target to az {command.az_px:g}, el {command.el_px:g} px"
+        """Match a complete place."""
+        found = parse_place(query)
+        if found is not None:
+            label, command = found
             app = cast("ConsoleApp", self.app)
-            yield Hit(1.0, label, partial(app.give, command), help="Through the prefilter")
+            yield Hit(1.0, label, partial(app.give, command), help=ROWS[type(command)].help)
 
 
 class _ListProvider(Provider):

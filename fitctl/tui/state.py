@@ -116,6 +116,8 @@ class ConsoleState:
         By name, in the supervisor's order.
     events : deque of Event
         Newest first.
+    events_missing : bool
+        There may be events of this supervisor that this console has not heard.
     shown : str
         Name of the loop on the screen.
     window : Window
@@ -130,6 +132,7 @@ class ConsoleState:
         self.now_s = started_s
         self.loops: dict[str, LoopView] = {}
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.events_missing = False
         self.shown = ""
         self.window = WINDOWS[0]
         self.missed = 0
@@ -146,11 +149,17 @@ class ConsoleState:
         """Take in one message that came at `now_s`."""
         if self.newest is not None and self.newest.pid != message.pid:
             self.loops.clear()  # another supervisor: its past is not this one's
+            if message.time_s < self.newest.time_s:
+                self.events.clear()  # of a clock that has begun anew: their times mean nothing now
             self.newest = None
             self.missed = 0
             self._arrivals_s.clear()
-        if self.newest is not None:
-            self.missed += max(0, message.sequence - self.newest.sequence - 1)
+        if self.newest is None:
+            self.events_missing = True
+        else:
+            gap = max(0, message.sequence - self.newest.sequence - 1)
+            self.missed += gap
+            self.events_missing |= gap > 0
         self._arrivals_s.append(now_s)
         self.newest, self.received_s = message, now_s
         self.events.extendleft(message.events)
@@ -160,6 +169,12 @@ class ConsoleState:
             self.loops[loop.name].accept(loop, message)
         if self.shown not in self.loops:
             self.shown = next(iter(self.loops), "")
+
+    def recall(self, events: list[Event]) -> None:
+        """Put events that the supervisor remembers where they belong, each once."""
+        once = dict.fromkeys([*self.events, *reversed(events)])
+        newest_first = sorted(once, key=lambda event: event.time_s, reverse=True)
+        self.events = deque(newest_first[:EVENTS_KEPT], maxlen=EVENTS_KEPT)
 
     @property
     def loop(self) -> LoopView | None:

@@ -18,6 +18,7 @@ from fitctl.supervisor.messages import (
     Acquire,
     Experiment,
     Hold,
+    Look,
     Off,
     Recover,
     Reset,
@@ -98,6 +99,14 @@ def every_command(simulation):
     simulation.run(0.1)
     simulation.command(Standby())
     simulation.run(0.3)
+
+
+def another_star(simulation):
+    hold_a_star(simulation)
+    az_px, el_px = simulation.plants["right"].spots_px(simulation.clock.now_s())[0][1].tolist()
+    assert simulation.command(Look(az_px=az_px, el_px=el_px)).accepted
+    simulation.run(3.0)
+    assert simulation.ticks[-1].star_flux_dn == pytest.approx(24_000, rel=0.02)
 
 
 def an_experiment(simulation):
@@ -184,10 +193,15 @@ INTERLOCKS = [
     "interlocks.clock={ quantity = 'clock_step_s', high = 1.0, for_s = 0.1, modes = ['VERNIER'], "
     "action = 'safe', reset = 'hand' }",
 ]
+TWO_STARS = (
+    "plant.loops.right.spots=[{name='a', offset_px={az=0.0, el=0.0}, flux_dn=30000.0, diameter_px=3.0}, "
+    "{name='b', offset_px={az=-9.0, el=5.0}, flux_dn=24000.0, diameter_px=3.0}]"
+)
 FAULT = {"STAR_FOUND", "IN_REACH", "FAULT", "RECOVER"}
 # What is done, with which rig, and what must have happened for it to say anything.
 COURSES = {
     "every command": (every_command, [], {"HOLD", "STOP", "RECOVER", "OFF", "IN_REACH"}),
+    "another star": (another_star, [TWO_STARS], {"IN_REACH"}),
     "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),
     "a lost star": (a_star_that_is_lost, [], {"STAR_LOST", "STAR_FOUND", "IN_REACH"}),
     "nothing opens": (nothing_that_opens, [], {"STANDBY", "IN_REACH"}),

@@ -17,6 +17,7 @@ from fitctl.supervisor.messages import (
     MAX_COMMAND_BYTES,
     Acquire,
     Experiment,
+    RecentEvents,
     RecorderReport,
     SetTarget,
     Standby,
@@ -209,6 +210,31 @@ def test_what_the_service_was_too_slow_for_is_in_the_telemetry(served):
     losses = served.follow(lambda telemetry: telemetry.losses.events_unsent > 0).losses
     assert (losses.records_offered, losses.records_lost) == (1000, 7)
     assert (losses.ticks_unsent, losses.mode_changes_unsent) == (0, 0)
+
+
+def test_who_comes_late_is_told_what_has_happened(served):
+    heard = []
+    served.client.send(Standby(), timeout_s=20.0)
+    served.client.send(Acquire(), timeout_s=20.0)
+    served.follow(lambda t: heard.extend(t.events) or t.loops[0].mode == "VERNIER")
+
+    told = served.client_of(served.folder).send(RecentEvents(), timeout_s=20.0).events
+
+    assert any("STANDBY -> ACQUISITION" in event.message for event in told)
+    assert told[-len(heard) :] == heard
+
+
+def test_what_is_told_of_the_past_fits_one_answer(served):
+    for number in range(400):
+        text = f"{number} " + 1000 * "x"
+        served.buffer.add(Event(time_s=number, severity="info", source="test", message=text))
+    served.follow(lambda t: any(event.message.startswith("399 ") for event in t.events))
+
+    told = served.client.send(RecentEvents()).events
+
+    numbers = [int(event.time_s) for event in told]
+    assert numbers == list(range(400 - len(told), 400))
+    assert 60_000 < len(msgspec.msgpack.encode(told)) <= 64 * 1024 + 16
 
 
 def test_a_reply_to_somebody_who_has_gone_is_counted(served):

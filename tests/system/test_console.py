@@ -113,7 +113,7 @@ def test_a_whole_acquisition_is_driven_by_keys_at_a_terminal(rig, terminal):
         assert "s STOP" in terminal.until(words)
 
     terminal.press("t")
-    terminal.until("target here?")
+    terminal.until("look here?")
     terminal.press("Right", "Right", "Enter")
     moved = rig.follow(lambda t: t.ticks and abs(t.ticks[-1].target_az_px - 25.0) < 0.05)
     assert moved[-1].loops[0].mode == "VERNIER"

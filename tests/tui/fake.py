@@ -28,8 +28,10 @@ from fitctl.supervisor.messages import (
     AnyCommand,
     LoopLimits,
     LoopState,
+    RecentEvents,
     Reply,
     SequenceStatus,
+    SpotPlace,
     Status,
     Telemetry,
     TrippedInterlock,
@@ -194,6 +196,7 @@ class FakeSupervisor:
             watched=[self._watched(*row) for row in WATCHED],
             bias_offset_urad=self.bias_offset_urad,
             search_centre_sky_arcsec=(100.0, -40.0) if self.mode == "ACQUISITION" else None,
+            other_spots=[SpotPlace(name="fringe", az_offset_px=-12.0, el_offset_px=0.0)],
         )
 
     def _watched(self, name, quantity, value, low, high, action, modes) -> Watched:
@@ -389,13 +392,15 @@ def _events() -> list[Event]:
 class FakeLink:
     """Delivers what a test puts in, keeps what was sent, and answers as the test says.
 
-    What the console sends of its own accord, to keep the instrument, is only counted.
+    What the console sends of its own accord, to keep the instrument and to hear of earlier events, is
+    only counted.
     """
 
     def __init__(self, answer: Callable[[AnyCommand], Reply] | None = None) -> None:
         self.incoming: queue.Queue[Telemetry] = queue.Queue()
         self.sent: list[AnyCommand] = []
         self.kept = 0
+        self.asked_for_events = 0
         self.closed = False
         self._answer = answer or (lambda _command: Reply(accepted=True))
 
@@ -412,6 +417,8 @@ class FakeLink:
     def send(self, command: AnyCommand) -> Reply:
         if isinstance(command, Status):
             self.kept += 1
+        elif isinstance(command, RecentEvents):
+            self.asked_for_events += 1
         else:
             self.sent.append(command)
         return self._answer(command)

@@ -12,12 +12,14 @@ import zmq
 from textual.command import CommandPalette
 from textual.pilot import Pilot
 
+from fitctl.logging.records import Event
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
 from fitctl.supervisor.messages import (
     Acquire,
     Hold,
     Off,
+    RecentEvents,
     Recover,
     Reply,
     Reset,
@@ -29,7 +31,7 @@ from fitctl.supervisor.messages import (
 )
 from fitctl.tui import app as console_app
 from fitctl.tui.app import ConsoleApp
-from fitctl.tui.dialogs import Confirm, Reader
+from fitctl.tui.dialogs import Confirm, Reader, events_text
 from fitctl.tui.views.help import HelpView
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.header import Header
@@ -452,3 +454,57 @@ def test_an_open_console_keeps_the_instrument_and_never_complains_of_it(monkeypa
         assert notifications(app) == ""
 
     assert not run(scenario, link=FakeLink(lambda _: Reply(accepted=False, text="no"))).sent
+
+
+# ---------------------------------------------------------------- events from before
+
+
+EARLIER = Event(time_s=START_S - 500.0, severity="error", source="right", message="it was cloudy")
+
+
+class RememberingLink(FakeLink):
+    """Answers with events of the past, the first time only after some failures."""
+
+    def __init__(self, failures: int = 0) -> None:
+        super().__init__()
+        self.failures = failures
+
+    def send(self, command):
+        reply = super().send(command)
+        if not isinstance(command, RecentEvents):
+            return reply
+        if self.asked_for_events <= self.failures:
+            raise ConnectionError("nobody is there")
+        return Reply(accepted=True, events=[EARLIER, *FakeSupervisor().message().events])
+
+
+def test_events_from_before_the_console_came_are_shown_once():
+    async def scenario(app, pilot, link):
+        await until(pilot, lambda: EARLIER in app.state.events)
+        heard = FakeSupervisor().message().events
+        assert list(app.state.events) == [*reversed(heard), EARLIER]
+        assert "it was cloudy" in events_text(app.state, 100).plain
+
+    assert run(scenario, link=RememberingLink()).asked_for_events == 1
+
+
+def test_events_of_before_are_asked_for_until_they_come(monkeypatch):
+    monkeypatch.setattr(console_app, "KEEP_S", 0.05)
+
+    async def scenario(app, pilot, link):
+        await until(pilot, lambda: EARLIER in app.state.events)
+        assert notifications(app) == ""
+
+    assert run(scenario, link=RememberingLink(failures=3)).asked_for_events == 4
+
+
+def test_events_that_a_slow_link_swallowed_are_asked_for(monkeypatch):
+    monkeypatch.setattr(console_app, "KEEP_S", 0.05)
+
+    async def scenario(app, pilot, link):
+        await until(pilot, lambda: link.asked_for_events == 1)
+        link.deliver(FakeSupervisor().messages(9)[-1:])
+        await until(pilot, lambda: link.asked_for_events == 2)
+        assert app.state.missed == 6
+
+    run(scenario)

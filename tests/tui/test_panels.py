@@ -8,16 +8,16 @@ import pytest
 import scipy.signal
 
 from fitctl.logging.records import Event
-from fitctl.supervisor.messages import SequenceStatus, TrippedInterlock
+from fitctl.supervisor.messages import Look, SequenceStatus, SetTarget, TrippedInterlock
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import VIEWS, keys_of
 from fitctl.tui.draw.frame import place
 from fitctl.tui.jog import JogPad
-from fitctl.tui.palette import parse_target
+from fitctl.tui.palette import parse_place
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.events import Events, event_lines
-from fitctl.tui.widgets.focalplane import FocalPlane, tick_marks
+from fitctl.tui.widgets.focalplane import FocalPlane, spot_marks, tick_marks
 from fitctl.tui.widgets.hand import Hand
 from fitctl.tui.widgets.header import Header
 from fitctl.tui.widgets.health import Devices, Timing
@@ -223,6 +223,32 @@ def test_without_a_star_only_the_target_is_marked():
         mark.character for mark in tick_marks(state.loop.tick, place(40, 40, 40, 20)).values()
     }
     assert characters == {"▔", "│"}
+
+
+def test_a_fringe_spot_is_marked_on_its_light_and_named_in_the_caption():
+    state = shown(FakeSupervisor())
+    frame, placing = state.newest.frame, place(40, 40, 40, 20)
+    ((column, row),) = spot_marks(state.loop, placing)
+    az_px, el_px = placing.pixel(column, row)
+    image = np.frombuffer(frame.data, "<u2").reshape(40, 40).astype(int)
+    near = image[round(el_px) - 1 : round(el_px) + 2, round(az_px) - 1 : round(az_px) + 2]
+    assert near.sum() - 9 * np.median(image) > 0.5 * 11_000
+
+    caption = plain(FocalPlane(state).draw(40, 21))[-1]
+    assert "◦ fringe" in caption
+    assert "star" in caption
+
+
+def test_without_a_star_no_other_spot_is_marked():
+    assert not spot_marks(shown(FakeSupervisor("ACQUISITION")).loop, place(40, 40, 40, 20))
+
+
+def test_what_has_no_room_in_the_caption_is_the_light_and_not_a_spots_name():
+    state = shown(FakeSupervisor())
+    changed_tick(state, star_flux_dn=1_234_567.0)
+    caption = plain(FocalPlane(state).draw(40, 21))[-1]
+    assert "◦ fringe" in caption
+    assert "DN" not in caption
 
 
 def test_an_ill_device_keeps_a_row_of_its_own_and_comes_first():
@@ -440,15 +466,16 @@ def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():
 
 
 @pytest.mark.parametrize(
-    ("query", "target"),
+    ("query", "command"),
     [
-        ("target 24 19.5", (24.0, 19.5)),
-        ("TARGET -1,+2.25 ", (-1.0, 2.25)),
+        ("target 24 19.5", SetTarget(az_px=24.0, el_px=19.5)),
+        ("TARGET -1,+2.25 ", SetTarget(az_px=-1.0, el_px=2.25)),
+        ("look 12 20", Look(az_px=12.0, el_px=20.0)),
         ("target 24", None),
-        ("target nan 3", None),
+        ("look nan 3", None),
         ("standby", None),
     ],
 )
-def test_a_target_is_read_from_the_palette(query, target):
-    command = parse_target(query)
-    assert (command and (command.az_px, command.el_px)) == target
+def test_a_place_is_read_from_the_palette(query, command):
+    found = parse_place(query)
+    assert (found and found[1]) == command

@@ -3,7 +3,10 @@ import math
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from fitctl.logging.records import Event
 from fitctl.tui.history import KEPT_S, Past
 from fitctl.tui.state import WINDOWS, ConsoleState, error_rms
 from tests.tui.fake import MESSAGE_S, START_S, WALL_MINUS_MONOTONIC_S, FakeSupervisor
@@ -97,6 +100,33 @@ def test_events_are_newest_first():
     state = fed(FakeSupervisor(), 1)
     times_s = [event.time_s for event in state.events]
     assert times_s == sorted(times_s, reverse=True)
+
+
+@given(
+    st.lists(st.integers(0, 20)),
+    st.integers(0, 30),
+    st.integers(0, 30),
+)
+def test_events_of_the_past_are_put_in_their_places_once(times_s, begin, end):
+    """Whatever part of them was heard: `begin` to `end`."""
+    all_ = [
+        Event(time_s=time_s, severity="info", source="x", message=str(number))
+        for number, time_s in enumerate(sorted(times_s))
+    ]
+    state = ConsoleState(START_S)
+    state.events.extendleft(all_[begin:end])
+    state.recall(all_)
+    assert sorted(event.message for event in state.events) == sorted(e.message for e in all_)
+    shown_s = [event.time_s for event in state.events]
+    assert shown_s == sorted(shown_s, reverse=True)
+
+
+def test_events_of_a_clock_that_has_begun_anew_are_not_shown_with_false_times():
+    state = fed(FakeSupervisor(pid=1), 1)
+    assert state.events
+    after_boot = msgspec.structs.replace(FakeSupervisor(pid=2).message(), time_s=5.0, events=[])
+    state.accept(after_boot, START_S)
+    assert not state.events
 
 
 def test_loops_are_cycled_by_name():

@@ -11,6 +11,7 @@ from textual.widgets import Input
 from fitctl.supervisor.messages import (
     Hold,
     Jog,
+    Look,
     Reset,
     SequenceControl,
     SequenceStatus,
@@ -182,6 +183,29 @@ def test_a_click_puts_the_cursor_and_moves_nothing_by_itself():
         await pressed(app, pilot, "escape", "enter")
 
     assert sent(run(scenario)) == []
+
+
+def test_the_window_is_put_on_another_star_with_the_same_cursor():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "i", "left", "left", "down")
+        assert app.view.query_one(FocalPlane).cursor_px == (23.0, 19.0)
+        assert "Look here" in app.view.query_one(Keys).render_line(0).text
+        assert not sent(app)
+        await pressed(app, pilot, "i")
+        assert app.view.query_one(FocalPlane).cursor_px is None
+
+    assert sent(run(scenario)) == [Look(loop="right", az_px=23.0, el_px=19.0)]
+
+
+def test_the_mouse_alone_puts_the_window_on_another_star():
+    async def scenario(app, pilot):
+        await pilot.click(FocalPlane, offset=(10, 6))
+        await settle(app, pilot)
+        line = app.view.query_one(Keys).render_line(0).text
+        await pilot.click(Keys, offset=(line.index("Look here"), 0))
+        await settle(app, pilot)
+
+    assert sent(run(scenario)) == [Look(loop="right", az_px=10.0, el_px=28.5)]
 
 
 def test_the_cursor_stays_on_the_frame():

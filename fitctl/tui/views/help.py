@@ -17,6 +17,7 @@ from fitctl.tui.views.view import View
 
 _SIGNS = (
     ("+ in a box", "centroid in its 7×7 px window; the four blue lines point at the target"),
+    ("◦", "another spot that moves with the star, such as its fringe spot, by the rig file"),
     (
         "dotted lines",
         "zero and ± the requirement; RMS is of the last 10 s in this mode, about the target",

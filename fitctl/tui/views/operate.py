@@ -8,7 +8,7 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Container
 
-from fitctl.supervisor.messages import SetBiasOffset, SetTarget
+from fitctl.supervisor.messages import Look, SetBiasOffset, SetTarget
 from fitctl.tui.commands import Key, keys_of
 from fitctl.tui.jog import JogPad
 from fitctl.tui.views.view import View
@@ -24,6 +24,7 @@ MODES_WITH_STAR = {"COARSE", "VERNIER"}
 _AIM_KEYS = [
     Key("", "↑↓←→", "Move", "", ""),
     Key("enter", "enter", "Set target", "screen.take", ""),
+    Key("i", "i", "Look here", "screen.look", ""),
     Key("escape", "esc", "Leave", "screen.leave", ""),
 ]
 _JOG_KEYS = [
@@ -92,7 +93,7 @@ class OperateView(View):
         self.query_one(Events).display = hand != "jog"
         self.call_after_refresh(self.console.draw_all)
 
-    # ------------------------------------------------------------ target
+    # ------------------------------------------------------------ target and window
 
     def action_aim(self) -> None:
         """Put a cursor on the target."""
@@ -100,13 +101,22 @@ class OperateView(View):
         if tick is not None:
             self._aim_at(tick.target_az_px, tick.target_el_px)
 
+    def action_look(self) -> None:
+        """Put the window where the cursor is; without one, put a cursor."""
+        cursor = self._plane.cursor_px
+        if self.hand == "aim" and cursor is not None:
+            self.console.give(Look(az_px=round(cursor[0], 3), el_px=round(cursor[1], 3)))
+            self._take_hand("")
+        else:
+            self.action_aim()
+
     def on_focal_plane_picked(self, event: FocalPlane.Picked) -> None:
-        """Put the cursor where the mouse was; the target moves when it is confirmed."""
+        """Put the cursor where the mouse was; what it is for is then chosen by a key."""
         self._aim_at(event.az_px, event.el_px)
 
     def _aim_at(self, az_px: float, el_px: float) -> None:
         if self.state.mode not in MODES_WITH_STAR:
-            self.notify("a target is moved while a star is held", timeout=3)
+            self.notify("target and window are moved while a star is held", timeout=3)
             return
         frame = self.state.newest.frame if self.state.newest else None
         if frame is not None:

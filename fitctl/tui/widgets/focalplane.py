@@ -1,4 +1,4 @@
-"""The focal plane: the newest frame, windows, centroids, targets, and a cursor to put a target with."""
+"""The focal plane: the newest frame, windows, centroids, targets, and a cursor to put things with."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from fitctl.tui.look import (
     GREEN,
     INK,
     ORANGE,
+    PINK,
     SKY,
     WHITE,
     YELLOW,
@@ -36,12 +37,14 @@ from fitctl.tui.look import (
     number,
     pad,
     text,
+    width,
 )
-from fitctl.tui.state import ConsoleState
+from fitctl.tui.state import ConsoleState, LoopView
 from fitctl.tui.widgets.panel import Panel
 
 WINDOW_PX = 2 * HALF_WINDOW_PX + 1
 """Side of the centroid's window; a tick names its central pixel."""
+OTHER_SPOT = "◦"
 
 
 class FocalPlane(Panel):
@@ -52,7 +55,7 @@ class FocalPlane(Panel):
     colours, stretch : str
         Of `ANCHORS` and `STRETCHES`.
     cursor_px : tuple of float or None
-        Where a target would be put, az and el.
+        Where a target or the window would be put, az and el.
     """
 
     every: ClassVar[int] = 1
@@ -83,7 +86,7 @@ class FocalPlane(Panel):
         image = np.frombuffer(frame.data, dtype="<u2").reshape(frame.height_px, frame.width_px)
         placing = self._placing = place(frame.width_px, frame.height_px, columns, rows)
         marks = self._marks(tick, placing)
-        caption = self._caption(frame, tick)
+        caption = self._caption(frame, tick, columns - placing.left)
         below = placing.top + placing.rows
         if below >= rows:
             marks |= _written_over(caption, placing.left, rows - 1)
@@ -113,8 +116,10 @@ class FocalPlane(Panel):
         marks: Marks = {}
         for name, loop in self.state.loops.items():  # one camera sees the stars of all loops
             if name != self.state.shown and loop.tick is not None:
+                marks |= spot_marks(loop, placing, DIM)
                 marks |= tick_marks(loop.tick, placing, target=FAINT, window=DIM)
-        if tick is not None:
+        if self.state.loop is not None and tick is not None:
+            marks |= spot_marks(self.state.loop, placing)
             marks |= tick_marks(tick, placing)
         if self.cursor_px is not None:
             column, row = placing.column(self.cursor_px[0]), placing.row(self.cursor_px[1])
@@ -122,20 +127,20 @@ class FocalPlane(Panel):
             marks[math.floor(column), math.floor(row)] = Mark("╳", YELLOW)
         return marks
 
-    def _caption(self, frame: FrameRecord, tick: Tick | None) -> Line:
+    def _caption(self, frame: FrameRecord, tick: Tick | None, columns: int) -> Line:
         if self.cursor_px is not None:
             az_px, el_px = self.cursor_px
-            return [text(f"╳ target here? {az_px:.1f} {el_px:.1f} px", YELLOW, bold=True)]
+            return [text(f"╳ {az_px:.1f} {el_px:.1f} px: target, or look here?", YELLOW, bold=True)]
         if tick is None or not tick.star_visible:
             return [text("○ no star", ORANGE, bold=True), text(f"  frame {frame.number}", DIM)]
         position = f"{number(tick.star_az_px, '5.2f')} {number(tick.star_el_px, '5.2f')} px"
         flux = f"{number(tick.star_flux_dn, ',.0f')} DN".replace(",", " ")
-        return [
-            text("+", WHITE, bold=True),
-            text(" star ", GREEN, bold=True),
-            text(position, INK),
-            text(f"  {flux}", DIM),
-        ]
+        star = [text("+", WHITE, bold=True), text(" star ", GREEN, bold=True), text(position, INK)]
+        spots = self.state.loop.state.other_spots if self.state.loop else []
+        names = dict.fromkeys(spot.name for spot in spots)
+        legend = [text(f" {OTHER_SPOT} {name}", PINK) for name in names]
+        whole = [*star, text(f" {flux}", DIM), *legend]
+        return whole if width(whole) <= columns else [*star, *legend]
 
 
 def tick_marks(tick: Tick, placing: Placing, target: str = SKY, window: str = GREEN) -> Marks:
@@ -158,6 +163,19 @@ def tick_marks(tick: Tick, placing: Placing, target: str = SKY, window: str = GR
         )
         centroid = placing.column(tick.star_az_px), placing.row(tick.star_el_px)
         marks[math.floor(centroid[0]), math.floor(centroid[1])] = Mark("+")
+    return marks
+
+
+def spot_marks(loop: LoopView, placing: Placing, colour: str = PINK) -> Marks:
+    """Where a loop's other spots are, from the star that its last tick measured; none without a star."""
+    tick = loop.tick
+    if tick is None or not tick.star_visible:
+        return {}
+    marks: Marks = {}
+    for spot in loop.state.other_spots:
+        column = placing.column(tick.star_az_px + spot.az_offset_px)
+        row = placing.row(tick.star_el_px + spot.el_offset_px)
+        marks[math.floor(column), math.floor(row)] = Mark(OTHER_SPOT, colour)
     return marks
 
 
