@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.model.optics import scales
@@ -88,18 +90,10 @@ def _place(view: View) -> tuple[float, float]:
     if not seen:
         return math.nan, math.nan
     scale, target, look = scales(view.rig, view.settings), view.settings.target_px, seen[-1]
-    beside_px = (
-        look.star_az_px - target.az - scale.mirror_px_per_rad * look.mirror_az_rad,
-        look.star_el_px - target.el - scale.mirror_px_per_rad * look.mirror_el_rad,
-    )
-    turned_px = (
-        scale.motor_px_per_rad * look.motor_az_rad,
-        scale.motor_px_per_rad * look.motor_el_rad,
-    )
-    az, el = (
-        (beside - turned) * scale.sky_arcsec_per_px
-        for beside, turned in zip(beside_px, turned_px, strict=True)
-    )
+    beside_px = np.array([look.star_az_px - target.az, look.star_el_px - target.el])
+    mirror_px = scale.mirror_px(np.array([look.mirror_az_rad, look.mirror_el_rad]))
+    motor_px = scale.motor_px(np.array([look.motor_az_rad, look.motor_el_rad]))
+    az, el = scale.sky_arcsec(beside_px - mirror_px - motor_px).tolist()
     return az, el
 
 

@@ -175,7 +175,7 @@ class StepMethods(ABC, Generic[R_co]):
         duration_s: float = 20.0,
         max_error: float = 0.02,
         max_residual_px: float = 0.5,
-        max_rotation_deg: float = 10.0,
+        max_rotation_deg: float = 45.0,
         **limits: Unpack[MotionLimits],
     ) -> R_co:
         """Drive both stages, open loop, and solve how each moves the star."""

@@ -229,8 +229,11 @@ class PlateScale(Moving):
         Positive, Field(description="largest RMS that the fit may leave unexplained")
     ] = 0.5
     max_rotation_deg: Annotated[
-        Positive, Field(le=45, description="a stage turned farther than this is refused")
-    ] = 10.0
+        Positive,
+        Field(
+            le=180, description="a stage turned farther than this from the rig file's is refused"
+        ),
+    ] = 45.0
 
 
 class Dark(Step):

@@ -266,9 +266,9 @@ class StellarLoop:
                 self.fire(Trigger.STAR_LOST, f"no star on {findings.lost} frames in a row")
             return
         findings.lost = 0
-        target_az_px, target_el_px = self._prefilter.value_px.tolist()
-        error_px = abs(star.az_px - target_az_px) + abs(star.el_px - target_el_px)
-        need = error_px / self._range_px
+        error_px = _position(star) - self._prefilter.value_px
+        # The mirror's diamond lies along its own axes.
+        need = float(np.abs(error_px.dot(self._scale.mirror_turn)).sum()) / self._range_px
         frames = self.settings.coarse.reach_frames
         in_reach = need <= self.settings.coarse.reach_fraction
         findings.in_reach = findings.in_reach + 1 if in_reach else 0
@@ -359,7 +359,8 @@ class StellarLoop:
         command_px = self._prefilter.step(self.target_px)
         if seen.star is not None:
             error_px = _position(seen.star) - command_px
-            self._siderostat_by(-self._coarse_step_rad_per_px * error_px)
+            along_px = error_px.dot(self._scale.siderostat_turn)
+            self._siderostat_by(-self._coarse_step_rad_per_px * along_px)
 
     def _hold_star(self, seen: Seen) -> None:
         command_px = self._prefilter.step(self.target_px)

@@ -62,8 +62,7 @@ class Search:
         self._target_px = np.array([loop.target_px.az, loop.target_px.el])
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
-        self._sky_arcsec_per_px = scale.sky_arcsec_per_px
-        self._motor_px_per_rad = scale.motor_px_per_rad
+        self._scale = scale
         self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
         self._plan_spiral = partial(plan_spiral, rig, loop_name)
         self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
@@ -87,7 +86,7 @@ class Search:
         asked, self._asked = self._asked, Acquire()
         if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
             offset = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
-            place_px = self._target_px + offset / self._sky_arcsec_per_px
+            place_px = self._target_px + self._scale.sky_px(offset)
             self._estimator.place(place_px, np.zeros(2), np.zeros(2))
         self._radius_sky_arcsec = (
             asked.search_radius_sky_arcsec or self._settings.search_radius_sky_arcsec
@@ -108,7 +107,7 @@ class Search:
         """
         if not self._there:
             middle_rad = np.clip(self.centre_rad, -self._travel_rad, self._travel_rad)
-            away_px = float(np.abs(motor_rad - middle_rad).max()) * self._motor_px_per_rad
+            away_px = float(np.abs(motor_rad - middle_rad).max()) * self._scale.motor_px_per_rad
             self._there = away_px <= NEAR * self._plan.field_radius_px
         return self._there
 
@@ -140,7 +139,7 @@ class Search:
             return self._sighting.motor_rad
         if not self.is_there(motor_rad):
             return self.centre_rad
-        return self.centre_rad + self._spiral.advance(duration_s) / self._motor_px_per_rad
+        return self.centre_rad + self._scale.motor_rad(self._spiral.advance(duration_s))
 
     def _star_in_the_middle_rad(self) -> Floats:
         """With the star in the middle of the field, the search sees farthest."""
