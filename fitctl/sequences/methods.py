@@ -59,6 +59,7 @@ class StepMethods(ABC, Generic[R_co]):
         field_overlap: float | None = None,
         expected_az_sky_arcsec: float | None = None,
         expected_el_sky_arcsec: float | None = None,
+        star_flux_dn: float | None = None,
         **limits: Unpack[Limits],
     ) -> R_co:
         """Search for the star, pull it in, until it is held in VERNIER."""
@@ -69,6 +70,7 @@ class StepMethods(ABC, Generic[R_co]):
             "field_overlap": field_overlap,
             "expected_az_sky_arcsec": expected_az_sky_arcsec,
             "expected_el_sky_arcsec": expected_el_sky_arcsec,
+            "star_flux_dn": star_flux_dn,
         }
         return self._do(steps.Acquire, {**keys, **limits})
 

@@ -37,6 +37,7 @@ from fitctl.logging.records import (
 from fitctl.model.drives import SIDEROSTAT, Drive, channel_values, experiment_s
 from fitctl.model.optics import scales
 from fitctl.supervisor.interlocks import Interlocks
+from fitctl.supervisor.messages import Acquire
 from fitctl.supervisor.modes import FOLLOWING, TRACKING, Mode, Trigger, transition
 from fitctl.supervisor.power import failure_record
 from fitctl.supervisor.quantities import Quantities, places
@@ -334,6 +335,13 @@ class StellarLoop:
             self._prefilter.reset(self.target_px)
         elif self.mode is Mode.VERNIER:
             self._start_pair(motor_rad)
+
+    def look_for(self, asked: Acquire) -> None:
+        """What the next search is to find, and how, as a command asks that was not refused."""
+        flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
+        self._sensor.expect(flux_dn)
+        self.measured.star_flux_dn = flux_dn
+        self.search.ask(asked)
 
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""

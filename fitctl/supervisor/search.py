@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
-from fitctl.controllers.centroid import Star
+from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.model.optics import scales
@@ -146,6 +146,22 @@ class Search:
         return self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
 
 
+def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
+    """Why a star of this flux could not be found, or nothing."""
+    if star_flux_dn is None:
+        return ""
+    if not 0 < star_flux_dn < math.inf:
+        return f"star_flux_dn must be above 0 (is {star_flux_dn:g})"
+    acquisition = rig.loops[loop_name].acquisition
+    least_dn = acquisition.detection_sigma * rig.camera.pixel_noise_dn / LARGEST_PEAK
+    if star_flux_dn < least_dn:
+        return (
+            f"a star of {star_flux_dn:g} DN could not be told from noise; loops.{loop_name}.acquisition."
+            f"detection_sigma needs at least {least_dn:.0f} DN"
+        )
+    return ""
+
+
 def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
     """Why a search cannot be made as asked, or nothing."""
     loop = rig.loops[loop_name]
@@ -158,8 +174,9 @@ def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
         return f"search_radius_sky_arcsec must be above 0 (is {radius:g})"
     if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
         return f"field_overlap must lie in {LEAST_OVERLAP:g} to {MOST_OVERLAP:g} (is {overlap:g})"
-    if radius is None and not given:
-        return ""
+    too_faint = _too_faint(rig, loop_name, asked.star_flux_dn)
+    if too_faint or (radius is None and not given):
+        return too_faint
     radius = radius or loop.acquisition.search_radius_sky_arcsec
     travel = loop.siderostat.travel_sky_arcsec
     for place in given or [0.0]:
