@@ -199,17 +199,24 @@ def console(
     from fitctl.commands.connecting import connect
     from fitctl.commands.instrument import run_console
 
-    arguments = ["--remote", str(remote)] if remote else _rig_arguments(rig, overrides)
+    rig_arguments = _rig_arguments(rig, overrides)
+    remote_arguments = ["--remote", str(remote)] if remote else []
     client = connect(rig, overrides, remote)
     if web:
         from fitctl.commands.web import serve_console
 
         client.close()  # what is wrong with the rig is said here, not in the browser
-        serve_console(arguments, port)
+        serve_console([*rig_arguments, *remote_arguments], port)
         return
     # The logs of a rig elsewhere are elsewhere too.
     log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()
-    run_console(client, arguments, log_folder, quitting_ends_instrument=quitting_ends_instrument)
+    run_console(
+        client,
+        rig_arguments,
+        remote_arguments,
+        log_folder,
+        quitting_ends_instrument=quitting_ends_instrument,
+    )
 
 
 class _SendCommand(TyperCommand):

@@ -58,7 +58,7 @@ def run_demo(
         try:
             with demos.instrument(rig_path, overrides, seed) as running:
                 if console:
-                    return _demo_with_console(rig_path, running)
+                    return _demo_with_console(rig_path, overrides, running)
                 return _demo_headless(rig, running, duration_s, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
             typer.echo(f"demo: {error}", err=True)
@@ -70,7 +70,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
-def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
+def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.Instrument) -> int:
     thread = demos.acquire_in_background(running)
     # A process of its own: when its terminal goes away it may hang, and must not hang us with it.
     console = show_process(
@@ -78,6 +78,7 @@ def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
             "console",
             "--rig",
             str(rig_path),
+            *(part for override in overrides for part in ("--set", override)),
             "--set",
             f"service.folder={running.sockets}",
             "--quitting-ends-instrument",
@@ -295,19 +296,21 @@ def run_metrics(rig: Rig, *, parent_pid: int | None) -> None:
 
 def run_console(
     client: Client,
-    arguments: Sequence[str],
+    rig_arguments: Sequence[str],
+    remote_arguments: Sequence[str],
     log_folder: Path | None,
     *,
     quitting_ends_instrument: bool,
 ) -> None:
-    """Attach a console; other commands that it runs are given `arguments`."""
+    """Attach a console; other commands that it runs are given the arguments."""
     from fitctl.tui.app import ConsoleApp
 
     app = ConsoleApp(
         client,
         quit_shuts_down=quitting_ends_instrument,
         clock=client.now_s,
-        rig_arguments=arguments,
+        rig_arguments=rig_arguments,
+        remote_arguments=remote_arguments,
         log_folder=log_folder,
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
