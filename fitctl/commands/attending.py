@@ -25,13 +25,14 @@ def console(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig."""
-    arguments = ["--remote", str(remote)] if remote else rig_arguments(rig, overrides)
+    arguments = rig_arguments(rig, overrides)
+    remote_arguments = ["--remote", str(remote)] if remote else []
     client = connect(rig, overrides, remote)
     if web:
         from fitctl.commands.web import serve_console
 
         client.close()  # what is wrong with the rig is said here, not in the browser
-        serve_console(arguments, port)
+        serve_console([*arguments, *remote_arguments], port)
         return
     # The logs of a rig elsewhere are elsewhere too.
     log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()
@@ -42,6 +43,7 @@ def console(
         quit_shuts_down=quitting_ends_instrument,
         clock=client.now_s,
         rig_arguments=arguments,
+        remote_arguments=remote_arguments,
         log_folder=log_folder,
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was

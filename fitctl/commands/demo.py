@@ -9,6 +9,7 @@ from typing import Any
 import typer
 
 from fitctl import demo as demos
+from fitctl.commands.choosing import rig_arguments
 from fitctl.commands.exits import FAILED
 from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import Rig
@@ -34,23 +35,20 @@ def run_demo(
         try:
             with demos.instrument(rig_path, overrides, seed) as running:
                 if console:
-                    return _demo_with_console(rig_path, running)
+                    return _demo_with_console(rig_path, overrides, running)
                 return _demo_headless(rig, running, duration_s, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
             typer.echo(f"demo: {error}", err=True)
             return FAILED
 
 
-def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
+def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.Instrument) -> int:
     thread = demos.acquire_in_background(running)
     # A process of its own: when its terminal goes away it may hang, and must not hang us with it.
     console = show_process(
         [
             "console",
-            "--rig",
-            str(rig_path),
-            "--set",
-            f"service.folder={running.sockets}",
+            *rig_arguments(rig_path, [*overrides, f"service.folder={running.sockets}"]),
             "--quitting-ends-instrument",
         ]
     )

@@ -179,6 +179,10 @@ DEVICE_BY_TAG: dict[str, type[Settings]] = {
 AmplifierDevice = TypeVar("AmplifierDevice", bound=Settings)
 
 
+# Of a stage's axes about the line of sight, from the camera's, azimuth towards elevation.
+RotationDeg = Annotated[float, Field(ge=-180, le=180)]
+
+
 class Siderostat(Settings, Generic[AmplifierDevice]):
     """The coarse stage: geometry, limits, servo, amplifiers; generic in what its amplifiers are."""
 
@@ -186,6 +190,7 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
     spur_gear_ratio: Positive
     ball_screw_m_per_rad: Positive
     lever_arm_m: Positive
+    rotation_deg: RotationDeg
     travel_sky_arcsec: Positive
     velocity_limit_rad_s: Positive
     acceleration_limit_rad_s2: Positive
@@ -279,6 +284,7 @@ class Fsm(Settings):
     stack_scale_m_per_v: Positive
     stack_radius_m: Positive
     beam_per_mirror: Positive
+    rotation_deg: RotationDeg
     bias_v: Positive
     range_rad: Positive
     slew_v_per_s: Positive

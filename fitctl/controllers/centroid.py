@@ -68,9 +68,14 @@ class StarSensor:
     def __init__(self, camera: Camera, loop: Loop) -> None:
         self._dark = Dark(camera)
         self._threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
-        self._flux_low_dn = loop.flux_range.low * loop.star_flux_dn
-        self._flux_high_dn = loop.flux_range.high * loop.star_flux_dn
+        self._flux_range = loop.flux_range
         self._largest_az_px, self._largest_el_px = camera.largest_window_px
+        self.expect(loop.star_flux_dn)
+
+    def expect(self, star_flux_dn: float) -> None:
+        """From now on the loop's star is the one with this flux, within the loop's range about it."""
+        self._flux_low_dn = self._flux_range.low * star_flux_dn
+        self._flux_high_dn = self._flux_range.high * star_flux_dn
 
     def measure(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float

@@ -61,8 +61,8 @@ class StarEstimator:
 
     def motor_for_rad(self, star_px: Floats, mirror_rad: Floats) -> Floats:
         """Motor angles that bring the star to `star_px`, shape (2,)."""
-        mirror_px = self._scale.mirror_px_per_rad * mirror_rad
-        return (star_px - self._origin_px - mirror_px) / self._scale.motor_px_per_rad
+        mirror_px = self._scale.mirror_px(mirror_rad)
+        return self._scale.motor_rad(star_px - self._origin_px - mirror_px)
 
     def _stages_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
-        return self._scale.motor_px_per_rad * motor_rad + self._scale.mirror_px_per_rad * mirror_rad
+        return self._scale.motor_px(motor_rad) + self._scale.mirror_px(mirror_rad)

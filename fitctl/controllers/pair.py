@@ -92,7 +92,7 @@ class Pair:
 
     def __init__(self, design: Design, scale: Scales, range_rad: float) -> None:
         self.design = design
-        self._mirror_px_per_rad = scale.mirror_px_per_rad
+        self._scale = scale
         self._range_rad = range_rad
         self._at_rest = rest_state(design)
         self._left_at_rest = left_at_rest(design, self._at_rest)
@@ -106,7 +106,7 @@ class Pair:
         What a design does not hold by itself without an error (Eq. 20 holds nothing so) is added to its
         command, and handed over to the siderostat little by little.
         """
-        mirror_px = mirror_rad * self._mirror_px_per_rad
+        mirror_px = self._scale.mirror_px(mirror_rad)
         self._given[len(INPUTS) : -1] = np.outer(self._at_rest, mirror_px)
         self._given[-1] = mirror_px * self._left_at_rest
         self.excess_px = np.zeros(2)
@@ -124,17 +124,19 @@ class Pair:
         given = self._given
         given[0] = measured.error_px
         given[1] = self.excess_px
-        given[2] = measured.mirror_rad
-        given[3] = measured.motor_rad - self.motor_origin_rad
+        # The design's axes are the camera's; the stages' may be turned from them.
+        mirror_turn, siderostat_turn = self._scale.mirror_turn, self._scale.siderostat_turn
+        given[2] = mirror_turn.dot(measured.mirror_rad)
+        given[3] = siderostat_turn.dot(measured.motor_rad - self.motor_origin_rad)
         given[4] = measured.target_px - self.target_origin_px
         made = self._system.dot(given)  # `@` takes twice as long
         given[len(INPUTS) :] = made[len(OUTPUTS) :]
-        wanted_rad, motor_step_rad = made[: len(OUTPUTS)]
+        wanted_rad = made[0].dot(mirror_turn)
         mirror_rad = saturate_diamond(wanted_rad, self._range_rad)
         # Fed back a frame later, where the camera takes nearly two: much as the error would have been
         # had the mirror followed.
-        self.excess_px = (wanted_rad - mirror_rad) * self._mirror_px_per_rad
-        return PairCommand(mirror_rad, motor_step_rad)
+        self.excess_px = self._scale.mirror_px(wanted_rad - mirror_rad)
+        return PairCommand(mirror_rad, made[1].dot(siderostat_turn))
 
     def _in_rad(self, scale: Scales) -> Floats:
         """The design with its hand-over, but the stages in radians, as they are measured and commanded."""

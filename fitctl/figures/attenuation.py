@@ -99,8 +99,8 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
     # A command acts from its tick's end until the next.
     exposed_s = ticks["mid_exposure_s"]
     in_force = np.searchsorted(ticks["time_s"], exposed_s, side="right") - 1
-    mirror_px = scale.mirror_px_per_rad * angles_rad[np.maximum(in_force, 0)]
-    motor_px = scale.motor_px_per_rad * _pair(ticks, "siderostat_{}_rad")
+    mirror_px = scale.mirror_px(angles_rad[np.maximum(in_force, 0)])
+    motor_px = scale.motor_px(_pair(ticks, "siderostat_{}_rad"))
     return np.where(np.isnan(exposed_s)[:, None], np.nan, mirror_px + motor_px)
 
 

@@ -184,12 +184,14 @@ def analyse(rig: Rig, record: ExperimentRecord) -> BacklashResult:
 
 
 def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash:
-    nominal = scales(rig, rig.loops[record.loop]).motor_px_per_rad
+    scale = scales(rig, rig.loops[record.loop])
+    nominal = scale.motor_px_per_rad
+    star_px = record.star_px.dot(scale.siderostat_turn)[:, axis]  # along the siderostat's axis
     motor_px = record.motor_rad[:, axis] * nominal
     motor_px -= motor_px.mean()
-    frames = _usable_frames(AXES[axis], motor_px, record.star_px[:, axis])
+    frames = _usable_frames(AXES[axis], motor_px, star_px)
     times_s = record.tick["mid_exposure_s"]
-    seen_px = record.star_px[frames, axis]
+    seen_px = star_px[frames]
     whiten = whitener(rig, record.loop, times_s[frames])
     seen = whiten(seen_px[:, None])[:, 0]
     # Not by interpolation: it would smooth the encoders' counts, and be preferred for that.

@@ -87,12 +87,16 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
 def _check_star_stays(rig: Rig, loop_name: str, amplitude_v: float) -> None:
     loop = rig.loops[loop_name]
     per_stack_rad = loop.fsm.stack_scale_m_per_v / (2 * loop.fsm.stack_radius_m)
-    swing_px = 1.2 * amplitude_v * per_stack_rad * scales(rig, loop).mirror_px_per_rad
-    target = loop.target_px
+    swing_rad = 1.2 * amplitude_v * per_stack_rad
+    scale, target = scales(rig, loop), loop.target_px
+    # The second stack moves both of the mirror's axes, and what that is on the frame, its rotation decides.
+    az_px, el_px = (
+        swing_rad * scale.mirror_px_per_rad * np.abs(scale.mirror_turn).sum(axis=1)
+    ).tolist()
     for sign in (-1, 1):
-        if not rig.camera.window_fits(target.az + sign * swing_px, target.el + sign * swing_px):
+        if not rig.camera.window_fits(target.az + sign * az_px, target.el + sign * el_px):
             msg = (
-                f"a full swing of one stack moves the star by {swing_px:.1f} px, which must stay on "
+                f"a full swing of one stack moves the star by {max(az_px, el_px):.1f} px, which must stay on "
                 f"the frame; move loops.{loop_name}.target_px nearer to the frame's middle"
             )
             raise IdentifyError(msg)
@@ -255,8 +259,9 @@ class _Evidence:
         self.exposed_s = exposed_s[frames]
         self.star_px = record.star_px[frames]
         # By how much one metre of each stack moves the star, shape (stacks, axes).
-        per_rad = scales(rig, loop).mirror_px_per_rad
-        self.px_per_m = mirror_from_stacks(np.eye(3), loop.fsm.stack_radius_m) * per_rad
+        self.px_per_m = scales(rig, loop).mirror_px(
+            mirror_from_stacks(np.eye(3), loop.fsm.stack_radius_m)
+        )
         self._whiten = whitener(rig, record.loop, self.exposed_s)
         self._white_star = self._whitened(self.star_px.T[..., None])
 

@@ -52,6 +52,18 @@ def air_motion(
 
 
 @jit_inlined
+def turned(turn: Floats, az: float, el: float) -> Any:
+    """A pair, by a matrix of shape (2, 2)."""
+    return turn[0, 0] * az + turn[0, 1] * el, turn[1, 0] * az + turn[1, 1] * el
+
+
+@jit_inlined
+def turned_back(turn: Floats, az: float, el: float) -> Any:
+    """A pair, by the transpose of a matrix of shape (2, 2)."""
+    return turn[0, 0] * az + turn[1, 0] * el, turn[0, 1] * az + turn[1, 1] * el
+
+
+@jit_inlined
 def play_output(plays: Floats, value: float, half_width: Floats, gain: Floats) -> float:
     """Output of parallel plays, shape (n,) each, after they met `value`; they are moved on."""
     total = 0.0
@@ -84,11 +96,14 @@ def step_run(c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats)
     mirror_az = (s.displacement_m[1] - s.displacement_m[2]) / (2 * c.stack_radius_m)
     mirror_el = (s.displacement_m[0] - s.displacement_m[1]) / (2 * c.stack_radius_m)
     # On the focal plane: what of the mirror does not go through the modes, and each mode's part.
-    still_az_px = origin_px[0] + c.mirror_px_per_rad * (1 - c.participation) * mirror_az
-    still_el_px = origin_px[1] + c.mirror_px_per_rad * (1 - c.participation) * mirror_el
+    turned_az, turned_el = turned(c.mirror_turn, mirror_az, mirror_el)
+    still_az_px = origin_px[0] + c.mirror_px_per_rad * (1 - c.participation) * turned_az
+    still_el_px = origin_px[1] + c.mirror_px_per_rad * (1 - c.participation) * turned_el
     mode_px = c.mirror_px_per_rad * c.participation
-    az_px1, el_px1 = mode_px * c.mode_shape[0, 0], mode_px * c.mode_shape[0, 1]
-    az_px2, el_px2 = mode_px * c.mode_shape[1, 0], mode_px * c.mode_shape[1, 1]
+    shape_az1, shape_el1 = turned(c.mirror_turn, c.mode_shape[0, 0], c.mode_shape[0, 1])
+    shape_az2, shape_el2 = turned(c.mirror_turn, c.mode_shape[1, 0], c.mode_shape[1, 1])
+    az_px1, el_px1 = mode_px * shape_az1, mode_px * shape_el1
+    az_px2, el_px2 = mode_px * shape_az2, mode_px * shape_el2
     drive1 = mirror_az * c.mode_shape[0, 0] + mirror_el * c.mode_shape[0, 1]
     drive2 = mirror_az * c.mode_shape[1, 0] + mirror_el * c.mode_shape[1, 1]
     a1, b1, c1, d1 = (
@@ -118,12 +133,13 @@ def step_run(c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats)
         lead_el *= decay
         beam_az = max(motor_az - half, min(motor_az + half, beam_az))
         beam_el = max(motor_el - half, min(motor_el + half, beam_el))
+        turned_az, turned_el = turned(c.siderostat_turn, beam_az, beam_el)
         spot_px[row, 0] = (
-            still_az_px + az_px1 * place1 + az_px2 * place2 + motor_px * beam_az
+            still_az_px + az_px1 * place1 + az_px2 * place2 + motor_px * turned_az
             + air_px[row, 0]
         )  # fmt: skip
         spot_px[row, 1] = (
-            still_el_px + el_px1 * place1 + el_px2 * place2 + motor_px * beam_el
+            still_el_px + el_px1 * place1 + el_px2 * place2 + motor_px * turned_el
             + air_px[row, 1]
         )  # fmt: skip
     s.modes[0, 0], s.modes[0, 1], s.modes[1, 0], s.modes[1, 1] = place1, rate1, place2, rate2

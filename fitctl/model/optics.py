@@ -6,6 +6,7 @@ on their last axis.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """How far one unit of each stage moves the star on the focal plane.
+    """How far one unit of each stage moves the star on the focal plane, and which way.
+
+    A stage's axes may be turned from the camera's: what is in radians, or on the sky, is along the stage's;
+    what is in pixels, along the camera's.
 
     Attributes
     ----------
@@ -30,6 +34,8 @@ class Scales:
         Siderostat motor to focal plane: 1.437e-4 m/rad on FIT.
     mirror_px_per_rad : float
         Fast steering mirror to focal plane: k_FSM f_i / pixel.
+    siderostat_turn, mirror_turn : arrays, shape (2, 2)
+        Rotations from each stage's axes to the camera's; the identity where they agree.
     pixel_size_m : float
         One pixel.
     """
@@ -38,6 +44,8 @@ class Scales:
     motor_sky_rad_per_rad: float
     motor_px_per_rad: float
     mirror_px_per_rad: float
+    siderostat_turn: Floats
+    mirror_turn: Floats
     pixel_size_m: float
 
     @property
@@ -49,6 +57,28 @@ class Scales:
     def motor_sky_arcsec_per_rad(self) -> float:
         """Beam angle on the sky of one radian of motor."""
         return self.motor_sky_rad_per_rad * ARCSEC_PER_RAD
+
+    # All of these take and give shape (..., 2).
+
+    def motor_px(self, motor_rad: Floats) -> Floats:
+        """How far motor angles move the star."""
+        return self.motor_px_per_rad * motor_rad.dot(self.siderostat_turn.T)
+
+    def motor_rad(self, star_px: Floats) -> Floats:
+        """Motor angles that move the star so far."""
+        return star_px.dot(self.siderostat_turn) / self.motor_px_per_rad
+
+    def mirror_px(self, mirror_rad: Floats) -> Floats:
+        """How far mirror angles move the star."""
+        return self.mirror_px_per_rad * mirror_rad.dot(self.mirror_turn.T)
+
+    def sky_px(self, sky_arcsec: Floats) -> Floats:
+        """An angle on the sky, along the siderostat's axes, on the focal plane."""
+        return sky_arcsec.dot(self.siderostat_turn.T) / self.sky_arcsec_per_px
+
+    def sky_arcsec(self, star_px: Floats) -> Floats:
+        """What is so far on the focal plane, as an angle on the sky along the siderostat's axes."""
+        return star_px.dot(self.siderostat_turn) * self.sky_arcsec_per_px
 
 
 def scales(rig: Rig, loop: Loop) -> Scales:
@@ -65,8 +95,16 @@ def scales(rig: Rig, loop: Loop) -> Scales:
         motor_sky_rad_per_rad=motor_sky,
         motor_px_per_rad=motor_sky * sky_px_per_rad,
         mirror_px_per_rad=loop.fsm.beam_per_mirror * rig.optics.focal_length_m / pixel_size_m,
+        siderostat_turn=rotation(siderostat.rotation_deg),
+        mirror_turn=rotation(loop.fsm.rotation_deg),
         pixel_size_m=pixel_size_m,
     )
+
+
+def rotation(angle_deg: float) -> Floats:
+    """The matrix, shape (2, 2), that turns from azimuth towards elevation."""
+    cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def stack_matrix(stack_radius_m: float) -> Floats:

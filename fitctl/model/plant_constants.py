@@ -28,6 +28,8 @@ _PACKED = np.dtype(
         ("participation", "f8"),
         ("motor_px_per_rad", "f8"),
         ("mirror_px_per_rad", "f8"),
+        ("siderostat_turn", "f8", (2, 2)),
+        ("mirror_turn", "f8", (2, 2)),
     ]
 )
 
@@ -72,6 +74,8 @@ class PlantConstants:
     air: AirConstants
     motor_px_per_rad: float
     mirror_px_per_rad: float
+    siderostat_turn: Floats
+    mirror_turn: Floats
     spot_origin_px: Floats = field(repr=False)
 
     @functools.cached_property
@@ -123,6 +127,8 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         air=air_constants(plant.air_path, truth.step_s),
         motor_px_per_rad=scale.motor_px_per_rad,
         mirror_px_per_rad=scale.mirror_px_per_rad,
+        siderostat_turn=scale.siderostat_turn,
+        mirror_turn=scale.mirror_turn,
         spot_origin_px=target + star_offset_px[:, None, :] + spot_offset,
     )
 

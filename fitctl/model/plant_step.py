@@ -125,8 +125,8 @@ def advance_reference(
             + own_px
             + (
                 air_now_px[:, 0]
-                + c.motor_px_per_rad * state.beam_motor_rad
-                + c.mirror_px_per_rad * moving_rad
+                + c.motor_px_per_rad * state.beam_motor_rad @ c.siderostat_turn.T
+                + c.mirror_px_per_rad * moving_rad @ c.mirror_turn.T
             )[:, None, :]
         )
 

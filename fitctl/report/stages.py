@@ -134,9 +134,9 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
     known = motor_rad[~np.isnan(motor_rad).any(axis=1)]
     zero_rad = known[0] if len(known) else np.zeros(2)
     return (
-        scale.mirror_px_per_rad * mirror_rad,
-        scale.motor_px_per_rad * (motor_rad - zero_rad),
-        scale.motor_px_per_rad * (setpoint_rad - zero_rad),
+        scale.mirror_px(mirror_rad),
+        scale.motor_px(motor_rad - zero_rad),
+        scale.motor_px(setpoint_rad - zero_rad),
     )
 
 

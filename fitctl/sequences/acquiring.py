@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, let_go
-from fitctl.sequences.view import StepFailed, View
+from fitctl.sequences.view import Figures, StepFailed, View
 from fitctl.supervisor.messages import Acquire, Hold, Standby
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.search import refused_search
+
+_FOUND = ("found_az_sky_arcsec", "found_el_sky_arcsec", "found_flux_dn")
 
 
 def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Acquire:
@@ -27,6 +31,7 @@ def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Ac
         field_overlap=step.field_overlap,
         expected_az_sky_arcsec=step.expected_az_sky_arcsec,
         expected_el_sky_arcsec=step.expected_el_sky_arcsec,
+        star_flux_dn=step.star_flux_dn,
     )
 
 
@@ -53,7 +58,8 @@ def _own_s(step: steps.Acquire, rig: Rig, loop_name: str) -> float:
 
 
 def _run(step: steps.Acquire, view: View) -> None:
-    if step.expected_az_sky_arcsec is not None and view.tracking:
+    another = step.expected_az_sky_arcsec is not None or step.star_flux_dn is not None
+    if another and view.tracking:
         view.command(Hold(loop=view.loop_name))  # another star, or the same anew
     if view.mode is Mode.OFF:
         view.command(Standby(loop=view.loop_name))
@@ -75,32 +81,20 @@ def _done(step: steps.Acquire, view: View) -> Result | None:
     view.insist_on(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
     if view.mode is not Mode.VERNIER:
         return None
-    az, el = _place(view)
-    return Result(
-        {"acquired_s": view.gone_s, "found_az_sky_arcsec": az, "found_el_sky_arcsec": el},
-        f"held after {view.gone_s:.1f} s",
-    )
+    return Result({"acquired_s": view.gone_s, **_found(view)}, f"held after {view.gone_s:.1f} s")
 
 
-def _place(view: View) -> tuple[float, float]:
-    """Where the star is on the sky, in arcsec from where the encoders read zero; nan if it was not seen."""
+def _found(view: View) -> Figures:
+    """Where the star is on the sky, from where the encoders read zero, and its flux; nan if it was not seen."""
     seen = [look for look in view.looks if math.isfinite(look.star_az_px)]
     if not seen:
-        return math.nan, math.nan
+        return dict.fromkeys(_FOUND, math.nan)
     scale, target, look = scales(view.rig, view.settings), view.settings.target_px, seen[-1]
-    beside_px = (
-        look.star_az_px - target.az - scale.mirror_px_per_rad * look.mirror_az_rad,
-        look.star_el_px - target.el - scale.mirror_px_per_rad * look.mirror_el_rad,
-    )
-    turned_px = (
-        scale.motor_px_per_rad * look.motor_az_rad,
-        scale.motor_px_per_rad * look.motor_el_rad,
-    )
-    az, el = (
-        (beside - turned) * scale.sky_arcsec_per_px
-        for beside, turned in zip(beside_px, turned_px, strict=True)
-    )
-    return az, el
+    beside_px = np.array([look.star_az_px - target.az, look.star_el_px - target.el])
+    mirror_px = scale.mirror_px(np.array([look.mirror_az_rad, look.mirror_el_rad]))
+    motor_px = scale.motor_px(np.array([look.motor_az_rad, look.motor_el_rad]))
+    az, el = scale.sky_arcsec(beside_px - mirror_px - motor_px).tolist()
+    return dict(zip(_FOUND, (az, el, look.star_flux_dn), strict=True))
 
 
 ACQUIRE = {

@@ -59,6 +59,7 @@ class StepMethods(ABC, Generic[R_co]):
         field_overlap: float | None = None,
         expected_az_sky_arcsec: float | None = None,
         expected_el_sky_arcsec: float | None = None,
+        star_flux_dn: float | None = None,
         **limits: Unpack[Limits],
     ) -> R_co:
         """Search for the star, pull it in, until it is held in VERNIER."""
@@ -69,6 +70,7 @@ class StepMethods(ABC, Generic[R_co]):
             "field_overlap": field_overlap,
             "expected_az_sky_arcsec": expected_az_sky_arcsec,
             "expected_el_sky_arcsec": expected_el_sky_arcsec,
+            "star_flux_dn": star_flux_dn,
         }
         return self._do(steps.Acquire, {**keys, **limits})
 
@@ -175,7 +177,7 @@ class StepMethods(ABC, Generic[R_co]):
         duration_s: float = 20.0,
         max_error: float = 0.02,
         max_residual_px: float = 0.5,
-        max_rotation_deg: float = 10.0,
+        max_rotation_deg: float = 45.0,
         **limits: Unpack[MotionLimits],
     ) -> R_co:
         """Drive both stages, open loop, and solve how each moves the star."""

@@ -30,21 +30,19 @@ _SAMPLED_HZ = 100.0
 def motions_px(rig: Rig, loop_name: str, drives: list[Drive]) -> Floats:
     """Where the motions put the star about its place, by the rig file's scales, shape (n, 2)."""
     loop = rig.loops[loop_name]
+    scale = scales(rig, loop)
     per_px = stack_v_per_px(
-        loop.fsm.stack_radius_m,
-        loop.fsm.stack_scale_m_per_v,
-        scales(rig, loop).mirror_px_per_rad,
+        loop.fsm.stack_radius_m, loop.fsm.stack_scale_m_per_v, scale.mirror_px_per_rad
     )
     px_per_v = np.linalg.pinv(per_px)
     times_s = np.arange(0.0, experiment_s(drives), 1 / _SAMPLED_HZ).tolist()
-    return np.array(
-        [
-            channel_values(drives, SIDEROSTAT, time_s)
-            + channel_values(drives, FSM, time_s)
-            + px_per_v @ channel_values(drives, STACKS, time_s)
-            for time_s in times_s
-        ]
-    ).reshape(-1, 2)
+    moved_px = [
+        scale.siderostat_turn @ channel_values(drives, SIDEROSTAT, time_s)
+        + scale.mirror_turn
+        @ (channel_values(drives, FSM, time_s) + px_per_v @ channel_values(drives, STACKS, time_s))
+        for time_s in times_s
+    ]
+    return np.array(moved_px).reshape(-1, 2)
 
 
 def checked(plan: Plan) -> Callable[[Any, Rig, str], list[str]]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.model.drives import FSM, SIDEROSTAT, Drive
-from fitctl.model.optics import scales
+from fitctl.model.optics import Scales, scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Calibration, Result
 from fitctl.sequences.open_loop import open_loop, watched
@@ -148,13 +148,13 @@ def fit_plate_scale(time_s: Floats, star_px: Floats, swings: list[Swing]) -> Pla
     )
 
 
-def refusal(fit: PlateScaleFit, step: steps.PlateScale) -> str:
-    """Why a fit is not believed, or nothing."""
+def refusal(fit: PlateScaleFit, step: steps.PlateScale, scale: Scales) -> str:
+    """Why a fit is not believed beside the rig file's `scale`, or nothing."""
     if not fit.residual_px <= step.max_residual_px:
         return f"{fit.residual_px:.3f} px RMS are unexplained; max_residual_px is {step.max_residual_px:g}"
-    for name, matrix, deviation in (
-        ("mirror", fit.mirror, fit.mirror_sd),
-        ("siderostat", fit.siderostat, fit.siderostat_sd),
+    for name, matrix, deviation, turn in (
+        ("mirror", fit.mirror, fit.mirror_sd, scale.mirror_turn),
+        ("siderostat", fit.siderostat, fit.siderostat_sd, scale.siderostat_turn),
     ):
         if not deviation.max() <= step.max_error:
             return (
@@ -163,25 +163,36 @@ def refusal(fit: PlateScaleFit, step: steps.PlateScale) -> str:
             )
         if np.linalg.svd(matrix, compute_uv=False)[-1] < _LEAST_GAIN:
             return f"{name}: does not move the star along both axes; look at its wiring and its amplifiers"
-        turned_deg, mirrored = math.degrees(rotation_rad(matrix)), np.linalg.det(matrix) < 0
+        turned_deg, mirrored = rotation_deg(turn.T @ matrix), np.linalg.det(matrix) < 0
         if abs(turned_deg) > step.max_rotation_deg or mirrored:
             return (
-                f"{name}: turned by {turned_deg:+.1f} deg{', and mirrored' if mirrored else ''}; "
-                f"max_rotation_deg is {step.max_rotation_deg:g}; look at its wiring and the camera's mount"
+                f"{name}: turned by {turned_deg:+.1f} deg from the rig file's rotation_deg"
+                f"{', and mirrored' if mirrored else ''}; max_rotation_deg is {step.max_rotation_deg:g}; "
+                "look at its wiring and the camera's mount"
             )
     return ""
 
 
-def rotation_rad(matrix: Floats) -> float:
+def rotation_deg(matrix: Floats) -> float:
     """By how much a matrix, shape (2, 2), turns from azimuth towards elevation."""
     (az_az, az_el), (el_az, el_el) = matrix.tolist()
-    return math.atan2(el_az - az_el, az_az + el_el)
+    return math.degrees(math.atan2(el_az - az_el, az_az + el_el))
+
+
+def rotation_sd_deg(matrix: Floats, deviation: Floats) -> float:
+    """Standard deviation of :func:`rotation_deg`, from those of the matrix's elements."""
+    (az_az, az_el), (el_az, el_el) = matrix.tolist()
+    cos, sin = az_az + el_el, el_az - az_el
+    (sd_az_az, sd_az_el), (sd_el_az, sd_el_el) = deviation.tolist()
+    across = math.hypot(cos * sd_az_el, cos * sd_el_az, sin * sd_az_az, sin * sd_el_el)
+    return math.degrees(across / (cos**2 + sin**2))
 
 
 def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
     seen, figures = watched(view, drives)
     scale = scales(view.rig, view.settings)
     since_s = seen[:, 0] - view.marks[0]
+    # Along the siderostat's own axes: what they are on the frame is what is asked.
     motor_px = (seen[:, 5:7] - np.median(seen[:, 5:7], axis=0)) * scale.motor_px_per_rad
     measured_px = [None, None, motor_px[:, 0], motor_px[:, 1]]
     swings = [
@@ -189,7 +200,7 @@ def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
         for drive, moved_px in zip(drives, measured_px, strict=True)
     ]
     fit = fit_plate_scale(seen[:, 0], seen[:, 1:3], swings)
-    why_not = refusal(fit, step)
+    why_not = refusal(fit, step, scale)
     if why_not:
         raise StepFailed(why_not)
     stages = (
@@ -202,26 +213,29 @@ def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
         figures |= found
         said.append(
             f"{name} {found[f'{name}_scale']:.3f} of the rig file's, turned by "
-            f"{found[f'{name}_rotation_deg']:+.2f} deg"
+            f"{found[f'{name}_rotation_deg']:+.2f} +- {found[f'{name}_rotation_sd_deg']:.2f} deg"
         )
     figures["residual_px"] = fit.residual_px
     return Result(figures, "; ".join(said), _calibration(view, figures, said))
 
 
 def _calibration(view: View, figures: Figures, said: list[str]) -> Calibration:
-    """Both scales, into the keys that stand for a stage alone; no key of a rig file holds a rotation."""
+    """Both scales and rotations, into the keys that stand for a stage alone."""
     fsm, siderostat = view.settings.fsm, view.settings.siderostat
     ball_screw = siderostat.ball_screw_m_per_rad * figures["siderostat_scale"]
-    found: dict[str, dict[str, float]] = {"siderostat": {"ball_screw_m_per_rad": ball_screw}}
+    found = {
+        name: {"rotation_deg": round(figures[f"{name}_rotation_deg"], 3)}
+        for name in ("siderostat", "fsm")
+    }
+    found["siderostat"]["ball_screw_m_per_rad"] = ball_screw
     lines = [*said, "the siderostat's scale is taken into ball_screw_m_per_rad"]
     if fsm.hysteresis is None:
-        found["fsm"] = {"beam_per_mirror": fsm.beam_per_mirror * figures["fsm_scale"]}
+        found["fsm"]["beam_per_mirror"] = fsm.beam_per_mirror * figures["fsm_scale"]
         lines.append("the mirror's scale is taken into beam_per_mirror")
     else:
         lines.append(
             "the mirror's scale is left alone: identify fsm.hysteresis anew where it is off"
         )
-    lines.append("rotations are not corrected: each degree takes one from the loop's phase margin")
     fragment = {"loops": {view.loop_name: found}}
     return Calibration(f"{view.loop_name}-plate-scale", lines, fragment, {})
 
@@ -235,7 +249,8 @@ def _in_figures(name: str, matrix: Floats, deviation: Floats, px_per_rad: float)
         f"{name}_el_px_per_el_rad": el_el,
         f"{name}_scale": math.sqrt(abs(float(np.linalg.det(matrix)))),
         f"{name}_scale_sd": float(deviation.max()),
-        f"{name}_rotation_deg": math.degrees(rotation_rad(matrix)),
+        f"{name}_rotation_deg": rotation_deg(matrix),
+        f"{name}_rotation_sd_deg": rotation_sd_deg(matrix, deviation),
     }
 
 

@@ -30,6 +30,7 @@ def steps_of(step: steps.Stars, star: steps.Star) -> list[steps.Step]:
         steps.Acquire(
             expected_az_sky_arcsec=star.az_sky_arcsec,
             expected_el_sky_arcsec=star.el_sky_arcsec,
+            star_flux_dn=star.star_flux_dn,
             search_radius_sky_arcsec=step.search_radius_sky_arcsec,
             radius_growth=step.radius_growth,
             max_offset_sky_arcsec=step.max_offset_sky_arcsec,

@@ -43,6 +43,13 @@ ExpectedSkyArcsec = Annotated[
         "where it was last"
     ),
 ]
+StarFluxDn = Annotated[
+    Positive | None,
+    Field(
+        description="of the star: one that is not within `flux_range` of it is another; without it, the rig "
+        "file's"
+    ),
+]
 
 
 class Step(Settings):
@@ -65,7 +72,7 @@ class Standby(Step):
 class Acquire(Step):
     """Devices on, search for the star, pull it in, until it is held; one that is held stays so.
 
-    Where it is expected somewhere, a star that is held is let go first.
+    Where it is expected somewhere, or has a flux of its own, a star that is held is let go first.
     """
 
     step: Literal["acquire"] = "acquire"
@@ -81,6 +88,7 @@ class Acquire(Step):
     ] = None
     expected_az_sky_arcsec: ExpectedSkyArcsec = None
     expected_el_sky_arcsec: ExpectedSkyArcsec = None
+    star_flux_dn: StarFluxDn = None
     timeout_s: TimeoutS = 120.0
     attempts: Attempts = 2
 
@@ -96,12 +104,13 @@ class Hold(Step):
 
 
 class Star(Settings):
-    """A star of a list: where it is expected, from where the encoders read zero."""
+    """A star of a list: where it is expected, from where the encoders read zero, and how bright."""
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
     az_sky_arcsec: Finite
     el_sky_arcsec: Finite
     duration_s: DurationS | None = None
+    star_flux_dn: Positive | None = None
 
 
 class Stars(Step):
@@ -113,7 +122,8 @@ class Stars(Step):
         Field(
             min_length=1,
             max_length=1000,
-            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and, of its own, `duration_s`",
+            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and, of its own, `duration_s` "
+            "and `star_flux_dn`",
         ),
     ] = None
     file: Annotated[
@@ -229,8 +239,11 @@ class PlateScale(Moving):
         Positive, Field(description="largest RMS that the fit may leave unexplained")
     ] = 0.5
     max_rotation_deg: Annotated[
-        Positive, Field(le=45, description="a stage turned farther than this is refused")
-    ] = 10.0
+        Positive,
+        Field(
+            le=180, description="a stage turned farther than this from the rig file's is refused"
+        ),
+    ] = 45.0
 
 
 class Dark(Step):

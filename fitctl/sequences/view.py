@@ -71,6 +71,7 @@ class Look(NamedTuple):
     motor_el_rad: float
     mirror_az_rad: float
     mirror_el_rad: float
+    star_flux_dn: float
 
 
 @dataclass
@@ -211,9 +212,10 @@ def _look(tick: Tick) -> Look:
         tick.siderostat_el_rad,
         tick.fsm_az_rad,
         tick.fsm_el_rad,
+        tick.star_flux_dn,
     )
 
 
 def columns(looks: list[Look]) -> Floats:
-    """Looks as an array, shape (n, 9)."""
+    """Looks as an array, shape (n, 10)."""
     return np.array(looks, dtype=np.float64).reshape(-1, len(Look._fields))

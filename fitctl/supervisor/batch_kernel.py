@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.model.compiled import jit
+from fitctl.model.kernels import turned_back
 from fitctl.model.light import REACH_SIGMAS
 from fitctl.supervisor.batch_kernel_devices import (
     advance_to,
@@ -104,8 +105,9 @@ def sense(s: Any, r: Any, w: Any) -> int:
     if r.mode == ACQUISITION and not spiral_is_there(s, r):
         return _SEEN
     if (r.mode in (COARSE, VERNIER)) and r.lost == 0:
-        az = window_about(r.star_origin_px[0] + stages_px(s, r, 0), s.largest_az_px)
-        el = window_about(r.star_origin_px[1] + stages_px(s, r, 1), s.largest_el_px)
+        az_px, el_px = stages_px(s, r)
+        az = window_about(r.star_origin_px[0] + az_px, s.largest_az_px)
+        el = window_about(r.star_origin_px[1] + el_px, s.largest_el_px)
         left, top = az - HALF_WINDOW_PX, el - HALF_WINDOW_PX
         lit = spots_over(s, r, w, left, top, SIDE_PX, SIDE_PX)
         if lit < 0:
@@ -132,9 +134,11 @@ def command(s: Any, r: Any, w: Any) -> None:
     if r.mode == COARSE:
         prefilter_step(s, r)
         if r.star_visible:
-            for axis in range(2):
-                step_rad = -s.coarse_rad_per_px * (r.star_px[axis] - r.command_px[axis])
-                siderostat_to(s, r, axis, r.setpoint_rad[axis] + step_rad)
+            error_az_px, error_el_px = turned_back(
+                s.siderostat_turn, r.star_px[0] - r.command_px[0], r.star_px[1] - r.command_px[1]
+            )
+            siderostat_to(s, r, 0, r.setpoint_rad[0] - s.coarse_rad_per_px * error_az_px)
+            siderostat_to(s, r, 1, r.setpoint_rad[1] - s.coarse_rad_per_px * error_el_px)
     elif r.mode == ACQUISITION and r.sighted:
         siderostat_to(s, r, 0, r.sighting_rad[0])
         siderostat_to(s, r, 1, r.sighting_rad[1])

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 
 from fitctl.model.compiled import jit
-from fitctl.supervisor.batch_kernel_steps import pair_start, stages_px
+from fitctl.model.kernels import turned_back
+from fitctl.supervisor.batch_kernel_steps import (
+    motor_px,
+    pair_start,
+    stages_px,
+    star_in_the_middle_rad,
+)
 from fitctl.supervisor.modes import Mode
 
 OFF, STANDBY = int(Mode.OFF), int(Mode.STANDBY)
@@ -30,12 +36,10 @@ def change_mode(r: Any, mode: int) -> None:
 def start_search(s: Any, r: Any) -> None:
     """``StellarLoop._start_search`` and ``Search.begin``."""
     change_mode(r, ACQUISITION)
-    for axis in range(2):
-        if not r.star_known:
-            moved_px = s.motor_px_per_rad * r.position_rad[axis]
-            r.star_origin_px[axis] = s.target_px[axis] - moved_px
-        left_px = s.middle_px[axis] - r.star_origin_px[axis]
-        r.spiral_centre_rad[axis] = left_px / s.motor_px_per_rad
+    if not r.star_known:
+        az_px, el_px = motor_px(s, r.position_rad[0], r.position_rad[1])
+        r.star_origin_px[0], r.star_origin_px[1] = s.target_px[0] - az_px, s.target_px[1] - el_px
+    r.spiral_centre_rad[0], r.spiral_centre_rad[1] = star_in_the_middle_rad(s, r)
     r.spiral_there, r.spiral_angle = 0, 0.0
     r.sighted = 0
 
@@ -67,9 +71,7 @@ def judge_search(s: Any, r: Any, exposed_s: float) -> bool:
     if not r.sighted:
         if r.star_visible:
             r.sighted, r.sighted_s, r.sighting_frames = 1, exposed_s, 0
-            for axis in range(2):
-                left_px = s.middle_px[axis] - r.star_origin_px[axis]
-                r.sighting_rad[axis] = left_px / s.motor_px_per_rad
+            r.sighting_rad[0], r.sighting_rad[1] = star_in_the_middle_rad(s, r)
             return True
         return s.spiral_growth_px * r.spiral_angle < s.spiral_radius_px
     settled = exposed_s >= r.sighted_s + s.settle_s
@@ -91,8 +93,11 @@ def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
             start_search(s, r)
         return
     r.lost = 0
-    error_px = abs(r.star_px[0] - r.command_px[0]) + abs(r.star_px[1] - r.command_px[1])
-    need = error_px / (s.mirror_px_per_rad * s.range_rad)
+    az_px, el_px = r.star_px[0] - r.command_px[0], r.star_px[1] - r.command_px[1]
+    az_px, el_px = turned_back(
+        s.mirror_turn, az_px, el_px
+    )  # the diamond lies along the mirror's axes
+    need = (abs(az_px) + abs(el_px)) / (s.mirror_px_per_rad * s.range_rad)
     r.in_reach = r.in_reach + 1 if need <= s.reach_fraction else 0
     r.out_of_reach = r.out_of_reach + 1 if need > 1.0 else 0
     if r.mode == COARSE and r.in_reach >= s.reach_frames:
@@ -105,9 +110,8 @@ def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
 def judge(s: Any, r: Any, exposed_s: float, step_s: float, settle_s: float) -> bool:
     """``StellarLoop._judge``; False where the search has ended without a star."""
     if r.star_visible:
-        for axis in range(2):
-            moved_px = stages_px(s, r, axis)
-            r.star_origin_px[axis] = r.star_px[axis] - moved_px
+        az_px, el_px = stages_px(s, r)
+        r.star_origin_px[0], r.star_origin_px[1] = r.star_px[0] - az_px, r.star_px[1] - el_px
         r.star_known = 1
     if r.mode == ACQUISITION:
         return judge_search(s, r, exposed_s)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.controllers.centroid import EDGE_PX, LARGEST_PEAK, MAX_CANDIDATES
 from fitctl.model.compiled import jit, jit_inlined
-from fitctl.model.kernels import play_output, render
+from fitctl.model.kernels import play_output, render, turned, turned_back
 
 Floats = NDArray[np.float64]
 _SIDE_PX = 2 * HALF_WINDOW_PX + 1
@@ -165,11 +165,39 @@ def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
 # ---------------------------------------------------------------- where the stages are
 
 
+@jit_inlined
+def motor_px(s: Any, az_rad: float, el_rad: float) -> Any:
+    """``Scales.motor_px``."""
+    az, el = turned(s.siderostat_turn, az_rad, el_rad)
+    return s.motor_px_per_rad * az, s.motor_px_per_rad * el
+
+
+@jit_inlined
+def motor_rad(s: Any, az_px: float, el_px: float) -> Any:
+    """``Scales.motor_rad``."""
+    az, el = turned_back(s.siderostat_turn, az_px, el_px)
+    return az / s.motor_px_per_rad, el / s.motor_px_per_rad
+
+
+@jit_inlined
+def mirror_px(s: Any, az_rad: float, el_rad: float) -> Any:
+    """``Scales.mirror_px``."""
+    az, el = turned(s.mirror_turn, az_rad, el_rad)
+    return s.mirror_px_per_rad * az, s.mirror_px_per_rad * el
+
+
 @jit
-def stages_px(s: Any, r: Any, axis: int) -> float:
+def stages_px(s: Any, r: Any) -> Any:
     """``StarEstimator._stages_px`` at the exposure."""
-    motor_px = s.motor_px_per_rad * r.motor_rad[axis]
-    return motor_px + s.mirror_px_per_rad * r.seen_mirror_rad[axis]
+    az_px, el_px = motor_px(s, r.motor_rad[0], r.motor_rad[1])
+    mirror_az_px, mirror_el_px = mirror_px(s, r.seen_mirror_rad[0], r.seen_mirror_rad[1])
+    return az_px + mirror_az_px, el_px + mirror_el_px
+
+
+@jit
+def star_in_the_middle_rad(s: Any, r: Any) -> Any:
+    """``Search._star_in_the_middle_rad``."""
+    return motor_rad(s, s.middle_px[0] - r.star_origin_px[0], s.middle_px[1] - r.star_origin_px[1])
 
 
 @jit
@@ -301,20 +329,25 @@ def spiral_advance(s: Any, r: Any) -> None:
     radius_px = s.spiral_growth_px * r.spiral_angle
     az_px = radius_px * math.cos(r.spiral_angle)
     el_px = radius_px * math.sin(r.spiral_angle)
-    siderostat_to(s, r, 0, r.spiral_centre_rad[0] + az_px / s.motor_px_per_rad)
-    siderostat_to(s, r, 1, r.spiral_centre_rad[1] + el_px / s.motor_px_per_rad)
+    az_rad, el_rad = motor_rad(s, az_px, el_px)
+    siderostat_to(s, r, 0, r.spiral_centre_rad[0] + az_rad)
+    siderostat_to(s, r, 1, r.spiral_centre_rad[1] + el_rad)
 
 
 @jit
 def pair_start(s: Any, r: Any) -> None:
     """``Pair.start`` from where the stages are, and ``Mirror.held_rad``."""
     ideal_rad_per_v = s.scale_m_per_v / (2 * s.stack_radius_m)
+    if s.inverse_wanted and s.hysteresis_known:
+        az_px, el_px = mirror_px(s, r.mirror_rad[0], r.mirror_rad[1])
+    else:
+        az_px, el_px = mirror_px(
+            s,
+            (r.stack_v[1] - r.stack_v[2]) * ideal_rad_per_v,
+            (r.stack_v[0] - r.stack_v[1]) * ideal_rad_per_v,
+        )
     for axis in range(2):
-        if s.inverse_wanted and s.hysteresis_known:
-            held_rad = r.mirror_rad[axis]
-        else:
-            held_rad = (r.stack_v[1 - axis] - r.stack_v[2 - axis]) * ideal_rad_per_v
-        held_px = held_rad * s.mirror_px_per_rad
+        held_px = az_px if axis == 0 else el_px
         for state in range(s.states):
             r.pair_state[axis, state] = held_px * s.pair_at_rest[state]
         r.held_px[axis] = held_px * s.pair_left_at_rest
@@ -327,12 +360,16 @@ def pair_start(s: Any, r: Any) -> None:
 def pair_step(s: Any, r: Any, w: Any) -> Any:
     """``Pair.step``: from the error to the siderostat's set-point, and the mirror's angles."""
     columns = s.states + 5
+    mirror_az_px, mirror_el_px = mirror_px(s, r.seen_mirror_rad[0], r.seen_mirror_rad[1])
+    motor_az_px, motor_el_px = motor_px(
+        s, r.motor_rad[0] - r.motor_origin_rad[0], r.motor_rad[1] - r.motor_origin_rad[1]
+    )
+    step_az_px = step_el_px = 0.0
     for axis in range(2):
-        motor_rad = r.motor_rad[axis] - r.motor_origin_rad[axis]
         w.pair_inputs[0] = r.star_px[axis] - r.command_px[axis]
         w.pair_inputs[1] = r.excess_px[axis]
-        w.pair_inputs[2] = r.seen_mirror_rad[axis] * s.mirror_px_per_rad
-        w.pair_inputs[3] = motor_rad * s.motor_px_per_rad
+        w.pair_inputs[2] = mirror_az_px if axis == 0 else mirror_el_px
+        w.pair_inputs[3] = motor_az_px if axis == 0 else motor_el_px
         w.pair_inputs[4] = r.command_px[axis] - r.target_origin_px[axis]
         for state in range(s.states):
             w.pair_inputs[5 + state] = r.pair_state[axis, state]
@@ -345,14 +382,19 @@ def pair_step(s: Any, r: Any, w: Any) -> Any:
             elif row == 1:
                 handed_px = r.held_px[axis] * (1 - s.pair_kept)
                 r.held_px[axis] -= handed_px
-                step_rad = (total + handed_px) / s.motor_px_per_rad
-                siderostat_to(s, r, axis, r.setpoint_rad[axis] + step_rad)
+                if axis == 0:
+                    step_az_px = total + handed_px
+                else:
+                    step_el_px = total + handed_px
             else:
                 r.pair_state[axis, row - 2] = total
-    az_rad = r.wanted_px[0] / s.mirror_px_per_rad
-    el_rad = r.wanted_px[1] / s.mirror_px_per_rad
+    step_az_rad, step_el_rad = motor_rad(s, step_az_px, step_el_px)
+    siderostat_to(s, r, 0, r.setpoint_rad[0] + step_az_rad)
+    siderostat_to(s, r, 1, r.setpoint_rad[1] + step_el_rad)
+    az_px, el_px = turned_back(s.mirror_turn, r.wanted_px[0], r.wanted_px[1])
+    az_rad, el_rad = az_px / s.mirror_px_per_rad, el_px / s.mirror_px_per_rad
     scale = min(1.0, s.range_rad / max(abs(az_rad) + abs(el_rad), 1e-300))
     az_rad, el_rad = az_rad * scale, el_rad * scale
-    r.excess_px[0] = r.wanted_px[0] - az_rad * s.mirror_px_per_rad
-    r.excess_px[1] = r.wanted_px[1] - el_rad * s.mirror_px_per_rad
+    az_px, el_px = mirror_px(s, az_rad, el_rad)
+    r.excess_px[0], r.excess_px[1] = r.wanted_px[0] - az_px, r.wanted_px[1] - el_px
     return az_rad, el_rad

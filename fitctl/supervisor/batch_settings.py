@@ -206,6 +206,8 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         "middle_px": np.array([camera.width_px - 1, camera.height_px - 1]) / 2,
         "motor_px_per_rad": scale.motor_px_per_rad,
         "mirror_px_per_rad": scale.mirror_px_per_rad,
+        "siderostat_turn": scale.siderostat_turn,
+        "mirror_turn": scale.mirror_turn,
         "range_rad": fsm.range_rad,
         "travel_rad": siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad,
         "settle_s": acquisition.settle_s,

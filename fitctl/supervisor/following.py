@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Loop
 from fitctl.controllers.centroid import Star
+from fitctl.model.optics import Scales
 from fitctl.supervisor.modes import Finding, Mode, Trigger
 
 
@@ -16,8 +17,7 @@ class Following:
     Parameters
     ----------
     loop : Loop
-    range_px : float
-        The mirror's range, as it moves the star.
+    scale : Scales
 
     Attributes
     ----------
@@ -25,11 +25,12 @@ class Following:
         Frames in a row without the star; with an error that the mirror has room for; with one that it has not.
     """
 
-    def __init__(self, loop: Loop, range_px: float) -> None:
+    def __init__(self, loop: Loop, scale: Scales) -> None:
         self._lost_frames = loop.acquisition.lost_frames
         self._reach_frames = loop.coarse.reach_frames
         self._reach_fraction = loop.coarse.reach_fraction
-        self._range_px = range_px
+        self._range_px = scale.mirror_px_per_rad * loop.fsm.range_rad
+        self._mirror_turn = scale.mirror_turn
         self.begin()
 
     def begin(self) -> None:
@@ -47,9 +48,9 @@ class Following:
                 return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")
             return None
         self.lost = 0
-        target_az_px, target_el_px = target_px.tolist()
-        error_px = abs(star.az_px - target_az_px) + abs(star.el_px - target_el_px)
-        need = error_px / self._range_px
+        error_px = star.position_px - target_px
+        # The mirror's diamond lies along its own axes.
+        need = float(np.abs(error_px.dot(self._mirror_turn)).sum()) / self._range_px
         self.in_reach = self.in_reach + 1 if need <= self._reach_fraction else 0
         self.out_of_reach = self.out_of_reach + 1 if need > 1.0 else 0
         if mode is Mode.COARSE and self.in_reach >= self._reach_frames:

@@ -31,6 +31,7 @@ from fitctl.model.optics import scales
 from fitctl.supervisor.experiments import Experiments
 from fitctl.supervisor.following import Following
 from fitctl.supervisor.interlocks import Interlocks
+from fitctl.supervisor.messages import Acquire
 from fitctl.supervisor.modes import (
     FOLLOWING,
     TRACKING,
@@ -97,7 +98,7 @@ class StellarLoop:
         self._sensor = StarSensor(rig.camera, loop)
         self._estimator = StarEstimator(scale, self.target_px)
         self.search = Search(rig, name, self._estimator)
-        self.following = Following(loop, scale.mirror_px_per_rad * loop.fsm.range_rad)
+        self.following = Following(loop, scale)
         self.pointing = Pointing(rig, name, self.target_px)
         self.stages = Stages(rig, name, servo, dac, clock)
         self._experiments = Experiments(name, scale.motor_px_per_rad, report)
@@ -295,6 +296,13 @@ class StellarLoop:
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
             self.pointing.start_pair(self.stages, motor_rad)
+
+    def look_for(self, asked: Acquire) -> None:
+        """What the next search is to find, and how, as a command asks that was not refused."""
+        flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
+        self._sensor.expect(flux_dn)
+        self.measured.star_flux_dn = flux_dn
+        self.search.ask(asked)
 
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""

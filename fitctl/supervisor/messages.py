@@ -51,12 +51,15 @@ class Acquire(Command, frozen=True, kw_only=True):
         As the rig file's.
     expected_az_sky_arcsec, expected_el_sky_arcsec : float, optional
         Where the star is, from where the encoders read zero; without it, on the target or where it was last.
+    star_flux_dn : float, optional
+        As the rig file's, until the next time that one is searched for by command.
     """
 
     search_radius_sky_arcsec: float | None = None
     field_overlap: float | None = None
     expected_az_sky_arcsec: float | None = None
     expected_el_sky_arcsec: float | None = None
+    star_flux_dn: float | None = None
 
 
 class Hold(Command, frozen=True, kw_only=True):

@@ -70,7 +70,8 @@ class Pointing:
         command_px = self._prefilter.step(target_px)
         if seen.star is None:
             return None
-        return -self._coarse_step_rad_per_px * (seen.star.position_px - command_px)
+        error_px = seen.star.position_px - command_px
+        return -self._coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_turn)
 
     def step_pair(self, seen: Seen, target_px: Floats) -> PairCommand | None:
         """One frame: what both stages shall do; None where no star is seen."""

@@ -20,6 +20,8 @@ class Quantities:
     ----------
     readings : dict
         The newest of each quantity: value, time in s, note.
+    star_flux_dn : float
+        Of the star that is searched for or held.
     """
 
     def __init__(self, rig: Rig, loop_name: str) -> None:
@@ -27,7 +29,7 @@ class Quantities:
         self.readings: dict[str, Reading] = {}
         self._period_s = rig.camera.period_s
         self._delay_s = rig.camera.frame_delay_s
-        self._star_flux_dn = loop.star_flux_dn
+        self.star_flux_dn = loop.star_flux_dn
         self._range_rad = loop.fsm.range_rad
         self._servo_period_s = 1.0 / loop.siderostat.servo.rate_hz
         self._velocity_limit_rad_s = loop.siderostat.velocity_limit_rad_s
@@ -53,7 +55,7 @@ class Quantities:
             readings["frame_interval_periods"] = (periods, now_s, "")
         self._exposed_s = exposed_s
         if star is not None:
-            readings["star_flux_fraction"] = (star.flux_dn / self._star_flux_dn, now_s, "")
+            readings["star_flux_fraction"] = (star.flux_dn / self.star_flux_dn, now_s, "")
 
     def of_stages(self, servo: ServoState, stages: Stages, now_s: float) -> None:
         """Where mirror and siderostat are, and how their devices are."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
-from fitctl.controllers.centroid import Star
+from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.model.optics import scales
@@ -54,8 +54,7 @@ class Search:
         self._target_px = np.array([loop.target_px.az, loop.target_px.el])
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
-        self._sky_arcsec_per_px = scale.sky_arcsec_per_px
-        self._motor_px_per_rad = scale.motor_px_per_rad
+        self._scale = scale
         self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
         self._plan_spiral = partial(plan_spiral, rig, loop_name)
         self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
@@ -79,7 +78,7 @@ class Search:
         asked, self._asked = self._asked, Acquire()
         if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
             offset = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
-            place_px = self._target_px + offset / self._sky_arcsec_per_px
+            place_px = self._target_px + self._scale.sky_px(offset)
             self._estimator.place(place_px, np.zeros(2), np.zeros(2))
         self._radius_sky_arcsec = (
             asked.search_radius_sky_arcsec or self._settings.search_radius_sky_arcsec
@@ -100,7 +99,7 @@ class Search:
         """
         if not self._there:
             middle_rad = np.clip(self.centre_rad, -self._travel_rad, self._travel_rad)
-            away_px = float(np.abs(motor_rad - middle_rad).max()) * self._motor_px_per_rad
+            away_px = float(np.abs(motor_rad - middle_rad).max()) * self._scale.motor_px_per_rad
             self._there = away_px <= NEAR * self._plan.field_radius_px
         return self._there
 
@@ -132,11 +131,27 @@ class Search:
             return self._sighting.motor_rad
         if not self.is_there(motor_rad):
             return self.centre_rad
-        return self.centre_rad + self._spiral.advance(duration_s) / self._motor_px_per_rad
+        return self.centre_rad + self._scale.motor_rad(self._spiral.advance(duration_s))
 
     def _star_in_the_middle_rad(self) -> Floats:
         """With the star in the middle of the field, the search sees farthest."""
         return self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
+
+
+def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
+    """Why a star of this flux could not be found, or nothing."""
+    if star_flux_dn is None:
+        return ""
+    if not 0 < star_flux_dn < math.inf:
+        return f"star_flux_dn must be above 0 (is {star_flux_dn:g})"
+    acquisition = rig.loops[loop_name].acquisition
+    least_dn = acquisition.detection_sigma * rig.camera.pixel_noise_dn / LARGEST_PEAK
+    if star_flux_dn < least_dn:
+        return (
+            f"a star of {star_flux_dn:g} DN could not be told from noise; loops.{loop_name}.acquisition."
+            f"detection_sigma needs at least {least_dn:.0f} DN"
+        )
+    return ""
 
 
 def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
@@ -151,8 +166,9 @@ def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
         return f"search_radius_sky_arcsec must be above 0 (is {radius:g})"
     if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
         return f"field_overlap must lie in {LEAST_OVERLAP:g} to {MOST_OVERLAP:g} (is {overlap:g})"
-    if radius is None and not given:
-        return ""
+    too_faint = _too_faint(rig, loop_name, asked.star_flux_dn)
+    if too_faint or (radius is None and not given):
+        return too_faint
     radius = radius or loop.acquisition.search_radius_sky_arcsec
     travel = loop.siderostat.travel_sky_arcsec
     for place in given or [0.0]:

@@ -311,7 +311,7 @@ class Supervisor:
                 self._device_jobs.abandon(usable)
             for name in usable:
                 if isinstance(command, Acquire):
-                    self.loops[name].search.ask(command)
+                    self.loops[name].look_for(command)
                 self.loops[name].fire(trigger, "operator")
         return Reply(accepted=True)
 

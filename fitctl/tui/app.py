@@ -85,7 +85,9 @@ class ConsoleApp(App[None]):
     clock : callable
         Monotonic time in s, the supervisor's own when it runs on this machine.
     rig_arguments : sequence of str
-        With which other fitctl commands find the same rig.
+        With which other fitctl commands have the same rig file.
+    remote_arguments : sequence of str
+        And with which they reach its instrument, where that is on another machine.
     log_folder : Path
         Where the rig's logs are; None when that is on another machine.
     start_job : callable
@@ -126,6 +128,7 @@ class ConsoleApp(App[None]):
         quit_shuts_down: bool = False,
         clock: Callable[[], float] = time.monotonic,
         rig_arguments: Sequence[str] = (),
+        remote_arguments: Sequence[str] = (),
         log_folder: Path | None = Path("logs"),
         start_job: Callable[..., Job] = Job,
     ) -> None:
@@ -133,6 +136,7 @@ class ConsoleApp(App[None]):
         self.quit_shuts_down = quit_shuts_down
         self.clock = clock
         self.rig_arguments = list(rig_arguments)
+        self.remote_arguments = list(remote_arguments)
         self.log_folder = log_folder
         self.start_job = start_job
         self.state = ConsoleState(clock())

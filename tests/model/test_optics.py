@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.config import ARCSEC_PER_RAD
+from fitctl.config import ARCSEC_PER_RAD, default_rig_path, load_rig
 from fitctl.model.optics import (
     mirror_angles,
     mirror_from_stacks,
@@ -71,6 +71,47 @@ def test_one_step_of_the_dac_turns_the_mirror_by_1_1_mas(rig, scale):
 def test_the_backlash_is_0_37_px(rig, scale):
     backlash_arcsec = rig.plant.loops["right"].backlash_sky_arcsec
     assert backlash_arcsec / scale.sky_arcsec_per_px == pytest.approx(0.37, abs=5e-3)
+
+
+# ---------------------------------------------------------------- stages that are turned
+
+
+def turned_scale(siderostat_deg, mirror_deg):
+    rig = load_rig(
+        default_rig_path(),
+        [
+            f"loops.right.siderostat.rotation_deg={siderostat_deg}",
+            f"loops.right.fsm.rotation_deg={mirror_deg}",
+        ],
+    )
+    return scales(rig, rig.loops["right"])
+
+
+def test_a_turned_stage_moves_the_star_along_its_own_axes():
+    scale = turned_scale(30.0, -90.0)
+    along_az = np.array([1.0, 0.0])
+    assert scale.motor_px(along_az) / scale.motor_px_per_rad == pytest.approx(
+        [math.sqrt(3) / 2, 0.5]
+    )
+    assert scale.mirror_px(along_az) / scale.mirror_px_per_rad == pytest.approx([0.0, -1.0])
+
+
+@given(st.floats(-180, 180), st.floats(-180, 180), angle_pairs)
+def test_what_moves_the_star_and_back_is_the_identity(siderostat_deg, mirror_deg, motor_rad):
+    scale = turned_scale(siderostat_deg, mirror_deg)
+    assert scale.motor_rad(scale.motor_px(motor_rad)) == pytest.approx(motor_rad, abs=1e-15)
+    assert scale.sky_arcsec(scale.sky_px(motor_rad)) == pytest.approx(motor_rad, abs=1e-15)
+    # An angle on the sky is what the motors would have to turn the beam by.
+    motor_arcsec = scale.sky_arcsec(scale.motor_px(motor_rad))
+    assert motor_arcsec == pytest.approx(motor_rad * scale.motor_sky_arcsec_per_rad, abs=1e-12)
+
+
+@given(angle_pairs)
+def test_without_a_rotation_nothing_is_rounded(pair):
+    scale = turned_scale(0.0, 0.0)
+    assert np.array_equal(scale.motor_px(pair), scale.motor_px_per_rad * pair)
+    assert np.array_equal(scale.mirror_px(pair), scale.mirror_px_per_rad * pair)
+    assert np.array_equal(scale.motor_rad(pair), pair / scale.motor_px_per_rad)
 
 
 # ---------------------------------------------------------------- the mirror on its stacks, Eq. 1-5

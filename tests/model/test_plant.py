@@ -36,8 +36,18 @@ def from_target(plant, rig, time_s):
 
 @pytest.mark.skipif(compiled_advance() is None, reason="numba is not installed (extra `fast`)")
 @settings(max_examples=15)
-@given(seed=seeds, runs=st.integers(1, 3), steps=st.integers(1, 60))
-def test_the_compiled_step_does_what_the_reference_does(rig, seed, runs, steps):
+@given(
+    seed=seeds,
+    runs=st.integers(1, 3),
+    steps=st.integers(1, 60),
+    turned_deg=st.sampled_from([(0.0, 0.0), (30.0, 30.0), (-70.0, 120.0)]),
+)
+def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turned_deg):
+    siderostat_deg, mirror_deg = turned_deg
+    rig = rig_with(
+        f"loops.right.siderostat.rotation_deg={siderostat_deg}",
+        f"loops.right.fsm.rotation_deg={mirror_deg}",
+    )
     random = np.random.default_rng(seed)
     plant = Plant(rig, "right", range(runs))
     state = plant.state

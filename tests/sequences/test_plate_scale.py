@@ -9,16 +9,21 @@ from hypothesis import strategies as st
 
 from fitctl import Instrument
 from fitctl.config import default_rig_path, load_rig
+from fitctl.model.optics import rotation
+from fitctl.model.optics import scales as true_scales
 from fitctl.sequences.plate_scale import (
     fit_plate_scale,
     plan,
     refusal,
+    rotation_deg,
+    rotation_sd_deg,
     swing_of,
 )
 from fitctl.sequences.steps import PlateScale
 from fitctl.sequences.view import StepFailed
 
 RIG = load_rig(default_rig_path())
+SCALE = true_scales(RIG, RIG.loops["right"])
 STEP = PlateScale()
 DRIVES = plan(STEP, RIG, "right")
 TIME_S = np.arange(0.0, DRIVES[-1].start_s + DRIVES[-1].duration_s, 0.02)
@@ -44,8 +49,7 @@ def star_of(mirror, siderostat, *, play_px=0.37, noise_px=0.02, drift_px=0.5, se
 
 
 def turned(scale, angle_rad):
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return scale * np.array([[cos, -sin], [sin, cos]])
+    return scale * rotation(np.degrees(angle_rad))
 
 
 scales = st.floats(0.5, 1.5)
@@ -64,7 +68,7 @@ def test_matrices_that_are_known_come_back(
     fit = fit_plate_scale(TIME_S, star_px, swings)
 
     anyhow = STEP.model_copy(update={"max_rotation_deg": 180.0})
-    assert refusal(fit, anyhow) == ""
+    assert refusal(fit, anyhow, SCALE) == ""
     np.testing.assert_allclose(fit.mirror, mirror, atol=0.01)
     np.testing.assert_allclose(fit.siderostat, siderostat, atol=0.01)
 
@@ -80,6 +84,9 @@ def test_the_uncertainty_is_that_of_repeated_fits():
 
     assert np.all(claimed > 0.6 * scatter)
     assert np.all(claimed < 1.6 * scatter)
+    scatter_deg = np.std([rotation_deg(fit.mirror) for fit in fits])
+    claimed_deg = np.mean([rotation_sd_deg(fit.mirror, fit.mirror_sd) for fit in fits])
+    assert 0.6 * scatter_deg < claimed_deg < 1.6 * scatter_deg
 
 
 def test_frames_without_a_star_are_left_out():
@@ -104,7 +111,7 @@ def test_a_fit_that_cannot_be_believed_is_refused(mirror, siderostat, options, s
     swings, star_px = star_of(mirror, siderostat, **options)
     strict = STEP.model_copy(update={"max_error": 0.003})
 
-    assert said in refusal(fit_plate_scale(TIME_S, star_px, swings), strict)
+    assert said in refusal(fit_plate_scale(TIME_S, star_px, swings), strict, SCALE)
 
 
 def test_too_few_frames_are_refused():
@@ -153,21 +160,45 @@ def test_the_scales_that_are_measured_correct_the_rig_file(tmp_path):
     )
 
 
+def test_a_camera_that_is_turned_is_measured_within_the_stated_uncertainty(tmp_path):
+    """The rig file says 25 and 35 degrees; the camera stands at 30. The fragment then holds the star."""
+    said_deg, truth_deg = {"siderostat": 25.0, "fsm": 35.0}, 30.0
+    rig = load_rig(
+        default_rig_path(),
+        [f"loops.right.{stage}.rotation_deg={deg}" for stage, deg in said_deg.items()],
+    )
+    with Instrument(rig, simulate=True, seed=1) as instrument:
+        truth = instrument._link._simulation.plants["right"].constants.packed
+        truth["siderostat_turn"] = truth["mirror_turn"] = rotation(truth_deg)
+        instrument.acquire()
+        instrument.wait(5.0)
+        found = instrument.plate_scale(attempts=2)
+        (path,) = instrument.write_calibrations(tmp_path)
+
+    written = tomllib.loads(path.read_text())["loops"]["right"]
+    for stage in said_deg:
+        sd_deg = found[f"{stage}_rotation_sd_deg"]
+        assert sd_deg < 0.3
+        assert written[stage]["rotation_deg"] == pytest.approx(truth_deg, abs=3 * sd_deg)
+
+
 def test_a_known_hysteresis_is_not_corrected_by_a_scale():
     with Instrument(RIG, simulate=True, seed=1) as instrument:
         instrument.acquire()
         instrument.plate_scale(attempts=2)
         (calibration,) = instrument._runner.calibrations
 
-    assert list(calibration.fragment["loops"]["right"]) == ["siderostat"]
+    loop = calibration.fragment["loops"]["right"]
+    assert "ball_screw_m_per_rad" in loop["siderostat"]
+    assert list(loop["fsm"]) == ["rotation_deg"]
     assert "identify fsm.hysteresis anew" in "\n".join(calibration.lines)
 
 
 @pytest.mark.parametrize(
     ("matrix", "said"),
     [
-        (np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]), "turned by +11.5 deg;"),
-        (np.diag([1.0, -1.0]), "and mirrored; max_rotation_deg is 10"),
+        (rotation(50.0), "turned by +50.0 deg from the rig file's rotation_deg; max_rotation_deg is 45"),
+        (np.diag([1.0, -1.0]), "and mirrored; max_rotation_deg is 45"),
     ],
 )  # fmt: skip
 def test_a_stage_that_is_turned_too_far_or_mirrored_is_refused(matrix, said):
@@ -175,5 +206,5 @@ def test_a_stage_that_is_turned_too_far_or_mirrored_is_refused(matrix, said):
 
     fit = fit_plate_scale(TIME_S, star_px, swings)
 
-    assert "siderostat: " in refusal(fit, STEP)
-    assert said in refusal(fit, STEP)
+    assert "siderostat: " in refusal(fit, STEP, SCALE)
+    assert said in refusal(fit, STEP, SCALE)

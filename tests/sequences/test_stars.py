@@ -18,6 +18,7 @@ SKY = load_rig(default_rig_path().parent / "star-field.toml", ["supervisor.telem
 QUICK = {"duration_s": 2.0, "settle_s": 3.0, "search_radius_sky_arcsec": 60.0}
 ALPHA = {"name": "alpha", "az_sky_arcsec": 0.0, "el_sky_arcsec": 0.0}
 BETA = {"name": "beta", "az_sky_arcsec": 600.0, "el_sky_arcsec": 150.0}
+GAMMA = {"name": "gamma", "az_sky_arcsec": -450.0, "el_sky_arcsec": 500.0}  # half as bright
 MISSING = {"name": "nobody", "az_sky_arcsec": -700.0, "el_sky_arcsec": -600.0}
 
 
@@ -44,6 +45,25 @@ def test_each_star_is_found_where_it_is_and_a_missing_one_is_skipped():
         assert results[name].why_not == ""
     assert "no star within 60 arcsec" in results["nobody"].why_not
     assert np.linalg.norm(truth["alpha"]) > 3.0  # the list's error is real
+
+
+def test_a_star_is_taken_for_the_one_that_is_meant_by_its_own_flux():
+    faint, bright = {"star_flux_dn": 14000.0}, {"star_flux_dn": 28000.0}
+    stars = [
+        GAMMA | faint,
+        BETA,  # as bright as the rig file says: what gamma needed is not kept for it
+        GAMMA | bright | {"name": "not so bright"},
+        BETA | faint | {"name": "not so faint"},
+    ]
+    with Instrument(SKY, simulate=True, seed=3) as instrument:
+        instrument.stars(stars, **QUICK)
+        results = {result.name: result for result in star_results(instrument.attempts)}
+
+    assert {name for name, result in results.items() if not result.why_not} == {"gamma", "beta"}
+    assert results["gamma"].figures["found_flux_dn"] == pytest.approx(14000.0, rel=0.1)
+    assert results["beta"].figures["found_flux_dn"] == pytest.approx(28000.0, rel=0.1)
+    for name in ("not so bright", "not so faint"):
+        assert "no star within 60 arcsec" in results[name].why_not
 
 
 def test_a_list_may_end_with_its_first_failure():
@@ -78,10 +98,11 @@ def test_devices_that_are_not_ready_end_the_list_and_no_star_is_skipped(tried):
 
 
 FILES = {
-    "a.csv": "# a comment\nname, az_sky_arcsec, el_sky_arcsec, duration_s\n\nalpha,0,-1.5,\n7, 2e2,3,9\n",
-    "a.toml": "stars = [{name='alpha', az_sky_arcsec=0, el_sky_arcsec=-1.5},"
+    "a.csv": "# a comment\nname, az_sky_arcsec, el_sky_arcsec, duration_s, star_flux_dn\n\n"
+    "alpha,0,-1.5,,5e3\n7, 2e2,3,9,\n",
+    "a.toml": "stars = [{name='alpha', az_sky_arcsec=0, el_sky_arcsec=-1.5, star_flux_dn=5000},"
     "{name='7', az_sky_arcsec=200.0, el_sky_arcsec=3, duration_s=9}]",
-    "a.yaml": "stars:\n- {name: alpha, az_sky_arcsec: 0, el_sky_arcsec: -1.5}\n"
+    "a.yaml": "stars:\n- {name: alpha, az_sky_arcsec: 0, el_sky_arcsec: -1.5, star_flux_dn: 5e3}\n"
     "- {name: '7', az_sky_arcsec: 200, el_sky_arcsec: 3, duration_s: 9}\n",
 }
 
@@ -92,7 +113,7 @@ def test_a_list_is_csv_toml_or_yaml(tmp_path, name):
     path.write_text(FILES[name])
 
     assert read_stars(path) == [
-        Star(name="alpha", az_sky_arcsec=0.0, el_sky_arcsec=-1.5),
+        Star(name="alpha", az_sky_arcsec=0.0, el_sky_arcsec=-1.5, star_flux_dn=5000.0),
         Star(name="7", az_sky_arcsec=200.0, el_sky_arcsec=3.0, duration_s=9.0),
     ]
 
@@ -136,6 +157,10 @@ HEAD = 'schema_version = 1\nname = "a"\ndescription = "b"\n[[steps]]\nstep = "st
         ("stars = [A, A]", "star alpha: is twice in the list"),
         ("stars = [{name='far', az_sky_arcsec=1100, el_sky_arcsec=0}]", "star far: the search would"),
         ("stars = [A]\non_failure = 'go'", "on_failure: must be"),
+        ("stars = [{name='f', az_sky_arcsec=0, el_sky_arcsec=0, star_flux_dn=20}]",
+         "star f: a star of 20 DN could not be told from noise"),
+        ("stars = [{name='f', az_sky_arcsec=0, el_sky_arcsec=0, star_flux_dn=-1}]",
+         "stars.0.star_flux_dn: must be greater than 0"),
         ("stars = [{name='b', az_sky_arcsec=1}]", "stars.0.el_sky_arcsec: is missing"),
     ],
 )  # fmt: skip

@@ -7,8 +7,8 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.model.optics import scales
-from fitctl.supervisor.messages import Acquire, Standby
-from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.messages import Acquire, Hold, Standby
+from fitctl.supervisor.modes import Mode, Trigger
 from fitctl.supervisor.simulate import Simulation
 
 RIG = load_rig(default_rig_path())
@@ -86,6 +86,22 @@ def test_a_star_that_is_passed_on_the_way_is_another_one():
     assert not any(tick.star_visible for tick in simulation.ticks if tick.mode == "ACQUISITION")
 
 
+def test_a_flux_that_is_asked_for_holds_until_the_next_search_by_command():
+    simulation = star_at(0.0, 0.0)
+    loop = simulation.supervisor.loops["right"]
+
+    simulation.command(Acquire(star_flux_dn=0.8 * RIG.loops["right"].star_flux_dn))
+    run_until(simulation, Mode.VERNIER, 30.0)
+    loop.fire(Trigger.STAR_LOST, "a test")
+    run_until(simulation, Mode.VERNIER, 30.0)  # found again, as the same star
+
+    assert loop.measured.readings["star_flux_fraction"][0] == pytest.approx(1 / 0.8, rel=0.05)
+    simulation.command(Hold())
+    simulation.command(Acquire())
+    run_until(simulation, Mode.VERNIER, 30.0)
+    assert loop.measured.readings["star_flux_fraction"][0] == pytest.approx(1.0, rel=0.05)
+
+
 def test_a_middle_beyond_the_travel_is_not_waited_for():
     simulation = star_at(0.0, 3000.0)  # nowhere near
     loop = simulation.supervisor.loops["right"]
@@ -129,6 +145,8 @@ def test_a_finer_search_takes_longer():
     [
         ({"search_radius_sky_arcsec": 1201.0}, "would reach 1201 arcsec"),
         ({"search_radius_sky_arcsec": 0.0}, "must be above 0"),
+        ({"star_flux_dn": math.nan}, "star_flux_dn must be above 0"),
+        ({"star_flux_dn": 1.0}, "a star of 1 DN could not be told from noise"),
         ({"search_radius_sky_arcsec": math.nan}, "must be above 0"),
         ({"search_radius_sky_arcsec": math.inf}, "must be above 0"),
         ({"field_overlap": 0.9}, "must lie in 0.05 to 0.6"),

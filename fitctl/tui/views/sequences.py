@@ -118,7 +118,8 @@ class SequencesView(ListingView):
         steps = ", ".join(step["step"] for step in document["steps"])
         question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
         file = self._file()
-        arguments = ["sequence", "run", file, *self.console.rig_arguments]
+        console = self.console
+        arguments = ["sequence", "run", file, *console.rig_arguments, *console.remote_arguments]
         self.console.ask("Run", question, lambda: self._start(arguments, outlives=True))
 
     def action_pause(self) -> None:
@@ -141,7 +142,7 @@ class SequencesView(ListingView):
         def refused(name: str) -> str:
             return "" if Path(name).is_file() else f"{name}: no such file"
 
-        self.app.push_screen(Ask("Open", "a sequence file (TOML)", "", refused), take)
+        self.app.push_screen(Ask("Open", "a sequence file (TOML or YAML)", "", refused), take)
 
     # ------------------------------------------------------------ children
 
