@@ -7,6 +7,7 @@ from fitctl.supervisor.command_table import ROWS
 from fitctl.supervisor.messages import (
     Acquire,
     Hold,
+    RecentEvents,
     SequenceControl,
     Status,
     Stop,
@@ -84,10 +85,10 @@ def test_a_status_revives_no_lease_that_has_lapsed(admission):
 
 
 @pytest.mark.parametrize("row", ROWS.values(), ids=lambda row: row.name)
-def test_a_viewer_may_ask_for_the_status_and_nothing_else(admission, row):
+def test_a_viewer_may_ask_for_the_status_and_past_events_and_nothing_else(admission, row):
     refusal = admission.refusal(BOB, _example(row), 0.0)
 
-    assert (refusal == "") == (row.make is Status)
+    assert (refusal == "") == (row.make in {Status, RecentEvents})
     assert admission.commander(0.0) == ""
 
 
