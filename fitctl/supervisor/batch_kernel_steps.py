@@ -167,7 +167,7 @@ def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
 
 @jit
 def stages_px(s: Any, r: Any, axis: int) -> float:
-    """``StarEstimator._stages_px`` at the exposure."""
+    """``StarEstimator.stages_px`` at the exposure."""
     motor_px = s.motor_px_per_rad * r.motor_rad[axis]
     return motor_px + s.mirror_px_per_rad * r.seen_mirror_rad[axis]
 

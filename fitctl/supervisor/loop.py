@@ -152,13 +152,14 @@ class StellarLoop:
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
         if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
             return None  # what is seen on the way is another star
+        stages_px = self._estimator.stages_px(motor_rad, mirror_rad)
         if self.mode in FOLLOWING and self.following.lost == 0:
-            expected_px = self._estimator.predict_px(motor_rad, mirror_rad)
+            expected_px = self._estimator.predict_px(stages_px)
             star = self._sensor.follow(frame.image, *expected_px.tolist())
         else:
             star = self._sensor.find(frame.image)
         if star is not None and self.mode in TRACKING:
-            self._estimator.observe(star.position_px, motor_rad, mirror_rad)
+            self._estimator.observe(star.position_px, stages_px)
         return star
 
     def _judge(self, frame: Frame | None, seen: Seen) -> None:
