@@ -130,7 +130,8 @@ class StarSensor:
         side = _LEVER_PX.size
         light_dn = self._dark.light(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
         flux_dn, az_moment, el_moment = _SUMS.dot(light_dn.ravel()).tolist()
-        if flux_dn <= 0 or float(light_dn.max()) > LARGEST_PEAK * flux_dn:
+        peak_dn = light_dn.item(light_dn.argmax())  # `max` takes four times as long
+        if flux_dn <= 0 or peak_dn > LARGEST_PEAK * flux_dn:
             return None
         return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
 

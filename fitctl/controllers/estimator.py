@@ -44,25 +44,26 @@ class StarEstimator:
 
     def assume(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
         """Take the star to be at `star_px` with the stages as given; all shapes (2,)."""
-        self._origin_px = star_px - self._stages_px(motor_rad, mirror_rad)
+        self._origin_px = star_px - self.stages_px(motor_rad, mirror_rad)
 
-    def observe(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
+    def observe(self, star_px: Floats, stages_px: Floats) -> None:
         """A frame showed the star at `star_px` with the stages as they were at its exposure."""
-        self.assume(star_px, motor_rad, mirror_rad)
+        self._origin_px = star_px - stages_px
         self.known = self._expected = True
 
     def forget(self) -> None:
         """The stages' zeros have changed: nothing is known of the star any more."""
         self.known = self._expected = False
 
-    def predict_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
+    def predict_px(self, stages_px: Floats) -> Floats:
         """Where the star falls with the stages as given, shape (2,)."""
-        return self._origin_px + self._stages_px(motor_rad, mirror_rad)
+        return self._origin_px + stages_px
 
     def motor_for_rad(self, star_px: Floats, mirror_rad: Floats) -> Floats:
         """Motor angles that bring the star to `star_px`, shape (2,)."""
         mirror_px = self._scale.mirror_px(mirror_rad)
         return self._scale.motor_rad(star_px - self._origin_px - mirror_px)
 
-    def _stages_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
+    def stages_px(self, motor_rad: Floats, mirror_rad: Floats) -> Floats:
+        """How far the stages, each shape (2,), move the star, shape (2,)."""
         return self._scale.motor_px(motor_rad) + self._scale.mirror_px(mirror_rad)

@@ -188,7 +188,7 @@ def mirror_px(s: Any, az_rad: float, el_rad: float) -> Any:
 
 @jit
 def stages_px(s: Any, r: Any) -> Any:
-    """``StarEstimator._stages_px`` at the exposure."""
+    """``StarEstimator.stages_px`` at the exposure."""
     az_px, el_px = motor_px(s, r.motor_rad[0], r.motor_rad[1])
     mirror_az_px, mirror_el_px = mirror_px(s, r.seen_mirror_rad[0], r.seen_mirror_rad[1])
     return az_px + mirror_az_px, el_px + mirror_el_px

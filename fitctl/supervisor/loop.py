@@ -160,17 +160,19 @@ class StellarLoop:
         return Seen(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
-        star = self._looked_for(frame) or self._expected(frame, mirror_rad, motor_rad)
-        if star is not None and self.mode in TRACKING:
-            self._estimator.observe(star.position_px, motor_rad, mirror_rad)
-        return star
-
-    def _expected(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
-        """The star where it should be, or else anywhere on the frame."""
+        looked_for = self._looked_for(frame)
         if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
             return None  # what is seen on the way is another star
+        stages_px = self._estimator.stages_px(motor_rad, mirror_rad)
+        star = looked_for or self._expected(frame, stages_px)
+        if star is not None and self.mode in TRACKING:
+            self._estimator.observe(star.position_px, stages_px)
+        return star
+
+    def _expected(self, frame: Frame, stages_px: Floats) -> Star | None:
+        """The star where it should be, or else anywhere on the frame."""
         if self.mode in FOLLOWING and self.following.lost == 0:
-            expected_px = self._estimator.predict_px(motor_rad, mirror_rad)
+            expected_px = self._estimator.predict_px(stages_px)
             return self._sensor.follow(frame.image, *expected_px.tolist())
         return self._sensor.find(frame.image)
 

@@ -1,9 +1,13 @@
 """The instrument on the virtual clock, for statements about what the supervisor does."""
 
 import pytest
+from replay_courses import SOON, hold_a_star
+from simulated import NEAR, until
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.simulate import Simulation
+from tests.logged_simulation import LoggedSimulation
 
 
 @pytest.fixture
@@ -12,5 +16,42 @@ def simulate_with():
 
     def make(*overrides, seed=0, **kwargs):
         return Simulation(load_rig(default_rig_path(), overrides), seed, **kwargs)
+
+    return make
+
+
+@pytest.fixture
+def vernier(simulate_with):
+    """An instrument that holds its star."""
+    records = []
+    simulation = simulate_with(**NEAR, record=records.append)
+    simulation.records = records
+    simulation.acquire()
+    return until(simulation, Mode.VERNIER)
+
+
+@pytest.fixture
+def logged(tmp_path):
+    """The log of what `course` does with a simulation, and the simulation."""
+
+    def make(course, *overrides, rig=None, **options):
+        rig = rig or load_rig(default_rig_path(), [SOON, *overrides])
+        path = tmp_path / "run.mcap"
+        simulation = LoggedSimulation(rig, path, **options)
+        course(simulation)
+        simulation.writer.close()
+        return path, simulation
+
+    return make
+
+
+@pytest.fixture
+def held_log(logged):
+    """The log of a star that is held, and since when."""
+
+    def make(**options):
+        path, simulation = logged(hold_a_star, **options)
+        (since_s,) = (c.time_s for c in simulation.mode_changes if c.target == "VERNIER")
+        return path, since_s
 
     return make

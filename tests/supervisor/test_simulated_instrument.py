@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from simulated import NEAR, darken, events_of, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
-from fitctl.logging.records import Event
 from fitctl.model.optics import scales
 from fitctl.supervisor.messages import (
     Acquire,
@@ -21,41 +20,6 @@ from fitctl.supervisor.messages import (
 )
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.simulate import pair, simulate, true_residual_rms
-
-NEAR = {"star_offset_px": (10.0, -6.0)}
-
-
-def until(simulation, mode, limit_s=30.0):
-    """Run until the loop is in `mode`; fails after `limit_s` of virtual time."""
-    end_s = simulation.clock.now_s() + limit_s
-    loop = simulation.supervisor.loops["right"]
-    while loop.mode is not mode:
-        assert simulation.clock.now_s() < end_s, f"still {loop.mode.name}, wanted {mode.name}"
-        simulation.run(0.02)
-    return simulation
-
-
-def darken(simulation, factor=0.0):
-    """All spots fade to `factor` of their light."""
-    simulation.camera._scene._flux_dn = simulation.camera._scene._flux_dn * factor
-
-
-def mode_of(simulation):
-    return simulation.supervisor.loops["right"].mode
-
-
-def events_of(simulation):
-    return [record for record in simulation.records if isinstance(record, Event)]
-
-
-@pytest.fixture
-def vernier(simulate_with):
-    """An instrument that holds its star."""
-    records = []
-    simulation = simulate_with(**NEAR, record=records.append)
-    simulation.records = records
-    simulation.acquire()
-    return until(simulation, Mode.VERNIER)
 
 
 def test_the_star_is_found_pulled_in_and_held(simulate_with):
@@ -314,66 +278,6 @@ def test_stopping_again_in_safe_does_not_keep_the_amplifiers_on(vernier):
     assert not vernier.supervisor.servos["right"].enabled
 
 
-def test_a_fault_in_safe_is_told_once(vernier, monkeypatch):
-    vernier.command(Stop())
-    error = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
-    piezo = vernier.devices.loops["right"].piezo
-    monkeypatch.setattr(piezo, "stack_volts", fail("stack_volts", error))
-    vernier.run(5.0)
-
-    told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
-    assert [event.severity for event in told] == ["warning", "error"]
-
-
-def test_one_bad_answer_of_the_piezo_amplifier_is_asked_for_again(vernier, monkeypatch):
-    piezo = vernier.devices.loops["right"].piezo
-    answers = iter(
-        [fail("stack_volts", DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none"))]
-    )
-    measured = piezo.stack_volts
-
-    def once_bad():
-        return next(answers, measured)()
-
-    monkeypatch.setattr(piezo, "stack_volts", once_bad)
-    vernier.run(5.0)
-
-    assert vernier.supervisor.loops["right"].mode is Mode.VERNIER
-    told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
-    assert [event.severity for event in told] == ["warning"]
-
-
-@pytest.mark.parametrize("stack", [0, 1, 2])
-def test_a_stack_that_is_not_where_it_was_told_makes_the_loop_safe(vernier, monkeypatch, stack):
-    piezo = vernier.devices.loops["right"].piezo
-    measured = piezo.stack_volts
-
-    def saturated():
-        volts = measured()
-        volts[stack] = 150.0
-        return volts
-
-    monkeypatch.setattr(piezo, "stack_volts", saturated)
-    until(vernier, Mode.SAFE, limit_s=1.5)
-
-    assert f"expected stack {stack + 1} within 5 V of" in events_of(vernier)[-1].message
-    assert "got 150.0 V" in events_of(vernier)[-1].message
-
-
-def test_a_device_that_cannot_be_closed_keeps_no_other_from_being_closed(vernier, monkeypatch):
-    devices = vernier.devices
-    closed = []
-    monkeypatch.setattr(devices.loops["right"].piezo, "close", fail("close", OSError("stuck")))
-    monkeypatch.setattr(devices.camera, "close", lambda: closed.append("camera"))
-    vernier.command(Stop())
-    vernier.run(1.0)
-    assert vernier.command(Off()).accepted
-    vernier.run(0.1)
-
-    assert closed == ["camera"]
-    assert any("right piezo did not close well" in e.message for e in events_of(vernier))
-
-
 def test_off_waits_for_the_mirror(simulate_with):
     simulation = simulate_with("loops.right.fsm.slew_v_per_s=0.5", **NEAR)
     simulation.acquire()
@@ -390,15 +294,6 @@ def test_off_waits_for_the_mirror(simulate_with):
     assert simulation.command(Off()).accepted
 
 
-def test_an_error_that_is_no_devices_leads_to_safe_and_not_to_a_crash(vernier, monkeypatch):
-    amplifiers = vernier.devices.loops["right"].amplifiers
-    monkeypatch.setattr(amplifiers, "exchange", fail("exchange", KeyError("nobody knows")))
-
-    until(vernier, Mode.SAFE, limit_s=0.5)
-
-    assert any("nobody knows" in event.message for event in events_of(vernier))
-
-
 def test_a_star_seen_at_the_edge_is_brought_to_the_middle_of_the_field(simulate_with):
     simulation = simulate_with(star_offset_px=(28.0, 0.0))
     simulation.acquire()
@@ -409,22 +304,6 @@ def test_a_star_seen_at_the_edge_is_brought_to_the_middle_of_the_field(simulate_
     assert abs(tick.star_el_px - 19.5) < 3.0
 
 
-def test_encoders_that_count_anew_make_the_old_place_of_the_star_forgotten(vernier):
-    vernier.command(Hold())
-    vernier.command(Off())
-    vernier.run(0.1)
-    vernier.plants["right"].state.motor_rad[:] += 30.0
-    vernier.plants["right"].state.beam_motor_rad[:] += 30.0
-    vernier.command(Standby())
-    vernier.run(0.5)
-
-    assert any("forgotten" in event.message for event in events_of(vernier))
-    before = vernier.supervisor.servos["right"].position_rad.copy()
-    vernier.command(Acquire())
-    vernier.run(0.2)
-    assert np.all(np.abs(vernier.supervisor.servos["right"].position_rad - before) < 4.0)
-
-
 def test_one_command_recovers_and_another_finds_the_star_again(vernier):
     vernier.command(Stop())
     vernier.run(3.0)
@@ -433,66 +312,6 @@ def test_one_command_recovers_and_another_finds_the_star_again(vernier):
     assert vernier.command(Acquire()).accepted
 
     until(vernier, Mode.VERNIER, limit_s=15.0)
-
-
-def fail(method, error):
-    def failing(*_args, **_kwargs):
-        raise error
-
-    return failing
-
-
-FAULTS = {
-    "camera": ("camera", "next_frame"),
-    "D/A": ("dac", "write_v"),
-    "piezo": ("piezo", "stack_volts"),
-    "siderostat": ("amplifiers", "exchange"),
-}
-
-
-@pytest.mark.parametrize("device", FAULTS)
-def test_a_fault_of_any_device_leads_to_safe_with_an_event_that_names_it(
-    vernier, monkeypatch, device
-):
-    part, method = FAULTS[device]
-    devices = vernier.devices
-    target = devices.camera if part == "camera" else getattr(devices.loops["right"], part)
-    error = DeviceUnreachable(device, "127.0.0.1:1", "an answer", "nothing", "look at the cable")
-    monkeypatch.setattr(target, method, fail(method, error))
-
-    until(vernier, Mode.SAFE, limit_s=1.5)
-
-    message = events_of(vernier)[-1].message
-    assert device in message
-    assert "look at the cable" in message
-    assert events_of(vernier)[-1].severity == "error"
-
-
-def test_a_frame_that_does_not_come_is_a_fault_in_time(vernier, monkeypatch):
-    clock, camera = vernier.clock, vernier.devices.camera
-
-    def nothing(timeout_s):
-        camera._go_on_to(clock.now_s() + timeout_s)
-
-    since_s = clock.now_s()
-    monkeypatch.setattr(camera, "next_frame", nothing)
-    until(vernier, Mode.SAFE, limit_s=1.0)
-
-    limit_s = vernier.rig.interlocks["frame_missing"].stale_s
-    assert vernier.mode_changes[-1].time_s - since_s <= limit_s + 2 * vernier.rig.camera.period_s
-
-
-def test_devices_that_do_not_open_leave_the_instrument_off_and_say_why(simulate_with, monkeypatch):
-    records = []
-    simulation = simulate_with(record=records.append)
-    simulation.records = records
-    error = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
-    monkeypatch.setattr(simulation.devices.loops["right"].piezo, "open", fail("open", error))
-
-    simulation.command(Standby())
-
-    assert mode_of(simulation) is Mode.OFF
-    assert any("/dev/ttyUSB0" in event.message for event in events_of(simulation))
 
 
 def test_off_lets_go_of_everything_and_standby_takes_it_again(vernier):
@@ -582,15 +401,3 @@ def test_the_whole_run_is_judged_however_short_the_rigs_history():
     results = [simulate(rig, 3, 40.0)["right"] for rig in (load_rig(default_rig_path()), short)]
 
     assert results[0].rms_px == results[1].rms_px
-
-
-def test_what_happens_while_the_instrument_is_closed_is_recorded(vernier, monkeypatch):
-    replies = []
-    piezo = vernier.devices.loops["right"].piezo
-    monkeypatch.setattr(piezo, "close", fail("close", OSError("stuck")))
-    vernier.supervisor.stop("shutting down")
-    vernier.supervisor.post(Acquire(), replies.append)
-    vernier.supervisor.close()
-
-    assert any("right piezo did not close well" in e.message for e in events_of(vernier))
-    assert [(reply.accepted, reply.text) for reply in replies] == [(False, "shutting down")]

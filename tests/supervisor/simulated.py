@@ -1,0 +1,37 @@
+"""Small words for statements about an instrument on the virtual clock."""
+
+from fitctl.logging.records import Event
+
+NEAR = {"star_offset_px": (10.0, -6.0)}
+
+
+def until(simulation, mode, limit_s=30.0):
+    """Run until the loop is in `mode`; fails after `limit_s` of virtual time."""
+    end_s = simulation.clock.now_s() + limit_s
+    loop = simulation.supervisor.loops["right"]
+    while loop.mode is not mode:
+        assert simulation.clock.now_s() < end_s, f"still {loop.mode.name}, wanted {mode.name}"
+        simulation.run(0.02)
+    return simulation
+
+
+def darken(simulation, factor=0.0):
+    """All spots fade to `factor` of their light."""
+    simulation.camera._scene._flux_dn = simulation.camera._scene._flux_dn * factor
+
+
+def mode_of(simulation):
+    return simulation.supervisor.loops["right"].mode
+
+
+def events_of(simulation):
+    return [record for record in simulation.records if isinstance(record, Event)]
+
+
+def failing(error):
+    """A function that fails, whatever it is given."""
+
+    def fail(*_args, **_kwargs):
+        raise error
+
+    return fail

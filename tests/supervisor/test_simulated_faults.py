@@ -1,0 +1,156 @@
+"""What the supervisor does about devices that fail, on the virtual clock with the full plant."""
+
+import numpy as np
+import pytest
+from simulated import events_of, failing, mode_of, until
+
+from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
+from fitctl.supervisor.messages import Acquire, Hold, Off, Standby, Stop
+from fitctl.supervisor.modes import Mode
+
+FAULTS = {
+    "camera": ("camera", "next_frame"),
+    "D/A": ("dac", "write_v"),
+    "piezo": ("piezo", "stack_volts"),
+    "siderostat": ("amplifiers", "exchange"),
+}
+
+
+def test_a_fault_in_safe_is_told_once(vernier, monkeypatch):
+    vernier.command(Stop())
+    error = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
+    piezo = vernier.devices.loops["right"].piezo
+    monkeypatch.setattr(piezo, "stack_volts", failing(error))
+    vernier.run(5.0)
+
+    told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
+    assert [event.severity for event in told] == ["warning", "error"]
+
+
+def test_one_bad_answer_of_the_piezo_amplifier_is_asked_for_again(vernier, monkeypatch):
+    piezo = vernier.devices.loops["right"].piezo
+    answers = iter([failing(DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none"))])
+    measured = piezo.stack_volts
+
+    def once_bad():
+        return next(answers, measured)()
+
+    monkeypatch.setattr(piezo, "stack_volts", once_bad)
+    vernier.run(5.0)
+
+    assert vernier.supervisor.loops["right"].mode is Mode.VERNIER
+    told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
+    assert [event.severity for event in told] == ["warning"]
+
+
+@pytest.mark.parametrize("stack", [0, 1, 2])
+def test_a_stack_that_is_not_where_it_was_told_makes_the_loop_safe(vernier, monkeypatch, stack):
+    piezo = vernier.devices.loops["right"].piezo
+    measured = piezo.stack_volts
+
+    def saturated():
+        volts = measured()
+        volts[stack] = 150.0
+        return volts
+
+    monkeypatch.setattr(piezo, "stack_volts", saturated)
+    until(vernier, Mode.SAFE, limit_s=1.5)
+
+    assert f"expected stack {stack + 1} within 5 V of" in events_of(vernier)[-1].message
+    assert "got 150.0 V" in events_of(vernier)[-1].message
+
+
+def test_a_device_that_cannot_be_closed_keeps_no_other_from_being_closed(vernier, monkeypatch):
+    devices = vernier.devices
+    closed = []
+    monkeypatch.setattr(devices.loops["right"].piezo, "close", failing(OSError("stuck")))
+    monkeypatch.setattr(devices.camera, "close", lambda: closed.append("camera"))
+    vernier.command(Stop())
+    vernier.run(1.0)
+    assert vernier.command(Off()).accepted
+    vernier.run(0.1)
+
+    assert closed == ["camera"]
+    assert any("right piezo did not close well" in e.message for e in events_of(vernier))
+
+
+def test_an_error_that_is_no_devices_leads_to_safe_and_not_to_a_crash(vernier, monkeypatch):
+    amplifiers = vernier.devices.loops["right"].amplifiers
+    monkeypatch.setattr(amplifiers, "exchange", failing(KeyError("nobody knows")))
+
+    until(vernier, Mode.SAFE, limit_s=0.5)
+
+    assert any("nobody knows" in event.message for event in events_of(vernier))
+
+
+def test_encoders_that_count_anew_make_the_old_place_of_the_star_forgotten(vernier):
+    vernier.command(Hold())
+    vernier.command(Off())
+    vernier.run(0.1)
+    vernier.plants["right"].state.motor_rad[:] += 30.0
+    vernier.plants["right"].state.beam_motor_rad[:] += 30.0
+    vernier.command(Standby())
+    vernier.run(0.5)
+
+    assert any("forgotten" in event.message for event in events_of(vernier))
+    before = vernier.supervisor.servos["right"].position_rad.copy()
+    vernier.command(Acquire())
+    vernier.run(0.2)
+    assert np.all(np.abs(vernier.supervisor.servos["right"].position_rad - before) < 4.0)
+
+
+@pytest.mark.parametrize("device", FAULTS)
+def test_a_fault_of_any_device_leads_to_safe_with_an_event_that_names_it(
+    vernier, monkeypatch, device
+):
+    part, method = FAULTS[device]
+    devices = vernier.devices
+    target = devices.camera if part == "camera" else getattr(devices.loops["right"], part)
+    error = DeviceUnreachable(device, "127.0.0.1:1", "an answer", "nothing", "look at the cable")
+    monkeypatch.setattr(target, method, failing(error))
+
+    until(vernier, Mode.SAFE, limit_s=1.5)
+
+    message = events_of(vernier)[-1].message
+    assert device in message
+    assert "look at the cable" in message
+    assert events_of(vernier)[-1].severity == "error"
+
+
+def test_a_frame_that_does_not_come_is_a_fault_in_time(vernier, monkeypatch):
+    clock, camera = vernier.clock, vernier.devices.camera
+
+    def nothing(timeout_s):
+        camera._go_on_to(clock.now_s() + timeout_s)
+
+    since_s = clock.now_s()
+    monkeypatch.setattr(camera, "next_frame", nothing)
+    until(vernier, Mode.SAFE, limit_s=1.0)
+
+    limit_s = vernier.rig.interlocks["frame_missing"].stale_s
+    assert vernier.mode_changes[-1].time_s - since_s <= limit_s + 2 * vernier.rig.camera.period_s
+
+
+def test_devices_that_do_not_open_leave_the_instrument_off_and_say_why(simulate_with, monkeypatch):
+    records = []
+    simulation = simulate_with(record=records.append)
+    simulation.records = records
+    error = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
+    monkeypatch.setattr(simulation.devices.loops["right"].piezo, "open", failing(error))
+
+    simulation.command(Standby())
+
+    assert mode_of(simulation) is Mode.OFF
+    assert any("/dev/ttyUSB0" in event.message for event in events_of(simulation))
+
+
+def test_what_happens_while_the_instrument_is_closed_is_recorded(vernier, monkeypatch):
+    replies = []
+    piezo = vernier.devices.loops["right"].piezo
+    monkeypatch.setattr(piezo, "close", failing(OSError("stuck")))
+    vernier.supervisor.stop("shutting down")
+    vernier.supervisor.post(Acquire(), replies.append)
+    vernier.supervisor.close()
+
+    assert any("right piezo did not close well" in e.message for e in events_of(vernier))
+    assert [(reply.accepted, reply.text) for reply in replies] == [(False, "shutting down")]
