@@ -9,7 +9,7 @@ import pytest
 
 from fitctl.commands.fault import kinds
 from fitctl.config import CONTROLLERS, default_rig_path
-from fitctl.sequences.reading import shipped_sequences
+from fitctl.sequences.files import shipped_sequences
 
 pytestmark = pytest.mark.skipif(not shutil.which("bash"), reason="needs bash")
 ASK = """
