@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.model.optics import scales
-from fitctl.processes import end_process, last_line, signals_ignored, start_process
+from fitctl.processes import end_process, last_line, lock_held, signals_ignored, start_process
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import make_service_folder
 from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
@@ -65,7 +65,7 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
     """Start everything on free ports; end everything, whatever happens.
 
     Its sockets are where the rig file has them, so that other commands find the demo; where another
-    supervisor has that rig, they are in a folder of the demo's own.
+    supervisor or demo has that rig, they are in a folder of the demo's own.
 
     Raises
     ------
@@ -75,6 +75,7 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
     started_s = time.monotonic()
     processes: list[subprocess.Popen[bytes]] = []
     folder = Path(tempfile.mkdtemp(prefix="fitctl-demo-"))
+    stack = ExitStack()
     try:
         common = ["--rig", str(rig_path), *_set(overrides)]
         mocks = _start(
@@ -85,7 +86,7 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
         devices = [
             f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
         ]
-        sockets = _socket_folder(load_rig(rig_path, overrides), folder)
+        sockets = stack.enter_context(_socket_folder(load_rig(rig_path, overrides), folder))
         settings = _set([*devices, f"service.folder={sockets}"])
         supervisor = _start(folder, "supervisor", ["run", *common, *settings])
         processes.append(supervisor)
@@ -101,6 +102,7 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
     finally:
         with signals_ignored():
             _end(processes)
+            stack.close()
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -247,14 +249,21 @@ def _set(overrides: Sequence[str]) -> list[str]:
     return [part for override in overrides for part in ("--set", override)]
 
 
-def _socket_folder(rig: Rig, other: Path) -> Path:
-    """The rig's own, or the other where a supervisor has that."""
-    try:
-        folder = make_service_folder(rig)
-        with only_supervisor(folder):
-            return folder
-    except ConfigError:
-        return other
+@contextmanager
+def _socket_folder(rig: Rig, other: Path) -> Iterator[Path]:
+    """The rig's own, or the other where a supervisor or a demo has that.
+
+    A lock says that a demo has it: until its supervisor is up, nothing else does.
+    """
+    with ExitStack() as stack:
+        try:
+            folder = make_service_folder(rig)
+            stack.enter_context(lock_held(folder / "demo"))
+            with only_supervisor(folder):
+                pass
+        except (ConfigError, BlockingIOError):
+            folder = other
+        yield folder
 
 
 def _start(folder: Path, name: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:

@@ -7,7 +7,7 @@ import pytest
 import tomli_w
 
 from fitctl.cli import main
-from fitctl.sequences.reading import shipped_sequences
+from fitctl.sequences.files import shipped_sequences
 
 HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
 WAIT = HEAD + 'steps = [{ step = "wait", duration_s = 5.0 }]\n'

@@ -26,7 +26,7 @@ def rigs(incomplete: str) -> list[str]:
 
 def sequences(incomplete: str) -> list[str]:
     """Shipped sequences by name; for a file of one's own, a part of its path is needed."""
-    from fitctl.sequences.reading import shipped_sequences
+    from fitctl.sequences.files import shipped_sequences
 
     return _beginning(incomplete, (path.stem for path in shipped_sequences()))
 

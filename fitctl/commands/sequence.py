@@ -54,7 +54,8 @@ OutOption = Annotated[
 
 
 def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Rig, Sequence]:
-    from fitctl.sequences.reading import find_sequence, load_sequence
+    from fitctl.sequences.files import find_sequence
+    from fitctl.sequences.reading import load_sequence
 
     of_steps = [text for text in overrides or () if text.startswith("steps.")]
     settings = rig_of(rig, [text for text in overrides or () if text not in of_steps])
@@ -71,7 +72,8 @@ def list_(
     ] = False,
 ) -> None:
     """Print the shipped sequences."""
-    from fitctl.sequences.reading import read_sequence, shipped_sequences
+    from fitctl.sequences.files import shipped_sequences
+    from fitctl.sequences.reading import read_sequence
 
     listed = {path: read_sequence(path) for path in files or shipped_sequences()}
     if as_json:

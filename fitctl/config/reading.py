@@ -35,17 +35,15 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     ConfigError
         One line for each thing that is wrong: file, key, what is allowed.
     """
-    document = read_toml(
+    document = _read_part(
         path, "no such rig file; copy rigs/fit-mock.toml or name another with --rig"
     )
-    _anchor(document, path)
     base = document.pop("base", None)
     if base is not None:
         if not isinstance(base, str):
             msg = f"{path}: base: must be a file name (is {base!r})"
             raise ConfigError(msg)
-        under = read_toml(path.parent / base, f"no such rig file; it is the base of {path}")
-        _anchor(under, path.parent / base)
+        under = _read_part(path.parent / base, f"no such rig file; it is the base of {path}")
         lay_over(under, document)
         document = under
     fragments = document.pop("include", [])
@@ -56,9 +54,7 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     for name in fragments:
         fragment = path.parent / name
         missing = f"no such rig file; it is in the include list of {path}"
-        said = read_toml(fragment, missing)
-        _anchor(said, fragment)
-        lay_over(document, said)
+        lay_over(document, _read_part(fragment, missing))
         # What is wrong from here on, and was not before, is this fragment's.
         said_in = {what: said_in.get(what, str(fragment)) for what in _problems(document)}
     for override in overrides:
@@ -66,11 +62,13 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     return rig_from_document(document, str(path), said_in)
 
 
-def _anchor(document: dict[str, Any], path: Path) -> None:
-    """A file that a rig file names is beside it."""
+def _read_part(path: Path, missing: str) -> dict[str, Any]:
+    """A rig file, its base or a fragment; a file that it names is beside it."""
+    document = read_toml(path, missing)
     camera = document.get("camera")
     if isinstance(camera, dict) and isinstance(camera.get("dark_file"), str):
         camera["dark_file"] = str(path.parent / camera["dark_file"])
+    return document
 
 
 def _problems(document: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], str]]:

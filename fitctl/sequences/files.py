@@ -13,6 +13,25 @@ YAML_SUFFIXES = (".yaml", ".yml")
 SUFFIXES = (".toml", *YAML_SUFFIXES)
 
 
+def _shipped_folder() -> Path:
+    """Where the shipped sequences are: beside the package in a checkout, inside it once installed."""
+    package = Path(__file__).parent.parent
+    installed = package / "shipped_sequences"
+    return installed if installed.exists() else package.parent / "sequences"
+
+
+def find_sequence(name: Path) -> Path:
+    """The file of a sequence: as given, or a shipped one by its bare name."""
+    if name.exists() or name.parent != Path() or name.suffix:
+        return name
+    return next((path for path in shipped_sequences() if path.stem == str(name)), name)
+
+
+def shipped_sequences() -> list[Path]:
+    """The files of the shipped sequences, by name."""
+    return sorted(path for path in _shipped_folder().iterdir() if path.suffix in SUFFIXES)
+
+
 def read_document(path: Path, missing: str) -> dict[str, Any]:
     """The content of a TOML or YAML file, by its suffix; `missing` is said where there is no file.
 

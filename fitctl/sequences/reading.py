@@ -13,31 +13,12 @@ from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings
 from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours import problems
-from fitctl.sequences.files import SUFFIXES, read_document, read_table
+from fitctl.sequences.files import read_document, read_table, shipped_sequences
 from fitctl.sequences.steps import AnyStep, Sequence, Star, Stars, Step
 
 STEPS: dict[str, type[Step]] = {
     kind.model_fields["step"].default: kind for kind in get_args(AnyStep)
 }
-
-
-def shipped_folder() -> Path:
-    """Where the shipped sequences are: beside the package in a checkout, inside it once installed."""
-    package = Path(__file__).parent.parent
-    installed = package / "shipped_sequences"
-    return installed if installed.exists() else package.parent / "sequences"
-
-
-def find_sequence(name: Path) -> Path:
-    """The file of a sequence: as given, or a shipped one by its bare name."""
-    if name.exists() or name.parent != Path() or name.suffix:
-        return name
-    return next((path for path in shipped_sequences() if path.stem == str(name)), name)
-
-
-def shipped_sequences() -> list[Path]:
-    """The files of the shipped sequences, by name."""
-    return sorted(path for path in shipped_folder().iterdir() if path.suffix in SUFFIXES)
 
 
 def load_sequence(path: Path, rig: Rig, overrides: Iterable[str] = ()) -> Sequence:

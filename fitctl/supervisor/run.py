@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import importlib.metadata
 import os
@@ -22,7 +21,7 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import design_json
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
-from fitctl.processes import ended_by_signals
+from fitctl.processes import ended_by_signals, lock_held
 from fitctl.supervisor.children import Child
 from fitctl.supervisor.devices import rig_devices
 from fitctl.supervisor.endpoints import (
@@ -108,24 +107,16 @@ def only_supervisor(folder: Path) -> Iterator[None]:
     ConfigError
         If another holds it; the text names its process.
     """
-    path = folder / "lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
+            stack.enter_context(lock_held(folder / "lock"))
+        except BlockingIOError as error:
             msg = (
-                f"{folder}: another supervisor (process {owner}) has this rig; attach to it with "
+                f"{folder}: another supervisor ({error.strerror}) has this rig; attach to it with "
                 "`fitctl console`, or end it first"
             )
             raise ConfigError(msg) from None
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, str(os.getpid()).encode())
         yield
-        os.ftruncate(descriptor, 0)
-    finally:
-        os.close(descriptor)
 
 
 def run_supervisor(

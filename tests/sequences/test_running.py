@@ -7,8 +7,9 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.sequences import pointing, view
+from fitctl.sequences.files import find_sequence, shipped_sequences
 from fitctl.sequences.links import SimulatedLink
-from fitctl.sequences.reading import find_sequence, load_sequence, shipped_sequences
+from fitctl.sequences.reading import load_sequence
 from fitctl.sequences.runner import run_sequence
 from fitctl.supervisor.messages import Acquire, Hold, SequenceControl, Stop
 

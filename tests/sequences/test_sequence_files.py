@@ -9,13 +9,8 @@ from hypothesis import strategies as st
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.sequences.behaviours import BEHAVIOURS
-from fitctl.sequences.files import parse_yaml
-from fitctl.sequences.reading import (
-    STEPS,
-    load_sequence,
-    sequence_from_document,
-    shipped_sequences,
-)
+from fitctl.sequences.files import parse_yaml, shipped_sequences
+from fitctl.sequences.reading import STEPS, load_sequence, sequence_from_document
 
 RIG = load_rig(default_rig_path())
 HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
