@@ -6,17 +6,29 @@ HELD = (STAYED,)
 SAFE = ("SAFE",)
 SEARCHES = ("ACQUISITION",)
 SIDEROSTAT, DAC, PIEZO, CAMERA = "siderostat", "D/A at", "piezo amplifier at", "camera at"
-OWN = "the stacks lose their voltage with their amplifier"
+GOES_ON = "its last velocity goes on: its protocol has no watchdog"
 
 
-def held(*hows, says="", within_s=2.0):
+def held(*hows, within_s=2.0, **fields):
     """The star is held all the same."""
-    return tuple(Entry("", how, HELD, says, within_s=within_s) for how in hows)
+    return [Entry("", how, HELD, within_s=within_s, **fields) for how in hows]
 
 
-def made_safe(*hows, says, within_s=3.0, mode="VERNIER"):
+def made_safe(*hows, within_s=3.0, **fields):
     """The device's error is told, and the stages are made safe."""
-    return tuple(Entry("", how, SAFE, says, mode, within_s) for how in hows)
+    return [Entry("", how, SAFE, within_s=within_s, **fields) for how in hows]
+
+
+def amplifier_faults(unheard_moves=""):
+    """Of whatever amplifiers; `unheard_moves` is why motors go on without their link, if they do."""
+    return (
+        *made_safe("drop", "disconnect", "freeze", says=SIDEROSTAT, moves=unheard_moves),
+        *made_safe("delay 0.1", "corrupt", "reboot", says=SIDEROSTAT),
+        *made_safe("amplifier_fault", "encoder_jump", says=SIDEROSTAT),
+        # Nothing is asked of a siderostat that the mirror saves from moving; a search asks much.
+        *held("stuck_axis"),
+        *made_safe("stuck_axis", says=SIDEROSTAT, mode="ACQUISITION"),
+    )
 
 
 CAMERA_FAULTS = (
@@ -46,29 +58,34 @@ DAC_FAULTS = (
 MDT693_FAULTS = (
     # It is asked once a second, and believed to be wrong the second time.
     *made_safe("drop", "corrupt", "duplicate", "freeze", "silent", says=PIEZO, within_s=8.0),
-    *made_safe("disconnect", "limit_switch", "saturated_stack", says=PIEZO, within_s=8.0),
+    *made_safe("disconnect", says=PIEZO, within_s=8.0),
+    *made_safe(
+        "limit_switch", says=PIEZO, within_s=8.0, moves="it gives no more than the switch allows"
+    ),
+    *made_safe(
+        "saturated_stack", says=PIEZO, within_s=8.0, moves="the stack goes to its highest voltage"
+    ),
     *held("delay 0.1", "reorder"),  # as with the D/A; but no tick waits for it
     # It is back after 2 s, before it is asked a second time.
-    *held("reboot", says="asking again", within_s=4.0),
-)
-AMPLIFIER_FAULTS = (
-    *made_safe("drop", "delay 0.1", "corrupt", "disconnect", "freeze", "reboot", says=SIDEROSTAT),
-    *made_safe("amplifier_fault", "encoder_jump", says=SIDEROSTAT),
-    # Nothing is asked of a siderostat that the mirror saves from moving; a search asks much.
-    *held("stuck_axis"),
-    *made_safe("stuck_axis", says=SIDEROSTAT, mode="ACQUISITION"),
+    *held(
+        "reboot",
+        says="asking again",
+        within_s=4.0,
+        moves="without power the stacks have no voltage",
+    ),
 )
 CIA402_FAULTS = (
-    *AMPLIFIER_FAULTS,
+    *amplifier_faults(),
     *made_safe("link_loss", "following_error", says=SIDEROSTAT),
     *held("duplicate", "reorder"),
 )
-ENSEMBLE_FAULTS = (  # each answer belongs to the question before it
-    *AMPLIFIER_FAULTS,
+ENSEMBLE_FAULTS = (
+    *amplifier_faults(unheard_moves=GOES_ON),
+    # Each answer belongs to the question before it.
     *made_safe("following_error", "duplicate", "reorder", says=SIDEROSTAT),
 )
 BAL_FAULTS = (
-    *AMPLIFIER_FAULTS,
+    *amplifier_faults(),
     *held("duplicate", "reorder", "command_offset"),
 )
 # Rig, device of the mocks, its table.
@@ -80,22 +97,7 @@ STRUCK = (
     ("ensemble", "right.drive", ENSEMBLE_FAULTS),
     ("fit-bal-analog", "right.drive", BAL_FAULTS),
 )
-# What moves although nobody asks it to.
-BY_ITSELF = {
-    ("fit-mock", "right.mdt693", "reboot"): OWN,
-    ("fit-mock", "right.mdt693", "saturated_stack"): "the stack goes to its highest voltage",
-    (
-        "fit-mock",
-        "right.mdt693",
-        "limit_switch",
-    ): "the amplifier gives no more than the switch allows",
-} | {
-    ("ensemble", "right.drive", how): "its last velocity goes on: its protocol has no watchdog"
-    for how in ("drop", "disconnect", "freeze")
-}
 
 ENTRIES = tuple(
-    entry._replace(struck=device, rig=rig, moves=BY_ITSELF.get((rig, device, entry.how), ""))
-    for rig, device, table in STRUCK
-    for entry in table
+    entry._replace(struck=device, rig=rig) for rig, device, table in STRUCK for entry in table
 )

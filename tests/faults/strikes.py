@@ -81,8 +81,7 @@ def on_its_way(strike_supervisor):
         assert rig.client.send(Jog(az_sky_arcsec=JOG_SKY_ARCSEC, el_sky_arcsec=0.0)).accepted
         with strike_supervisor(rig, entry):
             yield
-            # Short of the jog's end or, if the drive missed its commands late, beyond; there, nothing was
-            # struck.
+            # Short of where it was sent or, if the drive missed its commands late, beyond.
             went_rad = rig.places[-1].motor_rad[0] - before_rad
             assert went_rad > MOVED_RAD, "it had not begun to jog"
             assert abs(went_rad - JOG_RAD) > MOVED_RAD, "it had ended its jog"
