@@ -3,7 +3,7 @@
 Mocks, supervisor and recorder are processes of their own, the star is held in VERNIER, and floods take turns,
 each in a process of its own that offers messages at a pace (10 000 a second by default). One flood goes
 elsewhere: it costs the machine as much, and the service nothing. What the service does not take waits with its
-sender.
+sender. Before each flood the star is held again, in case the one before, or the machine, has cost it.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 
 from fitctl import demo
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.supervisor.keys import new_key
+from fitctl.supervisor.messages import Acquire, Recover
 
 SETTLING_S = 1.0
+HOLD_S = 120.0
 FLOODS = {
     "nothing": "no flood",
     "elsewhere": "as many messages to another socket",
@@ -44,6 +46,9 @@ class Window(NamedTuple):
     timing: list[LoopTiming]
     offered: int
     sent: int
+    supervisor_cpu_s: float
+    gateway_cpu_s: float
+    lasted_s: float
 
 
 # ---------------------------------------------------------------- what the loop does meanwhile
@@ -65,35 +70,63 @@ def measure(options: argparse.Namespace) -> dict[str, Window]:
         near = "plant.loops.right.star_offset_sky_arcsec_max=5.0"
         with demo.instrument(default_rig_path(), [*settings, near], seed=0) as running:
             demo.acquire(running)
-            follow(running, lambda telemetry: telemetry.loops[0].mode == "VERNIER")
             for _ in range(options.rounds):
                 for kind in FLOODS:
                     arguments = [kind, str(running.sockets), str(key_file), str(options.rate)]
                     windows[kind].append(one(running, kind, arguments, options.duration))
                     print(".", end="", file=sys.stderr, flush=True)
-    return {
-        kind: Window(
-            [tick for window in some for tick in window.ticks],
-            [timing for window in some for timing in window.timing],
-            sum(window.offered for window in some),
-            sum(window.sent for window in some),
-        )
-        for kind, some in windows.items()
-    }
+    return {kind: together(some) for kind, some in windows.items()}
 
 
-def follow(running: demo.Instrument, reached: Callable) -> None:
-    """Receive telemetry until something is reached."""
-    deadline_s = time.monotonic() + 120
+def together(some: list[Window]) -> Window:
+    """All windows of one flood as one."""
+    ticks, timing, *sums = zip(*some, strict=True)
+    return Window(
+        [tick for part in ticks for tick in part],
+        [second for part in timing for second in part],
+        *map(sum, sums),
+    )
+
+
+def hold(running: demo.Instrument) -> None:
+    """Wait until the star is held, and see that it will be."""
+    deadline_s, told = time.monotonic() + HOLD_S, ""
+    towards = {"SAFE": Recover(), "STANDBY": Acquire()}
+    catch_up(running)
     while time.monotonic() < deadline_s:
         telemetry = running.client.receive(0.5)
-        if telemetry is not None and reached(telemetry):
+        running.check()
+        mode = "" if telemetry is None else telemetry.loops[0].mode
+        if mode == "VERNIER":
             return
-    raise SystemExit("the star was not held within 120 s; look at `fitctl demo`")
+        if mode in towards:
+            told = running.client.send(towards[mode]).text
+            time.sleep(SETTLING_S)
+            catch_up(running)
+    raise SystemExit(
+        f"the star was not held within {HOLD_S:g} s: {mode} {told}; look at `fitctl demo`"
+    )
+
+
+def catch_up(running: demo.Instrument) -> None:
+    """Let go of telemetry that came before now."""
+    while running.client.receive(0.0) is not None:
+        pass
+
+
+def cpu_s(pid: int) -> tuple[float, float]:
+    """What supervisor and gateway have taken of a processor so far; a new gateway begins at nothing."""
+    supervisor = psutil.Process(pid)
+    gateways = [child for child in supervisor.children() if "gateway" in child.cmdline()]
+    return tuple(
+        sum(sum(process.cpu_times()[:2]) for process in some) for some in ([supervisor], gateways)
+    )
 
 
 def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: float) -> Window:
     """The loop's records while one flood runs."""
+    hold(running)
+    pid = running.supervisor.pid
     process = None
     if kind != "nothing":
         duration = str(duration_s + 2 * SETTLING_S)
@@ -103,14 +136,16 @@ def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: f
         )
         process.stdout.readline()  # it has begun
     time.sleep(SETTLING_S)
-    while running.client.receive(0.0) is not None:
-        pass  # what came before
-    begun_s = time.monotonic()
+    catch_up(running)
+    begun_s, before = time.monotonic(), cpu_s(pid)
     course = demo.watch(running, duration_s, lambda gone_s, telemetry: None)
+    lasted_s, after = time.monotonic() - begun_s, cpu_s(pid)
     offered, sent = json.loads(process.communicate()[0]) if process else (0, 0)
     ticks = [tick for tick in course.ticks["right"] if tick.time_s >= begun_s]
     timing = [timing for timing in course.timing.values() if timing.time_s >= begun_s]
-    return Window([tick for tick in ticks if tick.number >= 0], timing, offered, sent)
+    taken = [max(0.0, now - then) for now, then in zip(after, before, strict=True)]
+    ticks = [tick for tick in ticks if tick.number >= 0]
+    return Window(ticks, timing, offered, sent, *taken, lasted_s)
 
 
 def spread(values: list[float], unit: float) -> str:
@@ -129,9 +164,9 @@ def main() -> None:
     windows = measure(options)
     print(
         "\n| flood | offered a second | sent a second | ticks in VERNIER % | compute ms "
-        "| exposure to command ms | servo late ms |"
+        "| exposure to command ms | servo late ms | supervisor, of a core | gateway, of a core |"
     )
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| --- " * 9 + "|")
     for kind, seen in windows.items():
         lasted_s = options.rounds * (options.duration + 2 * SETTLING_S)
         servo = [timing.servo_late_median_s for timing in seen.timing]
@@ -141,7 +176,8 @@ def main() -> None:
             f"| {100 * float(np.mean([tick.mode == 'VERNIER' for tick in seen.ticks])):.0f} "
             f"| {spread([tick.compute_s for tick in seen.ticks], 1e3)} "
             f"| {spread([t.time_s - t.mid_exposure_s for t in seen.ticks], 1e3)} "
-            f"| {1e3 * float(np.median(servo)):.2f} / {1e3 * worst:.2f} |"
+            f"| {1e3 * float(np.median(servo)):.2f} / {1e3 * worst:.2f} "
+            f"| {seen.supervisor_cpu_s / seen.lasted_s:.2f} | {seen.gateway_cpu_s / seen.lasted_s:.2f} |"
         )
 
 
