@@ -21,7 +21,6 @@ from fitctl.logging.records import (
     Event,
     LoopTiming,
     ModeChange,
-    PiezoReading,
     RecorderStatus,
     SequenceAttempt,
     Tick,
@@ -29,11 +28,9 @@ from fitctl.logging.records import (
 from fitctl.logging.schemas import TOPICS
 from fitctl.report.run import Run
 
-_ROWS = 20_000
+_ROWS = 20_000  # held as they come, before they find their place
 _KINDS: dict[Any, str] = {
-    Tick: "ticks",
     LoopTiming: "timing",
-    PiezoReading: "piezo",
     ModeChange: "modes",
     Event: "events",
     DeviceHealth: "health",
@@ -81,8 +78,8 @@ class Gathered:
     Attributes
     ----------
     run : Run
-    ticks, timing, piezo : dict of str to dict of str to array
-        By loop; fields as in :mod:`fitctl.logging.records`. Empty arrays where there are none.
+    ticks, timing : dict of str to dict of str to array
+        By loop; fields as in :mod:`fitctl.logging.records`. Without any, `timing` has no more than its times.
     modes, events, health, attempts : list of dict
         Records with their fields; of `health` only what differs from before.
     lost : int or None
@@ -92,7 +89,6 @@ class Gathered:
     run: Run
     ticks: dict[str, Columns]
     timing: dict[str, Columns]
-    piezo: dict[str, Columns]
     modes: list[dict[str, Any]]
     events: list[dict[str, Any]]
     health: list[dict[str, Any]]
@@ -114,52 +110,72 @@ def gather(run: Run) -> Gathered:
         for kind, name in _KINDS.items()
         for loop in (loops if "{loop}" in TOPICS[kind] else [""])
     }
+    tick_topics = {TOPICS[Tick].format(loop=loop): loop for loop in loops}
+    ticks = {loop: _room(run, topic) for topic, loop in tick_topics.items()}
+    filled = dict.fromkeys(loops, 0)
     blocks: dict[tuple[str, str], list[Columns]] = defaultdict(list)
     health: list[dict[str, Any]] = []
     states: dict[str, str] = {}
-    fields = {TOPICS[Tick].format(loop=loop): TICK_FIELDS for loop in loops}
+    fields = dict.fromkeys(tick_topics, TICK_FIELDS) | {TOPICS[RecorderStatus]: ["lost"]}
     for log in run.logs:
-        for topic, columns in column_blocks(log.path, list(places), _ROWS, fields):
-            place = places[topic]
+        for topic, columns in column_blocks(log.path, [*tick_topics, *places], _ROWS, fields):
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
-            kept = _small(columns, time_s, str(log.path)) if place[0] == "ticks" else columns
-            block = kept | {"time_s": time_s}
-            if place[0] == "health":  # tells the same every second, all night
+            if topic in tick_topics:
+                loop = tick_topics[topic]
+                filled[loop] += _fill(ticks[loop], filled[loop], columns, time_s, str(log.path))
+                continue
+            block = columns | {"time_s": time_s}
+            if places[topic][0] == "health":  # tells the same every second, all night
                 health += _changes(_rows([block]), states)
             else:
-                blocks[place].append(block)
-    of_loops = {
-        name: {loop: _in_order(_joined(blocks.pop((name, loop), []))) for loop in loops}
-        for name in ("ticks", "timing", "piezo")
-    }
+                blocks[places[topic]].append(block)
     modes = [row for loop in loops for row in _rows(blocks["modes", loop])]
     return Gathered(
         run=run,
-        **of_loops,
+        ticks={
+            loop: _in_order({name: column[: filled[loop]] for name, column in its.items()})
+            for loop, its in ticks.items()
+        },
+        timing={loop: _joined(blocks["timing", loop]) for loop in loops},
         modes=sorted(modes, key=itemgetter("time_s")),
         events=_rows(blocks["events", ""]),
         health=health,
         attempts=_rows(blocks["attempts", ""]),
-        lost=_lost(_rows(blocks["recorder", ""])),
+        lost=_lost(_joined(blocks["recorder", ""])),
     )
 
 
-def _small(columns: Columns, time_s: NDArray[np.float64], path: str) -> Columns:
-    """A block of ticks, only what is needed and no longer than needed."""
+def _room(run: Run, topic: str) -> Columns:
+    """For all ticks of a topic at once: put together from pieces, hours would be held twice."""
+    rows = sum(log.counts.get(topic, 0) for log in run.logs)
+    return {name: np.empty(rows, dtype) for name, dtype in TICK_FIELDS.items()}
+
+
+def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64], path: str) -> int:
+    """Put a block of ticks into their room, from row `at` on; returns how many rows there was room for."""
     missing = [name for name in TICK_FIELDS if name not in columns]
     if missing:
         msg = f"{path}: its ticks lack {', '.join(missing)}; it was recorded by another version of fitctl"
         raise LogError(msg)
-    columns["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])
-    return {name: columns[name].astype(dtype) for name, dtype in TICK_FIELDS.items()}
+    moved = {
+        "time_s": time_s,
+        "mid_exposure_s": columns["mid_exposure_s"] + (time_s - columns["time_s"]),
+    }
+    block = columns | moved
+    rows = min(
+        len(time_s), len(room["time_s"]) - at
+    )  # a log in the making has grown since it was counted
+    for name, column in room.items():
+        column[at : at + rows] = block[name][:rows]
+    return rows
 
 
 def _joined(blocks: list[Columns]) -> Columns:
-    """Blocks end to end; they are used up, so that hours are not held twice."""
+    """Blocks end to end, of the fields that all have."""
     if not blocks:
-        return {name: np.empty(0, dtype) for name, dtype in TICK_FIELDS.items()}
+        return {"time_s": np.empty(0)}
     names = [name for name in blocks[0] if all(name in block for block in blocks)]
-    return {name: np.concatenate([block.pop(name) for block in blocks]) for name in names}
+    return _in_order({name: np.concatenate([block[name] for block in blocks]) for name in names})
 
 
 def _in_order(columns: Columns) -> Columns:
@@ -198,11 +214,10 @@ def _changes(health: list[dict[str, Any]], states: dict[str, str]) -> list[dict[
     return changed
 
 
-def _lost(statuses: list[dict[str, Any]]) -> int | None:
+def _lost(statuses: Columns) -> int | None:
     """Records lost before the log; each recorder counts from its own start."""
-    total = before = 0
-    for status in statuses:
-        lost = int(status["lost"])
-        total += lost - before if lost >= before else lost
-        before = lost
-    return total if statuses else None
+    if "lost" not in statuses:
+        return None
+    lost = statuses["lost"].astype(int)
+    more = np.diff(lost, prepend=0)
+    return int(np.where(more >= 0, more, lost).sum())

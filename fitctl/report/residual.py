@@ -65,7 +65,9 @@ def rms_estimate(error_px: Floats) -> Estimate:
     error_px : array, shape (frames,)
         Evenly sampled; pieces of a record end to end.
     """
-    from scipy.stats import t  # half a second of import
+    from scipy.special import (
+        stdtrit,
+    )  # Student's t; scipy.stats has it too, and takes half a second to import
 
     error_px = np.asarray(error_px, dtype=float)
     if len(error_px) == 0:
@@ -76,7 +78,7 @@ def rms_estimate(error_px: Floats) -> Estimate:
     found = (_by_spectrum(error_px), _by_batches(error_px))
     independent = 2 / max(variance for variance, _ in found)
     # ln RMS is half of ln square.
-    half = max(t.ppf((1 + CONFIDENCE) / 2, freedom) * math.sqrt(v) / 2 for v, freedom in found)
+    half = max(stdtrit(freedom, (1 + CONFIDENCE) / 2) * math.sqrt(v) / 2 for v, freedom in found)
     if 2 * half > math.log(WIDEST):
         return Estimate(rms_px, math.nan, math.nan, independent)
     factor = math.exp(half)
