@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from fitctl.logging.records import DeviceHealth, ModeChange
 from fitctl.supervisor.messages import LoopState, Telemetry, TrippedInterlock
+from fitctl.supervisor.troubles import records_lost
 from fitctl.tui.state import ConsoleState
 
 BELL_EVERY_S = 10.0
@@ -121,7 +122,7 @@ def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
         # What was told of a device before the last change of mode is of the past.
         if device.state == "fault" and device.detail not in told and device.time_s >= changed_s:
             yield _device(newest, device)
-    yield from _log(state, newest)
+    yield from _log(newest)
 
 
 def _no_data(state: ConsoleState) -> Alarm:
@@ -168,8 +169,8 @@ def _device(newest: Telemetry, device: DeviceHealth) -> Alarm:
     )
 
 
-def _log(state: ConsoleState, newest: Telemetry) -> Iterator[Alarm]:
-    lost = state.records_lost
+def _log(newest: Telemetry) -> Iterator[Alarm]:
+    lost = records_lost(newest)
     if lost:
         what = f"{lost:,} records lost from the log".replace(",", " ")
         did = "the loop goes on; the gap is counted in the log"

@@ -201,27 +201,6 @@ class ConsoleState:
         """What is on the screen is old, or there is nothing yet."""
         return self.newest is None or self.silent_s > STALE_S
 
-    @property
-    def records_lost(self) -> int:
-        """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
-        if self.newest is None:
-            return 0
-        recorder = self.newest.recorder
-        return max(self.newest.records_lost, recorder.lost if recorder else 0)
-
-    @property
-    def unsent(self) -> int:
-        """Ticks, events, mode changes and replies that the supervisor could give to no console."""
-        if self.newest is None:
-            return 0
-        losses = self.newest.losses
-        return (
-            losses.ticks_unsent
-            + losses.events_unsent
-            + losses.mode_changes_unsent
-            + losses.replies_unsent
-        )
-
     def show_next_loop(self) -> None:
         """Cycle through the loops."""
         names = list(self.loops)
