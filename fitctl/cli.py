@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand
@@ -192,6 +192,12 @@ def console(
     quitting_ends_instrument: Annotated[
         bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
     ] = False,
+    graphics: Annotated[
+        Literal["auto", "half-blocks", "sixel", "kitty"],
+        typer.Option(
+            envvar="FITCTL_GRAPHICS", help="How the focal plane is drawn; auto goes by TERM."
+        ),
+    ] = "auto",
     web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
@@ -209,7 +215,13 @@ def console(
         return
     # The logs of a rig elsewhere are elsewhere too.
     log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()
-    run_console(client, arguments, log_folder, quitting_ends_instrument=quitting_ends_instrument)
+    run_console(
+        client,
+        arguments,
+        log_folder,
+        quitting_ends_instrument=quitting_ends_instrument,
+        graphics=graphics,
+    )
 
 
 class _SendCommand(TyperCommand):

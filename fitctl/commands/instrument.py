@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import threading
 import time
@@ -301,9 +302,11 @@ def run_console(
     log_folder: Path | None,
     *,
     quitting_ends_instrument: bool,
+    graphics: str,
 ) -> None:
     """Attach a console; other commands that it runs are given `arguments`."""
     from fitctl.tui.app import ConsoleApp
+    from fitctl.tui.graphics import Graphics, graphics_of
 
     app = ConsoleApp(
         client,
@@ -311,6 +314,7 @@ def run_console(
         clock=client.now_s,
         rig_arguments=arguments,
         log_folder=log_folder,
+        graphics=graphics_of(Graphics(graphics), os.environ),
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     app.run()

@@ -22,15 +22,22 @@ def run(
 ) -> FixedApp:
     """A console that has heard 21 s of telemetry, and a scenario on it."""
     app = FixedApp(supervisor or FakeSupervisor(mode), log_folder=log_folder)
+    run_app(app, lambda pilot: scenario(app, pilot), size=size)
+    return app
+
+
+def run_app(
+    app: FixedApp, scenario: Callable[[Pilot], Awaitable[None]], size: tuple[int, int] = (120, 40)
+) -> None:
+    """A scenario on a console that has just been made."""
 
     async def main() -> None:
         async with app.run_test(size=size, notifications=True) as pilot:
             app.feed()
             await pilot.pause()
-            await scenario(app, pilot)
+            await scenario(pilot)
 
     asyncio.run(main())
-    return app
 
 
 def sent(app: FixedApp):

@@ -8,7 +8,8 @@ import pytest
 import scipy.signal
 
 from fitctl.tui.draw.frame import place
-from fitctl.tui.widgets.focalplane import FocalPlane, spot_marks, tick_marks
+from fitctl.tui.draw.overlays import cell_marks, tick_overlays
+from fitctl.tui.widgets.focalplane import FocalPlane, spot_overlays
 from fitctl.tui.widgets.margins import Margins
 from fitctl.tui.widgets.spectrum import spectra_of
 from fitctl.tui.widgets.stages import Stages, working_point
@@ -81,7 +82,7 @@ def test_the_search_is_shown_while_searching():
 def test_the_window_and_the_centroid_are_where_the_tick_says():
     state = shown(FakeSupervisor())
     tick = changed_tick(state, star_az_px=10.2, star_el_px=30.1, window_az_px=10, window_el_px=30)
-    marks = tick_marks(tick, place(40, 40, 40, 20))
+    marks = cell_marks(tick_overlays(tick), place(40, 40, 40, 20))
     assert marks[10, 4].character == "+"
     assert (marks[6, 2].character, marks[14, 2].character) == ("┌", "┐")
 
@@ -89,7 +90,8 @@ def test_the_window_and_the_centroid_are_where_the_tick_says():
 def test_without_a_star_only_the_target_is_marked():
     state = shown(FakeSupervisor("ACQUISITION"))
     characters = {
-        mark.character for mark in tick_marks(state.loop.tick, place(40, 40, 40, 20)).values()
+        mark.character
+        for mark in cell_marks(tick_overlays(state.loop.tick), place(40, 40, 40, 20)).values()
     }
     assert characters == {"▔", "│"}
 
@@ -97,7 +99,7 @@ def test_without_a_star_only_the_target_is_marked():
 def test_a_fringe_spot_is_marked_on_its_light_and_named_in_the_caption():
     state = shown(FakeSupervisor())
     frame, placing = state.newest.frame, place(40, 40, 40, 20)
-    ((column, row),) = spot_marks(state.loop, placing)
+    ((column, row),) = cell_marks(spot_overlays(state.loop), placing)
     az_px, el_px = placing.pixel(column, row)
     image = np.frombuffer(frame.data, "<u2").reshape(40, 40).astype(int)
     near = image[round(el_px) - 1 : round(el_px) + 2, round(az_px) - 1 : round(az_px) + 2]
@@ -109,7 +111,7 @@ def test_a_fringe_spot_is_marked_on_its_light_and_named_in_the_caption():
 
 
 def test_without_a_star_no_other_spot_is_marked():
-    assert not spot_marks(shown(FakeSupervisor("ACQUISITION")).loop, place(40, 40, 40, 20))
+    assert not spot_overlays(shown(FakeSupervisor("ACQUISITION")).loop)
 
 
 def test_what_has_no_room_in_the_caption_is_the_light_and_not_a_spots_name():
