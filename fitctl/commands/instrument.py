@@ -61,7 +61,7 @@ def run_demo(
         try:
             with demos.instrument(rig_path, overrides, seed) as running:
                 if console:
-                    return _demo_with_console(rig_path, running)
+                    return _demo_with_console(rig_path, overrides, running)
                 return _demo_headless(rig, running, duration_s, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
             typer.echo(f"demo: {error}", err=True)
@@ -73,7 +73,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
-def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
+def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.Instrument) -> int:
     thread = demos.acquire_in_background(running)
     # A process of its own: when its terminal goes away it may hang, and must not hang us with it.
     console = show_process(
@@ -81,6 +81,7 @@ def _demo_with_console(rig_path: Path, running: demos.Instrument) -> int:
             "console",
             "--rig",
             str(rig_path),
+            *(part for text in overrides for part in ("--set", text)),
             "--set",
             f"service.folder={running.sockets}",
             "--quitting-ends-instrument",
