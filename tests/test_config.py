@@ -120,11 +120,6 @@ def test_a_number_in_quotes_or_a_truth_value_is_not_a_number(path):
     ("key", "value", "line"),
     [
         ("camera.frame_rate_hz", 0.5, "must be greater than or equal to 1 (is 0.5)"),
-        (
-            "loops.right.other_spots",
-            [{"name": "fringe", "offset_px": {"az": 1.0, "el": 0.0}, "flux_dn": 20000.0}],
-            "fringe with 20000 DN would be taken for the star, which may have 16800 to 44800",
-        ),
         ("camera.width_px", 15, "must be greater than or equal to 16 (is 15)"),
         ("camera.pixel_noise_dn", 0.0, "must be greater than 0 (is 0.0)"),
         ("camera.device.gvcp_port", 70000, "must be less than or equal to 65535 (is 70000)"),
@@ -394,4 +389,18 @@ def test_an_amplifier_that_nobody_knows_is_named_with_those_there_are(driver):
     assert text == (
         "my.toml: loops.right.siderostat.device.driver: must be one of 'cia402', 'ensemble', "
         f"'bal_analog' (is '{driver}')"
+    )
+
+
+def test_a_spot_that_would_be_taken_for_the_star_is_refused():
+    (spot,) = DOCUMENT["loops"]["right"]["other_spots"]
+    as_bright = changed(("loops", "right", "other_spots"), [spot | {"flux_dn": 20000.0}])
+    assert complaint(as_bright).startswith(
+        "my.toml: loops.right: other_spots: fringe with 20000 DN would be taken for the star, "
+        "which may have 16800 to 44800; "
+    )
+    assert (
+        not rig_from_document(changed(("loops", "right", "other_spots"), []), "x")
+        .loops["right"]
+        .other_spots
     )

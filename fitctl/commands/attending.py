@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand
@@ -21,6 +22,12 @@ def console(
     quitting_ends_instrument: Annotated[
         bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
     ] = False,
+    graphics: Annotated[
+        Literal["auto", "half-blocks", "sixel", "kitty"],
+        typer.Option(
+            envvar="FITCTL_GRAPHICS", help="How the focal plane is drawn; auto goes by TERM."
+        ),
+    ] = "auto",
     web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
@@ -37,6 +44,7 @@ def console(
     # The logs of a rig elsewhere are elsewhere too.
     log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()
     from fitctl.tui.app import ConsoleApp
+    from fitctl.tui.graphics import Graphics, graphics_of
 
     app = ConsoleApp(
         client,
@@ -45,6 +53,7 @@ def console(
         rig_arguments=arguments,
         remote_arguments=remote_arguments,
         log_folder=log_folder,
+        graphics=graphics_of(Graphics(graphics), os.environ),
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     app.run()

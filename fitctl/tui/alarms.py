@@ -121,7 +121,7 @@ def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
         # What was told of a device before the last change of mode is of the past.
         if device.state == "fault" and device.detail not in told and device.time_s >= changed_s:
             yield _device(newest, device)
-    yield from _log(state, newest)
+    yield from _log(newest)
 
 
 def _no_data(state: ConsoleState) -> Alarm:
@@ -168,8 +168,8 @@ def _device(newest: Telemetry, device: DeviceHealth) -> Alarm:
     )
 
 
-def _log(state: ConsoleState, newest: Telemetry) -> Iterator[Alarm]:
-    lost = state.records_lost
+def _log(newest: Telemetry) -> Iterator[Alarm]:
+    lost = newest.records_lost
     if lost:
         what = f"{lost:,} records lost from the log".replace(",", " ")
         did = "the loop goes on; the gap is counted in the log"

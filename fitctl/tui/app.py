@@ -28,6 +28,7 @@ from fitctl.supervisor.messages import (
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
+from fitctl.tui.graphics import Graphics, PictureSender
 from fitctl.tui.jobs import Job
 from fitctl.tui.link import Link
 from fitctl.tui.pace import Pace
@@ -92,6 +93,8 @@ class ConsoleApp(App[None]):
         Where the rig's logs are; None when that is on another machine.
     start_job : callable
         Starts another fitctl command.
+    graphics : Graphics
+        How the focal plane is drawn; not `auto`.
     """
 
     CSS_PATH = Path(__file__).with_name("console.tcss")
@@ -131,6 +134,7 @@ class ConsoleApp(App[None]):
         remote_arguments: Sequence[str] = (),
         log_folder: Path | None = Path("logs"),
         start_job: Callable[..., Job] = Job,
+        graphics: Graphics = Graphics.HALF_BLOCKS,
     ) -> None:
         super().__init__()
         self.quit_shuts_down = quit_shuts_down
@@ -139,6 +143,9 @@ class ConsoleApp(App[None]):
         self.remote_arguments = list(remote_arguments)
         self.log_folder = log_folder
         self.start_job = start_job
+        self.pictures: PictureSender | None = None
+        if graphics is not Graphics.HALF_BLOCKS:
+            self.pictures = PictureSender(graphics, self._write_to_terminal)
         self.state = ConsoleState(clock())
         self.alarms = AlarmBook()
         self._beat = 0
@@ -150,6 +157,10 @@ class ConsoleApp(App[None]):
             lambda problem: self.post_message(Unreadable(problem)),
             lambda *answer: self.post_message(Answered(*answer)),
         )
+
+    def _write_to_terminal(self, sequence: str) -> None:
+        if self._driver is not None:  # Textual has no public way for what is no text
+            self._driver.write(sequence)
 
     def on_mount(self) -> None:
         """Begin to read and to draw."""

@@ -201,16 +201,6 @@ class ConsoleState:
         """What is on the screen is old, or there is nothing yet."""
         return self.newest is None or self.silent_s > STALE_S
 
-    @property
-    def records_lost(self) -> int:
-        """Records missing from the log of this run."""
-        return self.newest.records_lost if self.newest else 0
-
-    @property
-    def unsent(self) -> int:
-        """Ticks, events, mode changes and replies that the supervisor could give to no console."""
-        return sum(self.newest.losses.unsent.values()) if self.newest else 0
-
     def show_next_loop(self) -> None:
         """Cycle through the loops."""
         names = list(self.loops)

@@ -5,12 +5,6 @@ Times are fixed: the monotonic clock reads `START_S` at the first message, wall 
 
 from __future__ import annotations
 
-import queue
-import threading
-import time
-from collections.abc import Callable, Iterator
-
-import msgspec
 import numpy as np
 
 from fitctl.logging.records import (
@@ -25,28 +19,42 @@ from fitctl.logging.records import (
     Tick,
 )
 from fitctl.supervisor.messages import (
-    AnyCommand,
     LoopLimits,
     LoopState,
-    RecentEvents,
-    Reply,
     SequenceStatus,
     SpotPlace,
-    Status,
     Telemetry,
     TrippedInterlock,
     Watched,
 )
 
 START_S = 1000.0
+
+
 WALL_MINUS_MONOTONIC_S = 1796021000.0
+
+
 MESSAGE_S = 0.05
+
+
 FRAME_S = 0.02
+
+
 SIZE_PX = 40
+
+
 BIAS_DN = 1000.0
+
+
 NOISE_DN = 20.0
+
+
 SPOT_SIGMA_PX = 0.75
+
+
 TARGET_PX = (24.0, 19.5)
+
+
 MODE_NUMBERS = {
     "OFF": 0,
     "STANDBY": 1,
@@ -56,15 +64,25 @@ MODE_NUMBERS = {
     "SAFE": 5,
     "EXPERIMENT": 6,
 }
+
+
 WITH_STAR = {"COARSE", "VERNIER", "EXPERIMENT"}
+
+
 LIMITS = LoopLimits(
     fsm_range_rad=1.772e-4,
     siderostat_travel_sky_arcsec=600.0,
     search_radius_sky_arcsec=215.0,
     spiral_pitch_sky_arcsec=50.0,
 )
+
+
 SPIRAL_S = 8.0
+
+
 # A few rows of the shipped table of interlocks: name, quantity, reading, low, high, action, in which modes.
+
+
 WATCHED = (
     ("star_lost", "star_flux_fraction", 0.98, 0.05, None, "warn", WITH_STAR),
     ("fsm_edge", "fsm_range_fraction", 0.31, None, 0.9, "warn", {"VERNIER"}),
@@ -75,6 +93,8 @@ WATCHED = (
     ("disk_space", "disk_free_bytes", 8.1e10, 1e9, None, "warn", set(MODE_NUMBERS)),
     ("piezo_limit", "piezo_limit_error_v", float("nan"), -1.0, 1.0, "safe", set()),
 )
+
+
 USABLE = {
     "OFF": ["Standby"],
     "STANDBY": ["Acquire", "Off"],
@@ -387,81 +407,3 @@ def _events() -> list[Event]:
             message="handed over to the mirror after 3.5 s",
         ),
     ]
-
-
-class FakeLink:
-    """Delivers what a test puts in, keeps what was sent, and answers as the test says.
-
-    What the console sends of its own accord, to keep the instrument and to hear of earlier events, is
-    only counted.
-    """
-
-    def __init__(self, answer: Callable[[AnyCommand], Reply] | None = None) -> None:
-        self.incoming: queue.Queue[Telemetry] = queue.Queue()
-        self.sent: list[AnyCommand] = []
-        self.kept = 0
-        self.asked_for_events = 0
-        self.closed = False
-        self._answer = answer or (lambda _command: Reply(accepted=True))
-
-    def deliver(self, messages: list[Telemetry]) -> None:
-        for message in messages:
-            self.incoming.put(message)
-
-    def receive(self, timeout_s: float) -> Telemetry | None:
-        try:
-            return self.incoming.get(timeout=min(timeout_s, 0.02))
-        except queue.Empty:
-            return None
-
-    def send(self, command: AnyCommand) -> Reply:
-        if isinstance(command, Status):
-            self.kept += 1
-        elif isinstance(command, RecentEvents):
-            self.asked_for_events += 1
-        else:
-            self.sent.append(command)
-        return self._answer(command)
-
-    def close(self) -> None:
-        self.closed = True
-
-
-class LiveLink(FakeLink):
-    """The fake supervisor in real time, through the codec as over a socket: for looking and measuring."""
-
-    def __init__(self, supervisor: FakeSupervisor) -> None:
-        super().__init__()
-        self._messages = self._paced(supervisor)
-        self._lock = threading.Lock()
-
-    def receive(self, timeout_s: float) -> Telemetry | None:
-        with self._lock:
-            return next(self._messages)
-
-    def _paced(self, supervisor: FakeSupervisor) -> Iterator[Telemetry]:
-        decoder = msgspec.msgpack.Decoder(Telemetry)
-        ready = [msgspec.msgpack.encode(message) for message in supervisor.messages(600)]
-        shift_s = time.monotonic() - START_S
-        due_s = time.monotonic()
-        while True:
-            for encoded in ready:
-                due_s += MESSAGE_S
-                time.sleep(max(0.0, due_s - time.monotonic()))
-                yield _shifted(decoder.decode(encoded), shift_s)
-            shift_s += len(ready) * MESSAGE_S
-
-
-def _shifted(message: Telemetry, shift_s: float) -> Telemetry:
-    replace = msgspec.structs.replace
-    return replace(
-        message,
-        time_s=message.time_s + shift_s,
-        wall_minus_monotonic_s=message.wall_minus_monotonic_s - shift_s,
-        loops=[replace(loop, since_s=loop.since_s + shift_s) for loop in message.loops],
-        ticks=[replace(tick, time_s=tick.time_s + shift_s) for tick in message.ticks],
-        events=[replace(event, time_s=event.time_s + shift_s) for event in message.events],
-        mode_changes=[
-            replace(change, time_s=change.time_s + shift_s) for change in message.mode_changes
-        ],
-    )

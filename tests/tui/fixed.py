@@ -7,7 +7,8 @@ from pathlib import Path
 
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.widgets.spectrum import Spectrum
-from tests.tui.fake import START_S, FakeLink, FakeSupervisor
+from tests.tui.fake import START_S, FakeSupervisor
+from tests.tui.links import FakeLink
 
 MESSAGES = 420
 LOG_TIME_S = 1796021000.0

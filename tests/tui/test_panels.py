@@ -1,23 +1,18 @@
-import json
-import math
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
-import scipy.signal
 
 from fitctl.logging.records import Event
 from fitctl.supervisor.messages import Look, SequenceStatus, SetTarget, TrippedInterlock
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import VIEWS, keys_of
-from fitctl.tui.draw.frame import place
 from fitctl.tui.jog import JogPad
 from fitctl.tui.palette import parse_place
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.events import Events, event_lines
-from fitctl.tui.widgets.focalplane import FocalPlane, spot_marks, tick_marks
+from fitctl.tui.widgets.focalplane import FocalPlane
 from fitctl.tui.widgets.hand import Hand
 from fitctl.tui.widgets.header import Header
 from fitctl.tui.widgets.health import Devices, Timing
@@ -27,28 +22,12 @@ from fitctl.tui.widgets.margins import Margins
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.readings import DeviceList, Readings, in_units
 from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
-from fitctl.tui.widgets.spectrum import Spectrum, spectra_of
-from fitctl.tui.widgets.stages import Stages, working_point
+from fitctl.tui.widgets.spectrum import Spectrum
+from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
-from fitctl.tui.widgets.traces import Traces, axis_limit_px, trace_lines
+from fitctl.tui.widgets.traces import Traces
+from tests.tui.drawn import plain, shown
 from tests.tui.fake import START_S, FakeSupervisor
-
-
-def shown(supervisor, count=50):
-    state = ConsoleState(START_S)
-    for message in supervisor.messages(count):
-        state.accept(message, message.time_s)
-    state.now_s = state.received_s
-    return state
-
-
-def plain(lines):
-    return ["".join(segment.text for segment in line) for line in lines]
-
-
-def changed_tick(state, **fields):
-    state.loop.tick = msgspec.structs.replace(state.loop.tick, **fields)
-    return state.loop.tick
 
 
 def header(state):
@@ -117,6 +96,8 @@ PANELS = (
     printed,
     log_list,
 )
+
+
 MODES = ["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT"]
 
 
@@ -147,108 +128,6 @@ def test_nothing_is_wider_than_its_panel_at_80_columns(panel, mode):
     lines = plain(panel(shown(FakeSupervisor(mode), 450)).draw(columns, rows))
     assert len(lines) <= rows
     assert max(len(line.rstrip()) for line in lines) <= columns
-
-
-@pytest.mark.parametrize(
-    ("worst_px", "limit_px"),
-    [(0.0, 0.2), (0.15, 0.2), (0.3, 0.5), (0.99, 2.0), (7.0, 10.0), (19, 20)],
-)
-def test_the_scale_is_a_sensible_step_that_holds_all_and_shows_the_band(worst_px, limit_px):
-    assert axis_limit_px(np.array([worst_px, math.nan]), 0.1) == pytest.approx(limit_px)
-
-
-def test_the_scale_without_a_star_is_twice_the_requirement():
-    assert axis_limit_px(np.full(4, math.nan), 0.25) == pytest.approx(0.5)
-
-
-def test_the_trace_has_its_scale_beside_it():
-    lines = trace_lines(
-        np.array([1.0]),
-        np.array([0.0]),
-        now_s=1.0,
-        span_s=20.0,
-        limit_px=0.2,
-        requirement_px=0.1,
-        colour="#ffffff",
-        columns=40,
-        rows=9,
-    )
-    labels = [line[:5].strip() for line in plain(lines)]
-    assert labels == ["+0.2", "", "+0.1", "", "0", "", "−0.1", "", "−0.2"]
-
-
-def test_the_rms_is_compared_with_the_requirement():
-    good = "".join(plain(Traces(shown(FakeSupervisor(error_px=0.03), 400)).draw(80, 20)))
-    bad = "".join(plain(Traces(shown(FakeSupervisor(error_px=0.3), 400)).draw(80, 20)))
-    assert "✓" in good
-    assert "✗" not in good
-    assert "✗" in bad
-    assert "% of 0.1 px" in good
-    assert "mas on the sky" in good
-
-
-def test_the_working_point_is_at_a_corner_when_one_axis_uses_all():
-    state = shown(FakeSupervisor())
-    tick = changed_tick(state, fsm_az_rad=1.772e-4, fsm_el_rad=0.0, fsm_range_fraction=1.0)
-    assert working_point(tick) == (pytest.approx(1.0), 0.0)
-    tick = changed_tick(state, fsm_az_rad=0.0, fsm_el_rad=0.0, fsm_range_fraction=0.0)
-    assert working_point(tick) == (0.0, 0.0)
-
-
-def test_saturation_is_said_in_words():
-    state = shown(FakeSupervisor())
-    assert "SATURATED" not in "".join(plain(Stages(state).draw(39, 4)))
-    changed_tick(state, fsm_saturated=True, fsm_range_fraction=1.0)
-    drawn = "".join(plain(Stages(state).draw(39, 4)))
-    assert "SATURATED" in drawn
-    assert "✗" in drawn
-
-
-def test_the_search_is_shown_while_searching():
-    assert "search" in "".join(plain(Stages(shown(FakeSupervisor("ACQUISITION"))).draw(39, 4)))
-    assert "search" not in "".join(plain(Stages(shown(FakeSupervisor("VERNIER"))).draw(39, 4)))
-
-
-def test_the_window_and_the_centroid_are_where_the_tick_says():
-    state = shown(FakeSupervisor())
-    tick = changed_tick(state, star_az_px=10.2, star_el_px=30.1, window_az_px=10, window_el_px=30)
-    marks = tick_marks(tick, place(40, 40, 40, 20))
-    assert marks[10, 4].character == "+"
-    assert (marks[6, 2].character, marks[14, 2].character) == ("┌", "┐")
-
-
-def test_without_a_star_only_the_target_is_marked():
-    state = shown(FakeSupervisor("ACQUISITION"))
-    characters = {
-        mark.character for mark in tick_marks(state.loop.tick, place(40, 40, 40, 20)).values()
-    }
-    assert characters == {"▔", "│"}
-
-
-def test_a_fringe_spot_is_marked_on_its_light_and_named_in_the_caption():
-    state = shown(FakeSupervisor())
-    frame, placing = state.newest.frame, place(40, 40, 40, 20)
-    ((column, row),) = spot_marks(state.loop, placing)
-    az_px, el_px = placing.pixel(column, row)
-    image = np.frombuffer(frame.data, "<u2").reshape(40, 40).astype(int)
-    near = image[round(el_px) - 1 : round(el_px) + 2, round(az_px) - 1 : round(az_px) + 2]
-    assert near.sum() - 9 * np.median(image) > 0.5 * 11_000
-
-    caption = plain(FocalPlane(state).draw(40, 21))[-1]
-    assert "◦ fringe" in caption
-    assert "star" in caption
-
-
-def test_without_a_star_no_other_spot_is_marked():
-    assert not spot_marks(shown(FakeSupervisor("ACQUISITION")).loop, place(40, 40, 40, 20))
-
-
-def test_what_has_no_room_in_the_caption_is_the_light_and_not_a_spots_name():
-    state = shown(FakeSupervisor())
-    changed_tick(state, star_flux_dn=1_234_567.0)
-    caption = plain(FocalPlane(state).draw(40, 21))[-1]
-    assert "◦ fringe" in caption
-    assert "DN" not in caption
 
 
 def test_an_ill_device_keeps_a_row_of_its_own_and_comes_first():
@@ -390,69 +269,6 @@ def test_a_list_scrolls_to_what_is_chosen():
         chosen = [line for line in lines if line.startswith("▌")]
         assert len(chosen) == 1
         assert readings.watched()[wanted].name in chosen[0]
-
-
-def test_the_siderostat_is_told_with_its_limits_and_warned_of_near_them():
-    state = shown(FakeSupervisor())
-    assert "of ±600″" in "".join(plain(Stages(state).draw(100, 9)))
-    changed_tick(state, siderostat_az_sky_arcsec=590.0)
-    assert "″!" in "".join(plain(Stages(state).draw(100, 9)))
-
-
-def test_the_search_has_its_map_with_the_way_and_the_field():
-    lines = plain(Traces(shown(FakeSupervisor("ACQUISITION"), 400)).draw(76, 20))
-    told = "\n".join(lines)
-    assert "searched 37 %" in told
-    assert "field, 108″" in told
-    assert "radius 215″" in told
-
-
-def test_the_spectrum_has_a_line_where_the_error_has_one():
-    times_s = np.arange(0, 20, 0.02)
-    tone = np.sqrt(2) * 0.05 * np.sin(2 * np.pi * 4.0 * times_s)
-    spectra = spectra_of(scipy.signal, np.column_stack([times_s, tone, 0 * tone]))
-    peak_hz = spectra.frequency_hz[np.argmax(spectra.density_px_per_sqrt_hz[:, 0])]
-    assert peak_hz == pytest.approx(4.0, abs=0.2)
-    step_hz = np.diff(spectra.frequency_hz)[0]
-    rms_px = np.sqrt(np.sum(spectra.density_px_per_sqrt_hz**2, axis=0) * step_hz)
-    assert rms_px == pytest.approx([0.05, 0.0], abs=0.003)
-
-
-def test_the_spectrum_is_of_the_ticks_since_the_star_was_missed():
-    errors = np.column_stack([np.arange(200) * 0.02, np.zeros((200, 2))])
-    errors[150, 1:] = math.nan
-    assert spectra_of(scipy.signal, errors) is None
-    errors[150, 1:] = 0.0
-    errors[20, 1:] = math.nan
-    assert spectra_of(scipy.signal, errors) is not None
-
-
-def test_margins_are_judged_against_what_is_usual():
-    margins = Margins(shown(FakeSupervisor(), 400))
-    told = {
-        "stable": True,
-        "crossover_hz": 3.9,
-        "phase_margin_deg": 22.7,
-        "gain_margin_db": 7.1,
-        "peak_sensitivity": 1.9,
-        "attenuation_1hz": 6.1,
-        "residual_px": 0.0131,
-    }
-    margins.told("minimum-variance", json.dumps(told), 0)
-    lines = plain(margins.draw(60, 12))
-    assert next(line for line in lines if "phase" in line).endswith("▲")
-    assert next(line for line in lines if "gain" in line).endswith("✓")
-    assert any("0.0131 px, by linear theory" in line for line in lines)
-    margins.told("minimum-variance", "design: no such loop", 2)
-    assert "✗ design: no such loop" in "\n".join(plain(margins.draw(60, 12)))
-
-
-def test_the_tick_is_broken_down_into_parts_that_make_up_the_whole():
-    state = shown(FakeSupervisor(), 400)
-    lines = plain(Breakdown(state).draw(100, 8))
-    median = {line.split()[0]: float(line.split()[1]) for line in lines[1:]}
-    whole = median["sense"] + median["decide"] + median["write"]
-    assert whole == pytest.approx(median["tick"], abs=0.02)
 
 
 def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():

@@ -10,7 +10,6 @@ from textual.binding import BindingType
 from fitctl.logging.errors import LogError
 from fitctl.logging.folder import keep
 from fitctl.tui.commands import keys_of
-from fitctl.tui.jobs import Job
 from fitctl.tui.views.listing import ListingView
 from fitctl.tui.widgets.loglist import LogList
 from fitctl.tui.widgets.printed import Printed
@@ -30,34 +29,18 @@ class LogsView(ListingView):
     view_name = "logs"
     BINDINGS: ClassVar[list[BindingType]] = [key.binding() for key in keys_of("logs") if key.action]
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._job: Job | None = None
-
     def parts(self) -> ComposeResult:
         """Two panels."""
         yield LogList(self.state, "Logs", self.console.log_folder)
         yield Printed(self.state, "Printed", HINT)
-
-    def on_unmount(self) -> None:
-        """Leave no child behind."""
-        if self._job is not None:
-            self._job.end()
 
     def action_tool(self, name: str) -> None:
         """Run a fitctl command on the chosen log."""
         log = self.query_one(LogList).chosen_log
         if log is None:
             self.notify("there is no log yet", timeout=3)
-        elif self._job is not None and self._job.status is None:
-            self.notify(f"still at work: {self._job.told}", severity="warning", timeout=4)
         else:
-            if self._job is not None:
-                self._job.end()
-            self._job = self.query_one(Printed).job = self.console.start_job(
-                [*TOOLS[name], str(log.path)]
-            )
-            self.console.draw_all()
+            self.query_one(Printed).start(self.console.start_job, *TOOLS[name], str(log.path))
 
     def action_keep(self) -> None:
         """Mark the chosen log, so that it is never deleted, or take the mark away."""

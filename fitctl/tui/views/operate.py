@@ -61,7 +61,7 @@ class OperateView(View):
 
     def parts(self) -> ComposeResult:
         """All panels, in reading order; the stylesheet places them."""
-        yield FocalPlane(self.state, "Focal plane")
+        yield FocalPlane(self.state, "Focal plane", self.console.pictures)
         yield Traces(self.state, "Pointing error")
         yield Stages(self.state, "Mirror and siderostat")
         with Container(id="health"):
@@ -69,6 +69,10 @@ class OperateView(View):
             yield Timing(self.state, "Timing and log")
         yield Events(self.state, "Events")
         yield Hand(self.state, self.pad)
+
+    def on_screen_suspend(self) -> None:
+        """A picture would lie over what is shown next; characters show through a dialog."""
+        self._plane.redraw()
 
     def keys_now(self) -> list[Key]:
         """What the arrow keys are for."""

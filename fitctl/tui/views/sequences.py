@@ -42,7 +42,6 @@ class SequencesView(ListingView):
         super().__init__()
         self._folder = tempfile.TemporaryDirectory(prefix="fitctl-console-")
         self._list: Job | None = None
-        self._job: Job | None = None
 
     def parts(self) -> ComposeResult:
         """Two lists, and two panels below them."""
@@ -58,10 +57,9 @@ class SequencesView(ListingView):
         self._list = self.console.start_job(["sequence", "list", "--json"])
 
     def on_unmount(self) -> None:
-        """What was begun is ended, but a sequence on the instrument goes on."""
-        for job in (self._list, self._job):
-            if job is not None:
-                job.end()
+        """What was asked for is not waited for."""
+        if self._list is not None:
+            self._list.end()
         self._folder.cleanup()
 
     def before_drawing(self) -> None:
@@ -74,7 +72,7 @@ class SequencesView(ListingView):
             self._take(json.loads(job.text()))
             job.end()
         else:
-            self.query_one(Printed).job = self._job = job  # it says why
+            self.query_one(Printed).job = job  # it says why
 
     def _take(self, documents: list[dict[str, Any]]) -> None:
         sequences = self.query_one(SequenceList)
@@ -98,7 +96,7 @@ class SequencesView(ListingView):
             if value is not None:
                 step[parameter.key] = parsed(value)
                 sequences.edited.add(document["file"])
-                self._start(["sequence", "check", self._file(), *self.console.rig_arguments])
+                self._start("check")
 
         told = (
             f"step {parameter.step + 1}, {step['step']}: {parameter.key} (is {parameter.value!r})"
@@ -108,7 +106,7 @@ class SequencesView(ListingView):
     def action_dry_run(self) -> None:
         """Rehearse the chosen sequence on the virtual clock."""
         if self._chosen():
-            self._start(["sequence", "dry-run", self._file(), *self.console.rig_arguments])
+            self._start("dry-run")
 
     def action_go(self) -> None:
         """Run the chosen sequence on the instrument, once the operator has said yes."""
@@ -117,10 +115,7 @@ class SequencesView(ListingView):
             return
         steps = ", ".join(step["step"] for step in document["steps"])
         question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
-        file = self._file()
-        console = self.console
-        arguments = ["sequence", "run", file, *console.rig_arguments, *console.remote_arguments]
-        self.console.ask("Run", question, lambda: self._start(arguments, outlives=True))
+        self.console.ask("Run", question, lambda: self._start("run", outlives=True))
 
     def action_pause(self) -> None:
         """Pause what is under way, or let it go on."""
@@ -162,16 +157,12 @@ class SequencesView(ListingView):
         path.write_text(tomli_w.dumps({k: v for k, v in document.items() if k != "file"}))
         return str(path)
 
-    def _start(self, arguments: list[str], *, outlives: bool = False) -> None:
-        if self._job is not None and self._job.status is None:
-            self.notify(f"still at work: {self._job.told}", severity="warning", timeout=4)
-            return
-        if self._job is not None:
-            self._job.end()
-        self._job = self.query_one(Printed).job = self.console.start_job(
-            arguments, outlives=outlives
-        )
-        self.console.draw_all()
+    def _start(self, word: str, *, outlives: bool = False) -> None:
+        """Do something with the chosen sequence."""
+        arguments = ["sequence", word, self._file(), *self.console.rig_arguments]
+        if word == "run":
+            arguments += self.console.remote_arguments
+        self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
 
 
 def parsed(value: str) -> Any:

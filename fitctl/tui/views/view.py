@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from textual.app import ComposeResult
@@ -51,9 +52,9 @@ class View(Screen[None]):
             yield from self.parts()
         yield Keys(self.state, self.view_name, self.keys_now)
 
+    @abstractmethod
     def parts(self) -> ComposeResult:
         """The screen's own part."""
-        raise NotImplementedError
 
     def keys_now(self) -> list[Key]:
         """Keys that go before the screen's own, at this moment."""
@@ -81,7 +82,7 @@ class View(Screen[None]):
         """Draw the panels whose turn it is; all without a beat."""
         self.set_class(self.state.stale, "stale")
         self.before_drawing()
-        for panel in self.query(Panel):
+        for panel in self.query(Panel):  # type: ignore[type-abstract]  # finds subclasses
             if panel.display and (beat is None or beat % panel.every == 0):
                 panel.redraw()
 

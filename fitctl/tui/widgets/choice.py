@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import ClassVar
 
 from textual.events import Click, MouseScrollDown, MouseScrollUp
@@ -46,9 +47,9 @@ class Choice(Panel):
         """Lines that stay above the rows."""
         return []
 
+    @abstractmethod
     def rows(self, columns: int) -> list[Line]:
         """One line for each row."""
-        raise NotImplementedError
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """The head, and as many rows as there is room for about the chosen one."""

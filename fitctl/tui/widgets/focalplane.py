@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from textual.events import Click
 from textual.message import Message
 
-from fitctl.config import HALF_WINDOW_PX
 from fitctl.logging.records import FrameRecord, Tick
-from fitctl.tui.draw.colours import ANCHORS, colour_map
+from fitctl.tui.draw.colours import ANCHORS, LEVELS, colour_map
 from fitctl.tui.draw.frame import (
     STRETCHES,
     Mark,
     Marks,
     Placing,
-    box_marks,
     frame_lines,
     levels_on_screen,
     place,
-    reticle_marks,
 )
+from fitctl.tui.draw.overlays import (
+    OTHER_SPOT,
+    OVERLAY_INKS,
+    Overlay,
+    cell_marks,
+    paint,
+    tick_overlays,
+)
+from fitctl.tui.graphics import PictureSender, cell_size_px
 from fitctl.tui.look import (
     DIM,
     FAINT,
@@ -30,7 +36,6 @@ from fitctl.tui.look import (
     INK,
     ORANGE,
     PINK,
-    SKY,
     WHITE,
     YELLOW,
     Line,
@@ -42,13 +47,18 @@ from fitctl.tui.look import (
 from fitctl.tui.state import ConsoleState, LoopView
 from fitctl.tui.widgets.panel import Panel
 
-WINDOW_PX = 2 * HALF_WINDOW_PX + 1
-"""Side of the centroid's window; a tick names its central pixel."""
-OTHER_SPOT = "◦"
+PICTURE_BEATS = 3
+TERMINAL = 1  # the file descriptor that Textual writes to
 
 
 class FocalPlane(Panel):
-    """The frame as half blocks, elevation up.
+    """The frame as half blocks, or as a picture where the terminal draws them, elevation up.
+
+    Parameters
+    ----------
+    state : ConsoleState
+    title : str
+    pictures : PictureSender, optional
 
     Attributes
     ----------
@@ -68,8 +78,12 @@ class FocalPlane(Panel):
             self.az_px = az_px
             self.el_px = el_px
 
-    def __init__(self, state: ConsoleState, title: str = "") -> None:
+    def __init__(
+        self, state: ConsoleState, title: str = "", pictures: PictureSender | None = None
+    ) -> None:
         super().__init__(state, title)
+        self._pictures = pictures
+        self._beats = 0
         self.colours = next(iter(ANCHORS))
         self.stretch = next(iter(STRETCHES))
         self.cursor_px: tuple[float, float] | None = None
@@ -85,16 +99,58 @@ class FocalPlane(Panel):
             return [[] for _ in range((rows - 1) // 2)] + note
         image = np.frombuffer(frame.data, dtype="<u2").reshape(frame.height_px, frame.width_px)
         placing = self._placing = place(frame.width_px, frame.height_px, columns, rows)
-        marks = self._marks(tick, placing)
         caption = self._caption(frame, tick, columns - placing.left)
         below = placing.top + placing.rows
+        levels = levels_on_screen(image, placing, self.stretch)
+        if self._has_room_for_pictures():
+            lines: list[Line] = [[] for _ in range(rows)]
+            self._picture(levels, placing, min(placing.rows, rows - 1 - placing.top))
+            lines[min(below, rows - 1)] = [text(" " * placing.left), *caption]
+            return lines
+        self.clear()
+        marks = cell_marks(self._overlays(), placing)
         if below >= rows:
             marks |= _written_over(caption, placing.left, rows - 1)
-        levels = levels_on_screen(image, placing, self.stretch)
         lines = frame_lines(levels, placing, marks, columns, rows, colour_map(self.colours))
         if below < rows:
             lines[below] = pad([text(" " * placing.left), *caption], columns)
         return lines
+
+    def clear(self) -> None:
+        """Take a picture away, if there is one."""
+        if self._pictures is not None:
+            self._pictures.clear()
+
+    def _has_room_for_pictures(self) -> bool:
+        """Nothing lies over the panel, and what it shows is not old, which would have to be faded."""
+        if self._pictures is None or self.state.stale or not self.screen.is_active:
+            return False
+        return not self.screen.query("Toast") and cell_size_px(TERMINAL) is not None
+
+    def _picture(self, levels: NDArray[np.int64], placing: Placing, rows: int) -> None:
+        """Send the frame with its overlays, now and then."""
+        self._beats += 1
+        cell_px, pictures = cell_size_px(TERMINAL), self._pictures
+        if pictures is None or cell_px is None or self._beats % PICTURE_BEATS:
+            return
+        shades = min(LEVELS, pictures.most_inks - len(OVERLAY_INKS))
+        colours = colour_map(self.colours)
+        steps = np.linspace(0, LEVELS - 1, shades).round().astype(int)
+        inks = [*(colours[step] for step in steps), *OVERLAY_INKS]
+        width_px, height_px = placing.columns * cell_px[0], placing.rows * cell_px[1]
+        down = np.arange(height_px) * levels.shape[0] // height_px
+        across = np.arange(width_px) * levels.shape[1] // width_px
+        picture = (levels * shades // LEVELS).astype(np.uint8)[np.ix_(down, across)]
+        paint(self._overlays(), picture, placing, inks)
+        region = self.content_region
+        at = (region.x + placing.left, region.y + placing.top)
+        cells = (placing.columns, rows)
+
+        def send() -> None:
+            if self._has_room_for_pictures():
+                pictures.show(picture[: rows * cell_px[1]], inks, at, cells)
+
+        self.call_after_refresh(send)  # after what Textual has to send, which would wipe it out
 
     def on_click(self, event: Click) -> None:
         """Say which pixel it was."""
@@ -112,20 +168,20 @@ class FocalPlane(Panel):
         """Take the next stretch."""
         self.stretch = _next(list(STRETCHES), self.stretch)
 
-    def _marks(self, tick: Tick | None, placing: Placing) -> Marks:
-        marks: Marks = {}
-        for name, loop in self.state.loops.items():  # one camera sees the stars of all loops
+    def _overlays(self) -> list[Overlay]:
+        """The shown loop's on top of those of others, whose stars the same camera sees."""
+        found: list[Overlay] = []
+        for name, loop in self.state.loops.items():
             if name != self.state.shown and loop.tick is not None:
-                marks |= spot_marks(loop, placing, DIM)
-                marks |= tick_marks(loop.tick, placing, target=FAINT, window=DIM)
-        if self.state.loop is not None and tick is not None:
-            marks |= spot_marks(self.state.loop, placing)
-            marks |= tick_marks(tick, placing)
+                found += spot_overlays(loop, DIM)
+                found += tick_overlays(loop.tick, target=FAINT, window=DIM)
+        shown = self.state.loop
+        if shown is not None and shown.tick is not None:
+            found += spot_overlays(shown)
+            found += tick_overlays(shown.tick)
         if self.cursor_px is not None:
-            column, row = placing.column(self.cursor_px[0]), placing.row(self.cursor_px[1])
-            marks |= reticle_marks(column, row, (1, 1), YELLOW)
-            marks[math.floor(column), math.floor(row)] = Mark("╳", YELLOW)
-        return marks
+            found.append(Overlay("cursor", *self.cursor_px, YELLOW))
+        return found
 
     def _caption(self, frame: FrameRecord, tick: Tick | None, columns: int) -> Line:
         if self.cursor_px is not None:
@@ -143,40 +199,17 @@ class FocalPlane(Panel):
         return whole if width(whole) <= columns else [*star, *legend]
 
 
-def tick_marks(tick: Tick, placing: Placing, target: str = SKY, window: str = GREEN) -> Marks:
-    """What a tick says about the frame: the target always; window and centroid while the star is seen.
-
-    `target` and `window` are their colours.
-    """
-    at = placing.column(tick.target_az_px), placing.row(tick.target_el_px)
-    half_columns = math.ceil((WINDOW_PX / 2) * placing.zoom / placing.shrink)
-    half_rows = math.ceil(half_columns / 2)
-    marks = reticle_marks(*at, (half_columns + 3, half_rows + 2), target)
-    if tick.star_visible:
-        low_az, low_el = tick.window_az_px - WINDOW_PX / 2, tick.window_el_px - WINDOW_PX / 2
-        marks |= box_marks(
-            math.floor(placing.column(low_az)) - 1,
-            math.floor(placing.row(low_el + WINDOW_PX)) - 1,
-            math.ceil(placing.column(low_az + WINDOW_PX)),
-            math.ceil(placing.row(low_el)),
-            window,
-        )
-        centroid = placing.column(tick.star_az_px), placing.row(tick.star_el_px)
-        marks[math.floor(centroid[0]), math.floor(centroid[1])] = Mark("+")
-    return marks
-
-
-def spot_marks(loop: LoopView, placing: Placing, colour: str = PINK) -> Marks:
+def spot_overlays(loop: LoopView, colour: str = PINK) -> list[Overlay]:
     """Where a loop's other spots are, from the star that its last tick measured; none without a star."""
     tick = loop.tick
     if tick is None or not tick.star_visible:
-        return {}
-    marks: Marks = {}
-    for spot in loop.state.other_spots:
-        column = placing.column(tick.star_az_px + spot.az_offset_px)
-        row = placing.row(tick.star_el_px + spot.el_offset_px)
-        marks[math.floor(column), math.floor(row)] = Mark(OTHER_SPOT, colour)
-    return marks
+        return []
+    return [
+        Overlay(
+            "spot", tick.star_az_px + spot.az_offset_px, tick.star_el_px + spot.el_offset_px, colour
+        )
+        for spot in loop.state.other_spots
+    ]
 
 
 def _next(names: list[str], name: str) -> str:

@@ -110,15 +110,13 @@ class Timing(Panel):
         newest, loop = self.state.newest, self.state.loop
         if newest is None or loop is None:
             return []
-        recorder = _recorder(newest, self.state.records_lost, columns)
+        recorder = _recorder(newest, newest.records_lost, columns)
         if loop.timing is None:
             return [[text("no timing yet", DIM)], recorder]
+        unsent = sum(newest.losses.unsent.values())
         if rows < TABLE_FROM_ROWS:
-            return [
-                *_dense(loop.timing, self.state.unsent, newest.scheduling, columns),
-                recorder,
-            ]
-        table = _table(loop.timing, self.state.unsent)
+            return [*_dense(loop.timing, unsent, newest.scheduling, columns), recorder]
+        table = _table(loop.timing, unsent)
         notes = textwrap.wrap(newest.scheduling, columns)[: rows - len(table) - 1]
         return [*table, *([text(note, DIM)] for note in notes), recorder]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import ClassVar
 
 from textual.geometry import Region
@@ -38,9 +39,9 @@ class Panel(Widget, can_focus=False):
         self.border_title = title
         self._strips: list[Strip] = []
 
+    @abstractmethod
     def draw(self, columns: int, rows: int) -> list[Line]:
         """Lines of the whole content, uppermost first; what is too long is cut."""
-        raise NotImplementedError
 
     def redraw(self) -> None:
         """Draw anew, and ask for a repaint of the lines that differ."""

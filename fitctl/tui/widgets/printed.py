@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from typing import ClassVar
 
 from fitctl.tui.jobs import Job
@@ -19,7 +20,7 @@ class Printed(Panel):
     Attributes
     ----------
     job : Job or None
-        It belongs to the screen.
+        Ended with the panel, unless it outlives the console.
     """
 
     every: ClassVar[int] = 3
@@ -28,6 +29,21 @@ class Printed(Panel):
         super().__init__(state, title)
         self._hint = hint
         self.job: Job | None = None
+
+    def on_unmount(self) -> None:
+        """Leave no child behind."""
+        if self.job is not None:
+            self.job.end()
+
+    def start(self, start_job: Callable[..., Job], *arguments: str, outlives: bool = False) -> None:
+        """Run another fitctl command, unless the one before is still at work."""
+        if self.job is not None and self.job.status is None:
+            self.notify(f"still at work: {self.job.told}", severity="warning", timeout=4)
+            return
+        if self.job is not None:
+            self.job.end()
+        self.job = start_job(arguments, outlives=outlives)
+        self.redraw()
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """The command and its state, then its last lines."""

@@ -1,0 +1,222 @@
+"""The screens with lists: devices and readings, sequences, logs."""
+
+from pathlib import Path
+
+import pytest
+from textual.widgets import Input
+
+from fitctl.supervisor.messages import (
+    Reset,
+    SequenceControl,
+    SequenceStatus,
+)
+from fitctl.tui.dialogs import Ask, Confirm, Reader
+from fitctl.tui.views.sequences import parsed
+from fitctl.tui.widgets.loglist import LogList
+from fitctl.tui.widgets.printed import Printed
+from fitctl.tui.widgets.readings import Readings
+from fitctl.tui.widgets.sequencing import Parameters, SequenceList
+from tests.tui.fake import FakeSupervisor
+from tests.tui.fixed import make_logs, settle
+from tests.tui.piloted import pressed, run, sent
+
+# ---------------------------------------------------------------- devices
+
+
+def test_a_device_and_a_reading_are_told_in_full():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "2", "down", "enter")
+        assert isinstance(app.screen, Reader)
+        assert app.screen._title == "right siderostat"
+        await pressed(app, pilot, "escape", "tab", "down", "enter")
+        assert app.screen._title == "fsm_edge"
+
+    run(scenario)
+
+
+def test_an_interlock_is_reset_from_its_row():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "2", "n")  # no reading is chosen yet
+        await pressed(app, pilot, "tab", "down", "down", "n")
+
+    assert sent(run(scenario)) == [Reset(loop="right", name="following_error")]
+
+
+def test_a_click_chooses_a_row_and_its_list():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "2")
+        await pilot.click(Readings, offset=(5, 4))
+        await settle(app, pilot)
+        readings = app.view.query_one(Readings)
+        assert readings.active
+        assert readings.now().name == "following_error"
+
+    run(scenario)
+
+
+# ---------------------------------------------------------------- sequences
+
+
+def test_a_sequence_is_rehearsed():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "d")
+        assert app.jobs[-1].arguments == ["sequence", "dry-run", "jog.toml"]
+        assert not app.jobs[-1].outlives
+        assert "last line" in app.view.query_one(Printed).render_line(2).text
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("answer", "runs"), [("y", True), ("n", False)])
+def test_a_sequence_runs_on_the_instrument_once_the_operator_says_yes(answer, runs):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "g")
+        assert isinstance(app.screen, Confirm)
+        await pressed(app, pilot, answer)
+        started = [job for job in app.jobs if job.arguments[:2] == ["sequence", "run"]]
+        assert [job.arguments[2] for job in started] == (["jog.toml"] if runs else [])
+        assert all(job.outlives for job in started)
+
+    app = run(scenario)
+    assert all(job.ended for job in app.jobs if job.arguments[:2] == ["sequence", "run"])
+
+
+def test_a_parameter_is_edited_checked_and_used():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "tab", *["down"] * 6, "enter")
+        assert isinstance(app.screen, Ask)
+        app.screen.query_one(Input).value = "0.5"
+        await pressed(app, pilot, "enter")
+        job = app.jobs[-1]
+        assert job.arguments[:2] == ["sequence", "check"]
+        assert "jog_px = 0.5" in Path(job.arguments[2]).read_text()
+        assert "jog*" in app.view.query_one(SequenceList).render_line(1).text
+        await pressed(app, pilot, "d")
+        assert app.jobs[-1].arguments[2] == job.arguments[2]
+        edited.append(job.arguments[2])
+
+    edited: list[str] = []
+    run(scenario)
+    assert not Path(edited[0]).exists()
+
+
+def test_editing_is_left_by_escape_and_s_is_a_letter_there():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "tab", "down", "enter", "s", "escape")
+        assert not app.view.query_one(SequenceList).edited
+
+    assert sent(run(scenario)) == []
+
+
+def test_a_file_of_ones_own_is_opened(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.touch()
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "f")
+        app.screen.query_one(Input).value = str(tmp_path / "no.toml")
+        await pressed(app, pilot, "enter")
+        assert isinstance(app.screen, Ask)
+        app.screen.query_one(Input).value = str(path)
+        await pressed(app, pilot, "enter")
+        assert ["sequence", "list", "--json", str(path)] in [job.arguments for job in app.jobs]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(
+    ("state", "wanted", "key", "action"),
+    [
+        ("running", "run", "p", "pause"),
+        ("paused", "pause", "p", "resume"),
+        ("running", "pause", "p", "resume"),
+        ("running", "run", "z", "stop"),
+    ],
+)
+def test_what_runs_is_paused_resumed_and_ended_wherever_it_was_started(state, wanted, key, action):
+    supervisor = FakeSupervisor()
+    supervisor.running_sequence = SequenceStatus(
+        run="1", name="jog", state=state, steps=3, step_number=2, step="hold", wanted=wanted
+    )
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", key)
+
+    assert sent(run(scenario, supervisor=supervisor)) == [
+        SequenceControl(loop="right", action=action)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1.5", 1.5), ("3", 3), ("true", True), ("right", "right"), ('"a b"', "a b"), ("", "")],
+)
+def test_a_value_is_read_as_toml_or_as_text(text, value):
+    assert parsed(text) == value
+
+
+def test_without_an_active_parameter_nothing_is_edited():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "enter")
+        assert not app.screen.is_modal
+        app.view.query_one(Parameters).chosen = 0
+        await pressed(app, pilot, "tab", "enter")  # a step's own row
+        assert not app.screen.is_modal
+
+    run(scenario)
+
+
+# ---------------------------------------------------------------- logs
+
+
+@pytest.mark.parametrize(
+    ("key", "command"),
+    [("enter", ["log", "info"]), ("f", ["log", "verify"]), ("t", ["report"]), ("y", ["replay"])],
+)
+def test_a_log_is_looked_into_by_the_command_for_it(tmp_path, key, command):
+    make_logs(tmp_path)
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "5", "down", key)
+        log = str(tmp_path / "fit-mock_20261131T031500Z.mcap")
+        assert app.jobs[-1].arguments == [*command, log]
+
+    run(scenario, log_folder=tmp_path)
+
+
+def test_a_log_is_kept_and_no_longer(tmp_path):
+    make_logs(tmp_path)
+    mark = tmp_path / "fit-mock_20261132T031500Z.mcap.keep"
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "5", "m")
+        assert mark.exists()
+        await pressed(app, pilot, "m")
+        assert not mark.exists()
+
+    run(scenario, log_folder=tmp_path)
+
+
+def test_the_log_that_is_recorded_is_marked_and_a_new_one_does_not_take_the_choice(tmp_path):
+    make_logs(tmp_path)
+    (tmp_path / "fit-mock-20261130T031500Z.mcap").touch()
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "5", "down", "down")
+        logs = app.view.query_one(LogList)
+        rows = [logs.render_line(y).text for y in range(1, 5)]
+        assert [row for row in rows if "recording" in row and "fit-mock-2026" in row]
+        chosen = logs.chosen_log.path
+        (tmp_path / "another.mcap").touch()
+        logs.look()
+        assert logs.chosen_log.path == chosen
+
+    run(scenario, log_folder=tmp_path)
+
+
+def test_a_folder_that_does_not_exist_is_an_empty_list(tmp_path):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "5", "enter", "m")
+        assert "no log in" in app.view.query_one(LogList).render_line(1).text
+
+    run(scenario, log_folder=tmp_path / "none")
