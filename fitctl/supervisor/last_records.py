@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from fitctl.logging.queue import RecordQueue
 from fitctl.supervisor.children import END_S, Child
 
-HELLO_S = 15.0  # for a recorder that is still being started, on a machine with too much to do
+HELLO_S = 60.0  # for a recorder that is still being started, on a machine with far too much to do
+_SILENT_S = 2.0  # so long nobody wonders
 _LAST_WORD_S = 0.2  # for a confirmation that is on its way still
 
 
-def finish_log(queue: RecordQueue, recorder: Child) -> str:
+def finish_log(queue: RecordQueue, recorder: Child, tell: Callable[[str], None]) -> None:
     """Let the recorder write everything and end, and close the queue.
 
     A recorder that is told to end while it is still being started ends at once, without a log; so it is
     told only when it has been sent everything.
 
-    Returns
-    -------
-    str
-        What may be missing from the log, and the next step; empty if nothing is.
+    Parameters
+    ----------
+    queue : RecordQueue
+    recorder : Child
+    tell : callable
+        Takes a line for people where this takes long, and where something may be missing from the log.
     """
-    queue.pump_while(lambda: recorder.running and queue.unsent, HELLO_S)
+
+    def unsent() -> bool:
+        return recorder.running and queue.unsent > 0
+
+    queue.pump_while(unsent, _SILENT_S)
+    if unsent():
+        tell(f"waiting for the recorder to take the records of this run, up to {HELLO_S:g} s")
+        queue.pump_while(unsent, HELLO_S)
     recorder.ask_to_end()
     queue.pump_while(lambda: recorder.running, END_S)
     hung = recorder.running
@@ -28,10 +40,9 @@ def finish_log(queue: RecordQueue, recorder: Child) -> str:
     queue.pump_while(lambda: queue.waiting, _LAST_WORD_S)
     missing = queue.waiting
     queue.close(timeout_s=0.0)
-    if not (hung or missing):
-        return ""
-    why = f"did not end within {END_S:g} s and was killed; it " if hung else ""
-    return (
-        f"the recorder {why}did not confirm the last {missing} of {queue.offered} records; what it has not "
-        "written is not in the log; an unfinished file is mended by: fitctl log recover"
-    )
+    if hung or missing:
+        why = f"did not end within {END_S:g} s and was killed; it " if hung else ""
+        tell(
+            f"the recorder {why}did not confirm the last {missing} of {queue.offered} records; what it has "
+            "not written is not in the log; an unfinished file is mended by: fitctl log recover"
+        )

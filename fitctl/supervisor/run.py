@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 from fitctl.clock import MonotonicClock
@@ -196,9 +197,7 @@ def run_supervisor(
             for thread in threads:
                 thread.stop()
             service.stop()
-            missing = finish_log(queue, children[0])
-            if missing:
-                print(missing, file=sys.stderr)
+            finish_log(queue, children[0], partial(print, file=sys.stderr, flush=True))
 
 
 def _children(

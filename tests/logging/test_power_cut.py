@@ -150,6 +150,7 @@ def test_a_full_disk_costs_nothing_once_there_is_room_again(queue, tmp_path):
     queue.offer(RUN_INFO)
     first = start_recorder(f"ipc://{tmp_path}/records", folder, SHIPPED, stderr=subprocess.PIPE)
     try:
+        wait_until(lambda: begun(folder), timeout_s=20)
         count = offer_for(queue, 1.5)
         (path,) = logs_in(folder)
         resource.prlimit(first.pid, resource.RLIMIT_FSIZE, (path.stat().st_size + 5000,) * 2)

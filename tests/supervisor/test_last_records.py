@@ -45,6 +45,13 @@ def queue(endpoint):
     queue.close()
 
 
+def finished(queue, recorder):
+    """What is said while the log is finished."""
+    said = []
+    finish_log(queue, recorder, said.append)
+    return said
+
+
 def test_a_recorder_that_comes_late_is_not_told_to_end_before_it_is_there(queue, endpoint):
     told = []
 
@@ -61,14 +68,16 @@ def test_a_recorder_that_comes_late_is_not_told_to_end_before_it_is_there(queue,
         receiver.confirm(9)
         receiver.close()
 
-    assert finish_log(queue, Recorder(late)) == ""
+    said = finished(queue, Recorder(late))
+
+    assert said == []
     assert not any(told)
 
 
 def test_records_that_a_dead_recorder_did_not_take_are_counted_at_once(queue):
     begun_s = time.monotonic()
 
-    said = finish_log(queue, Recorder(lambda _: iter(())))
+    (said,) = finished(queue, Recorder(lambda _: iter(())))
 
     assert "the recorder did not confirm the last 10 of 10 records" in said
     assert time.monotonic() - begun_s < last_records.HELLO_S / 3
@@ -82,10 +91,13 @@ def test_a_recorder_that_confirms_a_part_leaves_the_rest_counted(queue, endpoint
         receiver.confirm(3)
         receiver.close()
 
-    assert "did not confirm the last 6 of 10 records" in finish_log(queue, Recorder(takes_four))
+    (said,) = finished(queue, Recorder(takes_four))
+
+    assert "did not confirm the last 6 of 10 records" in said
 
 
 def test_a_recorder_that_hangs_is_waited_for_no_longer_than_its_time(queue, monkeypatch):
+    monkeypatch.setattr(last_records, "_SILENT_S", 0.1)
     monkeypatch.setattr(last_records, "HELLO_S", 0.2)
     monkeypatch.setattr(last_records, "END_S", 0.1)
 
@@ -94,8 +106,9 @@ def test_a_recorder_that_hangs_is_waited_for_no_longer_than_its_time(queue, monk
             yield "starting"
 
     recorder = Recorder(hangs)
-    said = finish_log(queue, recorder)
+    waiting, said = finished(queue, recorder)
 
+    assert "waiting for the recorder" in waiting
     assert recorder.killed
     assert "did not end within 0.1 s and was killed" in said
     assert "the last 10 of 10 records" in said
