@@ -1,7 +1,8 @@
 """The layouts for viewers name what logs have, in the form that the viewers read.
 
 Foxglove's and Lichtblick's form: a `LayoutData` of Lichtblick's `CurrentLayoutContext/actions`, a mosaic of
-panels, each `TYPE!id`. PlotJuggler's: what `plot_docker.cpp` and `plotwidget.cpp` of its 3.x read.
+panels, each `TYPE!id`. PlotJuggler's: what `plot_docker.cpp` and `plotwidget.cpp` of its 3.x read. Both were
+also opened in the programs themselves: `docs/reporting.md` says in which, when, and what was there.
 """
 
 import json
@@ -62,6 +63,20 @@ def test_the_foxglove_layout_shows_every_panel_once(foxglove):
 
     assert sorted(shown) == sorted(foxglove["configById"])
     assert {name.partition("!")[0] for name in shown} <= PANELS
+
+
+def test_foxglove_and_lichtblick_show_the_same_title_over_each_panel(foxglove):
+    for name, panel in foxglove["configById"].items():
+        assert panel["foxglovePanelTitle"], name
+        # Lichtblick renamed the key (`PANEL_TITLE_CONFIG_KEY` of its 1.28)
+        assert panel["lichtblickPanelTitle"] == panel["foxglovePanelTitle"], name
+
+
+def test_no_legend_lies_on_its_curves(foxglove):
+    plots = [p for name, p in foxglove["configById"].items() if name.startswith("Plot!")]
+
+    assert plots
+    assert all(plot["legendDisplay"] == "left" for plot in plots)
 
 
 def test_its_paths_are_fields_of_logs_or_reference_lines(foxglove):
