@@ -18,9 +18,10 @@ from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.logging.records import SequenceAttempt
 from fitctl.sequences import steps
 from fitctl.sequences.calibration import write_calibration
+from fitctl.sequences.files import find_sequence
 from fitctl.sequences.links import Link, SimulatedLink
 from fitctl.sequences.methods import StepMethods
-from fitctl.sequences.reading import find_sequence, load_sequence
+from fitctl.sequences.reading import load_sequence
 from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import Figures, SequenceError
 from fitctl.supervisor.client import Client
