@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from typer.exceptions import TyperException
 
+from fitctl import __version__
 from fitctl.commands import (
     attending,
     computing,
@@ -64,6 +66,22 @@ app.add_typer(faulting.app, name="fault")
 app.add_typer(log.app, name="log")
 app.add_typer(sequence.app, name="sequence")
 app.add_typer(keys.app, name="keys")
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fitctl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _of_all_commands(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_say_version, is_eager=True, help="Say which this is."),
+    ] = False,
+) -> None:
+    """Nothing: it has the options that stand before a command."""
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from fitctl import __version__
 from fitctl.cli import app, main
 
 
@@ -33,6 +34,13 @@ def test_every_command_has_a_help_text(command, capsys):
     text = capsys.readouterr().out
     assert "Usage" in text
     assert len(text.splitlines()) > 5
+
+
+def test_the_version_is_said():
+    said = fitctl("--version")
+
+    assert said.returncode == 0
+    assert said.stdout == f"fitctl {__version__}\n"
 
 
 def test_help_does_not_import_what_is_slow():

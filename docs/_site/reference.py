@@ -35,8 +35,17 @@ def command_line() -> str:
     """Every command that is not hidden, with its options."""
     group = copy.copy(typer.main.get_command(app))
     group.commands = {name: c for name, c in group.commands.items() if not c.hidden}
+    _not_cut_short(group)
     text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="fitctl")
     return text.replace("# `fitctl`\n", "# Command line\n", 1)
+
+
+def _not_cut_short(group: Any) -> None:
+    """Let lists of commands say a whole sentence about each; a terminal has less room."""
+    for command in group.commands.values():
+        command.short_help = _first_paragraph(command.help)
+        if hasattr(command, "commands"):
+            _not_cut_short(command)
 
 
 # ---------------------------------------------------------------- the rig file
@@ -192,8 +201,11 @@ def _type_name(kind: Any) -> str:
 
 def _plain(kind: type) -> str:
     """A docstring's first paragraph, without its roles."""
-    first = inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0]
-    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", first).replace("``", "`").replace("\n", " ")
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", _first_paragraph(kind.__doc__)).replace("``", "`")
+
+
+def _first_paragraph(text: str | None) -> str:
+    return inspect.cleandoc(text or "").split("\n\n")[0].replace("\n", " ")
 
 
 # ---------------------------------------------------------------- Python

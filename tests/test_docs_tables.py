@@ -1,0 +1,142 @@
+"""The documentation is true: its tables and diagrams are those of the code."""
+
+import time
+import tomllib
+
+from documents import ROOT, between, blocks, table
+
+from fitctl.commands.fault import kinds as fault_kinds
+from fitctl.config import default_rig_path, load_rig
+from fitctl.logging.schemas import MESSAGES, TOPICS
+from fitctl.mocks.faults import WIRE_FAULTS
+from fitctl.supervisor.command_table import COMMANDS as COMMAND_ROWS
+from fitctl.supervisor.messages import TrippedInterlock
+from fitctl.supervisor.metrics import InstrumentCollector
+from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
+from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
+from tests.tui.fake import FakeSupervisor
+
+
+def test_the_table_of_modes_is_that_of_the_code():
+    rows = [[mode.name, str(int(mode)), MEANING[mode]] for mode in Mode]
+
+    assert between("operating.md", "modes") == table(
+        ["mode", "number in logs", "what the loop does"], rows
+    )
+
+
+def test_the_table_of_transitions_is_that_of_the_code():
+    rows = [
+        [row.source.name, cause(row.trigger), row.target.name, row.condition]
+        for row in sorted(TRANSITIONS, key=lambda row: row.source)
+    ]
+
+    assert between("operating.md", "transitions") == table(
+        ["from", "what", "leads to", "when"], rows
+    )
+
+
+def cause(trigger):
+    words = trigger.name.lower().replace("_", " ")
+    return f"command `{words}`" if trigger in COMMANDS else words
+
+
+def test_the_diagram_of_modes_is_that_of_the_code():
+    diagrams = [b.text.strip() for b in blocks("mermaid") if b.document.name == "operating.md"]
+
+    assert diagrams == [mermaid()]
+
+
+def test_the_console_keys_are_those_of_the_console():
+    rows = [[f"`{command.key}`", command.label, command.help] for command in OPERATOR_COMMANDS]
+    rows += [[f"`{view.key}`", view.label, f"screen: {view.help}"] for view in VIEWS]
+
+    assert between("console.md", "keys") == table(["key", "command", "what it does"], rows)
+
+
+def test_the_other_keys_of_the_console_are_those_of_its_screens():
+    screens = {"": "every screen"} | {view.name: view.label for view in VIEWS}
+    rows = [
+        [screen, f"`{key.shown}`", key.label, key.help]
+        for name, screen in screens.items()
+        for key in keys_of(name)
+    ]
+
+    assert between("console.md", "screens") == table(
+        ["on", "key", "in the footer", "what it does"], rows
+    )
+
+
+def test_the_commands_are_those_of_the_table():
+    rows = [
+        [f"`{row.usage}`", row.help, row.needs, f"`{row.key}`" if row.key else ""]
+        for row in COMMAND_ROWS
+        if row.word
+    ]
+
+    assert between("remote.md", "commands") == table(
+        ["`fitctl send`", "what it does", "needs", "console key"], rows
+    )
+
+
+def test_the_faults_are_those_of_the_mocks():
+    tables = {"every device": WIRE_FAULTS} | {
+        device: {name: kind for name, kind in kinds.items() if name not in WIRE_FAULTS}
+        for device, kinds in fault_kinds().items()
+    }
+    rows = [
+        [
+            device,
+            f"`{name}`",
+            kind.text,
+            f"{kind.value:g} {kind.unit}" if kind.unit else "",
+            ", ".join(kind.parts),
+        ]
+        for device, kinds in tables.items()
+        for name, kind in kinds.items()
+    ]
+
+    assert between("devices.md", "faults") == table(
+        ["device", "fault", "what happens", "value, if none is given", "parts"], rows
+    )
+
+
+def test_the_topics_of_a_log_are_those_of_the_schemas():
+    loop = next(iter(load_rig(default_rig_path()).loops))
+    rows = []
+    for kind, topic in TOPICS.items():
+        message = MESSAGES[kind].DESCRIPTOR
+        fields = ", ".join(f"`{field.name}`" for field in message.fields)
+        what = kind.__doc__.split("\n")[0].replace("``", "`").replace(":class:", "")
+        rows.append([f"`{topic.format(loop=loop)}`", message.full_name, what, fields])
+
+    assert between("logs.md", "topics") == table(["topic", "message", "what it is", "fields"], rows)
+
+
+def test_the_metrics_are_those_that_are_served():
+    supervisor = FakeSupervisor()
+    supervisor.interlocks = [
+        TrippedInterlock(name="any", since_s=0.0, action="warn", reset="itself", reason="")
+    ]
+    collector = InstrumentCollector()
+    collector.accept(supervisor.message(), time.monotonic())
+    rows = [
+        [
+            f"`{family.samples[0].name}`",
+            family.type,
+            ", ".join(family.samples[0].labels),
+            family.documentation,
+        ]
+        for family in collector.collect()
+    ]
+
+    assert between("running-as-a-service.md", "metrics") == table(
+        ["metric", "kind", "labels", "what it is"], rows
+    )
+
+
+def test_the_layers_are_those_of_the_import_contract():
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    layers = next(c["layers"] for c in contracts["contracts"] if c["type"] == "layers")
+
+    assert between("architecture.md", "layers").splitlines()[1:-1] == layers
