@@ -49,7 +49,9 @@ def be_modest() -> None:
     Of threads that exist already it speaks to this one alone, so it is for the beginning of a process.
     """
     os.nice(_NICENESS)
-    resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard == resource.RLIM_INFINITY or hard > _MOST_BYTES:
+        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))
 
 
 def judge(
