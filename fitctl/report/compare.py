@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -89,9 +90,9 @@ def _figures(nights: list[Night]) -> Table:
         "rejection at 1 Hz": _at_1_hz,
         "time in VERNIER": lambda loop: seconds(loop.judged.vernier_s),
         "of it judged": lambda loop: seconds(loop.judged.judged_s),
-        "star seen": lambda loop: number(loop.judged.star_fraction, ".2%"),
-        "mirror's range, mean": lambda loop: number(loop.stages.range_mean, ".1%"),
-        "mirror's range, worst": lambda loop: number(loop.stages.range_worst, ".1%"),
+        "star seen": lambda loop: number(loop.judged.star_fraction, ".2f", "%", 100),
+        "mirror's range, mean": lambda loop: number(loop.stages.range_mean, ".1f", "%", 100),
+        "mirror's range, worst": lambda loop: number(loop.stages.range_worst, ".1f", "%", 100),
         "piston, RMS": lambda loop: number(loop.stages.piston_rms_m, ".1f", "nm", 1e9),
         "frames": lambda loop: str(loop.counts["frames"]),
         "frames lost": lambda loop: str(loop.counts["frames_lost"]),
@@ -104,7 +105,8 @@ def _figures(nights: list[Night]) -> Table:
 
 
 def _rms(found: Estimate) -> str:
-    return f"{number(found.rms_px, '.4f')} ({tables.interval(found)})"
+    told = number(found.rms_px, ".4f")
+    return told if math.isnan(found.rms_px) else f"{told} ({tables.interval(found)})"
 
 
 def _at_1_hz(loop: LoopFindings) -> str:

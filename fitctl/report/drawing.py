@@ -39,6 +39,7 @@ VARIABLES = {
     SKY: "sky",
 }
 _DPI = 120
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 BINS = 900  # of a trace: about as many as a page shows
 _STYLE: Any = {
     "font.family": "sans-serif",
@@ -158,6 +159,15 @@ def span(axes: Sequence[Axes], time: TimeAxis, duration_s: float) -> None:
         one.set_xlim(0, max(duration_s, 1e-3) / time.s_per_unit)
 
 
+def plain_number(value: float) -> str:
+    """As people write it, with powers of ten where it is very small or large: 0.002, 10⁻⁵, 2·10⁻⁵."""
+    digits, power, exponent = f"{value:g}".partition("e")
+    if not power:
+        return digits
+    raised = f"10{str(int(exponent)).translate(_RAISED)}"
+    return raised if digits == "1" else f"{digits}·{raised}"
+
+
 def decimal(axis: Axis, *, dense: bool = False) -> None:
     """Plain numbers on a logarithmic axis; at 1, 2 and 5 where it is short. Without data an axis is none."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -165,7 +175,7 @@ def decimal(axis: Axis, *, dense: bool = False) -> None:
     if axis.get_scale() != "log":
         return
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if dense else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _position: plain_number(value)))
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,12 @@ from fitctl.report.stages import Stacks, Stages, stacks, stages
 from fitctl.supervisor.modes import Mode
 
 AXES = ("az", "el")
+# What timing is told of a second at a time: the median of medians, the worst of worsts.
+_OF_SECONDS: dict[str, Callable[[Any], Any]] = {
+    "servo_late_median_s": np.median,
+    "servo_late_worst_s": np.max,
+    "worst_stall_s": np.max,
+}
 
 
 @dataclass(frozen=True)
@@ -137,21 +144,21 @@ def _counts(ticks: Columns, timing: Columns) -> dict[str, int]:
 def _timing(ticks: Columns, timing: Columns) -> dict[str, float]:
     frames = ticks["number"] >= 0
     age_s, compute_s = ticks["frame_age_s"][frames], ticks["compute_s"][frames]
-    worst = {
-        name: float(timing[name].max()) if len(timing.get(name, ())) else math.nan
-        for name in ("servo_late_worst_s", "worst_stall_s")
+    of_seconds = {
+        name: float(tell(timing[name])) if len(timing.get(name, ())) else math.nan
+        for name, tell in _OF_SECONDS.items()
     }
     if not frames.any():
         return (
             dict.fromkeys(
                 ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s"), math.nan
             )
-            | worst
+            | of_seconds
         )
     return {
         "age_median_s": float(np.median(age_s)),
         "age_worst_s": float(age_s.max()),
         "compute_median_s": float(np.median(compute_s)),
         "compute_worst_s": float(compute_s.max()),
-        **worst,
+        **of_seconds,
     }

@@ -42,7 +42,7 @@ def spectra(loop: LoopFindings) -> Plot:
     sums.axhline(loop.requirement_px, color=INK, linestyle=":", label="requirement")
     density.set_title("Power spectral density")
     density.set_ylabel("px²/Hz")
-    sums.set_title("RMS from all below a frequency")
+    sums.set_title("Cumulative RMS: of all below a frequency")
     sums.set_ylabel("px")
     sums.set_yscale("log")
     for axes in (density, sums):
@@ -163,3 +163,5 @@ def _gap_text(loop: LoopFindings) -> str:
 
 def _nothing(axes: Axes, why: str = _NO_DATA) -> None:
     axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", color=FAINT)
+    if not axes.lines:  # numbers would be of nothing
+        axes.set(xticks=[], yticks=[])

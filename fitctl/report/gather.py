@@ -28,7 +28,7 @@ from fitctl.logging.records import (
 from fitctl.logging.schemas import TOPICS
 from fitctl.report.run import Run
 
-_ROWS = 20_000  # held as they come, before they find their place
+_ROWS = 2_000  # of a topic, held as they come before they find their place
 _KINDS: dict[Any, str] = {
     LoopTiming: "timing",
     ModeChange: "modes",

@@ -87,12 +87,18 @@ def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     way.set_ylabel("arcsec on the sky")
     way.legend(ncols=2, loc="best")
     held = np.flatnonzero(ticks["mode_number"] == Mode.VERNIER)
+    # After a slew the siderostat is elsewhere: each stretch of VERNIER has a zero of its own.
+    entered = np.diff(held, prepend=-2) > 1
+    began = held[np.maximum.accumulate(np.where(entered, np.arange(len(held)), 0))]
     for number, (axis, axes) in enumerate(zip(AXES, offload, strict=True)):
         if len(held):
-            from_px = setpoint_px[held[0], number]
             for series, color, label in (
                 (mirror_px[held, number], SKY, "mirror"),
-                (setpoint_px[held, number] - from_px, INK, "siderostat, set-point"),
+                (
+                    setpoint_px[held, number] - setpoint_px[began, number],
+                    INK,
+                    "siderostat, set-point",
+                ),
             ):
                 at_s, low, high = envelope(ticks["time_s"][held], series)
                 axes.plot(at_s / time.s_per_unit, (low + high) / 2, color=color, label=label)
@@ -103,7 +109,8 @@ def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     span(offload[-1:], time, findings.run.duration_s)
     caption = (
         "What lasts goes from the mirror to the siderostat, and the mirror returns to its bias (0). The "
-        "siderostat's own way is from where it was when VERNIER first began; its play is not in its encoders."
+        "siderostat's own way is from where it was when each stretch of VERNIER began; its play is not in its "
+        "encoders."
     )
     return Plot(f"{loop.name}-siderostat", "Siderostat and offload", caption, figure)
 

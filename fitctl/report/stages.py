@@ -80,8 +80,8 @@ class Stages(NamedTuple):
         Of the frames.
     piston_rms_m : float
         About its mean; nan without a model of the stacks.
-    mirror_mean_px, motor_moved_px : array, shape (2,)
-        Where the mirror stood in the mean; how far the siderostat's set-point came from first to last.
+    motor_moved_px : array, shape (2,)
+        How far the siderostat's set-point came from first to last.
     gaps : list of Gap
         Of both axes.
     """
@@ -90,7 +90,6 @@ class Stages(NamedTuple):
     range_worst: float
     saturated_fraction: float
     piston_rms_m: float
-    mirror_mean_px: Floats
     motor_moved_px: Floats
     gaps: list[Gap]
 
@@ -152,7 +151,7 @@ def stages(
     rows = np.concatenate([np.empty(0, np.intp), *pieces])
     if len(rows) == 0:
         nothing = np.full(2, math.nan)
-        return Stages(math.nan, math.nan, math.nan, math.nan, nothing, nothing, [])
+        return Stages(math.nan, math.nan, math.nan, math.nan, nothing, [])
     told_px = mirror_px + setpoint_px
     target_px = np.column_stack([ticks[f"target_{axis}_px"] for axis in ("az", "el")])
     fraction = ticks["fsm_range_fraction"][rows]
@@ -161,7 +160,6 @@ def stages(
         range_worst=float(fraction.max()),
         saturated_fraction=float(ticks["fsm_saturated"][rows].mean()),
         piston_rms_m=math.nan if found is None else float(found.piston_m[rows].std()),
-        mirror_mean_px=mirror_px[rows].mean(axis=0),
         motor_moved_px=setpoint_px[rows[-1]] - setpoint_px[rows[0]],
         gaps=[_gap(_dwells(target_px[:, axis], told_px[:, axis], pieces)) for axis in range(2)],
     )

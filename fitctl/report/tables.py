@@ -77,7 +77,7 @@ def residual(loop: LoopFindings) -> Table:
                 number(found.rms_px, ".4f"),
                 interval(found),
                 number(found.rms_px * loop.sky_arcsec_per_px, ".4f"),
-                number(100 * found.rms_px / loop.requirement_px, ".0f", "%"),
+                number(found.rms_px / loop.requirement_px, ".0f", "%", 100),
                 number(found.independent, ".0f"),
             ]
             for axis, found in loop.residual.items()
@@ -88,16 +88,16 @@ def residual(loop: LoopFindings) -> Table:
 def key_figures(loop: LoopFindings) -> Table:
     """What else one asks first."""
     judged, moved = loop.judged, loop.stages
-    share = 100 * judged.star_fraction
     rows = [
-        ["time in VERNIER", seconds(judged.vernier_s)],
-        ["of it judged", f"{seconds(judged.judged_s)}; pieces: {len(judged.pieces)}"],
-        ["star seen in it", number(share, ".2f", "% of the frames")],
+        ["time in VERNIER, all of the run", seconds(judged.vernier_s)],
+        ["judged", f"{seconds(judged.judged_s)}; pieces: {len(judged.pieces)}"],
+        ["star seen in it", number(judged.star_fraction, ".2f", "% of the frames", 100)],
         [
             "mirror's range",
-            f"{number(moved.range_mean, '.1%')} mean, {number(moved.range_worst, '.1%')} worst",
+            f"{number(moved.range_mean, '.1f', '% mean', 100)}, "
+            f"{number(moved.range_worst, '.1f', '% worst', 100)}",
         ],
-        ["mirror saturated", number(moved.saturated_fraction, ".2%")],
+        ["mirror saturated", number(moved.saturated_fraction, ".2f", "% of the frames", 100)],
         ["piston (Eq. 4), RMS", number(moved.piston_rms_m, ".1f", "nm", 1e9)],
     ]
     rows += [
@@ -109,7 +109,7 @@ def key_figures(loop: LoopFindings) -> Table:
     ]
     rows.append(
         [
-            "modes",
+            "modes, all of the run",
             ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks",
         ]
     )
@@ -118,7 +118,7 @@ def key_figures(loop: LoopFindings) -> Table:
 
 def rejected(loop: LoopFindings) -> Table:
     """Measured rejection beside the design's."""
-    head = ["controller", "judged", "bound", "design's residual"]
+    head = ["controller", "judged", "least possible residual", "design's residual"]
     frequencies = [at_hz for at_hz, *_ in loop.rejections[0].table()] if loop.rejections else []
     head += [f"{at_hz:g} Hz" for at_hz in frequencies]
     rows = []
@@ -142,7 +142,7 @@ def timings(loop: LoopFindings) -> Table:
     rows = {
         "frame's age when used": (found["age_median_s"], found["age_worst_s"]),
         "tick, from frame to command": (found["compute_median_s"], found["compute_worst_s"]),
-        "servo's wake-up late": (math.nan, found["servo_late_worst_s"]),
+        "servo's wake-up late": (found["servo_late_median_s"], found["servo_late_worst_s"]),
         "the machine stood still": (math.nan, found["worst_stall_s"]),
     }
     texts = [

@@ -42,7 +42,7 @@ WINDOW_S = 10.0
 
 
 def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
-    """Middles of windows of `WINDOW_S` and the RMS of each axis' error in VERNIER; NaN without a star."""
+    """Mean times in windows of `WINDOW_S` and the RMS of each axis' error in VERNIER; NaN without a star."""
     ticks = loop.ticks
     held = (ticks["mode_number"] == Mode.VERNIER) & ticks["star_visible"]
     time_s = ticks["time_s"][held]
@@ -51,12 +51,16 @@ def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
     window = np.floor(time_s / WINDOW_S).astype(int)
     first, last = window[0], window[-1]
     count = np.bincount(window - first, minlength=last - first + 1)
-    rms = {}
-    for axis in AXES:
-        squares = ticks[f"error_{axis}_px"][held].astype(float) ** 2
-        with np.errstate(invalid="ignore"):
-            rms[axis] = np.sqrt(np.bincount(window - first, squares) / count)
-    return (np.arange(first, last + 1) + 0.5) * WINDOW_S, rms
+    with np.errstate(invalid="ignore"):
+        middles_s = np.bincount(window - first, time_s) / count
+        rms = {
+            axis: np.sqrt(
+                np.bincount(window - first, ticks[f"error_{axis}_px"][held].astype(float) ** 2)
+                / count
+            )
+            for axis in AXES
+        }
+    return middles_s, rms
 
 
 def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:

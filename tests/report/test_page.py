@@ -9,7 +9,7 @@ from report_samples import record
 
 from fitctl.logging.records import Event
 from fitctl.report.compare import make_comparison
-from fitctl.report.drawing import VARIABLES, envelope
+from fitctl.report.drawing import VARIABLES, envelope, plain_number
 from fitctl.report.findings import find
 from fitctl.report.make import make_report
 from fitctl.report.run import find_run
@@ -162,6 +162,14 @@ def test_nights_are_put_side_by_side(findings, rig, tmp_path):
     assert (tmp_path / "right-spectra.png").exists()
     nights = json.loads((tmp_path / "report.json").read_text())["nights"]
     assert [night["verdict"] for night in nights] == ["met", "not known"]
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [(0.002, "0.002"), (20, "20"), (1e-5, "10⁻⁵"), (2e-6, "2·10⁻⁶"), (1e12, "10¹²")],
+)
+def test_numbers_on_an_axis_are_as_people_write_them(value, told):
+    assert plain_number(value) == told
 
 
 def test_a_trace_shows_its_extremes_however_long_it_is():

@@ -112,7 +112,7 @@ GOOD, BAD, BETWEEN = (
     ("az", "el", "judged_s", "star_fraction", "word", "why"),
     [
         (GOOD, GOOD, 60.0, 1.0, "met", "both axes"),
-        (GOOD, BAD, 60.0, 1.0, "not met", "el: all of the interval is above"),
+        (GOOD, BAD, 60.0, 1.0, "not met", "the whole interval of el is above it"),
         (GOOD, BETWEEN, 60.0, 1.0, "not known", "holds the requirement"),
         (GOOD, UNKNOWN, 6.0, 1.0, "not known", "too short to judge: the 6 s that count"),
         (GOOD, GOOD, 60.0, 0.9, "not known", "star is missing on 10.0 %"),
