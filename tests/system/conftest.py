@@ -17,6 +17,7 @@ from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
+MOCKS_PRIORITY = 40  # below all threads of the supervisor
 WITH_US = ("--parent-pid", os.getpid())  # they end when the tests are killed
 signal.signal(
     signal.SIGINT, signal.default_int_handler
@@ -44,6 +45,16 @@ def end(process, number=signal.SIGTERM, timeout_s=20.0):
         process.kill()
         process.wait()
         raise
+
+
+def never_wait(pid):
+    """Make a process as real-time as the supervisor is, where that is allowed.
+
+    Mock devices stand for hardware, which does not wait for what else the computer has to do.
+    """
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(PermissionError):
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(MOCKS_PRIORITY))
 
 
 class Rig:
@@ -76,6 +87,7 @@ class Rig:
             stderr=self.errors,
         )
         self.endpoints = json.loads(self.mocks.stdout.readline())
+        never_wait(self.mocks.pid)
 
     def restart_mocks(self):
         """New mock devices where the old ones listened."""
