@@ -48,7 +48,7 @@ from fitctl.tui.state import ConsoleState, LoopView
 from fitctl.tui.widgets.panel import Panel
 
 PICTURE_BEATS = 3
-TERMINAL = 1  # the file descriptor that Textual writes to
+TERMINAL = 2  # the file descriptor that Textual writes to
 
 
 class FocalPlane(Panel):
