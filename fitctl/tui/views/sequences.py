@@ -163,7 +163,8 @@ class SequencesView(ListingView):
         return str(path)
 
     def _start(self, arguments: list[str], *, outlives: bool = False) -> None:
-        if self._job is not None and self._job.status is None:
+        # A check or a rehearsal, which moves nothing, makes way for what is asked next.
+        if self._job is not None and self._job.status is None and self._job.outlives:
             self.notify(f"still at work: {self._job.told}", severity="warning", timeout=4)
             return
         if self._job is not None:
