@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.controllers.centroid import Star, StarSensor
-from fitctl.controllers.estimator import StarEstimator
+from fitctl.controllers.centroid import Star
 from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
 from fitctl.logging.records import (
@@ -35,7 +34,6 @@ from fitctl.supervisor.messages import Acquire
 from fitctl.supervisor.modes import (
     FOLLOWING,
     TRACKING,
-    WITH_WINDOW,
     Finding,
     Mode,
     Trigger,
@@ -47,6 +45,7 @@ from fitctl.supervisor.quantities import Quantities, places
 from fitctl.supervisor.search import Search
 from fitctl.supervisor.seen import Seen
 from fitctl.supervisor.servo import ServoState, SiderostatServo
+from fitctl.supervisor.sighting import Sighting
 from fitctl.supervisor.stages import Stages
 from fitctl.supervisor.tick_record import TickRecords, TickTimes
 
@@ -90,14 +89,12 @@ class StellarLoop:
         self.last_change: ModeChange | None = None
         self._last_failure = ""
         self.target_px = np.array([loop.target_px.az, loop.target_px.el])
-        self.look_at_px: tuple[float, float] | None = None  # on the next frame, and then no more
         self._clock = clock
         self._report = report
         scale = scales(rig, loop)
         self._period_s = rig.camera.period_s
-        self._sensor = StarSensor(rig.camera, loop)
-        self._estimator = StarEstimator(scale, self.target_px)
-        self.search = Search(rig, name, self._estimator)
+        self.sighting = Sighting(rig, name, self.target_px, self._event)
+        self.search = Search(rig, name, self.sighting.estimator)
         self.following = Following(loop, scale)
         self.pointing = Pointing(rig, name, self.target_px)
         self.stages = Stages(rig, name, servo, dac, clock)
@@ -160,34 +157,10 @@ class StellarLoop:
         return Seen(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
-        looked_for = self._looked_for(frame)
         if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
             return None  # what is seen on the way is another star
-        stages_px = self._estimator.stages_px(motor_rad, mirror_rad)
-        star = looked_for or self._expected(frame, stages_px)
-        if star is not None and self.mode in TRACKING:
-            self._estimator.observe(star.position_px, stages_px)
-        return star
-
-    def _expected(self, frame: Frame, stages_px: Floats) -> Star | None:
-        """The star where it should be, or else anywhere on the frame."""
-        if self.mode in FOLLOWING and self.following.lost == 0:
-            expected_px = self._estimator.predict_px(stages_px)
-            return self._sensor.follow(frame.image, *expected_px.tolist())
-        return self._sensor.find(frame.image)
-
-    def _looked_for(self, frame: Frame) -> Star | None:
-        """The star where somebody told the loop to look, if there is one."""
-        look_px, self.look_at_px = self.look_at_px, None
-        if look_px is None or self.mode not in WITH_WINDOW:
-            return None
-        star = self._sensor.find_at(frame.image, *look_px)
-        place = f"az {look_px[0]:g}, el {look_px[1]:g} px"
-        if star is None:
-            self._event("warning", f"no star in the window at {place}; nothing changes")
-        else:
-            self._event("info", f"the star at {place} is followed from now on")
-        return star
+        follows = self.mode in FOLLOWING and self.following.lost == 0
+        return self.sighting.find(frame.image, self.mode, motor_rad, mirror_rad, follows=follows)
 
     def _judge(self, frame: Frame | None, seen: Seen) -> None:
         """Errors of devices and findings: what leads to another mode."""
@@ -302,13 +275,13 @@ class StellarLoop:
     def look_for(self, asked: Acquire) -> None:
         """What the next search is to find, and how, as a command asks that was not refused."""
         flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
-        self._sensor.expect(flux_dn)
+        self.sighting.expect_flux(flux_dn)
         self.measured.star_flux_dn = flux_dn
         self.search.ask(asked)
 
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""
-        self._estimator.expect(self.target_px, motor_rad, np.zeros(2))
+        self.sighting.estimator.expect(self.target_px, motor_rad, np.zeros(2))
         self.search.begin()
 
     # ------------------------------------------------------------ control laws
@@ -401,7 +374,7 @@ class StellarLoop:
         self.measured.begin()
         self.interlocks.reset_all(self._clock.now_s())
         if self.servo.encoders_jumped:
-            self._estimator.forget()
+            self.sighting.estimator.forget()
             self._event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
             )

@@ -106,7 +106,7 @@ def test_a_middle_beyond_the_travel_is_not_waited_for():
     simulation = star_at(0.0, 3000.0)  # nowhere near
     loop = simulation.supervisor.loops["right"]
     beyond_px = np.array([1300.0, 0.0]) / ARCSEC_PER_PX
-    loop._estimator.place(loop.target_px + beyond_px, np.zeros(2), np.zeros(2))
+    loop.sighting.estimator.place(loop.target_px + beyond_px, np.zeros(2), np.zeros(2))
 
     simulation.command(Acquire())
     run_until(simulation, Mode.STANDBY, 60.0)
