@@ -89,13 +89,15 @@ class Client:
         dealer = self._dealer()
         timeout_ms = int(timeout_s * 1000)
         try:
-            # A socket that was refused since its last command has no way out: sending would wait for ever.
-            can_send = dealer.poll(timeout_ms, zmq.POLLOUT)
-            if can_send:
-                dealer.send_multipart([next(self._tags).to_bytes(8, "big"), payload])
-            if not can_send or not dealer.poll(timeout_ms):
+            # A socket that was refused since its last command has no way out; sending would wait for ever.
+            dealer.setsockopt(zmq.SNDTIMEO, timeout_ms)
+            dealer.send_multipart([next(self._tags).to_bytes(8, "big"), payload])
+            if not dealer.poll(timeout_ms):
                 raise ConnectionError(self._why_silent(timeout_s))
             _, answer = dealer.recv_multipart()
+        except zmq.Again:
+            dealer.close()
+            raise ConnectionError(self._why_silent(timeout_s)) from None
         except BaseException:  # also Ctrl-C: a socket left open would hold up close()
             dealer.close()
             raise
