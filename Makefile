@@ -13,7 +13,7 @@ FAULT_RESULTS ?= .fault-results.json
 FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults reliability test-peers bench-console bench-devices bench-recorder bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-faults reliability test-peers bench-console bench-devices bench-recorder bench-report bench-flood bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -79,6 +79,9 @@ soak: $(READY)  ## SOAK_S seconds on mocks with random faults: what grows, is la
 
 bench-sim: $(READY)  ## How many times real time the simulation and the batch run
 	$(BIN)/python -m benchmarks.simulate $(ARGS)
+
+bench-report: $(READY)  ## What the report of an eight-hour night takes in time and room
+	$(BIN)/python -m benchmarks.report $(ARGS)
 
 bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
 	$(BIN)/python -m benchmarks.recorder $(ARGS)

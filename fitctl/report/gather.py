@@ -129,13 +129,12 @@ def gather(run: Run) -> Gathered:
                 health += _changes(_rows([block]), states)
             else:
                 blocks[places[topic]].append(block)
+    for loop, its in ticks.items():
+        its.update({name: column[: filled[loop]] for name, column in its.items()})
     modes = [row for loop in loops for row in _rows(blocks["modes", loop])]
     return Gathered(
         run=run,
-        ticks={
-            loop: _in_order({name: column[: filled[loop]] for name, column in its.items()})
-            for loop, its in ticks.items()
-        },
+        ticks={loop: _in_order(its) for loop, its in ticks.items()},
         timing={loop: _joined(blocks["timing", loop]) for loop in loops},
         modes=sorted(modes, key=itemgetter("time_s")),
         events=_rows(blocks["events", ""]),
@@ -183,7 +182,10 @@ def _in_order(columns: Columns) -> Columns:
     time_s = columns["time_s"]
     new = np.ones(len(time_s), bool)
     new[1:] = time_s[1:] > np.maximum.accumulate(time_s)[:-1]
-    return columns if new.all() else {name: column[new] for name, column in columns.items()}
+    if not new.all():
+        for name in columns:  # one by one: all at once, hours would be held twice
+            columns[name] = columns[name][new]
+    return columns
 
 
 def _rows(blocks: list[Columns]) -> list[dict[str, Any]]:

@@ -118,7 +118,7 @@ def key_figures(loop: LoopFindings) -> Table:
 
 def rejected(loop: LoopFindings) -> Table:
     """Measured rejection beside the design's."""
-    head = ["controller", "judged", "least possible residual", "design's residual"]
+    head = ["controller", "judged", "bound", "design's residual"]
     frequencies = [at_hz for at_hz, *_ in loop.rejections[0].table()] if loop.rejections else []
     head += [f"{at_hz:g} Hz" for at_hz in frequencies]
     rows = []
