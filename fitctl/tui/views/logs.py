@@ -49,11 +49,9 @@ class LogsView(ListingView):
         log = self.query_one(LogList).chosen_log
         if log is None:
             self.notify("there is no log yet", timeout=3)
-        elif self._job is not None and self._job.status is None:
-            self.notify(f"still at work: {self._job.told}", severity="warning", timeout=4)
         else:
             if self._job is not None:
-                self._job.end()
+                self._job.end()  # what is asked next takes its place
             self._job = self.query_one(Printed).job = self.console.start_job(
                 [*TOOLS[name], str(log.path)]
             )
