@@ -50,6 +50,9 @@ class Terminal:
     def press(self, *keys):
         self._run("send-keys", "-t", "fitctl", *keys)
 
+    def type(self, words):
+        self._run("send-keys", "-l", "-t", "fitctl", words)
+
     def screen(self):
         return self._run("capture-pane", "-p", "-t", "fitctl")
 

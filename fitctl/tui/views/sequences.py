@@ -158,15 +158,11 @@ class SequencesView(ListingView):
         return str(path)
 
     def _start(self, word: str, *, outlives: bool = False) -> None:
-        """Do something with the chosen sequence; what is under way and moves nothing makes way."""
+        """Do something with the chosen sequence."""
         arguments = ["sequence", word, self._file(), *self.console.rig_arguments]
         if word == "run":
             arguments += self.console.remote_arguments
-        printed = self.query_one(Printed)
-        if printed.job is not None and not printed.job.outlives:
-            printed.job.end()
-            printed.job = None
-        printed.start(self.console.start_job, *arguments, outlives=outlives)
+        self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
 
 
 def parsed(value: str) -> Any:

@@ -36,8 +36,8 @@ class Printed(Panel):
             self.job.end()
 
     def start(self, start_job: Callable[..., Job], *arguments: str, outlives: bool = False) -> None:
-        """Run another fitctl command, unless the one before is still at work."""
-        if self.job is not None and self.job.status is None:
+        """Run another fitctl command in place of the one before, unless that moves the stages still."""
+        if self.job is not None and self.job.outlives and self.job.status is None:
             self.notify(f"still at work: {self.job.told}", severity="warning", timeout=4)
             return
         if self.job is not None:
