@@ -26,6 +26,7 @@ from fitctl.supervisor.gateway import judge
 from fitctl.supervisor.intake import Intake
 from fitctl.supervisor.keys import AllowedKey
 from fitctl.supervisor.messages import (
+    RecentEvents,
     RecorderReport,
     Reply,
     SequenceStatus,
@@ -61,6 +62,7 @@ _VALUES = {
     "field_overlap": 0.3,
     "expected_az_sky_arcsec": 20.0,
     "expected_el_sky_arcsec": -20.0,
+    "star_flux_dn": 30_000.0,
     "name": "flux_low",
     "drives": [_DRIVE],
     "action": "pause",
@@ -144,7 +146,7 @@ def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
     _SERVICE._send_replies()
     if len(door.replies) != replies:
         raise AssertionError(f"{payload!r} has {len(door.replies)} replies, not {replies}")
-    may = role == "commander" or (role and isinstance(decode_command(said), Status))
+    may = role == "commander" or (role and isinstance(decode_command(said), Status | RecentEvents))
     if any(reply.accepted for reply in door.replies) and not may:
         raise AssertionError(f"{payload!r} of {sender} was accepted")
     for name, loop in _SIMULATION.supervisor.loops.items():

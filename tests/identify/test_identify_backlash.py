@@ -93,9 +93,11 @@ def test_a_record_without_motion_is_refused(rig):
 
 
 def test_a_record_with_the_star_lost_is_refused(rig, record):
-    tick = record.tick | {"star_el_px": record.tick["star_el_px"].copy()}
-    tick["star_el_px"][1500:2000] = np.nan
-    with pytest.raises(IdentifyError, match=r"the star is on \d+ of \d+ frames of el"):
+    tick = dict(record.tick)
+    for name in ("star_az_px", "star_el_px"):  # one without the other there never is
+        tick[name] = tick[name].copy()
+        tick[name][1500:2000] = np.nan
+    with pytest.raises(IdentifyError, match=r"the star is on \d+ of \d+ frames of az"):
         backlash.analyse(rig, dataclasses.replace(record, tick=tick))
 
 
