@@ -14,6 +14,8 @@ from fitctl.commands import completing
 from fitctl.commands.choosing import connect, insist_on_loop, rig_arguments, rig_of
 from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SetOption
 
+_NICENESS = 5
+
 
 def console(
     rig: RigOption = None,
@@ -56,6 +58,7 @@ def console(
         graphics=graphics_of(Graphics(graphics), os.environ),
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
+    os.nice(_NICENESS)  # whatever points the star goes first
     app.run()
 
 

@@ -84,6 +84,11 @@ class RecordQueue:
         return len(self._kept)
 
     @property
+    def heard(self) -> bool:
+        """A recorder has said that it is there."""
+        return self._recorder is not None
+
+    @property
     def unsent(self) -> int:
         """Those of the waiting that this recorder was not yet sent."""
         return len(self._kept) - self._sent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from fitctl.logging.queue import RecordQueue
@@ -15,8 +16,8 @@ _LAST_WORD_S = 0.2  # for a confirmation that is on its way still
 def finish_log(queue: RecordQueue, recorder: Child, tell: Callable[[str], None]) -> None:
     """Let the recorder write everything and end, and close the queue.
 
-    A recorder that is told to end while it is still being started ends at once, without a log; so it is
-    told only when it has been sent everything.
+    A recorder that is told to end while it is still being started ends at once, without a log; so one that
+    was never heard is told only when it has been sent everything. One that was heard and takes nothing hangs.
 
     Parameters
     ----------
@@ -29,12 +30,14 @@ def finish_log(queue: RecordQueue, recorder: Child, tell: Callable[[str], None])
     def unsent() -> bool:
         return recorder.running and queue.unsent > 0
 
+    end_s = time.monotonic() + END_S
     queue.pump_while(unsent, _SILENT_S)
-    if unsent():
+    if unsent() and not queue.heard:
         tell(f"waiting for the recorder to take the records of this run, up to {HELLO_S:g} s")
         queue.pump_while(unsent, HELLO_S)
+        end_s = time.monotonic() + END_S
     recorder.ask_to_end()
-    queue.pump_while(lambda: recorder.running, END_S)
+    queue.pump_while(lambda: recorder.running, end_s - time.monotonic())
     hung = recorder.running
     recorder.end(timeout_s=0.0)
     queue.pump_while(lambda: queue.waiting, _LAST_WORD_S)

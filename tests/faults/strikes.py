@@ -21,6 +21,7 @@ RIG = load_rig(default_rig_path())
 JOG_SKY_ARCSEC = 90.0  # nearly as far as one jog goes
 JOG_RAD = JOG_SKY_ARCSEC / scales(RIG, RIG.loops["right"]).motor_sky_arcsec_per_rad
 MOVED_RAD = 0.1  # of a motor
+BEGINS_S = 2.0  # a jog
 
 
 @contextmanager
@@ -79,6 +80,9 @@ def on_its_way(strike_supervisor):
     def struck(rig, entry):
         before_rad = rig.place().motor_rad[0]
         assert rig.client.send(Jog(az_sky_arcsec=JOG_SKY_ARCSEC, el_sky_arcsec=0.0)).accepted
+        end_s = time.monotonic() + BEGINS_S
+        while rig.place().motor_rad[0] - before_rad < 2 * MOVED_RAD and time.monotonic() < end_s:
+            time.sleep(0.005)
         with strike_supervisor(rig, entry):
             yield
             # Short of where it was sent or, if the drive missed its commands late, beyond.

@@ -24,7 +24,7 @@ ENTRIES = (
     ),
     Entry(
         "supervisor", "told to end while its recorder is stopped", ("OFF",),
-        "did not end within 5 s and was killed; the last records, up to", within_s=5.0
+        "did not end within 5 s and was killed; it did not confirm the last", within_s=5.0
     ),
     Entry("clock", "3600", STAYS, "clock_step_s 3600 is above", within_s=4.0, rig="own clock"),
     Entry("clock", "-3600", STAYS, "clock_step_s -3600 is below", within_s=4.0, rig="own clock"),

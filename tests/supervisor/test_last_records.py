@@ -96,7 +96,27 @@ def test_a_recorder_that_confirms_a_part_leaves_the_rest_counted(queue, endpoint
     assert "did not confirm the last 6 of 10 records" in said
 
 
-def test_a_recorder_that_hangs_is_waited_for_no_longer_than_its_time(queue, monkeypatch):
+def test_a_recorder_that_was_there_and_hangs_has_its_five_seconds_and_no_more(
+    queue, endpoint, monkeypatch
+):
+    monkeypatch.setattr(last_records, "_SILENT_S", 0.1)
+    monkeypatch.setattr(last_records, "END_S", 0.3)
+
+    def hangs(_):
+        receiver = RecordReceiver(endpoint)
+        while receiver.receive(0) is None:
+            yield "here it is"
+        while True:
+            yield "hanging"
+
+    begun_s = time.monotonic()
+    (said,) = finished(queue, Recorder(hangs))
+
+    assert "did not end within 0.3 s and was killed" in said
+    assert time.monotonic() - begun_s < last_records.HELLO_S / 3
+
+
+def test_a_recorder_that_never_comes_is_waited_for_no_longer_than_its_time(queue, monkeypatch):
     monkeypatch.setattr(last_records, "_SILENT_S", 0.1)
     monkeypatch.setattr(last_records, "HELLO_S", 0.2)
     monkeypatch.setattr(last_records, "END_S", 0.1)

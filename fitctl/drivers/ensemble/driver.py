@@ -94,6 +94,7 @@ class EnsembleAmplifiers:
         DeviceFault
             An axis is in fault or does not come up in time; then neither has power.
         """
+        self._opened().last_words = tuple(f"ABORT {self._at(axis)}" for axis in range(2))
         try:
             for axis in range(2):
                 self._sent[axis] = ""

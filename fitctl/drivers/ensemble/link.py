@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -28,6 +29,9 @@ _POLL_S = 0.02  # how long one read waits; the time limit is counted above it
 class EnsembleLink:
     """A serial port or TCP connection; after anything but an answer it is closed, being out of step.
 
+    Before that `last_words` are sent, whose answers nobody waits for: an axis in free run goes on by itself,
+    and a controller that cannot be understood may still hear.
+
     Through ``socket://``, pyserial itself allows 5 s to connect and takes 0.3 s to close.
 
     Parameters
@@ -42,6 +46,7 @@ class EnsembleLink:
 
     def __init__(self, device: EnsembleDevice) -> None:
         self._device = device
+        self.last_words: tuple[str, ...] = ()
         try:
             self._port = serial.serial_for_url(
                 device.port,
@@ -126,7 +131,7 @@ class EnsembleLink:
 
     def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
         """The error for an answer that cannot be; the link is closed."""
-        self.close()
+        self._give_up()
         hint = "check that nobody else uses this port of the controller, then recover"
         return DeviceProtocolError(DEVICE, self._device.port, expected, got, hint)
 
@@ -167,7 +172,7 @@ class EnsembleLink:
                 raise self._broken(text, error) from error
             if byte:
                 return byte
-        self.close()
+        self._give_up()
         raise DeviceTimeout(
             DEVICE,
             self._device.port,
@@ -175,6 +180,12 @@ class EnsembleLink:
             "none",
             "check the controller's power and its ASCII command set-up, then recover",
         )
+
+    def _give_up(self) -> None:
+        with contextlib.suppress(OSError):
+            for words in self.last_words:
+                self._port.write(words.encode("ascii") + EOS)
+        self.close()
 
     def _broken(self, text: str, error: OSError) -> DeviceUnreachable:
         self.close()

@@ -204,6 +204,22 @@ def test_after_an_answer_that_did_not_come_nothing_is_asked_before_it_is_opened_
     driver.exchange(STILL)
 
 
+@pytest.mark.parametrize("answer", ["?!\n", ""], ids=["nonsense", "silence"])
+def test_before_it_is_given_up_the_controller_is_told_to_stop_both_axes(scripted, answer):
+    driver, script = scripted()
+    driver.open()
+    driver.enable()
+    driver.exchange((0.5, 0.0))
+    script.answers["PFBKPROG(@0)"] = answer
+    with pytest.raises(DeviceError):
+        driver.exchange((0.5, 0.0))
+
+    end_s = time.monotonic() + 5.0
+    while script.heard[-1] != "ABORT @1" and time.monotonic() < end_s:
+        time.sleep(0.01)
+    assert script.heard[-3:] == ["PFBKPROG(@0)", "ABORT @0", "ABORT @1"]
+
+
 def test_an_angle_that_no_motor_can_reach_in_the_time_is_an_error(scripted):
     driver, script = scripted()
     driver.open()
