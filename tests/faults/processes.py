@@ -37,8 +37,9 @@ ENTRIES = (
     *in_each_mode("supervisor", "killed", 5.0, ("OFF",), "", ("OFF",)),
     *in_each_mode("supervisor", "stopped", 5.0, ("SAFE",), "expected"),
     # In EXPERIMENT both stages move when it is struck; the siderostat alone, and far, when it jogs.
-    Entry("supervisor", "killed while it jogs", ("OFF",), mode="STANDBY", within_s=5.0),
-    Entry("supervisor", "stopped while it jogs", ("SAFE",), "expected", mode="STANDBY", within_s=5.0),
+    Entry("supervisor", "killed while it jogs", ("OFF",), mode="STANDBY", within_s=5.0, rig="slow siderostat"),
+    Entry("supervisor", "stopped while it jogs", ("SAFE",), "expected", mode="STANDBY", within_s=5.0,
+          rig="slow siderostat"),
     *in_each_mode("supervisor", "slowed", 2.0, SLOW, ""),
     *in_each_mode("recorder", "killed", 5.0, STAYS, "the recorder was killed by signal 9",
                   STAYS, "the recorder was killed by signal 9"),

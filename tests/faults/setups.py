@@ -70,6 +70,8 @@ SETUPS = {
     "ensemble": Setup(file="ensemble"),
     "fit-bal-analog": Setup(file="fit-bal-analog"),
     "fast telemetry": Setup(settings=("supervisor.telemetry_hz=100.0",)),
+    # Alone, its drive goes on for half a second: at full speed, further than a search goes.
+    "slow siderostat": Setup(settings=("loops.right.siderostat.velocity_limit_rad_s=6.0",)),
     "by TCP": Setup(
         settings=(
             "service.tcp_address=127.0.0.1",

@@ -147,7 +147,7 @@ def told_to_end(rig, _entry):
     rig.client.send(Shutdown())
     rig.supervisor.wait(ENDS_WITHIN_S)
     rig.heard.append(rig.complaints())
-    told = re.findall(r"the last records, up to (\d+)", rig.complaints())
+    told = re.findall(r"did not confirm the last (\d+)", rig.complaints())
     rig.lost_of["told at the end"] = sum(map(int, told))
     try:
         yield
