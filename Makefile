@@ -46,9 +46,9 @@ contract: $(READY)
 pytest: $(READY)
 ifdef ARGS
 	$(BIN)/pytest $(ARGS)
-else  # those of the whole instrument run in real time, and alone
+else  # those of the whole instrument run in real time: two of them beside each other, and nothing else
 	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system
-	$(BIN)/pytest tests/system
+	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system
 endif
 
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
