@@ -12,12 +12,12 @@ from pathlib import Path
 import psutil
 import pytest
 
+from benchmarks.hardware import never_wait
 from fitctl.config import default_rig_path
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
-MOCKS_PRIORITY = 40  # below all threads of the supervisor
 WITH_US = ("--parent-pid", os.getpid())  # they end when the tests are killed
 signal.signal(
     signal.SIGINT, signal.default_int_handler
@@ -45,16 +45,6 @@ def end(process, number=signal.SIGTERM, timeout_s=20.0):
         process.kill()
         process.wait()
         raise
-
-
-def never_wait(pid):
-    """Make a process as real-time as the supervisor is, where that is allowed.
-
-    Mock devices stand for hardware, which does not wait for what else the computer has to do.
-    """
-    for thread in Path(f"/proc/{pid}/task").iterdir():
-        with suppress(PermissionError):
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(MOCKS_PRIORITY))
 
 
 class Rig:
