@@ -185,6 +185,10 @@ class EnsembleLink:
         with contextlib.suppress(OSError):
             for words in self.last_words:
                 self._port.write(words.encode("ascii") + EOS)
+            # A connection closed with answers unread is reset, and what was not yet heard is lost.
+            end_s = time.monotonic() + self._device.response_timeout_s
+            while self.last_words and self._port.read(64) and time.monotonic() < end_s:
+                pass
         self.close()
 
     def _broken(self, text: str, error: OSError) -> DeviceUnreachable:
