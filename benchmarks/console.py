@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.hardware import never_wait
 from benchmarks.recorder import processor_s
 from fitctl import demo
 from fitctl.config import default_rig_path
@@ -128,7 +127,6 @@ def measure(duration_s: float, turns: int, keys: str, size: tuple[int, int]) -> 
     with tempfile.TemporaryDirectory() as logs:
         settings = [NEAR, f"logging.folder={logs}"]
         with demo.instrument(default_rig_path(), settings, seed=1) as running:
-            never_wait(running.mocks.pid)
             to_vernier(running)
             for _ in range(turns):
                 spells["without"].append(spell(running.client, duration_s, []))

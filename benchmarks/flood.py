@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from benchmarks.hardware import never_wait
 from fitctl import demo
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import LoopTiming, Tick
@@ -70,7 +69,6 @@ def measure(options: argparse.Namespace) -> dict[str, Window]:
         new_key(load_rig(default_rig_path(), settings), "flood", "commander", "", key_file)
         near = "plant.loops.right.star_offset_sky_arcsec_max=5.0"
         with demo.instrument(default_rig_path(), [*settings, near], seed=0) as running:
-            never_wait(running.mocks.pid)
             demo.acquire(running)
             for _ in range(options.rounds):
                 for kind in FLOODS:

@@ -20,8 +20,11 @@ from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.faults import UnknownFault
 from fitctl.mocks.testbed import Testbed
 from fitctl.processes import ENDING_SIGNALS, end_with_parent
+from fitctl.supervisor.realtime import become_realtime
 
 Picture = Callable[[float], NDArray[np.uint16]]
+
+_PRIORITY = 40  # below all threads of the supervisor
 
 
 def run_mocks(
@@ -97,5 +100,6 @@ async def _serve_mocks(
         width = max(map(len, endpoints))
         for key, value in endpoints.items():
             print(f"{key:<{width}}  {value}", flush=True)
+    become_realtime(_PRIORITY)  # the hardware that they stand for does not wait for a computer at work
     await ending.wait()
     await testbed.stop()
