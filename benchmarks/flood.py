@@ -145,7 +145,6 @@ def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: f
     ticks = [tick for tick in course.ticks["right"] if tick.time_s >= begun_s]
     timing = [timing for timing in course.timing.values() if timing.time_s >= begun_s]
     taken = [max(0.0, now - then) for now, then in zip(after, before, strict=True)]
-    ticks = [tick for tick in ticks if tick.number >= 0]
     return Window(ticks, timing, offered, sent, *taken, lasted_s)
 
 
