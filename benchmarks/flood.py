@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
+from benchmarks.recorder import processor_s
 from fitctl import demo
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import LoopTiming, Tick
@@ -116,11 +117,9 @@ def catch_up(running: demo.Instrument) -> None:
 
 def cpu_s(pid: int) -> tuple[float, float]:
     """What supervisor and gateway have taken of a processor so far; a new gateway begins at nothing."""
-    supervisor = psutil.Process(pid)
-    gateways = [child for child in supervisor.children() if "gateway" in child.cmdline()]
-    return tuple(
-        sum(sum(process.cpu_times()[:2]) for process in some) for some in ([supervisor], gateways)
-    )
+    children = psutil.Process(pid).children()
+    gateways = [child.pid for child in children if "gateway" in child.cmdline()]
+    return processor_s(pid), sum(map(processor_s, gateways))
 
 
 def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: float) -> Window:
@@ -144,7 +143,6 @@ def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: f
     ticks = [tick for tick in course.ticks["right"] if tick.time_s >= begun_s]
     timing = [timing for timing in course.timing.values() if timing.time_s >= begun_s]
     taken = [max(0.0, now - then) for now, then in zip(after, before, strict=True)]
-    ticks = [tick for tick in ticks if tick.number >= 0]
     return Window(ticks, timing, offered, sent, *taken, lasted_s)
 
 

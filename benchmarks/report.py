@@ -14,6 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import msgspec
@@ -28,20 +30,19 @@ from fitctl.supervisor.simulate import Simulation
 
 PART_S = 600.0
 PARTS_A_FILE = 6
-CHUNK_BYTES = load_rig(default_rig_path()).logging.chunk_bytes
+RIG = load_rig(default_rig_path())
 
 
 def simulate(path: Path, duration_s: float) -> None:
     """A run on the virtual clock that acquires and holds its star, as a recorder would have it."""
-    rig = load_rig(default_rig_path())
-    info = msgspec.structs.replace(run_info(rig, "simulated", 0.0), wall_minus_monotonic_s=1.8e9)
-    with LogWriter(path, rig.logging) as log:
+    info = msgspec.structs.replace(run_info(RIG, "simulated", 0.0), wall_minus_monotonic_s=1.8e9)
+    with LogWriter(path, RIG.logging) as log:
 
         def take(record: AnyRecord) -> None:
             log.write(record, info.wall_minus_monotonic_s + simulation.clock.now_s())
 
         log.write(info, info.wall_minus_monotonic_s)
-        simulation = Simulation(rig, seed=0, record=take)
+        simulation = Simulation(RIG, seed=0, record=take)
         simulation.acquire()
         simulation.run(duration_s)
 
@@ -50,7 +51,8 @@ def repeat(source: Path, target: Path, times: range, part_s: float) -> None:
     """Copy a log end to end, later by `part_s` each time."""
     with source.open("rb") as stream, target.open("wb") as file:
         reader = SeekingReader(stream)
-        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        size = RIG.logging.chunk_bytes
+        writer = Writer(file, chunk_size=size, compression=CompressionType.ZSTD)
         writer.start(library="fitctl")
         for entry in reader.iter_metadata():
             writer.add_metadata(entry.name, entry.metadata)
@@ -115,7 +117,9 @@ def main() -> None:
         folder = arguments.folder or Path(name)
         folder.mkdir(parents=True, exist_ok=True)
         if not list(folder.glob("*.mcap")):
-            make_night(folder, arguments.hours)
+            # In a process of its own: Linux counts the most that this one ever held as its children's too.
+            with ProcessPoolExecutor(1, get_context("spawn")) as maker:
+                maker.submit(make_night, folder, arguments.hours).result()
         print(json.dumps(measure(folder), indent=1))
 
 

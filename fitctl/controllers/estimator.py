@@ -26,34 +26,28 @@ class StarEstimator:
     def __init__(self, scale: Scales, target_px: Floats) -> None:
         self._scale = scale
         self._origin_px = target_px.copy()
-        self.known = self._expected = False
+        self._expected = False
 
     def expect(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
-        """Take a star of which nothing is known to be at `star_px`; as :meth:`assume`.
+        """:meth:`place` a star of which nothing is known.
 
         Once: what follows, another search too, expects it where it was expected first.
         """
         if not self._expected:
-            self.assume(star_px, motor_rad, mirror_rad)
-        self._expected = True
+            self.place(star_px, motor_rad, mirror_rad)
 
     def place(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
-        """Expect another star, at `star_px`; as :meth:`assume`."""
-        self.assume(star_px, motor_rad, mirror_rad)
-        self.known, self._expected = False, True
-
-    def assume(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
         """Take the star to be at `star_px` with the stages as given; all shapes (2,)."""
-        self._origin_px = star_px - self.stages_px(motor_rad, mirror_rad)
+        self.observe(star_px, self.stages_px(motor_rad, mirror_rad))
 
     def observe(self, star_px: Floats, stages_px: Floats) -> None:
         """A frame showed the star at `star_px` with the stages as they were at its exposure."""
         self._origin_px = star_px - stages_px
-        self.known = self._expected = True
+        self._expected = True
 
     def forget(self) -> None:
         """The stages' zeros have changed: nothing is known of the star any more."""
-        self.known = self._expected = False
+        self._expected = False
 
     def predict_px(self, stages_px: Floats) -> Floats:
         """Where the star falls with the stages as given, shape (2,)."""

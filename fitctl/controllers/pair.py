@@ -96,7 +96,7 @@ class Pair:
         self._range_rad = range_rad
         self._at_rest = rest_state(design)
         self._left_at_rest = left_at_rest(design, self._at_rest)
-        self._system = self._in_rad(scale)
+        self._system = self._in_rad()
         self._given = np.zeros((len(self._system) + 3, 2))
         self.start(np.zeros(2), np.zeros(2), np.zeros(2))
 
@@ -138,9 +138,9 @@ class Pair:
         self.excess_px = self._scale.mirror_px(wanted_rad - mirror_rad)
         return PairCommand(mirror_rad, made[1].dot(siderostat_turn))
 
-    def _in_rad(self, scale: Scales) -> Floats:
+    def _in_rad(self) -> Floats:
         """The design with its hand-over, but the stages in radians, as they are measured and commanded."""
-        system = self._with_hand_over()
+        system, scale = self._with_hand_over(), self._scale
         system[:, INPUTS.index("mirror_px")] *= scale.mirror_px_per_rad
         system[:, INPUTS.index("motor_px")] *= scale.motor_px_per_rad
         system[OUTPUTS.index("mirror_px")] /= scale.mirror_px_per_rad

@@ -23,18 +23,20 @@ def estimator(scale):
 
 
 def test_an_unknown_star_is_taken_to_be_on_the_target(estimator):
-    assert not estimator.known
     assert (
         estimator.predict_px(estimator.stages_px(np.zeros(2), np.zeros(2))).tolist()
         == TARGET_PX.tolist()
     )
 
 
-def test_only_a_frame_makes_the_star_known(estimator):
-    estimator.assume(np.array([3.0, 4.0]), np.zeros(2), np.zeros(2))
-    assert not estimator.known
-    estimator.observe(np.array([3.0, 4.0]), estimator.stages_px(np.zeros(2), np.zeros(2)))
-    assert estimator.known
+def test_a_star_that_was_seen_is_expected_there_until_that_is_forgotten(estimator):
+    seen_px, elsewhere_px, still_rad = np.array([3.0, 4.0]), np.array([7.0, 8.0]), np.zeros(2)
+    estimator.observe(seen_px, np.zeros(2))
+    estimator.expect(elsewhere_px, still_rad, still_rad)
+    assert estimator.predict_px(np.zeros(2)).tolist() == seen_px.tolist()
+    estimator.forget()
+    estimator.expect(elsewhere_px, still_rad, still_rad)
+    assert estimator.predict_px(np.zeros(2)).tolist() == elsewhere_px.tolist()
 
 
 @given(star_px=places, motor_rad=motors, mirror_rad=mirrors)

@@ -24,6 +24,7 @@ T = TypeVar("T")
 _REPLIES = {reply.value: reply for reply in Reply}
 _BLANKS = b"\r\n "
 _POLL_S = 0.02  # how long one read waits; the time limit is counted above it
+_LAST_ANSWERS_S = 0.1  # that they are read, after the last words
 
 
 class EnsembleLink:
@@ -182,13 +183,12 @@ class EnsembleLink:
         )
 
     def _give_up(self) -> None:
-        with contextlib.suppress(OSError):
-            for words in self.last_words:
-                self._port.write(words.encode("ascii") + EOS)
-            # A connection closed with answers unread is reset, and what was not yet heard is lost.
-            end_s = time.monotonic() + self._device.response_timeout_s
-            while self.last_words and self._port.read(64) and time.monotonic() < end_s:
-                pass
+        if self.last_words:
+            with contextlib.suppress(OSError):
+                self._port.write(b"".join(text.encode("ascii") + EOS for text in self.last_words))
+                # A connection closed with answers unread is reset, and what was not yet heard is lost.
+                self._port.timeout = _LAST_ANSWERS_S
+                self._port.read(COMMAND_BYTES_MAX)
         self.close()
 
     def _broken(self, text: str, error: OSError) -> DeviceUnreachable:

@@ -5,10 +5,13 @@ import time
 from collections.abc import Callable, Iterator
 
 import can
+import pytest
 from can.interfaces.slcan import slcanBus
 
 from fitctl import config
 from fitctl.mocks.cia402.drive import Cia402DriveMock
+
+STILL = (0.0, 0.0)
 
 
 class IntegratingMotors:
@@ -90,6 +93,25 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 3.0) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, "did not happen in time"
         time.sleep(0.005)
+
+
+def exchange_until(amplifiers, condition, timeout_s=3.0):
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        reading = amplifiers.exchange(STILL)
+        if reading is not None and condition(reading):
+            return reading
+        time.sleep(0.002)
+    return pytest.fail("the reading did not come")
+
+
+def reading_of(amplifiers, velocity_rad_s=STILL):
+    """A reading, allowing for periods that a stall of the machine ate."""
+    for _ in range(50):
+        reading = amplifiers.exchange(velocity_rad_s)
+        if reading is not None:
+            return reading
+    return pytest.fail("no reading in 50 periods")
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ from cia402_bench import Bench
 from serial.urlhandler import protocol_socket
 
 from fitctl import config
+from fitctl.drivers.cia402.driver import Cia402Amplifiers
 
 
 @pytest.fixture(autouse=True)
@@ -25,3 +26,10 @@ def bench(siderostat) -> Iterator[Bench]:
     bench = Bench(siderostat)
     yield bench
     bench.close()
+
+
+@pytest.fixture
+def amplifiers(bench):
+    amplifiers = Cia402Amplifiers(bench.siderostat)
+    yield amplifiers
+    amplifiers.close()

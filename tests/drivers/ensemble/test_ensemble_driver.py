@@ -1,6 +1,7 @@
 """The Ensemble driver against controllers that differ from the mock, and on its other wires."""
 
 import contextlib
+import threading
 import time
 
 import pytest
@@ -44,13 +45,17 @@ class Script:
     def __init__(self, answers):
         self.answers = WELL | answers
         self.heard = []
+        self.left = threading.Event()
 
     def talk(self, client):
-        with client.makefile("rb") as lines:
-            for line in lines:
-                command = line.decode().strip()
-                self.heard.append(command)
-                client.sendall(self.answers.get(command, "%\n").encode())
+        try:
+            with client.makefile("rb") as lines:
+                for line in lines:
+                    command = line.decode().strip()
+                    self.heard.append(command)
+                    client.sendall(self.answers.get(command, "%\n").encode())
+        finally:
+            self.left.set()
 
 
 @pytest.fixture
@@ -214,9 +219,7 @@ def test_before_it_is_given_up_the_controller_is_told_to_stop_both_axes(scripted
     with pytest.raises(DeviceError):
         driver.exchange((0.5, 0.0))
 
-    end_s = time.monotonic() + 5.0
-    while script.heard[-1] != "ABORT @1" and time.monotonic() < end_s:
-        time.sleep(0.01)
+    assert script.left.wait(5.0)
     assert script.heard[-3:] == ["PFBKPROG(@0)", "ABORT @0", "ABORT @1"]
 
 

@@ -33,7 +33,7 @@ def test_discovery_answers_with_the_first_registers() -> None:
         (p.Command.READREG, "00000a04", p.Status.INVALID_ADDRESS),
         (p.Command.READREG, "00000a01", p.Status.BAD_ALIGNMENT),
         (p.Command.READREG, "", p.Status.INVALID_HEADER),
-        (p.Command.READREG, "00" * 544, p.Status.INVALID_HEADER),
+        pytest.param(p.Command.READREG, "00" * 544, p.Status.INVALID_HEADER, id="544 bytes"),
         (p.Command.READMEM, "00000048 0000", p.Status.INVALID_HEADER),
         (p.Command.READMEM, "00000048 0000 021c", p.Status.INVALID_PARAMETER),
         (p.Command.READMEM, "00000048 0000 0000", p.Status.INVALID_PARAMETER),

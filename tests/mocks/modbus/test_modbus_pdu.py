@@ -100,11 +100,13 @@ def test_an_unknown_function_is_exception_01_whatever_else_is_wrong(function):
         "10 ff ff 00 00 00",
         "10 ff ff 00 02 02 00 00",
         "10 ff ff 00 02 04 00 00",
-        "10 ff ff 00 7c f8" + " 00" * 248,
+        pytest.param("10 ff ff 00 7c f8" + " 00" * 248, id="10 ff ff 00 7c f8 ..."),
         "17 ff ff 00 00 00 00 00 01 02 00 00",
         "17 ff ff 00 7e 00 00 00 01 02 00 00",
         "17 ff ff 00 01 00 00 00 00 00",
-        "17 ff ff 00 01 00 00 00 7a f4" + " 00" * 244,
+        pytest.param(
+            "17 ff ff 00 01 00 00 00 7a f4" + " 00" * 244, id="17 ff ff 00 01 00 00 00 7a f4 ..."
+        ),
         "17 ff ff 00 01 00 00 00 01 04 00 00",
     ],
 )
