@@ -115,7 +115,8 @@ class SequencesView(ListingView):
             return
         steps = ", ".join(step["step"] for step in document["steps"])
         question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
-        self.console.ask("Run", question, lambda: self._start("run", outlives=True))
+        remote = self.console.remote_arguments
+        self.console.ask("Run", question, lambda: self._start("run", *remote, outlives=True))
 
     def action_pause(self) -> None:
         """Pause what is under way, or let it go on."""
@@ -157,11 +158,9 @@ class SequencesView(ListingView):
         path.write_text(tomli_w.dumps({k: v for k, v in document.items() if k != "file"}))
         return str(path)
 
-    def _start(self, word: str, *, outlives: bool = False) -> None:
+    def _start(self, word: str, *more: str, outlives: bool = False) -> None:
         """Do something with the chosen sequence."""
-        arguments = ["sequence", word, self._file(), *self.console.rig_arguments]
-        if word == "run":
-            arguments += self.console.remote_arguments
+        arguments = ["sequence", word, self._file(), *self.console.rig_arguments, *more]
         self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
 
 
