@@ -68,11 +68,15 @@ class SequencesView(ListingView):
         if job is None or job.status is None:
             return
         self._list = None
+        printed = self.query_one(Printed)
         if job.status == 0:
             self._take(json.loads(job.text()))
             job.end()
+        elif printed.moving is None:
+            printed.show(job)  # it says why
         else:
-            self.query_one(Printed).job = job  # it says why
+            self.notify(job.text(), severity="error", timeout=8, markup=False)
+            job.end()
 
     def _take(self, documents: list[dict[str, Any]]) -> None:
         sequences = self.query_one(SequenceList)
