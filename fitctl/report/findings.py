@@ -117,7 +117,7 @@ def _loop(gathered: Gathered, name: str) -> LoopFindings:
         mode_s=_mode_s(ticks, rig.camera.period_s),
         rejections=rejections(gathered, name, judged),
         stacks=found,
-        stages=stages(rig, name, ticks, judged.pieces, found),
+        stages=stages(rig, name, ticks, judged, found),
         counts=_counts(ticks, gathered.timing[name]),
         timing=_timing(ticks, gathered.timing[name]),
     )
