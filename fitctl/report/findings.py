@@ -21,8 +21,15 @@ from fitctl.report.stages import Stacks, Stages, stacks, stages
 from fitctl.supervisor.modes import Mode
 
 AXES = ("az", "el")
-# What timing is told of a second at a time: the median of medians, the worst of worsts.
-_OF_SECONDS: dict[str, Callable[[Any], Any]] = {
+_Tell = Callable[[Any], Any]
+_OF_FRAMES: dict[str, tuple[str, _Tell]] = {
+    "age_median_s": ("frame_age_s", np.median),
+    "age_worst_s": ("frame_age_s", np.max),
+    "compute_median_s": ("compute_s", np.median),
+    "compute_worst_s": ("compute_s", np.max),
+}
+# What is recorded of a second at a time: the median of medians, the worst of worsts.
+_OF_SECONDS: dict[str, _Tell] = {
     "servo_late_median_s": np.median,
     "servo_late_worst_s": np.max,
     "worst_stall_s": np.max,
@@ -117,7 +124,7 @@ def _loop(gathered: Gathered, name: str) -> LoopFindings:
         mode_s=_mode_s(ticks, rig.camera.period_s),
         rejections=rejections(gathered, name, judged),
         stacks=found,
-        stages=stages(rig, name, ticks, judged.pieces, found),
+        stages=stages(rig, name, ticks, judged, found),
         counts=_counts(ticks, gathered.timing[name]),
         timing=_timing(ticks, gathered.timing[name]),
     )
@@ -143,22 +150,9 @@ def _counts(ticks: Columns, timing: Columns) -> dict[str, int]:
 
 def _timing(ticks: Columns, timing: Columns) -> dict[str, float]:
     frames = ticks["number"] >= 0
-    age_s, compute_s = ticks["frame_age_s"][frames], ticks["compute_s"][frames]
-    of_seconds = {
-        name: float(tell(timing[name])) if len(timing.get(name, ())) else math.nan
-        for name, tell in _OF_SECONDS.items()
-    }
-    if not frames.any():
-        return (
-            dict.fromkeys(
-                ("age_median_s", "age_worst_s", "compute_median_s", "compute_worst_s"), math.nan
-            )
-            | of_seconds
-        )
+    series = {name: (ticks[field][frames], tell) for name, (field, tell) in _OF_FRAMES.items()}
+    series |= {name: (timing.get(name, np.empty(0)), tell) for name, tell in _OF_SECONDS.items()}
     return {
-        "age_median_s": float(np.median(age_s)),
-        "age_worst_s": float(age_s.max()),
-        "compute_median_s": float(np.median(compute_s)),
-        "compute_worst_s": float(compute_s.max()),
-        **of_seconds,
+        name: float(tell(values)) if len(values) else math.nan
+        for name, (values, tell) in series.items()
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +64,8 @@ def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
     begins = np.ones(len(rows), bool)
     left = np.cumsum(ticks["mode_number"] != Mode.VERNIER)[rows]
     begins[1:] = (np.diff(left) > 0) | (np.diff(time_s) > LONGEST_GAP_S)
-    since_s = time_s - _last(time_s, begins)
-    still_s = time_s - _last(time_s, _moves(ticks, rows, begins, requirement_px) | begins)
+    since_s = time_s - last_marked(time_s, begins)
+    still_s = time_s - last_marked(time_s, _moves(ticks, rows, begins, requirement_px) | begins)
     counts = (since_s >= SETTLE_S) & (still_s >= TARGET_SETTLE_S)
     seen = rows[counts & ticks["star_visible"][rows]]
     seen_s = ticks["mid_exposure_s"][seen]
@@ -83,10 +83,10 @@ def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
     )
 
 
-def _last(time_s: NDArray[np.float64], marked: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """When it was marked last, at each time; the first counts as marked."""
-    index = np.where(marked, np.arange(len(time_s)), 0)
-    return time_s[np.maximum.accumulate(index)]
+def last_marked(values: NDArray[Any], marked: NDArray[np.bool_]) -> NDArray[Any]:
+    """At each place, the value where it was marked last; the first counts as marked."""
+    index = np.where(marked, np.arange(len(values)), 0)
+    return values[np.maximum.accumulate(index)]
 
 
 def _moves(

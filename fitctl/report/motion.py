@@ -22,6 +22,7 @@ from fitctl.report.drawing import (
     trace,
 )
 from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.judged import last_marked
 from fitctl.report.stages import motion_px
 from fitctl.supervisor.modes import Mode
 
@@ -88,8 +89,7 @@ def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     way.legend(ncols=2, loc="best")
     held = np.flatnonzero(ticks["mode_number"] == Mode.VERNIER)
     # After a slew the siderostat is elsewhere: each stretch of VERNIER has a zero of its own.
-    entered = np.diff(held, prepend=-2) > 1
-    began = held[np.maximum.accumulate(np.where(entered, np.arange(len(held)), 0))]
+    began = last_marked(held, np.diff(held, prepend=-2) > 1)
     for number, (axis, axes) in enumerate(zip(AXES, offload, strict=True)):
         if len(held):
             for series, color, label in (

@@ -65,17 +65,20 @@ def rms_estimate(error_px: Floats) -> Estimate:
     error_px : array, shape (frames,)
         Evenly sampled; pieces of a record end to end.
     """
-    from scipy.special import (
-        stdtrit,
-    )  # Student's t; scipy.stats has it too, and takes half a second to import
+    from scipy.fft import prev_fast_len
+
+    # Student's t; scipy.stats has it too, and takes half a second to import.
+    from scipy.special import stdtrit
 
     error_px = np.asarray(error_px, dtype=float)
     if len(error_px) == 0:
         return Estimate(math.nan, math.nan, math.nan, math.nan)
     rms_px = math.sqrt(np.mean(error_px**2))
-    if len(error_px) < _LEAST_FRAMES or error_px.min() == error_px.max():
+    # To transform other lengths takes ten times the room.
+    whole_px = error_px[: prev_fast_len(len(error_px), real=True)]
+    if len(error_px) < _LEAST_FRAMES or whole_px.min() == whole_px.max():
         return Estimate(rms_px, math.nan, math.nan, math.nan)
-    found = (_by_spectrum(error_px), _by_batches(error_px))
+    found = (_by_spectrum(whole_px), _by_batches(error_px))
     independent = 2 / max(variance for variance, _ in found)
     # ln RMS is half of ln square.
     half = max(stdtrit(freedom, (1 + CONFIDENCE) / 2) * math.sqrt(v) / 2 for v, freedom in found)
@@ -97,9 +100,8 @@ def _by_spectrum(error_px: Floats) -> tuple[float, float]:
     The degrees of freedom are halved. From one record alone slow motion looks quicker than it is, and by as
     much did trials fall short (tests/report/test_residual.py, docs/measurements.md).
     """
-    from scipy.fft import prev_fast_len, rfft
+    from scipy.fft import rfft
 
-    error_px = error_px[: prev_fast_len(len(error_px), real=True)]  # others take ten times the room
     power = np.abs(rfft(error_px) / len(error_px)) ** 2
     at_rest, moving = float(power[0]), 2 * power[1:]
     noise_at_rest = float(moving[:_AT_REST_BINS].mean()) / 2

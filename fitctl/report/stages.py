@@ -12,6 +12,7 @@ from fitctl.config import Rig
 from fitctl.logging.reading import Columns
 from fitctl.model.hysteresis import displacement_series, half_widths_v, stack_gains
 from fitctl.model.optics import piston_m, scales
+from fitctl.report.judged import Judged
 
 Floats = NDArray[np.float64]
 _SAME_PLACE_PX = 0.02  # of the target
@@ -140,15 +141,11 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
 
 
 def stages(
-    rig: Rig,
-    loop_name: str,
-    ticks: Columns,
-    pieces: list[NDArray[np.intp]],
-    found: Stacks | None,
+    rig: Rig, loop_name: str, ticks: Columns, judged: Judged, found: Stacks | None
 ) -> Stages:
-    """The figures of some pieces, rows of ticks; nan without any."""
+    """The figures of what is judged; nan without any."""
     mirror_px, _, setpoint_px = motion_px(rig, loop_name, ticks)
-    rows = np.concatenate([np.empty(0, np.intp), *pieces])
+    rows, pieces = judged.rows, judged.pieces
     if len(rows) == 0:
         nothing = np.full(2, math.nan)
         return Stages(math.nan, math.nan, math.nan, math.nan, nothing, [])

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import msgspec
 from textual.app import App, SystemCommand
@@ -101,7 +101,7 @@ class ConsoleApp(App[None]):
     TITLE = "fitctl"
     ENABLE_COMMAND_PALETTE = True
     COMMANDS = App.COMMANDS | {PlaceProvider, ControllerProvider, ResetProvider}
-    MODES: ClassVar[dict[str, type[View]]] = {  # type: ignore[assignment]  # of str or callable to Screen
+    MODES: ClassVar[dict[str, str | Callable[[], Screen[Any]]]] = {
         "operate": OperateView,
         "devices": DevicesView,
         "loop": LoopScreen,

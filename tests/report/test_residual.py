@@ -95,7 +95,16 @@ def test_the_interval_scales_with_the_motion_and_is_never_wide(factor, duration_
     assert not whole.known or 1 < whole.high_px / whole.low_px <= WIDEST
 
 
-@pytest.mark.parametrize("series", [np.empty(0), np.ones(9), np.ones(5000), np.zeros(5000)])
+@pytest.mark.parametrize(
+    "series",
+    [
+        np.empty(0),
+        np.ones(9),
+        np.ones(5000),
+        np.zeros(5000),
+        np.append(np.zeros(1008), 1.0),  # at rest for all of the length that is transformed
+    ],
+)
 def test_without_enough_data_or_without_motion_there_is_no_interval(series):
     assert not rms_estimate(series).known
 

@@ -1,4 +1,4 @@
-"""A supervisor that never was: deterministic telemetry of a plausible scenario, and links that deliver it.
+"""A supervisor that never was: deterministic telemetry of a plausible scenario.
 
 Times are fixed: the monotonic clock reads `START_S` at the first message, wall time is a winter night.
 """
@@ -29,32 +29,14 @@ from fitctl.supervisor.messages import (
 )
 
 START_S = 1000.0
-
-
 WALL_MINUS_MONOTONIC_S = 1796021000.0
-
-
 MESSAGE_S = 0.05
-
-
 FRAME_S = 0.02
-
-
 SIZE_PX = 40
-
-
 BIAS_DN = 1000.0
-
-
 NOISE_DN = 20.0
-
-
 SPOT_SIGMA_PX = 0.75
-
-
 TARGET_PX = (24.0, 19.5)
-
-
 MODE_NUMBERS = {
     "OFF": 0,
     "STANDBY": 1,
@@ -64,25 +46,15 @@ MODE_NUMBERS = {
     "SAFE": 5,
     "EXPERIMENT": 6,
 }
-
-
 WITH_STAR = {"COARSE", "VERNIER", "EXPERIMENT"}
-
-
 LIMITS = LoopLimits(
     fsm_range_rad=1.772e-4,
     siderostat_travel_sky_arcsec=600.0,
     search_radius_sky_arcsec=215.0,
     spiral_pitch_sky_arcsec=50.0,
 )
-
-
 SPIRAL_S = 8.0
-
-
 # A few rows of the shipped table of interlocks: name, quantity, reading, low, high, action, in which modes.
-
-
 WATCHED = (
     ("star_lost", "star_flux_fraction", 0.98, 0.05, None, "warn", WITH_STAR),
     ("fsm_edge", "fsm_range_fraction", 0.31, None, 0.9, "warn", {"VERNIER"}),
@@ -93,8 +65,6 @@ WATCHED = (
     ("disk_space", "disk_free_bytes", 8.1e10, 1e9, None, "warn", set(MODE_NUMBERS)),
     ("piezo_limit", "piezo_limit_error_v", float("nan"), -1.0, 1.0, "safe", set()),
 )
-
-
 USABLE = {
     "OFF": ["Standby"],
     "STANDBY": ["Acquire", "Off"],

@@ -5,11 +5,7 @@ from pathlib import Path
 import pytest
 from textual.widgets import Input
 
-from fitctl.supervisor.messages import (
-    Reset,
-    SequenceControl,
-    SequenceStatus,
-)
+from fitctl.supervisor.messages import Reset, SequenceControl, SequenceStatus
 from fitctl.tui.dialogs import Ask, Confirm, Reader
 from fitctl.tui.views.sequences import parsed
 from fitctl.tui.widgets.loglist import LogList
@@ -17,7 +13,8 @@ from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.readings import Readings
 from fitctl.tui.widgets.sequencing import Parameters, SequenceList
 from tests.tui.fake import FakeSupervisor
-from tests.tui.fixed import make_logs, settle
+from tests.tui.fixed import FakeJob, make_logs, settle
+from tests.tui.live import notifications
 from tests.tui.piloted import pressed, run, sent
 
 # ---------------------------------------------------------------- devices
@@ -122,6 +119,27 @@ def test_a_file_of_ones_own_is_opened(tmp_path):
         assert ["sequence", "list", "--json", str(path)] in [job.arguments for job in app.jobs]
 
     run(scenario)
+
+
+def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_stages(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.touch()
+    unreadable = FakeJob(["sequence", "check"])
+    unreadable.status = 2
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "g", "y")
+        run_job = app.jobs[-1]
+        run_job.status = None
+        app.start_job = lambda *_arguments: unreadable
+        await pressed(app, pilot, "f")
+        app.screen.query_one(Input).value = str(path)
+        await pressed(app, pilot, "enter")
+        assert app.view.query_one(Printed).job is run_job
+        assert "last line" in notifications(app)
+
+    run(scenario)
+    assert unreadable.ended
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,7 @@ import zmq
 from fitctl.logging.records import Event
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
-from fitctl.supervisor.messages import (
-    RecentEvents,
-    Reply,
-    Stop,
-)
+from fitctl.supervisor.messages import RecentEvents, Reply, Stop
 from fitctl.tui import app as console_app
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.dialogs import events_text
@@ -53,30 +49,24 @@ def test_a_stop_just_before_quitting_is_still_sent():
     assert link.closed
 
 
-def test_a_stop_that_nobody_answers_is_told_as_a_danger():
-    def nobody(_command):
-        raise ConnectionError("no answer in 1 s")
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ConnectionError("no answer in 1 s"), "Stop not confirmed"),
+        (TypeError("a defect"), "Stop not confirmed: It failed: TypeError: a defect"),
+    ],
+)
+def test_a_stop_that_nobody_answers_or_that_fails_is_told_as_a_danger(error, told):
+    def fails(_command):
+        raise error
 
     async def scenario(app, pilot, link):
         await pilot.press("s")
         await until(pilot, lambda: notifications(app))
-        assert "Stop not confirmed" in notifications(app)
+        assert told in notifications(app)
         assert "may still move" in notifications(app)
 
-    run(scenario, link=FakeLink(nobody))
-
-
-def test_a_stop_that_fails_in_an_unforeseen_way_is_told_as_a_danger_too():
-    def broken(_command):
-        raise TypeError("a defect")
-
-    async def scenario(app, pilot, link):
-        await pilot.press("s")
-        await until(pilot, lambda: notifications(app))
-        assert "Stop not confirmed: It failed: TypeError: a defect" in notifications(app)
-        assert "may still move" in notifications(app)
-
-    run(scenario, link=FakeLink(broken))
+    run(scenario, link=FakeLink(fails))
 
 
 def test_old_data_are_said_to_be_old_and_new_data_end_it():

@@ -20,9 +20,7 @@ ANCHORS = {
 @cache
 def colour_map(name: str) -> tuple[str, ...]:
     """`LEVELS` colours from dark to bright."""
-    anchors = np.array(
-        [[int(c[i : i + 2], 16) for i in (0, 2, 4)] for c in ANCHORS[name].split()], dtype=float
-    )
+    anchors = np.array([list(bytes.fromhex(c)) for c in ANCHORS[name].split()], dtype=float)
     places = np.linspace(0, len(anchors) - 1, LEVELS)
     channels = [np.interp(places, np.arange(len(anchors)), anchors[:, i]) for i in range(3)]
     return tuple(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from fitctl.tui.draw.colours import LEVELS
 from fitctl.tui.look import WHITE, Line, style
 
 Floats = NDArray[np.float64]
+PlaceT = TypeVar("PlaceT", float, Floats)  # one place, or many at once
 
 STRETCHES: dict[str, Callable[[Floats, float], Floats]] = {
     "asinh": lambda above, noise: np.arcsinh(above / (4 * noise)),
@@ -52,11 +54,11 @@ class Placing:
     top: int
     height_px: int
 
-    def column(self, az_px: float) -> float:
+    def column(self, az_px: PlaceT) -> PlaceT:
         """Panel column of an azimuth; a cell's left edge is a whole number."""
         return self.left + (az_px + 0.5) * self.zoom / self.shrink
 
-    def row(self, el_px: float) -> float:
+    def row(self, el_px: PlaceT) -> PlaceT:
         """Panel row of an elevation; a cell's upper edge is a whole number."""
         return self.top + (self.height_px - 0.5 - el_px) * self.zoom / self.shrink / 2
 

@@ -135,10 +135,8 @@ def paint(
     for overlay in overlays:
         ink = inks.index(overlay.colour or WHITE)  # over light and dark, white is seen best
         for line in SHAPES[overlay.shape].lines:
-            x = (placing.column(0) - placing.left) * across
-            x = x + (overlay.az_px + line[:, 0]) * placing.zoom / placing.shrink * across
-            y = (placing.row(0) - placing.top) * down
-            y = y - (overlay.el_px + line[:, 1]) * placing.zoom / placing.shrink / 2 * down
+            x = (placing.column(overlay.az_px + line[:, 0]) - placing.left) * across
+            y = (placing.row(overlay.el_px + line[:, 1]) - placing.top) * down
             _stroke(picture, x, y, ink)
 
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIXEL_INKS = 16  # colour registers of a VT340, which xterm imitates to the letter
-KITTY_IMAGE = (
-    0x464954  # this console's only picture: each one sent takes the place of the one before
-)
+# This console's only picture: each one sent takes the place of the one before.
+KITTY_IMAGE = 0x464954
 _CHUNK = 4096
 _RUN = re.compile(r"(.)\1{3,254}", re.DOTALL)
 _BAND_PX = 6
@@ -54,7 +53,7 @@ def sixel(picture: Inks, inks: Sequence[str]) -> str:
 def kitty(picture: Inks, inks: Sequence[str], columns: int, rows: int) -> str:
     """The escape sequence that puts a picture at the cursor, over so many cells; parameters as of `sixel`."""
     height, width = picture.shape
-    table = np.array([_rgb(ink) for ink in inks], dtype=np.uint8)
+    table = np.array([list(_rgb(ink)) for ink in inks], dtype=np.uint8)
     data = base64.standard_b64encode(zlib.compress(table[picture].tobytes(), 1)).decode("ascii")
     chunks = [data[at : at + _CHUNK] for at in range(0, len(data), _CHUNK)]
     keys = f"a=T,f=24,o=z,s={width},v={height},i={KITTY_IMAGE},p=1,c={columns},r={rows},C=1,q=2,"
@@ -73,5 +72,5 @@ def _repeated(run: re.Match[str]) -> str:
     return f"!{len(run[0])}{run[1]}"
 
 
-def _rgb(ink: str) -> tuple[int, int, int]:
-    return int(ink[1:3], 16), int(ink[3:5], 16), int(ink[5:7], 16)
+def _rgb(ink: str) -> bytes:
+    return bytes.fromhex(ink[1:])

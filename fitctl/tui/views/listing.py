@@ -23,7 +23,7 @@ class ListingView(View):
 
     def choices(self) -> list[Choice]:
         """The lists, in reading order."""
-        return list(self.query(Choice))  # type: ignore[type-abstract]  # finds subclasses
+        return [widget for widget in self.query() if isinstance(widget, Choice)]
 
     def on_mount(self) -> None:
         """The first list is active."""

@@ -68,11 +68,15 @@ class SequencesView(ListingView):
         if job is None or job.status is None:
             return
         self._list = None
+        printed = self.query_one(Printed)
         if job.status == 0:
             self._take(json.loads(job.text()))
             job.end()
+        elif printed.moving is None:
+            printed.show(job)  # it says why
         else:
-            self.query_one(Printed).job = job  # it says why
+            self.notify(job.text(), severity="error", timeout=8, markup=False)
+            job.end()
 
     def _take(self, documents: list[dict[str, Any]]) -> None:
         sequences = self.query_one(SequenceList)
@@ -115,7 +119,8 @@ class SequencesView(ListingView):
             return
         steps = ", ".join(step["step"] for step in document["steps"])
         question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
-        self.console.ask("Run", question, lambda: self._start("run", outlives=True))
+        remote = self.console.remote_arguments
+        self.console.ask("Run", question, lambda: self._start("run", *remote, outlives=True))
 
     def action_pause(self) -> None:
         """Pause what is under way, or let it go on."""
@@ -157,11 +162,9 @@ class SequencesView(ListingView):
         path.write_text(tomli_w.dumps({k: v for k, v in document.items() if k != "file"}))
         return str(path)
 
-    def _start(self, word: str, *, outlives: bool = False) -> None:
+    def _start(self, word: str, *more: str, outlives: bool = False) -> None:
         """Do something with the chosen sequence."""
-        arguments = ["sequence", word, self._file(), *self.console.rig_arguments]
-        if word == "run":
-            arguments += self.console.remote_arguments
+        arguments = ["sequence", word, self._file(), *self.console.rig_arguments, *more]
         self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
 
 

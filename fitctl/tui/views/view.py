@@ -82,7 +82,8 @@ class View(Screen[None]):
         """Draw the panels whose turn it is; all without a beat."""
         self.set_class(self.state.stale, "stale")
         self.before_drawing()
-        for panel in self.query(Panel):  # type: ignore[type-abstract]  # finds subclasses
+        panels = [widget for widget in self.query() if isinstance(widget, Panel)]
+        for panel in panels:
             if panel.display and (beat is None or beat % panel.every == 0):
                 panel.redraw()
 

@@ -101,13 +101,18 @@ class FocalPlane(Panel):
         placing = self._placing = place(frame.width_px, frame.height_px, columns, rows)
         caption = self._caption(frame, tick, columns - placing.left)
         below = placing.top + placing.rows
-        levels = levels_on_screen(image, placing, self.stretch)
-        if self._has_room_for_pictures():
+        pictures, cell_px = self._pictures, self._picture_cell_px()
+        if pictures is not None and cell_px is not None:
+            self._beats += 1
+            if self._beats % PICTURE_BEATS == 0:
+                seen_rows = min(placing.rows, rows - 1 - placing.top)
+                self._send(pictures, cell_px, image, placing, seen_rows)
             lines: list[Line] = [[] for _ in range(rows)]
-            self._picture(levels, placing, min(placing.rows, rows - 1 - placing.top))
             lines[min(below, rows - 1)] = [text(" " * placing.left), *caption]
             return lines
-        self.clear()
+        if pictures is not None:
+            pictures.clear()
+        levels = levels_on_screen(image, placing, self.stretch)
         marks = cell_marks(self._overlays(), placing)
         if below >= rows:
             marks |= _written_over(caption, placing.left, rows - 1)
@@ -116,23 +121,25 @@ class FocalPlane(Panel):
             lines[below] = pad([text(" " * placing.left), *caption], columns)
         return lines
 
-    def clear(self) -> None:
-        """Take a picture away, if there is one."""
-        if self._pictures is not None:
-            self._pictures.clear()
+    def _picture_cell_px(self) -> tuple[int, int] | None:
+        """Width and height of a cell; None while there can be no picture.
 
-    def _has_room_for_pictures(self) -> bool:
-        """Nothing lies over the panel, and what it shows is not old, which would have to be faded."""
+        That is while something lies over the panel, or what it shows is old, which would have to be faded.
+        """
         if self._pictures is None or self.state.stale or not self.screen.is_active:
-            return False
-        return not self.screen.query("Toast") and cell_size_px(TERMINAL) is not None
+            return None
+        return None if self.screen.query("Toast") else cell_size_px(TERMINAL)
 
-    def _picture(self, levels: NDArray[np.int64], placing: Placing, rows: int) -> None:
-        """Send the frame with its overlays, now and then."""
-        self._beats += 1
-        cell_px, pictures = cell_size_px(TERMINAL), self._pictures
-        if pictures is None or cell_px is None or self._beats % PICTURE_BEATS:
-            return
+    def _send(
+        self,
+        pictures: PictureSender,
+        cell_px: tuple[int, int],
+        image: NDArray[np.uint16],
+        placing: Placing,
+        rows: int,
+    ) -> None:
+        """Send the frame with its overlays, as much of it as so many rows of cells show."""
+        levels = levels_on_screen(image, placing, self.stretch)
         shades = min(LEVELS, pictures.most_inks - len(OVERLAY_INKS))
         colours = colour_map(self.colours)
         steps = np.linspace(0, LEVELS - 1, shades).round().astype(int)
@@ -147,7 +154,7 @@ class FocalPlane(Panel):
         cells = (placing.columns, rows)
 
         def send() -> None:
-            if self._has_room_for_pictures():
+            if self._picture_cell_px() is not None:
                 pictures.show(picture[: rows * cell_px[1]], inks, at, cells)
 
         self.call_after_refresh(send)  # after what Textual has to send, which would wipe it out

@@ -110,7 +110,7 @@ class Timing(Panel):
         newest, loop = self.state.newest, self.state.loop
         if newest is None or loop is None:
             return []
-        recorder = _recorder(newest, newest.records_lost, columns)
+        recorder = _recorder(newest, columns)
         if loop.timing is None:
             return [[text("no timing yet", DIM)], recorder]
         unsent = sum(newest.losses.unsent.values())
@@ -121,7 +121,8 @@ class Timing(Panel):
         return [*table, *([text(note, DIM)] for note in notes), recorder]
 
 
-def _recorder(newest: Telemetry, lost: int, columns: int) -> Line:
+def _recorder(newest: Telemetry, columns: int) -> Line:
+    lost = newest.records_lost
     if lost:
         return [text(f" ✗ {lost:,} RECORDS LOST ".replace(",", " "), PAPER, on=RED, bold=True)]
     recorder = newest.recorder

@@ -37,12 +37,23 @@ class Printed(Panel):
 
     def start(self, start_job: Callable[..., Job], *arguments: str, outlives: bool = False) -> None:
         """Run another fitctl command in place of the one before, unless that moves the stages still."""
-        if self.job is not None and self.job.outlives and self.job.status is None:
-            self.notify(f"still at work: {self.job.told}", severity="warning", timeout=4)
-            return
+        moving = self.moving
+        if moving is not None:
+            self.notify(f"still at work: {moving.told}", severity="warning", timeout=4)
+        else:
+            self.show(start_job(arguments, outlives=outlives))
+
+    @property
+    def moving(self) -> Job | None:
+        """The command, while it is at work and moves the stages."""
+        job = self.job
+        return job if job is not None and job.outlives and job.status is None else None
+
+    def show(self, job: Job) -> None:
+        """Let a command take the place of the one before, which is ended."""
         if self.job is not None:
             self.job.end()
-        self.job = start_job(arguments, outlives=outlives)
+        self.job = job
         self.redraw()
 
     def draw(self, columns: int, rows: int) -> list[Line]:
