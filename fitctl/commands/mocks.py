@@ -100,6 +100,8 @@ async def _serve_mocks(
         width = max(map(len, endpoints))
         for key, value in endpoints.items():
             print(f"{key:<{width}}  {value}", flush=True)
-    become_realtime(_PRIORITY)  # the hardware that they stand for does not wait for a computer at work
+    become_realtime(
+        _PRIORITY
+    )  # the hardware that they stand for does not wait for a computer at work
     await ending.wait()
     await testbed.stop()
