@@ -161,7 +161,7 @@ def test_quick_commands_run_and_print_what_the_document_shows(found, checkout):
         env=os.environ | {"COLUMNS": "80", "TERM": "dumb"},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=110,  # a batch compiles its kernels first
         check=False,
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Fsm
-from fitctl.model.hysteresis import inverse_volts, play
+from fitctl.model.hysteresis import inverse_volts, play, raised_displacement
 from fitctl.model.optics import mirror_from_stacks, stack_matrix
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Mirror:
             self._half_width_v = np.asarray(known.half_widths_v)
             self._gains = np.asarray(known.gains_m_per_v)
             # Where stacks rest that came up from zero to their bias: the mirror's zero.
-            self._zero_m = self._gains @ np.maximum(fsm.bias_v - self._half_width_v, 0.0)
+            self._zero_m = raised_displacement(fsm.bias_v, self._half_width_v, self._gains)
             self._zero_rad = mirror_from_stacks(self._zero_m, fsm.stack_radius_m)
             per_m = mirror_from_stacks(np.eye(3), fsm.stack_radius_m).T
             self._rad_per_play_v = (per_m[..., None] * self._gains).reshape(2, -1)

@@ -13,7 +13,7 @@ from scipy.signal import welch
 from fitctl.config import Fsm, Rig
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.records import Tick
-from fitctl.model.hysteresis import displacement_series
+from fitctl.model.hysteresis import displacement_series, raised_displacement
 from fitctl.model.optics import mirror_angles, mirror_from_stacks, scales
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.simulate import SETTLE_S
@@ -112,7 +112,7 @@ def _mirror_angles_rad(fsm: Fsm, ticks: Ticks) -> Floats:
         return mirror_angles(volts, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
     half_width_v, gains = np.asarray(known.half_widths_v), np.asarray(known.gains_m_per_v)
     moved_m = displacement_series(volts, half_width_v, gains)
-    moved_m -= gains @ np.maximum(fsm.bias_v - half_width_v, 0.0)
+    moved_m -= raised_displacement(fsm.bias_v, half_width_v, gains)
     return mirror_from_stacks(moved_m, fsm.stack_radius_m)
 
 

@@ -90,6 +90,23 @@ def hysteresis_output(state: Floats, gains: Floats) -> Floats:
     return np.vecdot(state, gains)
 
 
+def raised_displacement(volts: float, half_width_v: Floats, gains: Floats) -> Floats:
+    """Displacements of relaxed stacks once raised to a voltage, such as the bias: the virgin curve.
+
+    Parameters
+    ----------
+    volts : float
+    half_width_v : array, shape (n,)
+    gains : array, shape (n,) or (stacks, n)
+
+    Returns
+    -------
+    array, shape () or (stacks,)
+        Metres.
+    """
+    return np.asarray(gains @ np.maximum(volts - half_width_v, 0.0))
+
+
 def inverse_model(half_width_v: Floats, gains: Floats) -> tuple[Floats, Floats]:
     """The exact inverse operator, metres to volts: itself parallel plays.
 

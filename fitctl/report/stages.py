@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.logging.reading import Columns
-from fitctl.model.hysteresis import displacement_series, half_widths_v, stack_gains
+from fitctl.model.hysteresis import (
+    displacement_series,
+    half_widths_v,
+    raised_displacement,
+    stack_gains,
+)
 from fitctl.model.optics import piston_m, scales
 from fitctl.report.judged import Judged
 
@@ -114,7 +119,7 @@ def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
         return None
     volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
     displacement_m = displacement_series(volts, half_v, gains)
-    displacement_m -= gains @ np.maximum(fsm.bias_v - half_v, 0.0)
+    displacement_m -= raised_displacement(fsm.bias_v, half_v, gains)
     # Piece by piece: its vectors would take ten times the room of what comes of them.
     pieces = np.array_split(displacement_m, 1 + len(volts) // _PIECE)
     piston = np.concatenate([piston_m(piece, fsm.stack_radius_m) for piece in pieces])

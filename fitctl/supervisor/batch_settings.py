@@ -17,6 +17,7 @@ from fitctl.config import HALF_WINDOW_PX, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import HAND_OVER_S, left_at_rest, rest_state
 from fitctl.controllers.spiral import plan_spiral
+from fitctl.model.hysteresis import raised_displacement
 from fitctl.model.light import light_table
 from fitctl.model.optics import mirror_angles, scales, stack_matrix
 from fitctl.model.pixel_noise import quantiles
@@ -244,7 +245,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         "known_plays": len(known_half_v),
         "known_half_v": _padded(known_half_v, MOST_PLAYS),
         "known_gains": _padded(known_gains, 3, MOST_PLAYS),
-        "zero_m": known_gains @ np.maximum(fsm.bias_v - known_half_v, 0.0),
+        "zero_m": raised_displacement(fsm.bias_v, known_half_v, known_gains),
         "dac_step_v": fsm.dac.full_scale_v / (2**fsm.dac.bits - 1),
         "dac_most_v": fsm.piezo.limit_v / fsm.piezo.gain,
         "servo_period_s": servo_period_s,
