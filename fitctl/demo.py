@@ -32,6 +32,7 @@ from fitctl.processes import (
 )
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import make_service_folder
+from fitctl.supervisor.last_records import HELLO_S
 from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.run import only_supervisor
@@ -39,7 +40,7 @@ from fitctl.supervisor.simulate import pair, rms
 
 JUDGED_S = 30.0
 _START_TIMEOUT_S = 60.0
-_END_TIMEOUT_S = 75.0  # longer than the supervisor waits for its recorder
+_END_TIMEOUT_S = HELLO_S + 15.0  # longer than the supervisor waits for its recorder
 
 
 class DemoError(Exception):
