@@ -60,7 +60,9 @@ def console(
         graphics=graphics_of(Graphics(graphics), os.environ),
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
-    os.nice(_NICENESS)  # whatever points the star goes first
+    # Whatever points the star goes first. What the console starts gives way as well: a sequence, too, only
+    # asks the supervisor for what that then does in its own time.
+    os.nice(_NICENESS)
     app.run()
 
 
