@@ -22,9 +22,17 @@ from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.model.optics import scales
-from fitctl.processes import end_process, last_line, lock_held, signals_ignored, start_process
+from fitctl.processes import (
+    end_process,
+    last_line,
+    lock_held,
+    rig_arguments,
+    signals_ignored,
+    start_process,
+)
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import make_service_folder
+from fitctl.supervisor.last_records import HELLO_S
 from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.run import only_supervisor
@@ -32,7 +40,7 @@ from fitctl.supervisor.simulate import pair, rms
 
 JUDGED_S = 30.0
 _START_TIMEOUT_S = 60.0
-_END_TIMEOUT_S = 75.0  # longer than the supervisor waits for its recorder
+_END_TIMEOUT_S = HELLO_S + 15.0  # longer than the supervisor waits for its recorder
 
 
 class DemoError(Exception):
@@ -77,18 +85,16 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
     folder = Path(tempfile.mkdtemp(prefix="fitctl-demo-"))
     stack = ExitStack()
     try:
-        common = ["--rig", str(rig_path), *_set(overrides)]
-        mocks = _start(
-            folder, "mocks", ["mocks", *common, "--seed", str(seed), "--free-ports", "--json"]
-        )
+        options = ["--seed", str(seed), "--free-ports", "--json"]
+        mocks = _start(folder, "mocks", ["mocks", *rig_arguments(rig_path, overrides), *options])
         processes.append(mocks)
         endpoints = _first_line(mocks, folder)
         devices = [
             f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
         ]
         sockets = stack.enter_context(_socket_folder(load_rig(rig_path, overrides), folder))
-        settings = _set([*devices, f"service.folder={sockets}"])
-        supervisor = _start(folder, "supervisor", ["run", *common, *settings])
+        settings = [*overrides, *devices, f"service.folder={sockets}"]
+        supervisor = _start(folder, "supervisor", ["run", *rig_arguments(rig_path, settings)])
         processes.append(supervisor)
         bench_port = int(endpoints["mocks.bench_port"])
         running = Instrument(
@@ -243,10 +249,6 @@ def newest_telemetry(folder: Path) -> Telemetry | None:
 
 
 # ---------------------------------------------------------------- parts
-
-
-def _set(overrides: Sequence[str]) -> list[str]:
-    return [part for override in overrides for part in ("--set", override)]
 
 
 @contextmanager

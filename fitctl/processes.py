@@ -17,6 +17,11 @@ ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PARENT_CHECK_S = 0.25
 
 
+def rig_arguments(path: Path, overrides: Sequence[str]) -> list[str]:
+    """Options by which another fitctl process is told the same rig."""
+    return ["--rig", str(path), *(part for text in overrides for part in ("--set", text))]
+
+
 def start_process(
     arguments: Sequence[str],
     *,

@@ -11,8 +11,10 @@ import typer
 from typer.core import TyperCommand
 
 from fitctl.commands import completing
-from fitctl.commands.choosing import connect, insist_on_loop, rig_arguments, rig_of
+from fitctl.commands.choosing import connect, insist_on_loop, rig_of
 from fitctl.commands.options import JsonOption, RemoteOption, RigOption, SetOption
+from fitctl.config import default_rig_path
+from fitctl.processes import rig_arguments
 
 _NICENESS = 5
 
@@ -34,7 +36,7 @@ def console(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig."""
-    arguments = rig_arguments(rig, overrides)
+    arguments = rig_arguments(rig or default_rig_path(), overrides or ())
     remote_arguments = ["--remote", str(remote)] if remote else []
     client = connect(rig, overrides, remote)
     if web:
@@ -58,7 +60,9 @@ def console(
         graphics=graphics_of(Graphics(graphics), os.environ),
     )
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
-    os.nice(_NICENESS)  # whatever points the star goes first
+    # Whatever points the star goes first. What the console starts gives way as well: a sequence, too, only
+    # asks the supervisor for what that then does in its own time.
+    os.nice(_NICENESS)
     app.run()
 
 

@@ -23,14 +23,6 @@ def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
     return load_rig(path or default_rig_path(), overrides or ())
 
 
-def rig_arguments(path: Path | None, overrides: list[str] | None) -> list[str]:
-    """The same rig for another fitctl process."""
-    arguments = ["--rig", str(path or default_rig_path())]
-    for override in overrides or ():
-        arguments += ["--set", override]
-    return arguments
-
-
 def with_controller(
     path: Path | None, overrides: list[str] | None, controller: str | None
 ) -> list[str]:

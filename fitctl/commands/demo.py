@@ -9,11 +9,16 @@ from typing import Any
 import typer
 
 from fitctl import demo as demos
-from fitctl.commands.choosing import rig_arguments
 from fitctl.commands.exits import FAILED
 from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import Rig
-from fitctl.processes import end_process, ended_by_signals, interrupt, show_process
+from fitctl.processes import (
+    end_process,
+    ended_by_signals,
+    interrupt,
+    rig_arguments,
+    show_process,
+)
 from fitctl.supervisor.messages import Telemetry
 
 _CONSOLE_END_S = 3.0

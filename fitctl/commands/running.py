@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from fitctl.commands.choosing import client_of, rig_arguments, rig_of, with_controller
+from fitctl.commands.choosing import client_of, rig_of, with_controller
 from fitctl.commands.options import (
     ControllerOption,
     JsonOption,
@@ -87,7 +87,7 @@ def run(
     parent_pid: ParentOption = None,
 ) -> None:
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
-    from fitctl.processes import end_with_parent
+    from fitctl.processes import end_with_parent, rig_arguments
     from fitctl.supervisor.run import run_supervisor
 
     overrides = with_controller(rig, overrides, controller)
@@ -95,7 +95,7 @@ def run(
     end_with_parent(parent_pid)
     run_supervisor(
         settings,
-        rig_arguments(rig, overrides),
+        rig_arguments(rig or default_rig_path(), overrides),
         lambda folder: print(f"supervising {settings.name}; sockets in {folder}", flush=True),
     )
 

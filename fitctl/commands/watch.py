@@ -14,7 +14,7 @@ import msgspec
 from fitctl.commands.printing import to_json
 from fitctl.commands.status import NO_SUPERVISOR, utc
 from fitctl.logging.records import Severity
-from fitctl.processes import ended_by_signals
+from fitctl.processes import ended_by_signals, interrupt
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import LoopState, Telemetry
 from fitctl.supervisor.modes import Mode
@@ -67,10 +67,6 @@ class Silence(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", tag="
 Entry = Second | Happened | Silence
 
 
-class _Ended(Exception):
-    """Ctrl-C or another signal: the ordinary end."""
-
-
 def run_watch(client: Client, duration_s: float | None, *, as_json: bool) -> int:
     """Print lines until Ctrl-C, for `duration_s` at the most; returns the exit status.
 
@@ -79,22 +75,18 @@ def run_watch(client: Client, duration_s: float | None, *, as_json: bool) -> int
     text = to_json if as_json else _text
     heard = False
     try:
-        with ended_by_signals(_end):
+        with ended_by_signals(interrupt):
             for entry in entries(client.receive, duration_s):
                 heard = heard or not isinstance(entry, Silence)
                 print(text(entry), flush=True)
-    except _Ended:
-        pass
+    except KeyboardInterrupt:
+        pass  # the ordinary end
     except BrokenPipeError:
         # Nobody reads any more; what Python would still flush has nowhere to go.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         client.close()
     return 0 if heard else NO_SUPERVISOR
-
-
-def _end() -> None:
-    raise _Ended
 
 
 def entries(

@@ -94,9 +94,8 @@ def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
         return
     r.lost = 0
     az_px, el_px = r.star_px[0] - r.command_px[0], r.star_px[1] - r.command_px[1]
-    az_px, el_px = turned_back(
-        s.mirror_turn, az_px, el_px
-    )  # the diamond lies along the mirror's axes
+    # The diamond lies along the mirror's axes.
+    az_px, el_px = turned_back(s.mirror_turn, az_px, el_px)
     need = (abs(az_px) + abs(el_px)) / (s.mirror_px_per_rad * s.range_rad)
     r.in_reach = r.in_reach + 1 if need <= s.reach_fraction else 0
     r.out_of_reach = r.out_of_reach + 1 if need > 1.0 else 0

@@ -17,9 +17,9 @@ from fitctl.config import HALF_WINDOW_PX
 from fitctl.controllers.centroid import EDGE_PX, LARGEST_PEAK, MAX_CANDIDATES
 from fitctl.model.compiled import jit, jit_inlined
 from fitctl.model.kernels import play_output, render, turned, turned_back
+from fitctl.supervisor.batch_settings import SIDE_PX
 
 Floats = NDArray[np.float64]
-_SIDE_PX = 2 * HALF_WINDOW_PX + 1
 
 
 # ---------------------------------------------------------------- position servo
@@ -80,12 +80,12 @@ def centroid(
     All nan where there is no light, or one pixel has most of it.
     """
     top, left = window_el - HALF_WINDOW_PX - first_row, window_az - HALF_WINDOW_PX - first_column
-    window_dn = light_dn[top : top + _SIDE_PX, left : left + _SIDE_PX]
+    window_dn = light_dn[top : top + SIDE_PX, left : left + SIDE_PX]
     flux = az_moment = el_moment = peak = 0.0
-    for row in range(_SIDE_PX):
+    for row in range(SIDE_PX):
         # A sum of its own for each row: one long sum would wait for itself.
         row_dn = row_moment = 0.0
-        for column in range(_SIDE_PX):
+        for column in range(SIDE_PX):
             dn = window_dn[row, column] - s.bias_dn
             peak = max(peak, dn)
             row_dn += dn
@@ -339,18 +339,17 @@ def pair_start(s: Any, r: Any) -> None:
     """``Pair.start`` from where the stages are, and ``Mirror.held_rad``."""
     ideal_rad_per_v = s.scale_m_per_v / (2 * s.stack_radius_m)
     if s.inverse_wanted and s.hysteresis_known:
-        az_px, el_px = mirror_px(s, r.mirror_rad[0], r.mirror_rad[1])
+        held_px = mirror_px(s, r.mirror_rad[0], r.mirror_rad[1])
     else:
-        az_px, el_px = mirror_px(
+        held_px = mirror_px(
             s,
             (r.stack_v[1] - r.stack_v[2]) * ideal_rad_per_v,
             (r.stack_v[0] - r.stack_v[1]) * ideal_rad_per_v,
         )
     for axis in range(2):
-        held_px = az_px if axis == 0 else el_px
         for state in range(s.states):
-            r.pair_state[axis, state] = held_px * s.pair_at_rest[state]
-        r.held_px[axis] = held_px * s.pair_left_at_rest
+            r.pair_state[axis, state] = held_px[axis] * s.pair_at_rest[state]
+        r.held_px[axis] = held_px[axis] * s.pair_left_at_rest
         r.excess_px[axis] = 0.0
         r.motor_origin_rad[axis] = r.position_rad[axis]
         r.target_origin_px[axis] = r.command_px[axis]
@@ -360,16 +359,16 @@ def pair_start(s: Any, r: Any) -> None:
 def pair_step(s: Any, r: Any, w: Any) -> Any:
     """``Pair.step``: from the error to the siderostat's set-point, and the mirror's angles."""
     columns = s.states + 5
-    mirror_az_px, mirror_el_px = mirror_px(s, r.seen_mirror_rad[0], r.seen_mirror_rad[1])
-    motor_az_px, motor_el_px = motor_px(
+    mirrors_px = mirror_px(s, r.seen_mirror_rad[0], r.seen_mirror_rad[1])
+    motors_px = motor_px(
         s, r.motor_rad[0] - r.motor_origin_rad[0], r.motor_rad[1] - r.motor_origin_rad[1]
     )
     step_az_px = step_el_px = 0.0
     for axis in range(2):
         w.pair_inputs[0] = r.star_px[axis] - r.command_px[axis]
         w.pair_inputs[1] = r.excess_px[axis]
-        w.pair_inputs[2] = mirror_az_px if axis == 0 else mirror_el_px
-        w.pair_inputs[3] = motor_az_px if axis == 0 else motor_el_px
+        w.pair_inputs[2] = mirrors_px[axis]
+        w.pair_inputs[3] = motors_px[axis]
         w.pair_inputs[4] = r.command_px[axis] - r.target_origin_px[axis]
         for state in range(s.states):
             w.pair_inputs[5 + state] = r.pair_state[axis, state]

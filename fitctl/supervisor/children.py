@@ -25,7 +25,7 @@ class Child:
     arguments : sequence of str
         ``fitctl`` arguments that start it.
     errors : Path
-        Where its error output goes.
+        Where its error output goes; removed at the end.
     again : str
         What starting it again means, for people.
     note : callable
@@ -82,6 +82,7 @@ class Child:
     def end(self, timeout_s: float = END_S) -> None:
         """Let it write what it has and end; it is killed if it does not within the time."""
         end_process(self._process, timeout_s)
+        self._errors.unlink(missing_ok=True)
 
     def _start(self) -> None:
         with self._errors.open("wb") as errors:

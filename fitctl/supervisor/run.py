@@ -54,18 +54,7 @@ from fitctl.supervisor.service_manager import (
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
 
-_RECORDER_ERRORS = "recorder.err"
-_METRICS_ERRORS = "metrics.err"
-_GATEWAY_ERRORS = "gateway.err"
-_FILES = (
-    COMMAND_SOCKET,
-    TELEMETRY_SOCKET,
-    RECORDS_SOCKET,
-    GATEWAY_SOCKET,
-    _RECORDER_ERRORS,
-    _METRICS_ERRORS,
-    _GATEWAY_ERRORS,
-)
+_SOCKETS = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
@@ -147,7 +136,7 @@ def run_supervisor(
         stack.enter_context(ended_by_signals(ending.set))
         stack.enter_context(only_supervisor(folder))
         check_keyed_door(rig)  # what the gateway will need
-        for name in _FILES:
+        for name in _SOCKETS:
             stack.callback((folder / name).unlink, missing_ok=True)
         clock = MonotonicClock()
         queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
@@ -206,21 +195,17 @@ def _children(
     folder: Path,
     note: Callable[[Severity, str, str], None],
 ) -> list[Child]:
-    record = ["record", *rig_arguments]
-    children = [
-        Child("recorder", record, folder / _RECORDER_ERRORS, "a new one begins a new file", note)
+    """The recorder, and then what else the rig asks for."""
+    beside = (
+        (True, "recorder", "record", "a new one begins a new file"),
+        (rig.service.metrics_port, "metrics server", "metrics", "a new one is started"),
+        (rig.service.tcp_address, "gateway", "gateway", "a new one is started"),
+    )
+    return [
+        Child(name, [command, *rig_arguments], folder / f"{command}.err", again, note)
+        for wanted, name, command, again in beside
+        if wanted
     ]
-    if rig.service.metrics_port:
-        serve = ["metrics", *rig_arguments]
-        children.append(
-            Child("metrics server", serve, folder / _METRICS_ERRORS, "a new one is started", note)
-        )
-    if rig.service.tcp_address:
-        admit = ["gateway", *rig_arguments]
-        children.append(
-            Child("gateway", admit, folder / _GATEWAY_ERRORS, "a new one is started", note)
-        )
-    return children
 
 
 def _modes(supervisor: Supervisor) -> str:

@@ -2,7 +2,6 @@
 
 import time
 from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
 import psutil
@@ -142,11 +141,8 @@ class WatchedRig(Rig):
     def is_reached_from_elsewhere(self):
         """Somebody with a key, who was there all the time, sees telemetry and is answered."""
         if self.elsewhere is None:
-            path, *settings = (part for part in self.common[1:] if part != "--set")
-            file = self.folder / "anna.key.toml"
-            self.elsewhere = Client(
-                new_key(load_rig(Path(path), settings), "anna", "commander", "", file)
-            )
+            rig, file = load_rig(self.file, self.settings), self.folder / "anna.key.toml"
+            self.elsewhere = Client(new_key(rig, "anna", "commander", "", file))
         while self.elsewhere.receive(0.0) is not None:
             pass  # what came before
         answered = seen = False

@@ -12,10 +12,14 @@ from tests.logged_simulation import LoggedSimulation
 
 @pytest.fixture
 def simulate_with():
-    """Make a simulation of the default rig with some values replaced."""
+    """Make a simulation of the default rig with some values replaced; its `records` are all that it made."""
 
-    def make(*overrides, seed=0, **kwargs):
-        return Simulation(load_rig(default_rig_path(), overrides), seed, **kwargs)
+    def make(*overrides, seed=0, **options):
+        records = []
+        rig = load_rig(default_rig_path(), overrides)
+        simulation = Simulation(rig, seed, record=records.append, **options)
+        simulation.records = records
+        return simulation
 
     return make
 
@@ -23,9 +27,7 @@ def simulate_with():
 @pytest.fixture
 def vernier(simulate_with):
     """An instrument that holds its star."""
-    records = []
-    simulation = simulate_with(**NEAR, record=records.append)
-    simulation.records = records
+    simulation = simulate_with(**NEAR)
     simulation.acquire()
     return until(simulation, Mode.VERNIER)
 

@@ -1,7 +1,7 @@
 """What a simulation does while it is logged, and the replay of such a log."""
 
 import pytest
-from simulated import failing, until
+from simulated import TWO_STARS, darken, failing, until
 
 from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_json
 from fitctl.drivers.interface import DeviceMismatch, DeviceTimeout
@@ -80,7 +80,7 @@ def an_experiment(simulation):
 def a_star_that_is_lost(simulation):
     hold_a_star(simulation)
     flux_dn = simulation.camera._scene._flux_dn
-    simulation.camera._scene._flux_dn = 0.0 * flux_dn
+    darken(simulation)
     simulation.run(1.0)
     simulation.camera._scene._flux_dn = flux_dn
     simulation.run(3.0)
@@ -164,10 +164,6 @@ INTERLOCKS = [
     "interlocks.clock={ quantity = 'clock_step_s', high = 1.0, for_s = 0.1, modes = ['VERNIER'], "
     "action = 'safe', reset = 'hand' }",
 ]
-TWO_STARS = (
-    "plant.loops.right.spots=[{name='a', offset_px={az=0.0, el=0.0}, flux_dn=30000.0, diameter_px=3.0}, "
-    "{name='b', offset_px={az=-9.0, el=5.0}, flux_dn=24000.0, diameter_px=3.0}]"
-)
 FAULT = {"STAR_FOUND", "IN_REACH", "FAULT", "RECOVER"}
 # What is done, with which rig, and what must have happened for it to say anything.
 COURSES = {

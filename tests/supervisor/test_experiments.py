@@ -26,16 +26,15 @@ def held(simulate_with):
     """A star held in VERNIER, and every record from then on."""
 
     def make(*overrides):
-        records = []
-        simulation = simulate_with(*overrides, record=records.append, star_offset_px=(2.0, -1.0))
+        simulation = simulate_with(*overrides, star_offset_px=(2.0, -1.0))
         simulation.acquire()
         loop = simulation.supervisor.loops["right"]
         while loop.mode is not Mode.VERNIER:
             assert simulation.clock.now_s() < 60
             simulation.run(0.5)
         simulation.run(5.0)
-        records.clear()
-        return simulation, loop, records
+        simulation.records.clear()
+        return simulation, loop, simulation.records
 
     return make
 

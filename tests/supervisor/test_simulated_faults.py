@@ -132,9 +132,7 @@ def test_a_frame_that_does_not_come_is_a_fault_in_time(vernier, monkeypatch):
 
 
 def test_devices_that_do_not_open_leave_the_instrument_off_and_say_why(simulate_with, monkeypatch):
-    records = []
-    simulation = simulate_with(record=records.append)
-    simulation.records = records
+    simulation = simulate_with()
     error = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
     monkeypatch.setattr(simulation.devices.loops["right"].piezo, "open", failing(error))
 

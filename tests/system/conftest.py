@@ -14,14 +14,14 @@ import pytest
 
 from benchmarks.hardware import never_wait
 from fitctl.config import default_rig_path
+from fitctl.processes import rig_arguments
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
 WITH_US = ("--parent-pid", os.getpid())  # they end when the tests are killed
-signal.signal(
-    signal.SIGINT, signal.default_int_handler
-)  # ignored in a shell's background, also by children
+# In a shell's background it is ignored, also by children.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 NEAR = "plant.loops.right.star_offset_sky_arcsec_max=5.0"  # found at once
 
 
@@ -53,23 +53,22 @@ class Rig:
     def __init__(self, folder: Path, file: Path | None = None):
         self.folder = folder
         self.sockets = Path(f"/tmp/fitctl-test-{os.getpid()}-{time.monotonic_ns()}")
-        self.common = [
-            "--rig",
-            str(file or default_rig_path()),
-            "--set",
-            f"logging.folder={folder}",
-            "--set",
-            f"service.folder={self.sockets}",
-        ]
+        self.file = file or default_rig_path()
+        self.settings = [f"logging.folder={folder}", f"service.folder={self.sockets}"]
         self.before = ()  # what goes before the supervisor on its command line
         self.errors = None  # where the error output of mocks and supervisor goes; None is our own
         self.mocks = self.supervisor = None
         self.client = None
 
-    def start_mocks(self, *arguments):
+    @property
+    def common(self):
+        """Options by which another process is told this rig."""
+        return rig_arguments(self.file, self.settings)
+
+    def start_mocks(self, *arguments, settings=()):
         self.mocks = fitctl(
             "mocks",
-            *self.common,
+            *rig_arguments(self.file, [*self.settings, *settings]),
             *WITH_US,
             "--json",
             *arguments,
@@ -88,25 +87,21 @@ class Rig:
             "mocks.loops.right.modbus_port": self.endpoints["loops.right.fsm.dac.port"],
             "mocks.loops.right.mdt693_port": self._port("loops.right.fsm.piezo.port"),
         }
-        self.start_mocks(
-            *(part for key, port in ports.items() for part in ("--set", f"{key}={port}"))
-        )
+        self.start_mocks(settings=[f"{key}={port}" for key, port in ports.items()])
 
     def _port(self, key):
         return self.endpoints[key].rpartition(":")[2]
 
     def start_supervisor(self):
         devices = [
-            part
+            f"{key}={value}"
             for key, value in self.endpoints.items()
             if not key.startswith("mocks.")
-            for part in ("--set", f"{key}={value}")
         ]
         self.supervisor = fitctl(
             "run",
-            *self.common,
+            *rig_arguments(self.file, [*self.settings, *devices]),
             *WITH_US,
-            *devices,
             before=self.before,
             stdout=subprocess.PIPE,
             stderr=self.errors,
@@ -176,7 +171,7 @@ def running(folder, *settings, file=None, kind=Rig, before=(), mocks=()):
     """Mock testbed and supervisor of a rig, with some values replaced; `mocks` are options of the testbed."""
     rig = kind(folder, file)
     rig.before = before
-    rig.common += [part for setting in settings for part in ("--set", setting)]
+    rig.settings += settings
     try:
         rig.start_mocks("--free-ports", *mocks)
         rig.start_supervisor()

@@ -25,10 +25,8 @@ def test_two_demos_begun_at_once_are_two_instruments(tmp_path, sockets):
             "--headless",
             "--duration",
             1,
-            "--set",
-            f"logging.folder={tmp_path}",
-            "--set",
-            f"service.folder={sockets}",
+            *("--set", f"logging.folder={tmp_path}"),
+            *("--set", f"service.folder={sockets}"),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )

@@ -12,7 +12,8 @@ import pytest
 import zmq
 from served import free_port
 
-from fitctl.config import default_rig_path, load_rig
+from fitctl.config import load_rig
+from fitctl.processes import rig_arguments
 from fitctl.supervisor.client import Client
 from fitctl.supervisor.endpoints import tcp_endpoint
 from fitctl.supervisor.keys import new_key
@@ -30,15 +31,14 @@ def rig(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gateway")
     rig = Rig(folder)
     rig.endpoints = {}
-    rig.settings = [
+    rig.settings += [
         "interlocks.disk_space.low=0.0",
         "service.tcp_address=127.0.0.1",
         f"service.keys_folder={folder / 'keys'}",
         f"service.command_port={free_port()}",
         f"service.telemetry_port={free_port()}",
     ]
-    rig.common += [part for setting in rig.settings for part in ("--set", setting)]
-    loaded = load_rig(default_rig_path(), rig.settings)
+    loaded = load_rig(rig.file, rig.settings)
     rig.key, rig.other_key = (
         new_key(loaded, name, "commander", "", folder / f"{name}.key.toml")
         for name in ("anna", "bob")
@@ -139,9 +139,9 @@ def test_a_port_that_somebody_else_has_is_one_line_and_status_2(rig, tmp_path):
         other.listen()
         port = other.getsockname()[1]
         changed = [f"service.command_port={port}", f"service.folder={tmp_path / 's'}"]
-        options = [part for setting in changed for part in ("--set", setting)]
+        options = rig_arguments(rig.file, [*rig.settings, *changed])
         done = subprocess.run(
-            [sys.executable, "-m", "fitctl", "run", *rig.common, *options],
+            [sys.executable, "-m", "fitctl", "run", *options],
             capture_output=True,
             text=True,
             timeout=START_S,

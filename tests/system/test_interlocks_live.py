@@ -11,7 +11,7 @@ from .conftest import Rig
 def supervisor(tmp_path):
     """One that asks for more room on the disk than there is; it needs no devices to say so."""
     rig = Rig(tmp_path)
-    rig.common += ["--set", "interlocks.disk_space.low=1e18"]
+    rig.settings.append("interlocks.disk_space.low=1e18")
     rig.endpoints = {}
     try:
         rig.start_supervisor()

@@ -13,6 +13,7 @@ from contextlib import suppress
 import psutil
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from served import free_port
 
 from fitctl.supervisor.messages import Stop
 
@@ -24,11 +25,8 @@ def supervisor(tmp_path):
     """One without devices: OFF, recording, and well."""
     rig = Rig(tmp_path)
     rig.endpoints = {}
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        rig.metrics_port = free.getsockname()[1]
-    rig.common += ["--set", f"service.metrics_port={rig.metrics_port}"]
-    rig.common += ["--set", "interlocks.disk_space.low=0.0"]
+    rig.metrics_port = free_port()
+    rig.settings += [f"service.metrics_port={rig.metrics_port}", "interlocks.disk_space.low=0.0"]
     try:
         yield rig
     finally:

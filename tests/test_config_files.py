@@ -1,0 +1,150 @@
+"""Rig files as files: what is laid over what, and by which name a mistake is told."""
+
+import pytest
+
+from fitctl.config import ConfigError, default_rig_path, load_rig
+
+# ---------------------------------------------------------------- files that are not rig files
+
+
+def test_no_such_file(tmp_path):
+    path = tmp_path / "gone.toml"
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+    expected = f"{path}: no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+    assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[camera\n", r"not TOML: .*\(at line 1, column 8\)"),
+        (b"name = 'a'\nname = 'b'\n", r"not TOML: .*line 2"),
+        (b"\xff\xfe\x00", "cannot be read: 'utf-8' codec"),
+        (b"", "schema_version: is missing"),
+    ],
+)
+def test_a_file_that_is_not_a_rig(tmp_path, content, said):
+    path = tmp_path / "odd.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"odd\.toml: {said}"):
+        load_rig(path)
+
+
+def test_a_folder_is_not_a_rig(tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot be read: .*Is a directory"):
+        load_rig(tmp_path)
+
+
+# ---------------------------------------------------------------- --set
+
+
+def test_overrides_replace_values_in_order():
+    rig = load_rig(
+        default_rig_path(),
+        [
+            "camera.frame_rate_hz=25",
+            "camera.frame_rate_hz = 40.0",
+            "logging.compression=lz4",
+            "loops.right.fsm.dac.host='10.0.0.9'",
+            "loops.right.target_px={ az = 20.0, el = 20.0 }",
+            "mocks.gvcp_port=0",
+        ],
+    )
+    assert rig.camera.frame_rate_hz == 40.0
+    assert rig.logging.compression == "lz4"
+    assert rig.loops["right"].fsm.dac.host == "10.0.0.9"
+    assert rig.loops["right"].target_px.az == 20.0
+    assert rig.mocks.gvcp_port == 0
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("camera.frame_rate_hz", r"--set camera\.frame_rate_hz: expected key\.path=value"),
+        ("=50", "expected key.path=value"),
+        ("camera..x=1", "expected key.path=value"),
+        ("camera.width_px.more=1", r"camera\.width_px is not a table"),
+        ("plant.loops.right.spots.0.flux_dn=1.0", r"plant\.loops\.right\.spots is not a table"),
+        ("camera.frame_rate=50", r"camera\.frame_rate: unknown key; did you mean frame_rate_hz\?"),
+        ("camera.frame_rate_hz=fast", r"camera\.frame_rate_hz: must be a valid number \(is 'fast'"),
+        ("camera.frame_rate_hz=0", r"camera\.frame_rate_hz: must be greater than or equal to 1"),
+    ],
+)
+def test_an_override_that_cannot_be_is_refused(override, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_rig(default_rig_path(), [override])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[loops.right.fsm]\nbias_x = 1.0", "loops.right.fsm.bias_x: unknown key"),
+        ("[loops.right.siderostat]\nbacklash_sky_arcsec = -1.0", "(is -1.0)"),
+        ("[loops.right.fsm.hysteresis]\nhalf_widths_v = [0.0, 1.0]", "half_widths_v 2"),
+        ("[loops.right.fsm]\nrange_rad = 1.0", "lower range_rad"),
+        ('include = ["other.toml"]', "include: unknown key"),
+        ("mocks = 3", "mocks: must be"),
+        ("a = [", "not TOML"),
+    ],
+)
+def test_what_a_fragment_has_wrong_is_told_with_its_name(tmp_path, text, said):
+    (tmp_path / "good.toml").write_text("[camera]\nframe_delay_s = 0.03\n")
+    (tmp_path / "bad.toml").write_text(text)
+    rig_file = tmp_path / "rig.toml"
+    include = 'include = ["bad.toml", "good.toml"]\n'
+    rig_file.write_text(include + default_rig_path().read_text(encoding="utf-8"))
+    with pytest.raises(ConfigError) as caught:
+        load_rig(rig_file)
+    for line in str(caught.value).splitlines():
+        assert line.startswith(f"{tmp_path / 'bad.toml'}: ")
+    assert said in str(caught.value)
+
+
+def test_what_a_rig_file_has_wrong_beside_a_fragment_keeps_its_own_name(tmp_path):
+    (tmp_path / "good.toml").write_text("[camera]\nframe_delay_s = 0.03\n")
+    rig_file = tmp_path / "rig.toml"
+    rig_file.write_text(
+        'include = ["good.toml"]\nunknown = 1\n' + default_rig_path().read_text(encoding="utf-8")
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_rig(rig_file)
+    assert str(caught.value).startswith(f"{rig_file}: unknown: unknown key")
+
+
+# ---------------------------------------------------------------- rigs that differ in a few tables
+
+
+def based(tmp_path, text, base="base.toml"):
+    (tmp_path / "base.toml").write_text(default_rig_path().read_text(encoding="utf-8"))
+    path = tmp_path / "mine.toml"
+    path.write_text(f'base = "{base}"\nname = "mine"\n{text}')
+    return path
+
+
+def test_a_rig_is_laid_over_its_base(tmp_path, rig):
+    mine = load_rig(based(tmp_path, "[camera]\nframe_rate_hz = 40.0\n"), ["camera.width_px=50"])
+    assert (mine.name, mine.camera.frame_rate_hz, mine.camera.width_px) == ("mine", 40.0, 50)
+    assert mine.loops == rig.loops
+
+
+def test_another_driver_leaves_nothing_of_the_device_in_the_base(tmp_path):
+    device = "[loops.right.siderostat.device]\ndriver = 'ensemble'\nport = 'socket://x:8000'\n"
+    with pytest.raises(ConfigError) as caught:
+        load_rig(based(tmp_path, device))
+    missing = {line.split(": ")[1].rpartition(".")[2] for line in str(caught.value).splitlines()}
+    assert missing == {"baud_rate", "axes", "response_timeout_s"}
+
+
+def test_a_base_that_is_not_there_is_named(tmp_path):
+    said = r"gone\.toml: no such rig file; it is the base of .*mine\.toml"
+    with pytest.raises(ConfigError, match=said):
+        load_rig(based(tmp_path, "", "gone.toml"))
+
+
+def test_a_base_must_be_a_name(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("base = 3\n")
+    with pytest.raises(ConfigError, match=r"mine\.toml: base: must be a file name \(is 3\)"):
+        load_rig(path)
