@@ -9,6 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+_COMPILED_FROM = (
+    "config/*.py",
+    "model/*.py",
+    "controllers/*.py",
+    "supervisor/batch*.py",
+    "supervisor/modes.py",
+)
+
 
 @functools.cache
 def kernels() -> ModuleType | None:
@@ -24,13 +32,14 @@ def kernels() -> ModuleType | None:
 
 @functools.cache
 def _cache_folder() -> str:
-    """Where compiled code is kept: named by what all files of kernels read.
+    """Where compiled code is kept: named by what all files say that kernels take code or constants from.
 
     Numba takes kept code for good as long as the outermost function's own file is unchanged, but
-    kernels here call kernels of other files.
+    kernels here call kernels of other files, and have the constants of others compiled in.
     """
     package = Path(__file__).parent.parent
-    sources = b"".join(path.read_bytes() for path in sorted(package.glob("*/*kernel*.py")))
+    files = sorted(path for part in _COMPILED_FROM for path in package.glob(part))
+    sources = b"".join(path.read_bytes() for path in files)
     return str(package / "__pycache__" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}")
 
 
