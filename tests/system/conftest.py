@@ -12,7 +12,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.hardware import never_wait
 from fitctl.config import default_rig_path
 from fitctl.processes import rig_arguments
 from fitctl.supervisor.client import Client
@@ -76,7 +75,6 @@ class Rig:
             stderr=self.errors,
         )
         self.endpoints = json.loads(self.mocks.stdout.readline())
-        never_wait(self.mocks.pid)
 
     def restart_mocks(self):
         """New mock devices where the old ones listened."""
