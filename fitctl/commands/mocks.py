@@ -100,8 +100,7 @@ async def _serve_mocks(
         width = max(map(len, endpoints))
         for key, value in endpoints.items():
             print(f"{key:<{width}}  {value}", flush=True)
-    become_realtime(
-        _PRIORITY
-    )  # the hardware that they stand for does not wait for a computer at work
+    # The hardware that they stand for does not wait for what else the computer has to do.
+    become_realtime(_PRIORITY)
     await ending.wait()
     await testbed.stop()
