@@ -134,11 +134,11 @@ def gateway(
     from fitctl.clock import MonotonicClock
     from fitctl.processes import end_with_parent, ended_by_signals
     from fitctl.supervisor.endpoints import service_folder
-    from fitctl.supervisor.gateway import Gateway, be_modest
+    from fitctl.supervisor.gateway import Gateway, be_modest, show_life
 
     settings = rig_of(rig, overrides)
     be_modest()
     end_with_parent(parent_pid)
     stop = threading.Event()
     with ended_by_signals(stop.set):
-        Gateway(settings, service_folder(settings), MonotonicClock()).run(stop)
+        Gateway(settings, service_folder(settings), MonotonicClock(), show_life).run(stop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -58,6 +59,8 @@ class Child:
                 self._patience_s = 0.0
         elif self._again_s == math.inf:
             how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+            if code == -signal.SIGALRM:
+                how = "hung"  # and had said beforehand that it is to be ended then
             why = last_line(self._errors)
             self._again_s = now_s + self._patience_s
             self._note(

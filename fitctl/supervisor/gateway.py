@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 import threading
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -35,6 +37,7 @@ _ROUND_MS = 5
 _MESSAGES_A_ROUND = 8
 _HANDSHAKES_A_ROUND = 4
 _LOOK_S = 0.25
+_HUNG_S = 10
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
 _NO_SUPERVISOR = Reply(accepted=False, text="the supervisor takes no commands just now; try again")
 _UNTOLD = 100  # lines that wait for a supervisor that takes none
@@ -52,6 +55,11 @@ def be_modest() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard == resource.RLIM_INFINITY or hard > _MOST_BYTES:
         resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))
+
+
+def show_life() -> None:
+    """Have SIGALRM end the process if this is not called again in time: then it hangs, whatever it hangs in."""
+    signal.alarm(_HUNG_S)
 
 
 def judge(
@@ -75,6 +83,8 @@ class Gateway:
     folder : Path
         Where the supervisor's Unix sockets are.
     clock : Clock
+    alive : callable
+        Called a few times a second, while it works.
 
     Raises
     ------
@@ -82,9 +92,12 @@ class Gateway:
         If the rig's TCP address or its keys cannot be used.
     """
 
-    def __init__(self, rig: Rig, folder: Path, clock: Clock) -> None:
+    def __init__(
+        self, rig: Rig, folder: Path, clock: Clock, alive: Callable[[], None] = lambda: None
+    ) -> None:
         service = rig.service
         self._clock = clock
+        self._alive = alive
         self._intake = Intake(service.commands_per_s)
         self._told: deque[tuple[Severity, str]] = deque(maxlen=_UNTOLD)
         self._reported: dict[str, AllowedKey] | None = None
@@ -120,6 +133,7 @@ class Gateway:
                 busy = poller.poll(int(_LOOK_S * 1000))
                 now_s = self._clock.now_s()
                 if now_s >= look_s:
+                    self._alive()
                     self._keyed.refresh()
                     for line in self._intake.dropped(now_s):
                         self._tell("warning", line)

@@ -1,6 +1,9 @@
 """The gateway between the network and the supervisor: what it passes on, for whom, and what only it may say."""
 
+import signal
 import socket
+import subprocess
+import sys
 import threading
 
 import msgspec
@@ -15,7 +18,7 @@ from fitctl.config import ConfigError
 from fitctl.supervisor.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, tcp_endpoint
 from fitctl.supervisor.envelope import Passed, Report, decode_envelope
 from fitctl.supervisor.keyed_door import check_keyed_door
-from fitctl.supervisor.keys import AllowedKey, revoke_key
+from fitctl.supervisor.keys import AllowedKey, new_key, revoke_key
 from fitctl.supervisor.messages import Hold, Status, Stop, TakeOver
 
 STOP = msgspec.msgpack.encode(Stop())
@@ -163,6 +166,35 @@ def test_a_report_of_keys_takes_the_instrument_from_nobody_else(served, say):
     until(lambda: "the key anna was revoked or changed" in served.events())
     assert "one key" in served.events()
     assert served.follow(lambda t: "@" in t.commander)
+
+
+HANGING = """
+import sys, time
+from fitctl.cli import main
+from fitctl.supervisor import gateway, keyed_door
+
+gateway._HUNG_S = 2
+keyed_door.KeyedDoor.admit = lambda *_: time.sleep(600)
+main(sys.argv[1:])
+"""
+
+
+def test_a_gateway_that_hangs_is_ended_by_its_alarm(tmp_path):
+    rig = rig_in(tmp_path, "service.tcp_address=127.0.0.1")
+    new_key(rig, "anna", "commander", "", tmp_path / "anna.key.toml")
+    settings = ("tcp_address", "folder", "keys_folder", "command_port", "telemetry_port")
+    given = [f"--set=service.{name}={getattr(rig.service, name)}" for name in settings]
+
+    done = subprocess.run(
+        [sys.executable, "-c", HANGING, "gateway", *given],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+    assert done.returncode == -signal.SIGALRM
+    assert not done.stderr
 
 
 # ---------------------------------------------------------------- ports

@@ -1,6 +1,7 @@
 """A real supervisor that is reached by TCP: the network is its gateway's, and so are the network's troubles."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -89,13 +90,18 @@ def test_the_supervisor_has_no_socket_on_the_network_and_its_gateway_gives_way(r
         assert os.sched_getscheduler(thread) == os.SCHED_OTHER
 
 
-def test_a_gateway_that_is_killed_is_told_of_and_clients_come_back_by_themselves(rig):
+@pytest.mark.parametrize(
+    ("by", "told"),
+    [(signal.SIGKILL, "the gateway was killed by signal 9"), (signal.SIGALRM, "the gateway hung")],
+    ids=["killed", "hung"],
+)
+def test_a_gateway_that_ends_is_told_of_and_clients_come_back_by_themselves(rig, by, told):
     assert answered(rig.anna).accepted
     before = gateway_of(rig)
 
-    before.kill()
+    before.send_signal(by)
 
-    rig.follow(lambda t: any("the gateway was killed by signal 9" in e.message for e in t.events))
+    rig.follow(lambda t: any(told in e.message for e in t.events))
     assert gateway_of(rig).pid != before.pid
     assert answered(rig.anna).text == "right OFF"
     while rig.anna.receive(0.0) is not None:
