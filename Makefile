@@ -13,7 +13,7 @@ FAULT_RESULTS ?= .fault-results.json
 FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-faults reliability test-peers bench-console bench-devices bench-recorder bench-report bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-slow test-console test-faults reliability test-peers bench-console bench-devices bench-recorder bench-report bench-flood bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -54,6 +54,10 @@ endif
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
+test-console: $(READY)  ## What people do: the tutorial, the console by keys (tmux) and in a browser (Chromium)
+	@tests/install-packages tmux chromium
+	$(BIN)/pytest -m terminal tests/system --numprocesses 2 $(ARGS)
+
 test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
 	$(BIN)/pytest $(FAULTS) $(ARGS)
 
@@ -64,7 +68,7 @@ reliability: $(READY)  ## The fault catalogue, and its results into docs/reliabi
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
 	$(BIN)/pytest -m peer tests/peers $(ARGS)
 
-$(PEERS): $(READY) requirements/peers.lock tests/peers/install tests/peers/canopen/package-lock.json
+$(PEERS): $(READY) requirements/peers.lock tests/install-packages tests/peers/install tests/peers/canopen/package-lock.json
 	@echo "Getting the peers ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/peers.lock
 	@tests/peers/install

@@ -8,7 +8,7 @@ from .conftest import running
 from .test_console import LIMIT_S, PATIENT, terminal
 
 __all__ = ["terminal"]  # a fixture
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.terminal, pytest.mark.timeout(900)]
 
 SEQUENCE = """
 schema_version = 1

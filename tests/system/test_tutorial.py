@@ -17,7 +17,7 @@ from fitctl.supervisor.client import Client
 
 from .conftest import end
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.terminal, pytest.mark.timeout(600)]
 PATIENCE_S = 180.0
 # What a reader is told to wait for before he types on.
 AWAITED = {
