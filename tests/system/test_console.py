@@ -33,8 +33,8 @@ def program(*names):
     for name in names:
         if path := shutil.which(name):
             return path
-    without = pytest.fail if os.environ.get("CI") else pytest.skip
-    without(f"{' or '.join(names)} is not installed; as root, `make test-console` does it")
+    missing = f"{' or '.join(names)} is not installed; as root, `make test-console` does it"
+    return pytest.fail(missing) if os.environ.get("CI") else pytest.skip(missing)
 
 
 class Terminal:
