@@ -98,6 +98,10 @@ class DeviceJobs:
         self._job = Job(future, partial(self._opened, names, with_camera, trigger))
         self.finish()
 
+    def opens(self, name: str) -> bool:
+        """The devices of this loop are being opened."""
+        return name in self._opening
+
     def abandon(self, names: list[str]) -> None:
         """Let go of what is being opened, if it is for one of these loops: a stop has the last word."""
         self._abandoned = self._abandoned or not self._opening.isdisjoint(names)

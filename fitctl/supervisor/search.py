@@ -18,6 +18,7 @@ from fitctl.supervisor.messages import Acquire
 from fitctl.supervisor.modes import Finding, Trigger
 
 Floats = NDArray[np.float64]
+_SLEWS = 10.0  # the siderostat may take as many times as long to begin as its limits would let it
 NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
 
 
@@ -56,11 +57,13 @@ class Search:
         scale = scales(rig, loop)
         self._scale = scale
         self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        self._slew_limit_s = _SLEWS * 2 * self._travel_rad / loop.siderostat.velocity_limit_rad_s
         self._plan_spiral = partial(plan_spiral, rig, loop_name)
         self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
         self._plan = self._plan_spiral()
         self._spiral = Spiral(self._plan)
         self._there = False
+        self._since_s = math.nan
         self._asked = Acquire()
         self._sighting: _Sighting | None = None
 
@@ -89,6 +92,7 @@ class Search:
         self.centre_rad = self._star_in_the_middle_rad()
         self._spiral = Spiral(self._plan)
         self._there = False
+        self._since_s = math.nan
         self._sighting = None
 
     def is_there(self, motor_rad: Floats) -> bool:
@@ -106,6 +110,8 @@ class Search:
     def judge(self, star: Star | None, now_s: float) -> Finding | None:
         """What a frame exposed at `now_s` showed, if it is anything to tell."""
         settings, sighting = self._settings, self._sighting
+        if not self._there:
+            return self._wait_for_siderostat(now_s)
         if sighting is None:
             if star is not None:
                 self._sighting = _Sighting(self._star_in_the_middle_rad(), now_s)
@@ -124,6 +130,17 @@ class Search:
             self._sighting = None
             return Finding(None, "a sighting was not confirmed; the search goes on")
         return None
+
+    def _wait_for_siderostat(self, now_s: float) -> Finding | None:
+        if math.isnan(self._since_s):
+            self._since_s = now_s
+        if now_s - self._since_s <= self._slew_limit_s:
+            return None
+        return Finding(
+            Trigger.SEARCH_EXHAUSTED,
+            f"the siderostat did not come to where the search begins within {self._slew_limit_s:.0f} s; "
+            "look whether its motors turn, then stop, recover and acquire again",
+        )
 
     def advance(self, duration_s: float, motor_rad: Floats) -> Floats:
         """Go on for `duration_s`, or wait where something was seen; motor set-point, shape (2,)."""

@@ -338,7 +338,10 @@ class Supervisor:
     # ------------------------------------------------------------ beside the ticks
 
     def _make_safer(self, loop: StellarLoop) -> None:
-        if self._clock.now_s() - loop.mode_since_s > self.rig.supervisor.safe_disable_after_s:
+        """Without power after a while in SAFE, but never what is being given power just now."""
+        lasted_s = self._clock.now_s() - loop.mode_since_s
+        being_opened = self._device_jobs.opens(loop.name)
+        if lasted_s > self.rig.supervisor.safe_disable_after_s and not being_opened:
             loop.servo.disable()
 
     def _finish_jobs(self) -> None:

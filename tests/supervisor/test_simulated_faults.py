@@ -5,8 +5,9 @@ import pytest
 from simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
-from fitctl.supervisor.messages import Acquire, Hold, Off, Standby, Stop
+from fitctl.supervisor.messages import Acquire, Hold, Off, Recover, Standby, Stop
 from fitctl.supervisor.modes import Mode
+from fitctl.supervisor.simulate import InlineExecutor
 
 FAULTS = {
     "camera": ("camera", "next_frame"),
@@ -41,6 +42,44 @@ def test_one_bad_answer_of_the_piezo_amplifier_is_asked_for_again(vernier, monke
     assert vernier.supervisor.loops["right"].mode is Mode.VERNIER
     told = [event for event in events_of(vernier) if "/dev/ttyUSB0" in event.message]
     assert [event.severity for event in told] == ["warning"]
+
+
+class LateExecutor(InlineExecutor):
+    """Device work takes no time, but that it is done is known half a second later."""
+
+    def __init__(self, clock):
+        self._clock = clock
+
+    def submit(self, fn, /, *args, **kwargs):
+        future, known_s = super().submit(fn, *args, **kwargs), self._clock.now_s() + 0.5
+        future.done = lambda: self._clock.now_s() >= known_s
+        return future
+
+
+def test_amplifiers_keep_their_power_however_long_the_recovery_from_safe_takes(
+    vernier, monkeypatch
+):
+    vernier.command(Stop())
+    vernier.run(2 * vernier.rig.supervisor.safe_disable_after_s)
+    assert not vernier.supervisor.servos["right"].enabled
+
+    monkeypatch.setattr(vernier.supervisor._device_jobs, "_executor", LateExecutor(vernier.clock))
+    vernier.command(Recover())
+    until(vernier, Mode.STANDBY, limit_s=1.0)
+    vernier.run(1.0)
+
+    assert vernier.supervisor.servos["right"].enabled
+    vernier.command(Acquire())
+    until(vernier, Mode.VERNIER)
+
+
+def test_a_siderostat_that_does_not_come_to_where_the_search_begins_is_told(vernier, monkeypatch):
+    vernier.command(Hold())
+    vernier.supervisor.servos["right"].stop()
+    vernier.command(Acquire(expected_az_sky_arcsec=400.0, expected_el_sky_arcsec=0.0))
+    until(vernier, Mode.STANDBY, limit_s=60.0)
+
+    assert "did not come to where the search begins" in events_of(vernier)[-1].message
 
 
 @pytest.mark.parametrize("stack", [0, 1, 2])
