@@ -96,6 +96,21 @@ def test_a_dark_frame_that_is_not_in_the_log_is_read_from_its_file_with_a_warnin
         log.unlink()
 
 
+def test_a_dark_frame_that_is_neither_in_the_log_nor_on_the_disk_is_asked_for(
+    replay, tmp_path, monkeypatch
+):
+    file, log = tmp_path / "dark.npy", tmp_path / "run.mcap"
+    np.save(file, np.full((40, 40), 1000.0))
+    monkeypatch.setattr("fitctl.supervisor.run.dark_bytes", lambda _path: None)
+    LoggedSimulation(load_rig(default_rig_path(), [f"camera.dark_file={file}"]), log).writer.close()
+    file.unlink()
+    status, _, errors = replay(log)
+
+    assert status == 2
+    assert errors.count("\n") == 1
+    assert f"{file} is no longer there: name the one of then with --set camera.dark_file" in errors
+
+
 UNUSABLE = {
     "a file that is none": (["no-such.mcap"], "no-such.mcap: cannot be opened"),
     "another camera": (["LOG", "--set", "camera.width_px=41"], "must be those of the log"),

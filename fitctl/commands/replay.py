@@ -33,10 +33,8 @@ _OPEN_LOOP = (
     "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
     "on from where\nthe log sent them; modes and the controllers' own state go on from today's"
 )
-_OLD_DARK = (
-    "{}: an older fitctl recorded it, and kept only the dark frame's name; {} was read as it is today: if it "
-    "was measured anew since, name the one of then with --set camera.dark_file=FILE"
-)
+_OLD_DARK = "an older fitctl recorded it, and kept only the dark frame's name"
+_NAME_IT = "name the one of then with --set camera.dark_file=FILE"
 
 
 def run_replay(
@@ -62,7 +60,8 @@ def run_replay(
         raise ConfigError(str(error)) from None
     named = ", ".join(map(str, logs))
     if dark_file := dark_of_today(info, rig):
-        typer.echo(_OLD_DARK.format(named, dark_file), err=True)
+        today = f"{dark_file} was read as it is today; if it was measured anew since, {_NAME_IT}"
+        typer.echo(f"{named}: {_OLD_DARK}; {today}", err=True)
     if as_json:
         typer.echo(to_json(_document(named, info, rig, result)))
     else:
@@ -114,6 +113,10 @@ def _rig(
             f"replay: loops, camera.width_px and camera.height_px must be those of the log, {needed}, are "
             f"{given}; replace other values, or none"
         )
+        raise ConfigError(msg)
+    dark_file = dark_of_today(info, rig)
+    if dark_file is not None and not Path(dark_file).exists():
+        msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
         raise ConfigError(msg)
     return rig
 
