@@ -18,6 +18,7 @@ from fitctl.controllers.design.files import design_json
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo
 from fitctl.supervisor.replay import replay
+from fitctl.supervisor.replay_files import dark_of_today, logged_files
 from fitctl.supervisor.replay_log import read_steps, whole_run
 from fitctl.supervisor.replay_result import LoopReplay, ReplayResult
 
@@ -32,6 +33,8 @@ _OPEN_LOOP = (
     "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
     "on from where\nthe log sent them; modes and the controllers' own state go on from today's"
 )
+_OLD_DARK = "an older fitctl recorded it, and kept only the dark frame's name"
+_NAME_IT = "name the one of then with --set camera.dark_file=FILE"
 
 
 def run_replay(
@@ -50,12 +53,15 @@ def run_replay(
         If the log, or the rig that it is to be replayed with, cannot be used.
     """
     try:
-        with whole_run(logs) as info:
-            rig = _rig(info, rig_path, overrides, controller)
+        with whole_run(logs) as info, logged_files(info) as files:
+            rig = _rig(info, files, rig_path, overrides, controller)
             result = _shown(info, rig)
     except LogError as error:
         raise ConfigError(str(error)) from None
     named = ", ".join(map(str, logs))
+    if dark_file := dark_of_today(info, rig):
+        today = f"{dark_file} was read as it is today; if it was measured anew since, {_NAME_IT}"
+        typer.echo(f"{named}: {_OLD_DARK}; {today}", err=True)
     if as_json:
         typer.echo(to_json(_document(named, info, rig, result)))
     else:
@@ -77,7 +83,13 @@ def _shown(info: LogInfo, rig: Rig) -> ReplayResult:
     return result
 
 
-def _rig(info: LogInfo, path: Path | None, overrides: Sequence[str], controller: str | None) -> Rig:
+def _rig(
+    info: LogInfo,
+    files: Sequence[str],
+    path: Path | None,
+    overrides: Sequence[str],
+    controller: str | None,
+) -> Rig:
     """The log's rig or the one of a file, with values replaced; its loops and frames must be the log's."""
     in_log = info.metadata.get("rig", {}).get("json")
     if in_log is None:
@@ -86,7 +98,9 @@ def _rig(info: LogInfo, path: Path | None, overrides: Sequence[str], controller:
     origin = f"the rig in {info.path}"
 
     def read(changes: Sequence[str]) -> Rig:
-        return load_rig(path, changes) if path else rig_from_json(in_log, origin, changes)
+        return (
+            load_rig(path, changes) if path else rig_from_json(in_log, origin, [*files, *changes])
+        )
 
     rig = read(overrides)
     if controller is not None:
@@ -99,6 +113,10 @@ def _rig(info: LogInfo, path: Path | None, overrides: Sequence[str], controller:
             f"replay: loops, camera.width_px and camera.height_px must be those of the log, {needed}, are "
             f"{given}; replace other values, or none"
         )
+        raise ConfigError(msg)
+    dark_file = dark_of_today(info, rig)
+    if dark_file is not None and not Path(dark_file).exists():
+        msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
         raise ConfigError(msg)
     return rig
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +64,8 @@ def read_dark(path: Path, shape: tuple[int, int]) -> Floats:
         If it cannot be read, has another shape, or does not say of enough pixels what they read.
     """
     try:
-        dark_dn = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        dark_dn = np.load(io.BytesIO(dark_bytes(path)), allow_pickle=False)
+    except (ValueError, EOFError) as error:
         msg = f"camera.dark_file {path}: cannot be read: {error}; {_MEASURE}"
         raise ConfigError(msg) from None
     if not isinstance(dark_dn, np.ndarray) or dark_dn.dtype.kind != "f" or dark_dn.shape != shape:
@@ -82,6 +83,21 @@ def read_dark(path: Path, shape: tuple[int, int]) -> Floats:
         )
         raise ConfigError(msg)
     return dark_dn.astype(np.float64)
+
+
+def dark_bytes(path: Path) -> bytes:
+    """All of a dark frame's file, as a log keeps it.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        msg = f"camera.dark_file {path}: cannot be read: {error}; {_MEASURE}"
+        raise ConfigError(msg) from None
 
 
 def _good_about(

@@ -32,6 +32,7 @@ class RunInfo(Record, frozen=True, kw_only=True):
     scheduling: str
     random_seed: int | None = None
     designs: dict[str, str] = {}  # by loop, as `fitctl design --out` saves them
+    dark_npy: bytes | None = None  # the file that camera.dark_file names, as it was read
 
 
 class Tick(Record, frozen=True, kw_only=True):

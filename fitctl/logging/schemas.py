@@ -6,8 +6,10 @@ defined once. Frames and events take Foxglove's own messages, which viewers know
 
 from __future__ import annotations
 
+import base64
 import types
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, Union, get_args, get_origin
 
 import msgspec
@@ -71,6 +73,7 @@ _FIELD_TYPES = {
 }
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _BYTES_PER_PIXEL = 2
+_DARK = "npy_zlib_base64"  # metadata holds text only; all that copies a log copies it
 
 
 def topic_of(record: AnyRecord) -> str:
@@ -109,7 +112,27 @@ def run_metadata(info: RunInfo) -> dict[str, dict[str, str]]:
         metadata["designs"] = dict(info.designs)
     if info.random_seed is not None:
         metadata["random_seed"] = {"value": str(info.random_seed)}
+    if info.dark_npy is not None:
+        metadata["dark"] = {_DARK: base64.b64encode(zlib.compress(info.dark_npy)).decode()}
     return metadata
+
+
+def dark_npy_of(metadata: Mapping[str, Mapping[str, str]]) -> bytes | None:
+    """The dark frame's file (.npy) that :func:`run_metadata` put there; None where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it is damaged.
+    """
+    text = metadata.get("dark", {}).get(_DARK)
+    if text is None:
+        return None
+    try:
+        return zlib.decompress(base64.b64decode(text, validate=True))
+    except (ValueError, zlib.error) as error:
+        msg = f"metadata dark: is no compressed dark frame: {error}"
+        raise ValueError(msg) from None
 
 
 def message_class(record_type: type[msgspec.Struct], pool: DescriptorPool) -> type[Message]:

@@ -106,8 +106,7 @@ class Instrument(StepMethods[Figures]):
         ConnectionError
             If the supervisor does not answer.
         """
-        self._runner = Runner(self._link, self.rig, NAME, 1)
-        return _figures(self._runner, [step])[0]
+        return self._run(self._runner_of(NAME, [step]), [step])[0]
 
     def run_sequence(self, file: Path | str) -> list[Figures]:
         """Run a sequence file, or a shipped sequence by its name; the figures of each step, as :meth:`run`.
@@ -119,9 +118,25 @@ class Instrument(StepMethods[Figures]):
         SequenceError, ConnectionError
             As :meth:`run`.
         """
-        sequence = load_sequence(find_sequence(Path(file)), self.rig)
-        self._runner = Runner(self._link, self.rig, sequence.name, len(sequence.steps))
-        return _figures(self._runner, sequence.steps)
+        sequence = self._sequence(file)
+        return self._run(self._runner_of(sequence.name, sequence.steps), sequence.steps)
+
+    def _sequence(self, file: Path | str) -> steps.Sequence:
+        return load_sequence(find_sequence(Path(file)), self.rig)
+
+    def _runner_of(self, name: str, todo: Sequence[steps.Step]) -> Runner:
+        return Runner(self._link, self.rig, name, len(todo))
+
+    def _run(self, runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
+        """Run steps; the figures of each, NaN where a value could not be had."""
+        self._runner = runner
+        # The last attempt at a step is the one that was done.
+        last = {attempt.step_number: attempt for attempt in run_steps(runner, todo)}
+        found = [
+            msgspec.json.decode(each.figures_json, type=dict[str, float | None])
+            for each in last.values()
+        ]
+        return [{k: float("nan") if v is None else v for k, v in each.items()} for each in found]
 
     @property
     def attempts(self) -> list[SequenceAttempt]:
@@ -140,7 +155,7 @@ class Instrument(StepMethods[Figures]):
         return [write_calibration(each, self.rig, Path(folder)) for each in measured]
 
     def send(self, command: AnyCommand) -> Reply:
-        """Give one command of :mod:`fitctl.supervisor.messages`."""
+        """Give one command of :mod:`fitctl.supervisor.messages`; from any thread."""
         return self._link.send(command)
 
     def telemetry(self) -> Telemetry:
@@ -155,8 +170,17 @@ class Instrument(StepMethods[Figures]):
                 return telemetry
 
     def stop(self) -> None:
-        """SAFE, at once: every loop."""
-        self._link.send(Stop())
+        """SAFE, at once: every loop; from any thread.
+
+        Raises
+        ------
+        SequenceError
+            If it is refused, as with a key that may only watch.
+        """
+        reply = self.send(Stop())
+        if not reply.accepted:
+            msg = f"stop is refused: {reply.text}"
+            raise SequenceError(msg)
 
     def end_step(self) -> None:
         """From another thread: end the step or the file that is running; the stages are held where they are."""
@@ -170,21 +194,11 @@ def _where(rig: Rig, folder: Path | str | None, remote: Path | str | None) -> Pa
     return service_folder(rig) if folder is None else Path(folder)
 
 
-def _figures(runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
-    """Run steps; the figures of each, NaN where a value could not be had."""
-    # The last attempt at a step is the one that was done.
-    last = {attempt.step_number: attempt for attempt in run_steps(runner, todo)}
-    found = [
-        msgspec.json.decode(each.figures_json, type=dict[str, float | None])
-        for each in last.values()
-    ]
-    return [{k: float("nan") if v is None else v for k, v in each.items()} for each in found]
-
-
 class AsyncInstrument(StepMethods[Awaitable[Figures]]):
-    """The same, to be awaited; cancelling a step ends it and holds the stages.
+    """The same, to be awaited; cancelling a step or a file ends it and holds the stages.
 
-    A step that waits for another one's end has not begun: cancelled, it never does, and the other goes on.
+    Steps and files run one after the other, in a thread of their own. One that waits for another one's end
+    has not begun: cancelled, it never does, and the other goes on. Commands, STOP above all, wait for none.
     Takes what :class:`Instrument` takes, and is made by ``async with``.
     """
 
@@ -202,6 +216,7 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         )
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="instrument")
         self._blocking: Instrument | None = None
+        self._unfinished: list[Runner] = []  # in their order; the first is the one that runs
 
     async def __aenter__(self) -> AsyncInstrument:
         self._blocking = await self._in_thread(self._make)
@@ -221,14 +236,31 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
     async def _in_thread(self, work: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
+    async def _at_once(self, work: Callable[[], T]) -> T:
+        """In a new thread, so that it waits for nothing else; once begun it is done, also if cancelled."""
+        thread = ThreadPoolExecutor(1, thread_name_prefix="instrument-command")
+        doing = asyncio.wrap_future(thread.submit(work))
+        thread.shutdown(wait=False)
+        return await asyncio.shield(doing)
+
     async def run(self, step: steps.Step) -> Figures:
         """Run one step, as :meth:`Instrument.run`."""
+        return (await self._run(NAME, [step]))[0]
+
+    async def run_sequence(self, file: Path | str) -> list[Figures]:
+        """Run a sequence file, as :meth:`Instrument.run_sequence`."""
+        sequence = self._instrument._sequence(file)
+        return await self._run(sequence.name, sequence.steps)
+
+    async def _run(self, name: str, todo: Sequence[steps.Step]) -> list[Figures]:
         instrument = self._instrument
-        runner = Runner(instrument._link, instrument.rig, NAME, 1)  # of its own, to be ended alone
-        running = self._thread.submit(_figures, runner, [step])
+        runner = instrument._runner_of(name, todo)  # of its own, to be ended alone
+        running = self._thread.submit(instrument._run, runner, todo)
+        self._unfinished.append(runner)
+        running.add_done_callback(lambda _: self._unfinished.remove(runner))
         ended = asyncio.wrap_future(running)
         try:
-            return (await asyncio.shield(ended))[0]
+            return await asyncio.shield(ended)
         except asyncio.CancelledError:
             if not running.cancel():
                 runner.contact.stop_wanted.set()
@@ -241,5 +273,25 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         return await self._in_thread(self._instrument.telemetry)
 
     async def send(self, command: AnyCommand) -> Reply:
-        """Give one command of :mod:`fitctl.supervisor.messages`; after the step that is running, if one is."""
-        return await self._in_thread(lambda: self._instrument.send(command))
+        """Give one command of :mod:`fitctl.supervisor.messages`, at once, also while a step runs."""
+        instrument = self._instrument
+        return await self._at_once(lambda: instrument.send(command))
+
+    async def stop(self) -> None:
+        """SAFE, at once, also while a step runs: every loop."""
+        await self._at_once(self._instrument.stop)
+
+    def end_step(self) -> None:
+        """End the step or the file that is running; the stages are held where they are."""
+        for runner in self._unfinished[:1]:
+            runner.contact.stop_wanted.set()
+
+    @property
+    def attempts(self) -> list[SequenceAttempt]:
+        """Every attempt so far of the step or file that began last, as the log has them."""
+        return self._instrument.attempts
+
+    async def write_calibrations(self, folder: Path | str) -> list[Path]:
+        """Write what that step or file has measured, as :meth:`Instrument.write_calibrations`."""
+        instrument = self._instrument
+        return await self._at_once(lambda: instrument.write_calibrations(folder))

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import threading
+from concurrent.futures import Future
 from typing import Protocol
 
 from fitctl.config import Rig
 from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
 from fitctl.supervisor.simulate import Simulation
 from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
+
+_TURN_S = 0.01
 
 
 class Link(Protocol):
@@ -28,9 +32,13 @@ class Link(Protocol):
 
 
 class SimulatedLink:
-    """The instrument on the virtual clock: waiting for telemetry is what moves the time on."""
+    """The instrument on the virtual clock: waiting for telemetry is what moves the time on.
+
+    As with a running rig, telemetry is received on one thread, and commands may be sent from any.
+    """
 
     def __init__(self, rig: Rig, seed: int) -> None:
+        self._stepping = threading.Lock()
         self._buffer = TelemetryBuffer()
         self._period_s = 1.0 / rig.supervisor.telemetry_hz
         self._simulation = Simulation(rig, seed, record=self._buffer.add, history_s=1.0)
@@ -47,14 +55,25 @@ class SimulatedLink:
         return self._simulation.clock.now_s()
 
     def send(self, command: AnyCommand) -> Reply:
-        """Give a command and step once, so that it is obeyed."""
-        return self._simulation.command(command)
+        """Give a command; the next step obeys it, of a thread that waits for telemetry or of this one."""
+        supervisor = self._simulation.supervisor
+        answered: Future[Reply] = Future()
+        supervisor.post(command, answered.set_result)
+        while not answered.done():
+            if self._stepping.acquire(timeout=_TURN_S):
+                try:
+                    if not answered.done():
+                        supervisor.step()
+                finally:
+                    self._stepping.release()
+        return answered.result()
 
     def receive(self, timeout_s: float) -> Telemetry | None:
         """Go on until telemetry is due, or by `timeout_s`."""
-        self._simulation.run(min(timeout_s, self._period_s))
-        self._simulation.ticks.clear()  # for judging a run; nobody does here
-        if timeout_s < self._period_s:
-            return None
-        self._state.sequence += 1
-        return self._buffer.telemetry(self._simulation.supervisor, self._state, self.now_s())
+        with self._stepping:
+            self._simulation.run(min(timeout_s, self._period_s))
+            self._simulation.ticks.clear()  # for judging a run; nobody does here
+            if timeout_s < self._period_s:
+                return None
+            self._state.sequence += 1
+            return self._buffer.telemetry(self._simulation.supervisor, self._state, self.now_s())

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
+from fitctl.controllers.dark import dark_bytes
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import design_json
 from fitctl.logging.queue import RecordQueue
@@ -246,7 +247,8 @@ def _loop(
 
 
 def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
-    """What is needed to understand this run's records."""
+    """What is needed to understand this run's records; a dark frame's file is read (ConfigError)."""
+    dark_file = rig.camera.dark_file
     versions = {name: importlib.metadata.version(name) for name in _VERSIONED}
     return RunInfo(
         time_s=now_s,
@@ -256,4 +258,5 @@ def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
         versions=versions | {"python": platform.python_version()},
         designs={name: design_json(design_for(rig, name)) for name in rig.loops},
         scheduling=scheduling,
+        dark_npy=None if dark_file is None else dark_bytes(Path(dark_file)),
     )

@@ -48,6 +48,7 @@ RUN_INFO = RunInfo(
     scheduling="SCHED_FIFO 50",
     random_seed=7,
     designs={"right": '{"name": "eq20"}'},
+    dark_npy=b"\x93NUMPY and so on",
 )
 _VALUES = {float: 0.125, int: 3, bool: True, str: "right", bytes: b"\x01\x02"}
 

@@ -1,3 +1,5 @@
+import io
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,7 +12,14 @@ from log_samples import RUN_INFO, filled, one_of_each
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.logging.records import AnyRecord, Event, FrameRecord, RunInfo, Tick
-from fitctl.logging.schemas import TOPICS, message_class, run_metadata, to_message, topic_of
+from fitctl.logging.schemas import (
+    TOPICS,
+    dark_npy_of,
+    message_class,
+    run_metadata,
+    to_message,
+    topic_of,
+)
 from fitctl.supervisor.run import run_info
 
 WALL_NS = 1_795_000_000_250_000_001
@@ -102,7 +111,23 @@ def test_the_run_is_described_in_metadata_without_rounding():
     assert metadata["rig"] == {"name": "bench", "json": '{"name": "bench"}'}
     assert metadata["random_seed"] == {"value": "7"}
     assert metadata["designs"] == {"right": '{"name": "eq20"}'}
+    assert dark_npy_of(metadata) == RUN_INFO.dark_npy
     assert float(metadata["clock"]["wall_minus_monotonic_s"]) == RUN_INFO.wall_minus_monotonic_s
+
+
+def test_a_dark_frame_in_a_log_is_as_its_file_was_or_refused_where_it_is_damaged():
+    file = io.BytesIO()
+    np.save(file, np.random.default_rng(1).normal(1000.0, 20.0, (40, 40)).astype(np.float32))
+    info = msgspec.structs.replace(RUN_INFO, dark_npy=file.getvalue())
+    (text,) = run_metadata(info)["dark"].values()
+
+    assert dark_npy_of(run_metadata(info)) == file.getvalue()
+    assert len(text) < 1.25 * len(file.getvalue())  # as text, and yet not a third larger
+    assert dark_npy_of({}) is None
+    assert dark_npy_of(run_metadata(msgspec.structs.replace(info, dark_npy=None))) is None
+    for damaged in (text[:-8], "AAAA", "no text", text.replace("A", "B")):
+        with pytest.raises(ValueError, match="metadata dark: is no compressed dark frame"):
+            dark_npy_of({"dark": {"npy_zlib_base64": damaged}})
 
 
 def test_the_design_that_a_log_carries_can_be_used_again(tmp_path):

@@ -14,7 +14,7 @@ from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import STEPS
 from fitctl.sequences.view import SequenceError
-from fitctl.supervisor.messages import Status
+from fitctl.supervisor.messages import Reply, Status, Stop
 
 NEAR = load_rig(default_rig_path(), ["plant.loops.right.star_offset_sky_arcsec_max=5.0"])
 
@@ -84,6 +84,24 @@ def test_a_file_is_ended_from_another_thread_and_the_stages_are_held(tmp_path):
             instrument.run_sequence(file)
         ending.join()
         assert mode(instrument) == "STANDBY"
+
+
+def test_stop_from_another_thread_ends_the_step_that_runs_and_has_the_last_word():
+    with Instrument(NEAR, simulate=True) as instrument:
+        stopping = threading.Timer(0.2, instrument.stop)
+        stopping.start()
+        with pytest.raises(SequenceError, match="loop right is SAFE"):
+            instrument.wait(80_000.0)
+        stopping.join()
+        assert mode(instrument) == "SAFE"
+
+
+def test_a_stop_that_is_refused_is_told(monkeypatch):
+    refusal = Reply(accepted=False, text="this key may only watch")
+    with Instrument(NEAR, simulate=True) as instrument:
+        monkeypatch.setattr(instrument._link, "send", lambda _command: refusal)
+        with pytest.raises(SequenceError, match="stop is refused: this key may only watch"):
+            instrument.stop()
 
 
 def test_without_a_supervisor_there_is_no_instrument(tmp_path):
@@ -169,6 +187,105 @@ def test_a_step_that_is_cancelled_before_its_turn_leaves_the_one_that_runs_alone
     assert held["frames_seen"] == 500
     assert telemetry.loops[0].mode == "VERNIER"
     assert telemetry.time_s < 500.0
+
+
+def test_what_the_blocking_form_can_the_awaited_one_can_too():
+    blocking, awaited = (
+        {n for n in dir(kind) if n[0] != "_"} for kind in (Instrument, AsyncInstrument)
+    )
+
+    assert blocking - awaited == {"close"}  # by `async with` alone
+
+
+@pytest.mark.parametrize(
+    "stop", [AsyncInstrument.stop, lambda instrument: instrument.send(Stop())], ids=["stop", "send"]
+)
+def test_stop_waits_for_no_step_and_none_runs_after_it(stop):
+    async def night():
+        async with AsyncInstrument(NEAR, simulate=True) as instrument, asyncio.timeout(60.0):
+            running = asyncio.create_task(instrument.wait(80_000.0))
+            waiting = asyncio.create_task(instrument.wait(80_000.0))
+            await asyncio.sleep(0.1)
+            await stop(instrument)
+            for task in (running, waiting):
+                with pytest.raises(SequenceError, match="loop right is SAFE"):
+                    await task
+            return await instrument.telemetry()
+
+    telemetry = asyncio.run(night())
+
+    assert telemetry.loops[0].mode == "SAFE"
+    assert telemetry.time_s < 80_000.0
+
+
+def test_stop_is_safe_while_as_many_threads_as_there_may_be_are_busy():
+    async def night():
+        busy = threading.Event()
+        async with AsyncInstrument(NEAR, simulate=True) as instrument:
+            for _ in range(100):
+                asyncio.get_running_loop().run_in_executor(None, busy.wait, 60.0)
+            await instrument.stop()
+            busy.set()
+            return (await instrument.telemetry()).loops[0].mode
+
+    assert asyncio.run(night()) == "SAFE"
+
+
+def test_the_step_that_runs_is_ended_and_the_next_one_goes_on():
+    async def night():
+        async with AsyncInstrument(NEAR, simulate=True) as instrument, asyncio.timeout(60.0):
+            running = asyncio.create_task(instrument.wait(80_000.0))
+            standing_by = asyncio.create_task(instrument.standby())
+            await asyncio.sleep(0)  # asked for, and perhaps not yet begun
+            instrument.end_step()
+            with pytest.raises(SequenceError, match="stopped by its program"):
+                await running
+            await standing_by
+            instrument.end_step()  # none runs: nothing to end
+            await instrument.wait(1.0)
+            return instrument.attempts
+
+    (waited,) = asyncio.run(night())
+
+    assert (waited.step, waited.outcome) == ("wait", "done")
+
+
+def test_a_file_is_awaited_and_what_it_measured_is_written(tmp_path):
+    file = file_of(tmp_path, 'step = "standby"', 'step = "dark", frames = 10')
+
+    async def night():
+        async with AsyncInstrument(simulate=True, seed=1) as instrument:
+            figures = await instrument.run_sequence(file)
+            return figures, instrument.attempts, await instrument.write_calibrations(tmp_path)
+
+    (nothing, dark), attempts, fragments = asyncio.run(night())
+
+    assert nothing == {}
+    assert dark["bias_dn"] == pytest.approx(1000.0, abs=1.0)
+    assert [(a.sequence_name, a.step, a.outcome) for a in attempts] == [
+        ("a", "standby", "done"),
+        ("a", "dark", "done"),
+    ]
+    assert fragments == [tmp_path / "fit-mock-dark.toml"]
+    assert (tmp_path / "fit-mock-dark.npy").exists()
+
+
+def test_a_file_that_is_cancelled_is_ended(tmp_path):
+    file = file_of(tmp_path, 'step = "standby"', 'step = "wait", duration_s = 80000.0')
+
+    async def night():
+        async with AsyncInstrument(NEAR, simulate=True) as instrument, asyncio.timeout(60.0):
+            running = asyncio.create_task(instrument.run_sequence(file))
+            await asyncio.sleep(0.1)
+            running.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await running
+            return instrument.attempts[-1], await instrument.telemetry()
+
+    attempt, telemetry = asyncio.run(night())
+
+    assert attempt.outcome == "stopped"
+    assert telemetry.time_s < 80_000.0
 
 
 @pytest.mark.parametrize("name", STEPS)

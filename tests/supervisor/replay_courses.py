@@ -21,6 +21,7 @@ from fitctl.supervisor.messages import (
 )
 from fitctl.supervisor.modes import Mode
 from fitctl.supervisor.replay import replay
+from fitctl.supervisor.replay_files import logged_files
 from fitctl.supervisor.replay_log import read_steps, whole_run
 
 SOON = "loops.right.coarse.reach_fraction=0.7"  # seconds less in COARSE
@@ -33,8 +34,8 @@ SCAN = [
 
 
 def replayed(*paths, change=()):
-    with whole_run(paths) as info:
-        rig = rig_from_json(info.metadata["rig"]["json"], "the log", change)
+    with whole_run(paths) as info, logged_files(info) as files:
+        rig = rig_from_json(info.metadata["rig"]["json"], "the log", [*files, *change])
         return replay(rig, read_steps(info, list(rig.loops)))
 
 

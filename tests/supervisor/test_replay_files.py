@@ -1,11 +1,14 @@
 """Which files can be replayed, and what is said of those that cannot."""
 
 import msgspec
+import numpy as np
 import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
 from replay_courses import hold_a_star, replayed
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import save_design
 from fitctl.logging import schemas
 from fitctl.logging.copying import cut
 from fitctl.logging.errors import LogError
@@ -78,6 +81,51 @@ def test_logs_of_two_runs_are_not_taken_for_one(held_log, tmp_path):
 
     with pytest.raises(LogError, match=r"other.mcap: is of another run"):
         replayed(path, other)
+
+
+def new_dark(path, seed):
+    np.save(path, np.random.default_rng(seed).normal(1000.0, 30.0, (40, 40)))
+
+
+def test_the_dark_frame_is_that_of_the_log_whatever_its_file_holds_by_now(logged, tmp_path):
+    file, second = tmp_path / "dark.npy", tmp_path / "second.mcap"
+    new_dark(file, 1)
+
+    def course(simulation):
+        hold_a_star(simulation)
+        simulation.go_on_in(second)
+        simulation.run(0.5)
+
+    path, _ = logged(course, f"camera.dark_file={file}")
+    new_dark(file, 2)
+
+    assert replayed(path, second).same
+    file.unlink()
+    assert replayed(path).same
+
+
+def test_a_log_with_but_the_name_of_its_dark_frame_is_replayed_with_todays(
+    logged, tmp_path, monkeypatch
+):
+    file = tmp_path / "dark.npy"
+    new_dark(file, 1)
+    monkeypatch.setattr("fitctl.supervisor.run.dark_bytes", lambda _path: None)
+    path, _ = logged(hold_a_star, f"camera.dark_file={file}")
+
+    assert replayed(path).same
+    new_dark(file, 2)
+    assert replayed(path).loops["right"].differences["star_px"].ticks > 100
+
+
+def test_a_design_from_a_file_is_that_of_the_log_whatever_the_file_holds_by_now(logged, tmp_path):
+    rig, file = load_rig(default_rig_path()), tmp_path / "mine.json"
+    save_design(design_for(rig, "right", "lqg-ltr"), file)
+    path, _ = logged(hold_a_star, f"loops.right.vernier.controller={file}")
+    save_design(design_for(rig, "right", "minimum-variance"), file)
+
+    assert replayed(path).same
+    file.unlink()
+    assert replayed(path).same
 
 
 def test_a_log_of_an_older_fitctl_is_refused_and_says_what_it_lacks(held_log, monkeypatch):

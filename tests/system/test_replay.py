@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
@@ -38,13 +39,16 @@ def finished(rig):
 
 
 def test_a_real_run_replayed_decides_the_same_to_the_last_bit(tmp_path):
-    with running(tmp_path, NEAR, SOON) as rig:
+    dark_file = tmp_path / "dark.npy"
+    np.save(dark_file, np.random.default_rng(1).normal(1000.0, 30.0, (40, 40)))
+    with running(tmp_path, NEAR, SOON, f"camera.dark_file={dark_file}") as rig:
         rig.to_vernier()
         assert rig.client.send(SetTarget(az_px=22.0, el_px=18.5)).accepted
         rig.follow(lambda telemetry: telemetry.ticks and telemetry.ticks[-1].number > 250)
         assert rig.client.send(Stop()).accepted
         rig.follow_to("SAFE")
         log = finished(rig)
+    np.save(dark_file, np.full((40, 40), 1000.0))  # measured anew
     result, status = replayed(log)
     loop = result["loops"]["right"]
 
