@@ -97,6 +97,18 @@ def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["frames"] > 0
 
 
+def test_a_saved_design_is_judged_as_it_was_saved_not_made_anew(design, tmp_path):
+    path = tmp_path / "mine.json"
+    other = ["--set", "loops.right.vernier.fslq.crossover_hz=2"]
+    saved = json.loads(design("fslq", "--json", "--out", path, *other)[1])
+    anew = json.loads(design("fslq", "--json")[1])
+    status, out, _ = design(path, "--json")
+    assert status == 0
+    assert json.loads(out) == pytest.approx(saved)
+    assert anew["crossover_hz"] != pytest.approx(saved["crossover_hz"], rel=0.01)
+    assert f"fslq of {path}" in design(path)[1]
+
+
 @pytest.mark.parametrize("what", ["eq20", "coarse", "compare"])
 def test_an_unstable_design_is_said_to_be_so(design, what):
     """Eq. 20 turns too far with two frames and three quarters of delay."""
@@ -115,6 +127,8 @@ def test_people_get_text_that_fits_their_terminal(design, what):
 
 BAD_INPUT = {
     "something that is no design": (["everything"], "there are vernier, coarse, bound"),
+    "a file that is none": (["none.json"], "none.json: no such design file"),
+    "a file of what was saved": (["none.json", "--out", "x.json"], "--out is for a pair"),
     "a loop that is none": (["bound", "--loop", "left"], "has right"),
     "a plot of another kind": (["vernier", "--plot", "fig9.bmp"], ".png or .svg"),
     "a plot of what has none": (["bound", "--plot", "bound.png"], "use it with vernier"),

@@ -35,15 +35,20 @@ def console(
     web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
-    """Attach an operator console to the running supervisor of a rig."""
-    arguments = rig_arguments(rig or default_rig_path(), overrides or ())
+    """Attach an operator console to the running supervisor of a rig.
+
+    With --remote, the margins of screen Loop and the sequences need that rig's own file too, with --rig.
+    """
+    arguments: list[str] | None = None  # what the shipped file says is not true of a rig elsewhere
+    if rig is not None or remote is None:
+        arguments = rig_arguments(rig or default_rig_path(), overrides or ())
     remote_arguments = ["--remote", str(remote)] if remote else []
     client = connect(rig, overrides, remote)
     if web:
         from fitctl.commands.web import serve_console
 
         client.close()  # what is wrong with the rig is said here, not in the browser
-        serve_console([*arguments, *remote_arguments], port)
+        serve_console([*(arguments or ()), *remote_arguments], port)
         return
     # The logs of a rig elsewhere are elsewhere too.
     log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()

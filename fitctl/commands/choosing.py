@@ -97,17 +97,17 @@ def client_of(rig: Rig, remote: Path | None = None) -> Client:
 def connect(path: Path | None, overrides: list[str] | None, remote: Path | None) -> Client:
     """A client of the rig's supervisor on this machine, or of the one that a key file is for.
 
-    Unlike with :func:`client_of`, a key file says which rig, and none is read.
+    A key file is enough by itself, and no rig file is read then; one that is given must be for the same rig.
 
     Raises
     ------
     ConfigError
-        If the rig file or the key file cannot be used.
+        If the rig file or the key file cannot be used, or they are for different rigs.
     """
-    if remote is None:
-        return client_of(rig_of(path, overrides))
-    if path is not None or overrides:
-        msg = f"--remote {remote}: the key file says which rig; leave out --rig and --set"
+    if remote is None or path is not None:
+        return client_of(rig_of(path, overrides), remote)
+    if overrides:
+        msg = f"--remote {remote}: --set changes a rig file; give that too, with --rig, or leave out --set"
         raise ConfigError(msg)
     from fitctl.supervisor.client import Client
     from fitctl.supervisor.keys import read_remote

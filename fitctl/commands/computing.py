@@ -120,7 +120,8 @@ def design(
     what: Annotated[
         str,
         typer.Argument(
-            help="vernier, coarse, bound, compare, or a pair: eq20, lqg-ltr, minimum-variance, fslq."
+            help="vernier, coarse, bound, compare, or a pair: eq20, lqg-ltr, minimum-variance, fslq, "
+            "or a saved file."
         ),
     ],
     rig: RigOption = None,

@@ -14,14 +14,15 @@ from numpy.typing import ArrayLike
 from fitctl.commands.printing import to_json
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, loopshape, lqg_ltr
-from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.basis import Basis, basis
 from fitctl.controllers.design.bound import bound
 from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
 from fitctl.controllers.design.eq20 import eq20_zpk
-from fitctl.controllers.design.files import save_design
+from fitctl.controllers.design.files import load_design, save_design
 from fitctl.controllers.design.standing import Standing, standing
+from fitctl.controllers.pair import Design
 from fitctl.model.optics import scales
 
 _RECOVERY_WEIGHTS = (1e-5, 1e-6, 1e-7, 1e-8, 0.5e-9, 1e-11)
@@ -40,7 +41,7 @@ class Output(NamedTuple):
 
 
 def run_design(rig: Rig, what: str, loop: str, output: Output) -> None:
-    """Design and print; `what` is a design's name, or vernier, coarse, bound or compare."""
+    """Design and print; `what` is a design's name or file, or vernier, coarse, bound or compare."""
     reports: dict[str, Callable[[Rig, str], Report]] = {
         "vernier": _vernier,
         "coarse": _coarse,
@@ -48,8 +49,13 @@ def run_design(rig: Rig, what: str, loop: str, output: Output) -> None:
         "compare": _compare,
         **{name: _one(name) for name in DESIGNS},
     }
+    if what.endswith(".json"):
+        reports[what] = _saved(Path(what))
     if what not in reports:
-        msg = f"design: {what} is nothing to design; there are {', '.join(reports)}"
+        msg = (
+            f"design: {what} is nothing to design; there are {', '.join(reports)}, and files (*.json) "
+            "that --out saved"
+        )
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what
     if output.out is not None and name not in DESIGNS:
@@ -218,14 +224,27 @@ def _bound(rig: Rig, loop: str) -> Report:
 def _one(name: str) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
         its_basis = basis(rig, loop)
-        found = standing(DESIGNS[name](its_basis), its_basis)
-        lines = [
-            f"{name}, order {found.order}, sampled at {1 / its_basis.period_s:g} Hz",
-            *_standing_lines(found),
-        ]
-        return _standing_numbers(found), lines
+        return _stands(name, DESIGNS[name](its_basis), its_basis)
 
     return report
+
+
+def _saved(file: Path) -> Callable[[Rig, str], Report]:
+    def report(rig: Rig, loop: str) -> Report:
+        its_basis = basis(rig, loop)
+        design = load_design(file, its_basis, DESIGNS)
+        return _stands(f"{design.name} of {file}", design, its_basis)
+
+    return report
+
+
+def _stands(title: str, design: Design, its_basis: Basis) -> Report:
+    found = standing(design, its_basis)
+    lines = [
+        f"{title}, order {found.order}, sampled at {1 / its_basis.period_s:g} Hz",
+        *_standing_lines(found),
+    ]
+    return _standing_numbers(found), lines
 
 
 def _compare(rig: Rig, loop: str) -> Report:

@@ -50,6 +50,8 @@ class Design:
         Whether stack voltages go through the inverse of the identified hysteresis.
     parameters : dict
         Everything that it was made from; with the name, enough to make it again.
+    file : str
+        The file that it was read from, absolute; empty when it was made from the rig's values.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Design:
     d: Floats = field(repr=False)
     hysteresis_inverse: bool
     parameters: dict[str, Any] = field(repr=False)
+    file: str = ""
 
 
 class Measurement(NamedTuple):

@@ -36,6 +36,7 @@ def loop_state(rig: Rig, loop: StellarLoop, now_s: float) -> LoopState:
             )
             for spot in loop.settings.other_spots
         ],
+        controller_file=loop.pointing.design.file,
     )
 
 

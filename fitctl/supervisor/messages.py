@@ -268,7 +268,11 @@ class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
-    """One loop as consoles show it."""
+    """One loop as consoles show it.
+
+    ``controller_file`` is the saved design that is at work, on the supervisor's machine; it is empty when the
+    design was made from the rig's values.
+    """
 
     name: str
     mode: str
@@ -284,6 +288,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     bias_offset_urad: tuple[float, float] = (0.0, 0.0)
     search_centre_sky_arcsec: tuple[float, float] | None = None
     other_spots: list[SpotPlace] = []
+    controller_file: str = ""
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):

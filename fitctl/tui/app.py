@@ -86,7 +86,8 @@ class ConsoleApp(App[None]):
     clock : callable
         Monotonic time in s, the supervisor's own when it runs on this machine.
     rig_arguments : sequence of str
-        With which other fitctl commands have the same rig file.
+        With which other fitctl commands have the same rig file; None when no file of this rig is known, and
+        nothing that needs one may be run.
     remote_arguments : sequence of str
         And with which they reach its instrument, where that is on another machine.
     log_folder : Path
@@ -130,7 +131,7 @@ class ConsoleApp(App[None]):
         *,
         quit_shuts_down: bool = False,
         clock: Callable[[], float] = time.monotonic,
-        rig_arguments: Sequence[str] = (),
+        rig_arguments: Sequence[str] | None = (),
         remote_arguments: Sequence[str] = (),
         log_folder: Path | None = Path("logs"),
         start_job: Callable[..., Job] = Job,
@@ -139,7 +140,7 @@ class ConsoleApp(App[None]):
         super().__init__()
         self.quit_shuts_down = quit_shuts_down
         self.clock = clock
-        self.rig_arguments = list(rig_arguments)
+        self.rig_arguments = rig_arguments
         self.remote_arguments = list(remote_arguments)
         self.log_folder = log_folder
         self.start_job = start_job

@@ -7,18 +7,22 @@ import pytest
 from simulated import NEAR, darken, events_of, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import save_design
 from fitctl.model.optics import scales
+from fitctl.supervisor.loop_state import loop_state
 from fitctl.supervisor.messages import (
     Acquire,
     Hold,
     Off,
     Recover,
+    SetController,
     SetTarget,
     Standby,
     Stop,
 )
 from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import pair, simulate, true_residual_rms
+from fitctl.supervisor.simulate import Simulation, pair, simulate, true_residual_rms
 
 
 def test_the_star_is_found_pulled_in_and_held(simulate_with):
@@ -262,6 +266,21 @@ def test_a_command_for_an_unknown_loop_is_refused_by_name(vernier):
     assert not reply.accepted
     assert "there are right" in reply.text
     assert mode_of(vernier) is Mode.VERNIER
+
+
+def test_telemetry_tells_which_file_the_design_at_work_is_from(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rig = load_rig(default_rig_path(), ["loops.right.vernier.controller=mine.json"])
+    save_design(design_for(rig, "right", "eq20"), tmp_path / "mine.json")
+    simulation = Simulation(rig, 0)
+
+    def at_work():
+        state = loop_state(rig, simulation.supervisor.loops["right"], simulation.clock.now_s())
+        return state.controller, state.controller_file
+
+    assert at_work() == ("eq20", str(tmp_path / "mine.json"))
+    simulation.command(SetController(name="eq20"))
+    assert at_work() == ("eq20", "")
 
 
 def test_the_siderostat_stays_within_its_travel(simulate_with):

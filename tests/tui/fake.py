@@ -120,6 +120,7 @@ class FakeSupervisor:
         self.trigger = "IN_REACH"
         self.reason = "5 frames within 50 % of the range"
         self.bias_offset_urad = (0.0, 0.0)
+        self.controller_file = ""
 
     @property
     def time_s(self) -> float:
@@ -187,6 +188,7 @@ class FakeSupervisor:
             bias_offset_urad=self.bias_offset_urad,
             search_centre_sky_arcsec=(100.0, -40.0) if self.mode == "ACQUISITION" else None,
             other_spots=[SpotPlace(name="fringe", az_offset_px=-12.0, el_offset_px=0.0)],
+            controller_file=self.controller_file,
         )
 
     def _watched(self, name, quantity, value, low, high, action, modes) -> Watched:

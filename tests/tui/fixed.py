@@ -83,7 +83,9 @@ def make_logs(folder: Path) -> Path:
 class FixedApp(ConsoleApp):
     """A console on recorded telemetry whose clock stands still after the last message."""
 
-    def __init__(self, supervisor: FakeSupervisor, silent_s: float = 0.02, log_folder=Path("logs")):
+    def __init__(
+        self, supervisor: FakeSupervisor, silent_s: float = 0.02, log_folder=Path("logs"), **options
+    ):
         self.recorded = supervisor.messages(MESSAGES)
         self.fixed_s = START_S
         self.jobs: list[FakeJob] = []
@@ -92,6 +94,7 @@ class FixedApp(ConsoleApp):
             clock=lambda: self.fixed_s,
             log_folder=log_folder,
             start_job=self.start_fake,
+            **options,
         )
         self.silent_s = silent_s
 

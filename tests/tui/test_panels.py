@@ -69,6 +69,10 @@ def log_list(state):
     return LogList(state, "", Path("no such folder"))
 
 
+def margins(state):
+    return Margins(state, "", lambda _loop: "")
+
+
 def printed(state):
     return Printed(state, "", "Choose something. " * 20)
 
@@ -89,7 +93,7 @@ PANELS = (
     Histograms,
     Breakdown,
     Spectrum,
-    Margins,
+    margins,
     sequence_list,
     parameters,
     Progress,

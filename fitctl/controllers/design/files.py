@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import json
 import math
@@ -74,7 +75,8 @@ def load_design(
     ConfigError
         One line: the file, what differs, what was expected, and what to do.
     """
-    return design_of(_document(path), path, rig_basis, makers)
+    design = design_of(_document(path), path, rig_basis, makers)
+    return dataclasses.replace(design, file=str(path.absolute()))
 
 
 def design_of(

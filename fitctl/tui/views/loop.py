@@ -7,12 +7,19 @@ from typing import ClassVar
 from textual.app import ComposeResult
 from textual.binding import BindingType
 
+from fitctl.supervisor.messages import LoopState
 from fitctl.tui.commands import keys_of
 from fitctl.tui.jobs import Job
 from fitctl.tui.views.view import View
-from fitctl.tui.widgets.margins import Margins
+from fitctl.tui.widgets.margins import Judged, Margins, judged
 from fitctl.tui.widgets.spectrum import Spectrum
 from fitctl.tui.widgets.timing import Breakdown, Histograms
+
+NEEDS_RIG = (
+    "Margins follow from the rig file, which is not known here: leave the console, and give it that file too, "
+    "with --rig FILE."
+)
+FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known here."
 
 
 class LoopScreen(View):
@@ -24,29 +31,35 @@ class LoopScreen(View):
     def __init__(self) -> None:
         super().__init__()
         self._job: Job | None = None
-        self._asked = ("", "")
+        self._asked = Judged("", "")
 
     def parts(self) -> ComposeResult:
         """Four panels."""
         yield Spectrum(self.state, "Spectrum of the pointing error")
         yield Histograms(self.state, "Timing")
         yield Breakdown(self.state, "The tick")
-        yield Margins(self.state, "Design")
+        yield Margins(self.state, "Design", self._why_unknown)
 
     def before_drawing(self) -> None:
         """Have the design at work judged by `fitctl design`, once for each design."""
         loop, job = self.state.loop, self._job
         if job is not None and job.status is not None:
-            self.query_one(Margins).told(self._asked[1], job.text(), job.status)
+            self.query_one(Margins).told(self._asked, job.text(), job.status)
             job.end()
             self._job = None
-        if loop is None or self._job is not None:
+        rig_arguments = self.console.rig_arguments
+        if loop is None or rig_arguments is None or self._job is not None:
             return
-        wanted = (loop.state.name, loop.state.controller)
-        if wanted != self._asked and wanted[1]:
+        wanted = judged(loop.state)
+        if wanted != self._asked and wanted.design and not self._why_unknown(loop.state):
             self._asked = wanted
-            options = ["--json", "--loop", wanted[0], *self.console.rig_arguments]
-            self._job = self.console.start_job(["design", wanted[1], *options])
+            options = ["--json", "--loop", wanted.loop, *rig_arguments]
+            self._job = self.console.start_job(["design", wanted.design, *options])
+
+    def _why_unknown(self, loop: LoopState) -> str:
+        if loop.controller_file and self.console.remote_arguments:
+            return FILE_ELSEWHERE
+        return NEEDS_RIG if self.console.rig_arguments is None else ""
 
     def on_unmount(self) -> None:
         """Leave no child behind."""

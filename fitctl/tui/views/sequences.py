@@ -24,6 +24,10 @@ HINT = (
     "Choose a sequence. tab and enter change its parameters, d rehearses all of it on the virtual clock, "
     "g runs it on the instrument."
 )
+NEEDS_RIG = (
+    "A sequence is checked, rehearsed and run with the rig file, which is not known here: leave the console, "
+    "and give it that file too, with --rig FILE. What is under way can be paused and ended."
+)
 
 
 class SequencesView(ListingView):
@@ -49,7 +53,8 @@ class SequencesView(ListingView):
         yield sequences
         yield Parameters(self.state, "Parameters", sequences)
         yield Progress(self.state, "On the instrument")
-        yield Printed(self.state, "Printed", HINT)
+        hint = NEEDS_RIG if self.console.rig_arguments is None else HINT
+        yield Printed(self.state, "Printed", hint)
 
     def on_mount(self) -> None:
         """Ask which sequences there are."""
@@ -90,8 +95,10 @@ class SequencesView(ListingView):
     def action_edit(self) -> None:
         """Change the chosen parameter."""
         sequences, parameter = self.query_one(SequenceList), self.query_one(Parameters).now()
-        document = sequences.document
-        if document is None or parameter is None or not self.query_one(Parameters).active:
+        document = self._chosen()
+        if document is None:
+            return
+        if parameter is None or not self.query_one(Parameters).active:
             self.notify("choose a parameter first: tab, then up and down", timeout=3)
             return
         step = document["steps"][parameter.step]
@@ -147,7 +154,11 @@ class SequencesView(ListingView):
     # ------------------------------------------------------------ children
 
     def _chosen(self) -> dict[str, Any] | None:
+        """The chosen sequence; if nothing can be done with one, the operator is told why."""
         document = self.query_one(SequenceList).document
+        if self.console.rig_arguments is None:
+            self.notify(NEEDS_RIG, severity="warning", timeout=8, markup=False)
+            return None
         if document is None:
             self.notify("no sequence is chosen yet", timeout=3)
         return document
@@ -163,9 +174,11 @@ class SequencesView(ListingView):
         return str(path)
 
     def _start(self, word: str, *more: str, outlives: bool = False) -> None:
-        """Do something with the chosen sequence."""
-        arguments = ["sequence", word, self._file(), *self.console.rig_arguments, *more]
-        self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
+        """Do something with the chosen sequence; never with the file of another rig."""
+        rig_arguments = self.console.rig_arguments
+        if rig_arguments is not None:
+            arguments = ["sequence", word, self._file(), *rig_arguments, *more]
+            self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
 
 
 def parsed(value: str) -> Any:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any, ClassVar
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
+from fitctl.supervisor.messages import LoopState
 from fitctl.tui.look import DIM, INK, ORANGE, RED, Line, mark, number, shorten, text
-from fitctl.tui.state import error_rms
+from fitctl.tui.state import ConsoleState, error_rms
 from fitctl.tui.widgets.panel import Panel
 
 LEAST_PHASE_DEG = 30.0
@@ -15,38 +19,68 @@ LEAST_GAIN_DB = 6.0
 MOST_SENSITIVITY = 2.0
 
 
+class Judged(NamedTuple):
+    """A loop, and the name or the file of the design that it works with."""
+
+    loop: str
+    design: str
+
+
+def judged(loop: LoopState) -> Judged:
+    """What is at work."""
+    return Judged(loop.name, loop.controller_file or loop.controller)
+
+
 class Margins(Panel):
     """What `fitctl design` says of the design at work; :meth:`told` hands it in.
 
     The limits beside the margins are the usual ones of textbooks (30 deg, 6 dB, 2).
+
+    Parameters
+    ----------
+    why_unknown : callable
+        Says why the margins of a loop's design cannot be known here; nothing if they can.
     """
 
     every: ClassVar[int] = 5
-    design: str = ""
-    figures: dict[str, Any] | None = None
-    problem: str = ""
 
-    def told(self, design: str, output: str, status: int) -> None:
+    def __init__(
+        self, state: ConsoleState, title: str, why_unknown: Callable[[LoopState], str]
+    ) -> None:
+        super().__init__(state, title)
+        self._why_unknown = why_unknown
+        self._judged = Judged("", "")
+        self._figures: dict[str, Any] | None = None
+        self._problem = ""
+
+    def told(self, what: Judged, output: str, status: int) -> None:
         """Take what the command printed."""
-        self.design = design
-        self.figures, self.problem = None, ""
+        self._judged = what
+        self._figures, self._problem = None, ""
         if status == 0:
-            self.figures = json.loads(output.strip().splitlines()[-1])
+            self._figures = json.loads(output.strip().splitlines()[-1])
         else:
-            self.problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
+            self._problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """A row a figure."""
         loop, newest = self.state.loop, self.state.newest
         if loop is None or newest is None:
             return []
-        design = loop.state.controller
-        lines: list[Line] = [[text("design ", DIM), text(design, INK, bold=True)]]
-        if self.problem:
-            return [*lines, [text(shorten(f"✗ {self.problem}", columns), RED)]]
-        figures = self.figures
-        if figures is None or self.design != design:
+        file = Path(loop.state.controller_file).name
+        head = [text("design ", DIM), text(loop.state.controller, INK, bold=True)]
+        lines: list[Line] = [[*head, text(f" of {file}", DIM)] if file else head]
+        unknown = self._why_unknown(loop.state)
+        if unknown:
+            return [
+                *lines,
+                *([text(line, DIM)] for line in textwrap.wrap(unknown, max(10, columns))),
+            ]
+        if self._judged != judged(loop.state):
             return [*lines, [text("its margins are being worked out", DIM)]]
+        figures = self._figures
+        if figures is None:
+            return [*lines, [text(shorten(f"✗ {self._problem}", columns), RED)]]
         if not figures["stable"]:
             return [*lines, [text("✗ unstable by the rig file's values", RED, bold=True)]]
         since_s = newest.time_s - self.state.window.rms_s

@@ -1,0 +1,107 @@
+"""A console of a rig on another machine: what it may say and run with a rig file, and what not without one."""
+
+from fitctl.supervisor.messages import SequenceControl
+from fitctl.tui.dialogs import Confirm
+from fitctl.tui.widgets.margins import Margins
+from fitctl.tui.widgets.printed import Printed
+from tests.tui.fake import FakeSupervisor
+from tests.tui.fixed import FixedApp
+from tests.tui.live import notifications
+from tests.tui.piloted import pressed, run_app, sent
+
+KEY = ["--remote", "anna.key.toml"]
+RIG = ["--rig", "theirs.toml", "--set", "camera.exposure_s=0.01"]
+
+
+def told(panel):
+    """A panel's lines as one paragraph."""
+    return " ".join(
+        " ".join(panel.render_line(y).text for y in range(panel.size.height)).split()
+    ).replace("│ ", "")
+
+
+def attached(scenario, *, rig=None, key=KEY, controller_file="", size=(120, 40)):
+    """A console that was given these options, after a scenario on it."""
+    supervisor = FakeSupervisor()
+    supervisor.controller_file = controller_file
+    app = FixedApp(supervisor, rig_arguments=rig, remote_arguments=key, log_folder=None)
+    run_app(app, lambda pilot: scenario(app, pilot), size=size)
+    return app
+
+
+def commands(app):
+    return [job.arguments for job in app.jobs if job.arguments[:2] != ["sequence", "list"]]
+
+
+# ---------------------------------------------------------------- without the rig file
+
+
+def test_without_the_rig_file_no_margins_are_shown_and_it_is_said_why():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        panel = app.view.query_one(Margins)
+        assert "design minimum-variance" in told(panel)
+        assert "--rig FILE" in told(panel)
+        assert "phase margin" not in told(panel)
+
+    assert commands(attached(scenario, size=(80, 24))) == []
+
+
+def test_without_the_rig_file_no_sequence_is_checked_or_run_but_what_is_under_way_is_ended():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4")
+        assert "--rig FILE" in told(app.view.query_one(Printed))
+        for number, keys in enumerate((["down", "d"], ["g"], ["tab", "down", "enter"]), 1):
+            await pressed(app, pilot, *keys)
+            assert not app.screen.is_modal
+            assert notifications(app).count("--rig FILE") == number
+        await pressed(app, pilot, "z")
+
+    app = attached(scenario)
+    assert commands(app) == []
+    assert sent(app) == [SequenceControl(loop="right", action="stop")]
+
+
+# ---------------------------------------------------------------- with it
+
+
+def test_margins_and_sequences_go_by_the_rig_file_that_was_given():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        assert "phase margin" in told(app.view.query_one(Margins))
+        await pressed(app, pilot, "4", "down", "d", "g")
+        assert isinstance(app.screen, Confirm)
+        await pressed(app, pilot, "y")
+
+    assert commands(attached(scenario, rig=RIG)) == [
+        ["design", "minimum-variance", "--json", "--loop", "right", *RIG],
+        ["sequence", "dry-run", "jog.toml", *RIG],
+        ["sequence", "run", "jog.toml", *RIG, *KEY],
+    ]
+
+
+# ---------------------------------------------------------------- saved designs
+
+
+def test_margins_of_a_saved_design_are_those_of_its_file():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        panel = app.view.query_one(Margins)
+        assert "design minimum-variance of mine.json" in told(panel)
+        assert "phase margin" in told(panel)
+        app.state.loop.state = made_anew
+        panel.redraw()
+        assert "being worked out" in told(panel)  # and not the margins of the other
+
+    (made_anew,) = FakeSupervisor().message().loops
+    app = attached(scenario, rig=RIG, key=[], controller_file="/rigs/mine.json")
+    assert commands(app) == [["design", "/rigs/mine.json", "--json", "--loop", "right", *RIG]]
+
+
+def test_a_file_on_another_machine_is_not_looked_for_on_this_one():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        assert "margins are not known" in told(app.view.query_one(Margins))
+        assert "phase margin" not in told(app.view.query_one(Margins))
+
+    assert commands(attached(scenario, rig=RIG, controller_file="/rigs/mine.json")) == []
