@@ -75,14 +75,17 @@ def records_table(results):
 
 
 def run_line(results):
-    """When and where, and how long the last of several runs took."""
-    run = results["run"]
+    """When and where, how many entries each run struck, and how long that took."""
+    runs = "; ".join(
+        f"{begun[:10]}, {run['entries']} entries in {run['took_min']:g} min, "
+        f"{run['cores']} cores, load average {run['load']:g}"
+        for begun, run in results["runs"].items()
+    )
     entries = [entry for group in GROUPS.values() for entry in group]
     known = [results[entry.name] for entry in entries if entry.name in results]
     first = sum(result["attempts"] == 1 for result in known)
     return (
-        f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g}. "
-        f"The run took {run['took_min']:g} min. "
+        f"*Runs, on a virtual machine: {runs}. A result is of the last run that struck its entry. "
         f"{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
         "another is made only where the machine itself stood still.*"
     )
