@@ -14,8 +14,6 @@ RESULTS = {}
 BEGUN_S = time.monotonic()
 RUN = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 """Which run of several this is, by when it began."""
-STRUCK = set()
-"""The entries of this run that ended as they should."""
 
 
 @pytest.fixture(scope="module")
@@ -36,23 +34,23 @@ def pytest_runtest_makereport(item):
 def pytest_runtest_logreport(report):
     """Add what was measured to the file that FITCTL_FAULT_RESULTS names, entry by entry.
 
-    What earlier runs found stays where this one finds nothing, and so does what is known of those runs.
+    What earlier runs found stays where this one finds nothing, and so does what is known of such a run.
     """
     path = os.environ.get("FITCTL_FAULT_RESULTS")
     if not path or report.when != "teardown" or "PYTEST_XDIST_WORKER" in os.environ:
         return
     file = Path(path)
     results = json.loads(file.read_text()) if file.exists() else {}
-    results |= dict(report.user_properties)
-    STRUCK.update(name for name, _ in report.user_properties if not name.startswith("records: "))
-    results["runs"] = results.get("runs", {}) | {RUN: run_so_far()}
+    runs = results.pop("runs", {}) | {RUN: run_so_far()}
+    results |= {name: result | {"run": RUN} for name, result in report.user_properties}
+    known = {result["run"] for result in results.values()}
+    results["runs"] = {begun: run for begun, run in runs.items() if begun in known}
     file.write_text(json.dumps(results, indent=1) + "\n")
 
 
 def run_so_far():
     """What this run took, on which machine."""
     return {
-        "entries": len(STRUCK),
         "load": round(os.getloadavg()[2], 1),
         "cores": os.cpu_count(),
         "took_min": round((time.monotonic() - BEGUN_S) / 60, 1),
