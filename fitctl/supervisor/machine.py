@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from fitctl.logging.records import Severity
+
 _SURE_S = 0.001  # two clocks read within this time are read together
+_LATE_S = 5.0
 
 
 def free_bytes(folder: Path) -> int:
-    """Room for ordinary users where `folder` is."""
+    """Room for ordinary users where `folder` is; where that disk is far away, its answer may never come."""
     return shutil.disk_usage(folder).free
 
 
@@ -28,6 +32,9 @@ def wall_minus_monotonic_s(
 class Machine:
     """Measures what interlocks judge of the computer.
 
+    The disk is asked on a thread of its own, because a disk of the network may let everyone wait who asks. It
+    is a daemon: what a thread waits for in the kernel cannot be ended, and must not keep the process.
+
     Parameters
     ----------
     folder : Path
@@ -35,7 +42,9 @@ class Machine:
     backlog : callable
         Part of the record queue that is taken.
     measured : callable
-        Takes a quantity's name and its value.
+        Takes a quantity's name and its value; from any thread.
+    note : callable
+        Takes events; from any thread.
     """
 
     def __init__(
@@ -43,17 +52,50 @@ class Machine:
         folder: Path,
         backlog: Callable[[], float],
         measured: Callable[[str, float], None],
+        note: Callable[[Severity, str, str], None],
     ) -> None:
         self._folder = folder
         self._backlog = backlog
         self._measured = measured
+        self._note = note
         self._difference_s = wall_minus_monotonic_s()
+        self._wanted = threading.Event()
+        self._asked_s: float | None = None  # while the disk has not answered
+        self._trouble = ""
+        threading.Thread(target=self._ask_disk, name="disk", daemon=True).start()
 
     def look(self) -> None:
-        """Measure; called about once a second, on a thread that may wait for a disk."""
+        """Measure, without waiting for anything; called about once a second."""
         self._measured("recorder_backlog_fraction", self._backlog())
         before_s, now_s = self._difference_s, wall_minus_monotonic_s()
         if before_s is not None and now_s is not None:
             self._measured("clock_step_s", now_s - before_s)
         self._difference_s = now_s if now_s is not None else before_s
-        self._measured("disk_free_bytes", float(free_bytes(self._folder)))
+        asked_s = self._asked_s
+        if asked_s is None:
+            self._asked_s = time.monotonic()
+            self._wanted.set()
+        elif time.monotonic() - asked_s > _LATE_S:
+            self._tell(f"has not told its free space for {_LATE_S:g} s")
+
+    def _ask_disk(self) -> None:
+        while True:
+            self._wanted.wait()
+            self._wanted.clear()
+            try:
+                self._measured("disk_free_bytes", float(free_bytes(self._folder)))
+                self._tell("")
+            except OSError as error:
+                self._tell(f"does not tell its free space: {error.strerror}")
+            self._asked_s = None
+
+    def _tell(self, trouble: str) -> None:
+        """Say what is wrong with the disk, and that it is over, once each."""
+        was, self._trouble = self._trouble, trouble
+        disk = f"the disk of {self._folder}"
+        if trouble and trouble != was:
+            remedy = "look at that disk, and at its link if it is not in this computer"
+            text = f"{disk} {trouble}; interlocks go by the last it told; {remedy}"
+            self._note("warning", "computer", text)
+        elif was and not trouble:
+            self._note("info", "computer", f"{disk} tells its free space again")

@@ -154,7 +154,10 @@ def run_supervisor(
         for child in children:
             stack.callback(child.end)
         machine = Machine(
-            log_folder, lambda: queue.waiting / rig.logging.queue_records, supervisor.measured
+            log_folder,
+            lambda: queue.waiting / rig.logging.queue_records,
+            supervisor.measured,
+            supervisor.note,
         )
         scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
         info = run_info(rig, scheduling, clock.now_s())
@@ -232,7 +235,7 @@ def _loop(
                 housekeep()
                 for child in children:
                     executor.submit(child.check)
-                executor.submit(machine.look)
+                machine.look()
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
                 tell_service_manager(ALIVE, status_line(_modes(supervisor)))

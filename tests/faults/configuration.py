@@ -55,7 +55,8 @@ WRONG = (
     Wrong("a queue for no records", "queue_records", ("logging.queue_records=0",)),
     Wrong("telemetry never sent", "telemetry_hz", ("supervisor.telemetry_hz=0.0",)),
     Wrong("an unknown controller", "controller", ("loops.right.vernier.controller=pid",)),
-    Wrong("a fault that no mock has", "", ("mocks.faults=[{ device = 'camera' }]",)),
+    Wrong("a fault without a kind", "mocks.faults.0.kind: is missing", (
+        "mocks.faults=[{ device = 'camera' }]",)),
     Wrong("a plant of another loop", "must name the same loops", change=(
         "plant.loops.right", "plant.loops.left")),
     Wrong("a file of another version", "schema_version: must be 1", change=(

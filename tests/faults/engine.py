@@ -8,14 +8,23 @@ from stalls import stalls
 
 from .strikes import strike
 
-STAYS_S = 2.0  # a mode in which the loop stays is watched for so long
+STAYS_S = 2.0  # a mode in which the loop stays is watched for so long, if the entry has the time
 SETTLE_S = 0.4  # from entering a mode of rest to standing still
 DEAD_SETTLE_S = (
     1.6  # without a supervisor: the drive's heartbeat and the D/A's watchdog, and what they take
 )
-BESIDE = {"recorder", "gateway", "console", "command", "disk", "log folder", "clock"}
+BESIDE = {
+    "recorder",
+    "gateway",
+    "metrics server",
+    "console",
+    "command",
+    "disk",
+    "log folder",
+    "clock",
+}
 """What stands beside the tick, which goes on whatever becomes of them."""
-PROCESSES = {"mocks", "supervisor", "recorder", "gateway", "console"}
+PROCESSES = {"mocks", "supervisor", "recorder", "gateway", "metrics server", "console"}
 REST = {"OFF", "STANDBY", "SAFE"}
 STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
 STILL_V = 0.1
@@ -72,6 +81,7 @@ def attempted(rig, entry, home, stalled):
 def watch(rig, entry, since_s, stalled):
     """Follow until it has ended as it should; the mode in which it was then, and how long that took."""
     stays = entry.mode in entry.modes
+    stays_s = min(STAYS_S, entry.within_s)
     modes, texts, done_s = [], [], []
 
     def over(telemetry):
@@ -83,7 +93,7 @@ def watch(rig, entry, since_s, stalled):
         so_far = " ".join([*rig.heard, *texts])
         if not done_s and (stays or modes[-1] in entry.modes) and entry.says in so_far:
             done_s.append(now_s)
-        return bool(done_s) and (not stays or now_s > since_s + STAYS_S)
+        return bool(done_s) and (not stays or now_s > since_s + stays_s)
 
     limit_s = max(entry.within_s, STAYS_S) + 1.0 + stalled.total_s
     with suppress(AssertionError):

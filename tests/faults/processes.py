@@ -45,7 +45,13 @@ ENTRIES = (
                   STAYS, "the recorder was killed by signal 9"),
     *in_each_mode("recorder", "stopped", 2.0, STAYS, ""),
     *in_each_mode("recorder", "slowed", 2.0, STAYS, ""),
-    Entry("gateway", "killed", STAYS, "the gateway was killed by signal 9", within_s=5.0, rig="by TCP"),
-    Entry("gateway", "stopped", STAYS, rig="by TCP"),
-    Entry("gateway", "slowed", STAYS, rig="by TCP"),
+    # Mode by mode: what is killed must have lived for a while, or it is not started again at once.
+    *(
+        Entry(beside, how, STAYS, says.format(beside), mode, within_s,
+              rig="by TCP, never in reach" if mode == "COARSE" else "by TCP")
+        for mode in MODES
+        for how, says, within_s in (
+            ("killed", "the {} was killed by signal 9", 3.0), ("stopped", "", 1.0), ("slowed", "", 1.0))
+        for beside in ("gateway", "metrics server")
+    ),
 )  # fmt: skip

@@ -75,16 +75,19 @@ def records_table(results):
 
 
 def run_line(results):
-    """When and where, and how long the last of several runs took."""
-    run = results["run"]
+    """How many entries have a result, and of which runs, when and where."""
     entries = [entry for group in GROUPS.values() for entry in group]
     known = [results[entry.name] for entry in entries if entry.name in results]
     first = sum(result["attempts"] == 1 for result in known)
+    runs = "; ".join(
+        f"{sum(result['run'] == begun for result in known)} of a run of {run['took_min']:g} min "
+        f"on {begun[:10]}, load average {run['load']:g}, {run['cores']} cores"
+        for begun, run in results["runs"].items()
+    )
     return (
-        f"*Date: {run['date']}. Machine: virtual, {run['cores']} cores, load average {run['load']:g}. "
-        f"The run took {run['took_min']:g} min. "
-        f"{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
-        "another is made only where the machine itself stood still.*"
+        f"*{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
+        "another is made only where the machine itself stood still. "
+        f"The results, from a virtual machine: {runs}.*"
     )
 
 

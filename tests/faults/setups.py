@@ -23,7 +23,6 @@ SOON = (
     "loops.right.coarse.reach_fraction=0.3",
     "mocks.loops.right.mdt693.reply_s=0.005",
 )
-CLOCK = Path(__file__).parent / "clock"
 OWN_MOUNT = 'mount -t tmpfs -o size=64m tmpfs "$0" && echo ready && exec sleep infinity'
 
 
@@ -47,15 +46,20 @@ def on_a_disk_of_its_own(stack, folder):
     return enter, Path(f"/proc/{holder.pid}/root")
 
 
-def by_a_clock_of_its_own(_stack, folder):
-    """Its time.time() is off by what a file says."""
-    return ("env", f"PYTHONPATH={CLOCK}:{Path.cwd()}", f"FITCTL_TEST_CLOCK={folder / 'step'}"), None
+def patched(patch, variable, file):
+    """Its Python imports the sitecustomize of a folder beside this module, which goes by a file."""
+
+    def where(_stack, folder):
+        path = f"{Path(__file__).parent / patch}:{Path.cwd()}"
+        return ("env", f"PYTHONPATH={path}", f"{variable}={folder / file}"), None
+
+    return where
 
 
 class Setup(NamedTuple):
     """One rig; `home` is the mode to which it comes back, `where` says what it runs in.
 
-    In settings, ``{folder}`` is a folder of its own.
+    In settings, ``{folder}`` is a folder of its own, and ``{port}`` a free one, another in each.
     """
 
     file: str = "fit-mock"
@@ -64,26 +68,32 @@ class Setup(NamedTuple):
     where: Callable = plainly
 
 
+NEVER_IN_REACH = ("loops.right.coarse.reach_frames=1000000",)
+BY_TCP = (
+    "service.tcp_address=127.0.0.1",
+    "service.command_port={port}",
+    "service.telemetry_port={port}",
+    "service.keys_folder={folder}/keys",
+    "service.metrics_port={port}",
+)
 SETUPS = {
     "fit-mock": Setup(),
-    "never in reach": Setup(settings=("loops.right.coarse.reach_frames=1000000",), home="COARSE"),
+    "never in reach": Setup(settings=NEVER_IN_REACH, home="COARSE"),
     "ensemble": Setup(file="ensemble"),
     "fit-bal-analog": Setup(file="fit-bal-analog"),
     "fast telemetry": Setup(settings=("supervisor.telemetry_hz=100.0",)),
     # Alone, its drive goes on for half a second: at full speed, further than a search goes.
     "slow siderostat": Setup(settings=("loops.right.siderostat.velocity_limit_rad_s=6.0",)),
-    "by TCP": Setup(
-        settings=(
-            "service.tcp_address=127.0.0.1",
-            f"service.command_port={free_port()}",
-            f"service.telemetry_port={free_port()}",
-            "service.keys_folder={folder}/keys",
-        )
-    ),
+    # What is struck there is beside the tick, and no loop notices: the way back to the star is not asked for.
+    "by TCP": Setup(settings=BY_TCP, home="STANDBY"),
+    "by TCP, never in reach": Setup(settings=(*BY_TCP, *NEVER_IN_REACH), home="STANDBY"),
     "small disk": Setup(
         settings=("logging.queue_records=300", "logging.rotate_s=8.0"), where=on_a_disk_of_its_own
     ),
-    "own clock": Setup(settings=("logging.rotate_s=4.0",), where=by_a_clock_of_its_own),
+    "own clock": Setup(
+        settings=("logging.rotate_s=4.0",), where=patched("clock", "FITCTL_TEST_CLOCK", "step")
+    ),
+    "silent disk": Setup(where=patched("disk", "FITCTL_TEST_SILENT_DISK", "silent")),
 }
 
 
@@ -94,7 +104,9 @@ def started(name, folder):
     file = default_rig_path().parent / f"{setup.file}.toml"
     with ExitStack() as stack:
         before, root = setup.where(stack, folder)
-        settings = [setting.format(folder=folder) for setting in (*SOON, *setup.settings)]
+        settings = [
+            setting.format(folder=folder, port=free_port()) for setting in (*SOON, *setup.settings)
+        ]
         with running(folder, *settings, file=file, kind=WatchedRig, before=before) as rig:
             rig.logs = root / folder.relative_to("/") if root else folder
             yield rig

@@ -40,7 +40,7 @@ def device(rig, entry):
 
 @contextmanager
 def killed(rig, entry):
-    """SIGKILL; then started again by whoever started it, recorder and gateway by their supervisor."""
+    """SIGKILL; then started again by whoever started it, what is beside the supervisor by that."""
     rig.process(entry.struck).kill()
     if entry.struck == "mocks":
         rig.bench_answers = False
@@ -55,7 +55,7 @@ def killed(rig, entry):
             rig.restart_mocks()
         if entry.struck == "supervisor":
             rig.start_supervisor()
-    if entry.struck == "gateway":
+    if entry.struck in {"gateway", "metrics server"}:
         goes_on(rig, entry)
 
 
@@ -130,9 +130,11 @@ def repeated(action, every_s):
 
 
 def goes_on(rig, entry):
-    """A console draws again; who is elsewhere is answered again."""
+    """A console draws again; who is elsewhere is answered again, and who asks for metrics gets them."""
     if entry.struck == "gateway":
         rig.is_reached_from_elsewhere()
+    if entry.struck == "metrics server":
+        rig.is_measured()
     if entry.struck == "console":
         drawn, end_s = rig.console.drawn, time.monotonic() + DRAWS_WITHIN_S
         while rig.console.drawn == drawn:
@@ -247,6 +249,23 @@ def read_only(rig, _entry):
 
 
 @contextmanager
+def not_told(rig, _entry):
+    """Whoever asks the disk for its room waits; meanwhile a new recorder comes, and devices are opened."""
+    silent = rig.folder / "silent"
+    silent.touch()
+    try:
+        yield
+        killed = rig.recorder()
+        killed.kill()
+        rig.follow(lambda _: rig.recorder().pid != killed.pid)
+        rig.reach("OFF")
+        rig.reach("STANDBY")
+    finally:
+        silent.unlink()
+    rig.follow(lambda t: any("free space again" in event.message for event in t.events))
+
+
+@contextmanager
 def clock(rig, entry):
     """Wall time is so many seconds later, then as before."""
     step = rig.folder / "step"
@@ -272,6 +291,7 @@ STRIKES = {
     "sent 100 messages a second": many_messages,
     "full": full,
     "read-only": read_only,
+    "is not told": not_told,
     "command": command,
     "clock": clock,
 }

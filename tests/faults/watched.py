@@ -3,6 +3,7 @@
 import time
 from contextlib import suppress
 from typing import NamedTuple
+from urllib.request import urlopen
 
 import psutil
 from system.conftest import Rig
@@ -136,6 +137,9 @@ class WatchedRig(Rig):
         if name == "gateway":
             self.is_reached_from_elsewhere()
             return self.child("gateway")
+        if name == "metrics server":
+            self.is_measured()
+            return self.child("metrics")
         return psutil.Process({"supervisor": self.supervisor, "mocks": self.mocks}[name].pid)
 
     def is_reached_from_elsewhere(self):
@@ -153,6 +157,19 @@ class WatchedRig(Rig):
                 answered = answered or self.elsewhere.send(Status()).accepted
             seen = seen or self.elsewhere.receive(LOOK_S) is not None
             self.receive(LOOK_S)
+
+    def is_measured(self):
+        """Whoever asks for metrics is told that the supervisor speaks."""
+        end_s = time.monotonic() + REACH_S
+        while b"fitctl_up 1.0" not in self._metrics():
+            assert time.monotonic() < end_s, "no metrics, or none of a supervisor that speaks"
+            self.receive(LOOK_S)
+
+    def _metrics(self):
+        port = load_rig(self.file, self.settings).service.metrics_port
+        with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/metrics", timeout=1.0) as page:
+            return page.read()
+        return b""
 
     def _open_console(self):
         """The console's process, once it has drawn something."""

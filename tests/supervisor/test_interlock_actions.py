@@ -1,16 +1,20 @@
 """What an interlock does to a loop, and who measures what it judges."""
 
+import threading
 import timeit
 
 import numpy as np
 import pytest
 from interlock_bench import Bench, late_frames, servo_that_skips, struck
+from served import until
 
 from fitctl.config import QUANTITIES
 from fitctl.model.drives import Drive
 from fitctl.supervisor.machine import Machine, wall_minus_monotonic_s
 from fitctl.supervisor.messages import Experiment, Hold, Off, Recover, Reset, SetTarget, Standby
 from fitctl.supervisor.modes import Mode
+
+MACHINE = "fitctl.supervisor.machine"
 
 
 def with_action(action, reset="hand", modes="['VERNIER']"):
@@ -121,7 +125,8 @@ def test_hold_by_command_is_no_interlock():
 def test_everything_that_a_row_may_be_about_is_measured(tmp_path):
     bench = Bench()
     servo_that_skips(bench)
-    Machine(tmp_path, lambda: 0.0, bench.supervisor.measured).look()
+    Machine(tmp_path, lambda: 0.0, bench.supervisor.measured, bench.supervisor.note).look()
+    until(lambda: any(row.name == "disk_free_bytes" for row in bench.supervisor._measured))
     bench.run(2.0)
 
     assert set(bench.loop.measured.readings) == set(QUANTITIES)
@@ -129,8 +134,9 @@ def test_everything_that_a_row_may_be_about_is_measured(tmp_path):
 
 def test_the_computer_is_measured_and_an_interrupted_look_at_the_clocks_does_not_count(tmp_path):
     measured = {}
-    machine = Machine(tmp_path, lambda: 0.25, measured.__setitem__)
+    machine = Machine(tmp_path, lambda: 0.25, measured.__setitem__, print)
     machine.look()
+    until(lambda: "disk_free_bytes" in measured)
 
     assert measured["disk_free_bytes"] > 0
     assert measured["recorder_backlog_fraction"] == 0.25
@@ -145,12 +151,63 @@ def test_a_step_of_wall_time_is_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "fitctl.supervisor.machine.wall_minus_monotonic_s", lambda: next(differences)
     )
-    machine = Machine(tmp_path, lambda: 0.0, measured.__setitem__)
+    machine = Machine(tmp_path, lambda: 0.0, measured.__setitem__, print)
     machine.look()
     assert "clock_step_s" not in measured
     machine.look()
 
     assert measured["clock_step_s"] == 2.5
+
+
+def test_a_disk_that_does_not_answer_holds_nobody_and_is_told_of_once(tmp_path, monkeypatch):
+    asked, answers = [], threading.Event()
+
+    def silent(folder):
+        asked.append(folder)
+        assert answers.wait(60.0)
+        return 7e9
+
+    monkeypatch.setattr(f"{MACHINE}.free_bytes", silent)
+    monkeypatch.setattr(f"{MACHINE}._LATE_S", 0.0)
+    measured, told = {}, []
+    machine = Machine(
+        tmp_path, lambda: len(told), measured.__setitem__, lambda *row: told.append(row)
+    )
+    for _ in range(5):
+        machine.look()  # and comes back
+
+    assert len(told) == 1
+    assert told[0][:2] == ("warning", "computer")
+    assert "has not told its free space" in told[0][2]
+    assert measured["recorder_backlog_fraction"] == 1  # of after it: what needs no disk goes on
+
+    answers.set()
+    until(lambda: len(told) == 2)
+    assert "tells its free space again" in told[1][2]
+    assert measured["disk_free_bytes"] == 7e9
+    assert asked.count(tmp_path) == 1
+
+
+def test_a_disk_that_is_gone_is_told_of_once_and_asked_again(tmp_path, monkeypatch):
+    answers = iter([OSError(5, "Input/output error")] * 2)
+    monkeypatch.setattr(f"{MACHINE}.free_bytes", lambda _: raised(next(answers, None)))
+    told = []
+    machine = Machine(tmp_path, lambda: 0.0, lambda *_: None, lambda *row: told.append(row))
+
+    def looked_again():
+        machine.look()
+        return len(told) == 2
+
+    until(looked_again)
+    assert [row[0] for row in told] == ["warning", "info"]
+    assert "does not tell its free space: Input/output error" in told[0][2]
+
+
+def raised(error):
+    """The error, or room on the disk where there is none."""
+    if error is not None:
+        raise error
+    return 7e9
 
 
 def test_measuring_and_judging_costs_a_small_part_of_a_tick():
