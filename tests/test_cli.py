@@ -81,10 +81,22 @@ BAD_INPUT = {
         ["check", "--set", "plant.step_s=1e-6", "--set", "plant.history_s=3600.0"],
         "history_s may be at most",
     ),
+    "a table that is none": (["check", "--set", "camera.width_px.of=3"], "is not a table"),
     "an option that is none": (["demo", "--fast"], "--fast"),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
 }
+
+
+# How a line says what was expected, or what to do now.
+NEXT_STEPS = (
+    *("must be", "may be at most", "expected", "did you mean", "there are", "rig fit-mock has"),
+    *("name another", "choose another", "lower it", "logs are", "(see fitctl"),
+)
+
+
+def names_a_next_step(line):
+    return any(words in line for words in NEXT_STEPS)
 
 
 @pytest.mark.parametrize("what", BAD_INPUT)
@@ -95,6 +107,7 @@ def test_bad_input_gets_a_clear_line_and_status_2(what):
     assert result.returncode == 2
     assert complaint in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
+    assert names_a_next_step(result.stderr), result.stderr
     assert result.stdout == ""
 
 
@@ -107,6 +120,7 @@ def test_a_rig_file_that_is_not_toml_or_not_text_gets_a_clear_line(tmp_path):
         assert result.returncode == 2
         assert str(path) in result.stderr
         assert len(result.stderr.strip().splitlines()) == 1
+        assert names_a_next_step(result.stderr), result.stderr
 
 
 def test_simulate_prints_one_json_object_on_its_last_line():

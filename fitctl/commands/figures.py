@@ -18,7 +18,7 @@ def run_figures(rig: Rig, loop_name: str, seed: int, out: Path, *, quick: bool) 
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        msg = f"figures: --out {out}: cannot be made a folder: {error.strerror}"
+        msg = f"figures: --out {out}: cannot be made a folder: {error.strerror}; name one you may write in"
         raise ConfigError(msg) from None
     amount = QUICK if quick else FULL
     try:
@@ -29,7 +29,7 @@ def run_figures(rig: Rig, loop_name: str, seed: int, out: Path, *, quick: bool) 
                 lambda part: progress.update(task, completed=part),
             )  # fmt: skip
     except OSError as error:
-        msg = f"figures: --out {out}: cannot be written: {error}"
+        msg = f"figures: --out {out}: cannot be written: {error}; make room or name another folder"
         raise ConfigError(msg) from None
     except (IdentifyError, RuntimeError) as error:
         typer.echo(f"figures: {error}", err=True)

@@ -104,7 +104,7 @@ def _write(path: Path, write: Callable[[], object]) -> None:
     try:
         write()
     except OSError as error:
-        msg = f"identify: {path}: cannot be written: {error}"
+        msg = f"identify: {path}: cannot be written: {error}; name another with --out or --plot"
         raise ConfigError(msg) from None
 
 

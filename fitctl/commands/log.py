@@ -167,7 +167,7 @@ def cut(
         from_ns = time_ns("--from", from_, found)
         to_ns = 2**63 if to is None else time_ns("--to", to, found)
         if to_ns <= from_ns:
-            msg = f"cut: --to {to} is not after --from {from_}"
+            msg = f"cut: --to {to} is not after --from {from_}; choose a later --to, or an earlier --from"
             raise ConfigError(msg)
         target = out or log.with_name(f"{log.stem}_cut.mcap")
         topics = _topics(found, topic)

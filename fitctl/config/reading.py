@@ -15,6 +15,8 @@ from fitctl.config.base import ConfigError, Settings
 from fitctl.config.devices import DEVICE_BY_TAG
 from fitctl.config.rig import Rig
 
+_EXAMPLE = "camera.frame_rate_hz=50.0"
+
 
 def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     """Read and validate a rig file.
@@ -91,7 +93,7 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
     try:
         return tomllib.loads(read_text(path, missing))
     except tomllib.TOMLDecodeError as error:
-        msg = f"{path}: not TOML: {error}"
+        msg = f"{path}: not TOML: {error}; mend it there: expected key = value, or [table]"
         raise ConfigError(msg) from None
 
 
@@ -109,7 +111,7 @@ def read_text(path: Path, missing: str) -> str:
         msg = f"{path}: {missing}"
         raise ConfigError(msg) from None
     except (OSError, UnicodeDecodeError) as error:
-        msg = f"{path}: cannot be read: {error}"
+        msg = f"{path}: cannot be read: {error}; expected a text file in UTF-8 that you may read"
         raise ConfigError(msg) from None
 
 
@@ -169,12 +171,15 @@ def rig_from_json(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
 
 
 def _override(document: dict[str, Any], text: str) -> None:
-    parts, value = parse_override(text, "camera.frame_rate_hz=50.0")
+    parts, value = parse_override(text, _EXAMPLE)
     table: Any = document
     for depth, part in enumerate(parts[:-1]):
         table = table.setdefault(part, {}) if isinstance(table, dict) else None
         if not isinstance(table, dict):
-            msg = f"--set {text}: {'.'.join(parts[: depth + 1])} is not a table"
+            place = ".".join(parts[: depth + 1])
+            msg = (
+                f"--set {text}: {place} is not a table; expected a value's key, such as {_EXAMPLE}"
+            )
             raise ConfigError(msg)
     table[parts[-1]] = value
 

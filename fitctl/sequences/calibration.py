@@ -43,6 +43,6 @@ def write_calibration(calibration: Calibration, rig: Rig, folder: Path) -> Path:
             np.save(folder / name, array)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        msg = f"{path}: cannot be written: {error}"
+        msg = f"{path}: cannot be written: {error}; make room or name another folder with --out, and run again"
         raise ConfigError(msg) from None
     return path

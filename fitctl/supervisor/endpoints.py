@@ -77,7 +77,7 @@ def make_service_folder(rig: Rig) -> Path:
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.stat()
     except OSError as error:
-        msg = f"service.folder: {folder} cannot be made: {error.strerror}"
+        msg = f"service.folder: {folder} cannot be made: {error.strerror}; choose one that you may write in"
         raise ConfigError(msg) from None
     if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
         msg = f"service.folder: {folder} must belong to you with mode 0700; remove it or choose another"

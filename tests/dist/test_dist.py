@@ -68,11 +68,15 @@ def test_the_sdist_builds_the_same_wheel(wheel, tmp_path):
         assert sorted(one.namelist()) == sorted(other.namelist())
 
 
-def test_the_wheel_has_rigs_sequences_and_the_systemd_unit(wheel):
+def test_the_wheel_has_rigs_sequences_layouts_and_the_systemd_unit(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
 
-    for folder, inside in (("rigs", "fitctl/rigs"), ("sequences", "fitctl/shipped_sequences")):
+    for folder, inside in (
+        ("rigs", "fitctl/rigs"),
+        ("sequences", "fitctl/shipped_sequences"),
+        ("layouts", "fitctl/layouts"),
+    ):
         assert {f"{inside}/{path.name}" for path in (ROOT / folder).iterdir()} <= names
     assert any(name.endswith("share/fitctl/systemd/fitctl@.service") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]
