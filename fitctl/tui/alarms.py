@@ -70,10 +70,20 @@ class AlarmBook:
             elif alarm.over_s is None:
                 alarm.over_s = _time_s(state)
         due = newly or state.now_s - self._rang_s >= BELL_EVERY_S
-        rings = due and any(not a.acknowledged and not a.silenced for a in self.alarms.values())
+        rings = due and self.loud
         if rings:
             self._rang_s = state.now_s
         return rings
+
+    @property
+    def unseen(self) -> bool:
+        """There are alarms that were not acknowledged."""
+        return any(not alarm.acknowledged for alarm in self.alarms.values())
+
+    @property
+    def loud(self) -> bool:
+        """The bell rings, now and again."""
+        return any(not a.acknowledged and not a.silenced for a in self.alarms.values())
 
     @property
     def in_order(self) -> list[Alarm]:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from textual.binding import Binding
 
 from fitctl.supervisor.command_table import COMMANDS
+from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.state import ConsoleState
 
 OPERATOR_COMMANDS = tuple(row for row in COMMANDS if row.key)
@@ -59,33 +60,51 @@ class Key(NamedTuple):
     action: str
     help: str
     view: str = ""
-    matters: Callable[[ConsoleState], bool] = lambda _: True
+    matters: Callable[[ConsoleState, AlarmBook], bool] = lambda *_: True
 
     def binding(self) -> Binding:
         """For Textual."""
         return Binding(self.keys, self.action, self.label, show=False)
 
 
-def _never(_state: ConsoleState) -> bool:
-    return False
-
-
-def _several_loops(state: ConsoleState) -> bool:
+def _several_loops(state: ConsoleState, _alarms: AlarmBook) -> bool:
     return len(state.loops) > 1
 
 
-def _by_hand(state: ConsoleState) -> bool:
+def _by_hand(state: ConsoleState, _alarms: AlarmBook) -> bool:
     return state.mode in {"STANDBY", "COARSE", "VERNIER"}
 
 
-def _has_star(state: ConsoleState) -> bool:
+def _has_star(state: ConsoleState, _alarms: AlarmBook) -> bool:
     return state.mode in {"COARSE", "VERNIER"}
 
 
-def _sequence(state: ConsoleState) -> bool:
+def _sequence(state: ConsoleState, _alarms: AlarmBook) -> bool:
     return bool(state.newest and state.newest.running_sequence)
 
 
+def _unseen(_state: ConsoleState, alarms: AlarmBook) -> bool:
+    return alarms.unseen
+
+
+def _loud(_state: ConsoleState, alarms: AlarmBook) -> bool:
+    return alarms.loud
+
+
+# In the footer these come before a screen's own keys.
+ALARM_KEYS = (
+    Key("k", "k", "Acknowledge", "app.acknowledge", "you have seen the alarms", "", _unseen),
+    Key("u", "u", "Silence", "app.silence", "no bell for these alarms", "", _loud),
+    Key(
+        "v",
+        "v",
+        "Alarms",
+        "app.alarms",
+        "alarms in full: what, since when, what to do",
+        "",
+        _unseen,
+    ),
+)
 KEYS = (
     Key("t", "t", "Target", "screen.aim", "put a cursor on the focal plane", "operate", _has_star),
     Key("i", "i", "Look", "screen.look", "follow the star at the cursor", "operate", _has_star),
@@ -106,18 +125,14 @@ KEYS = (
     Key("g", "g", "Go", "screen.go", "run it on the instrument", "sequences"),
     Key("p", "p", "Pause", "screen.pause", "pause it, or let it go on", "sequences", _sequence),
     Key("z", "z", "End it", "screen.end", "end it; its stages are held", "sequences", _sequence),
-    Key("f", "f", "File", "screen.file", "open a sequence file of your own", "sequences", _never),
+    Key("f", "f", "File", "screen.file", "open a sequence file of your own", "sequences"),
     Key("up,down", "↑↓", "Choose", "", "choose a log", "logs"),
     Key("enter", "enter", "Info", "screen.tool('info')", "what the chosen log holds", "logs"),
     Key("m", "m", "Keep", "screen.keep", "mark it, so that it is never deleted; or not", "logs"),
     Key("f", "f", "Verify", "screen.tool('verify')", "whether it is whole", "logs"),
     Key("t", "t", "Report", "screen.tool('report')", "one page about it", "logs"),
     Key("y", "y", "Replay", "screen.tool('replay')", "decide its frames again", "logs"),
-    Key("k", "k", "Acknowledge", "app.acknowledge", "you have seen the alarms", "", _never),
-    Key("u", "u", "Silence", "app.silence", "no bell for these alarms", "", _never),
-    Key(
-        "v", "v", "Alarms", "app.alarms", "alarms in full: what, since when, what to do", "", _never
-    ),
+    *ALARM_KEYS,
     Key("e", "e", "Events", "app.events", "all events at full length"),
     Key("l", "l", "Loop", "app.next_loop", "show the next loop", "", _several_loops),
     Key("ctrl+p", "^p", "Palette", "app.command_palette", "every command by its name"),

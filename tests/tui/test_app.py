@@ -5,43 +5,21 @@ import pytest
 from textual.command import CommandPalette
 
 from fitctl.supervisor.messages import (
-    Acquire,
     Hold,
     Off,
-    Recover,
     Reply,
     Reset,
+    SetController,
     SetTarget,
-    Standby,
+    Shutdown,
     Stop,
     TakeOver,
     TrippedInterlock,
 )
-from fitctl.tui.dialogs import Confirm, Reader
-from fitctl.tui.views.help import HelpView
+from fitctl.tui.dialogs import Confirm
 from tests.tui.fake import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 from tests.tui.live import header_text, notifications, run, until
-
-
-@pytest.mark.parametrize(
-    ("key", "command"),
-    [
-        ("a", Acquire(loop="right")),
-        ("h", Hold(loop="right")),
-        ("r", Recover(loop="right")),
-        ("b", Standby(loop="right")),
-        ("s", Stop()),
-        ("space", Stop()),
-        ("ctrl+s", Stop()),
-    ],
-)
-def test_every_command_is_one_key(key, command):
-    async def scenario(app, pilot, link):
-        await pilot.press(key)
-        await until(pilot, lambda: link.sent)
-
-    assert run(scenario).sent == [command]
 
 
 @pytest.mark.parametrize(
@@ -130,41 +108,25 @@ def test_loops_are_cycled_and_commands_go_to_the_shown_one():
     ]
 
 
-@pytest.mark.parametrize("closing", ["escape", "e", "q"])
-def test_the_events_open_and_close(closing):
-    async def scenario(app, pilot, link):
-        await pilot.press("e")
-        assert isinstance(app.screen, Reader)
-        await pilot.press(closing)
-        await until(pilot, lambda: not isinstance(app.screen, Reader))
-
-    run(scenario)
-
-
-@pytest.mark.parametrize("key", ["question_mark", "f1", "6"])
-def test_help_is_a_key_away(key):
-    async def scenario(app, pilot, link):
-        await pilot.press(key)
-        await until(pilot, lambda: isinstance(app.screen, HelpView))
-
-    run(scenario)
+async def chosen_in_palette(app, pilot, typed):
+    """Type in the palette until one command is left, and take it."""
+    await pilot.press("ctrl+p")
+    await until(pilot, lambda: isinstance(app.screen, CommandPalette))
+    await pilot.press(*("space" if letter == " " else letter for letter in typed))
+    await until(pilot, lambda: app.screen.query("OptionList").first().option_count == 1)
+    await pilot.press("enter")
+    await until(pilot, lambda: not isinstance(app.screen, CommandPalette))
 
 
-def test_a_target_is_given_through_the_palette():
-    async def scenario(app, pilot, link):
-        await pilot.press("ctrl+p")
-        await until(pilot, lambda: isinstance(app.screen, CommandPalette))
-        await pilot.press(*"target", "space", *"20", "space", *"19.5")
-        await until(pilot, lambda: app.screen.query("OptionList").first().option_count == 1)
-        await pilot.press("enter")
-        await until(pilot, lambda: link.sent or not isinstance(app.screen, CommandPalette))
-        if not link.sent:
-            await until(pilot, lambda: link.sent)
-
-    assert run(scenario).sent == [SetTarget(loop="right", az_px=20.0, el_px=19.5)]
-
-
-def test_a_tripped_interlock_is_reset_through_the_palette():
+@pytest.mark.parametrize(
+    ("typed", "command"),
+    [
+        ("target 20 19.5", SetTarget(loop="right", az_px=20.0, el_px=19.5)),
+        ("controller lqg-ltr", SetController(loop="right", name="lqg-ltr")),
+        ("reset clock", Reset(loop="right", name="clock_step")),
+    ],
+)
+def test_what_has_no_key_is_typed_into_the_palette(typed, command):
     supervisor = FakeSupervisor()
     supervisor.interlocks = [
         TrippedInterlock(
@@ -173,15 +135,23 @@ def test_a_tripped_interlock_is_reset_through_the_palette():
     ]
 
     async def scenario(app, pilot, link):
-        await pilot.press("ctrl+p")
-        await until(pilot, lambda: isinstance(app.screen, CommandPalette))
-        await pilot.press(*"reset", "space", *"clock")
-        await until(pilot, lambda: app.screen.query("OptionList").first().option_count == 1)
-        await pilot.press("enter")
+        await chosen_in_palette(app, pilot, typed)
         await until(pilot, lambda: link.sent)
 
-    sent = run(scenario, supervisor=supervisor).sent
-    assert sent == [Reset(loop="right", name="clock_step")]
+    assert run(scenario, supervisor=supervisor).sent == [command]
+
+
+@pytest.mark.parametrize(("answer", "sent"), [("y", [Shutdown()]), ("n", []), ("escape", [])])
+def test_the_supervisor_is_shut_down_through_the_palette_and_asks_once(answer, sent):
+    async def scenario(app, pilot, link):
+        await chosen_in_palette(app, pilot, "shut down")
+        await until(pilot, lambda: isinstance(app.screen, Confirm))
+        assert not link.sent
+        await pilot.press(answer)
+        await until(pilot, lambda: not isinstance(app.screen, Confirm))
+        await until(pilot, lambda: len(link.sent) == len(sent))
+
+    assert run(scenario).sent == sent
 
 
 def test_who_has_the_instrument_is_in_the_header():

@@ -6,7 +6,7 @@ import pytest
 from fitctl.logging.records import Event
 from fitctl.supervisor.messages import Look, SequenceStatus, SetTarget, TrippedInterlock
 from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.commands import VIEWS, keys_of
+from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.jog import JogPad
 from fitctl.tui.palette import parse_place
 from fitctl.tui.state import ConsoleState
@@ -35,13 +35,17 @@ def header(state):
 
 
 def keys(state):
-    return Keys(state, "operate")
+    return Keys(state, "operate", judged(state))
+
+
+def judged(state):
+    book = AlarmBook()
+    book.judge(state)
+    return book
 
 
 def alarm_bar(state):
-    book = AlarmBook()
-    book.judge(state)
-    return AlarmBar(state, book)
+    return AlarmBar(state, judged(state))
 
 
 def hand(state):
@@ -123,7 +127,7 @@ def test_nothing_is_wider_than_its_panel_at_80_columns(panel, mode):
     columns, rows = {
         header: (80, 3),
         FocalPlane: (40, 20),
-        Traces: (39, 8),
+        Traces: (39, 9),
         Stages: (39, 4),
         Devices: (39, 2),
         Timing: (39, 3),
@@ -209,6 +213,28 @@ def test_the_footer_has_stop_and_what_can_be_done_now_and_nothing_else():
     assert "? Help" in line
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_at_80_columns_an_alarms_keys_follow_stop_and_the_commands(mode):
+    supervisor = FakeSupervisor(mode)
+    supervisor.records_lost = 3
+    state = shown(supervisor)
+    book = judged(state)
+    footer = Keys(state, "operate", book)
+    line = plain(footer.draw(80, 1))[0]
+    commands = [row.label for row in OPERATOR_COMMANDS if row.name in state.usable_commands]
+    wanted = [*commands, "Help", "Acknowledge", "Silence", "Alarms"]
+    places = [line.index(word) for word in wanted]
+    assert places == sorted(places)
+    book.silence()
+    line = plain(footer.draw(80, 1))[0]
+    assert "Silence" not in line
+    assert "Acknowledge" in line
+    book.acknowledge()
+    line = plain(footer.draw(80, 1))[0]
+    assert "Acknowledge" not in line
+    assert "Alarms" not in line
+
+
 def test_a_narrow_footer_keeps_stop_the_commands_and_help():
     line = plain(keys(shown(FakeSupervisor("SAFE"))).draw(40, 1))[0]
     assert all(word in line for word in ("s STOP", "r Recover", "o Off", "? Help"))
@@ -217,11 +243,10 @@ def test_a_narrow_footer_keeps_stop_the_commands_and_help():
 
 @pytest.mark.parametrize("view", [view.name for view in VIEWS])
 def test_every_key_of_a_screen_is_clicked_as_it_is_pressed(view):
-    line = Keys(shown(FakeSupervisor()), view).draw(300, 1)[0]
+    state = shown(FakeSupervisor())
+    line = Keys(state, view, AlarmBook()).draw(300, 1)[0]
     actions = {segment.style.meta.get("@click") for segment in line if segment.style}
-    wanted = {
-        key.action for key in keys_of(view) if key.action and key.matters(shown(FakeSupervisor()))
-    }
+    wanted = {key.action for key in keys_of(view) if key.action and key.matters(state, AlarmBook())}
     assert wanted <= actions
     assert "app.command('Stop')" in actions
 

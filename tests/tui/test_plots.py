@@ -3,6 +3,7 @@
 import json
 import math
 
+import msgspec
 import numpy as np
 import pytest
 import scipy.signal
@@ -122,11 +123,48 @@ def test_what_has_no_room_in_the_caption_is_the_light_and_not_a_spots_name():
     assert "DN" not in caption
 
 
-def test_the_siderostat_is_told_with_its_limits_and_warned_of_near_them():
+@pytest.mark.parametrize("size", [(100, 9), (40, 8), (39, 4)])  # as at 200x60, 120x40 and 80x24
+def test_the_siderostat_is_told_with_its_limits_and_warned_of_near_them(size):
     state = shown(FakeSupervisor())
-    assert "of ±600″" in "".join(plain(Stages(state).draw(100, 9)))
-    changed_tick(state, siderostat_az_sky_arcsec=590.0)
-    assert "″!" in "".join(plain(Stages(state).draw(100, 9)))
+    (row,) = (line for line in plain(Stages(state).draw(*size)) if "sider " in line)
+    assert row.rstrip().endswith("of ±600″")
+    assert "!" not in row
+    changed_tick(state, siderostat_az_sky_arcsec=-590.0, siderostat_el_sky_arcsec=-123.4)
+    (row,) = (line for line in plain(Stages(state).draw(*size)) if "sider " in line)
+    assert "−590.0" in row
+    assert "!" in row
+    assert row.rstrip().endswith("of ±600″")
+    assert len(row.rstrip()) <= size[0]
+
+
+def test_a_limit_without_room_is_left_out_and_never_cut():
+    state = shown(FakeSupervisor())
+    limits = msgspec.structs.replace(state.loop.state.limits, siderostat_travel_sky_arcsec=12000.0)
+    state.loop.state = msgspec.structs.replace(state.loop.state, limits=limits)
+    assert "±" not in "".join(plain(Stages(state).draw(40, 8)))
+    assert "of ±12000″" in "".join(plain(Stages(state).draw(100, 9)))
+
+
+@pytest.mark.parametrize("size", [(39, 9), (79, 19)])  # as at 80x24 and 120x40
+def test_the_traces_have_a_time_axis_and_name_the_requirement(size):
+    lines = plain(Traces(shown(FakeSupervisor(), 450)).draw(*size))
+    assert lines[-1].split() == ["−20", "s", "−10", "s", "now"]
+    assert [line[:5].strip() for line in lines].count("+0.1") == 2
+    assert [line[:5].strip() for line in lines].count("−0.1") == 2
+    assert " mas" in lines[0]
+
+
+def test_without_a_row_for_the_time_axis_its_span_is_in_the_headings():
+    lines = plain(Traces(shown(FakeSupervisor(), 450)).draw(79, 8))
+    assert " px · 20 s " in lines[0]
+    assert "now" not in lines[-1]
+
+
+def test_the_requirement_gives_way_to_the_sky_and_both_to_the_rms():
+    traces = Traces(shown(FakeSupervisor(), 450))
+    assert "of 0.1 px ✓ 83 mas" in plain(traces.draw(50, 9))[0]
+    assert "of" not in plain(traces.draw(39, 9))[0]
+    assert plain(traces.draw(31, 9))[0].endswith("✓")
 
 
 def test_the_search_has_its_map_with_the_way_and_the_field():

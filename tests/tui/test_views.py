@@ -7,9 +7,7 @@ from fitctl.supervisor.messages import (
     Stop,
 )
 from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS, keys_of
-from fitctl.tui.dialogs import Alarms
 from fitctl.tui.widgets.keys import Keys
-from tests.tui.fake import FakeSupervisor
 from tests.tui.fixed import settle
 from tests.tui.piloted import pressed, run, sent
 
@@ -104,24 +102,3 @@ def test_the_smallest_and_the_largest_terminal_show_every_screen(size):
             assert "STOP" in app.view.query_one(Keys).render_line(0).text
 
     run(scenario, size=size)
-
-
-# ---------------------------------------------------------------- alarms
-
-
-def test_alarms_are_acknowledged_and_silenced_by_key_also_in_their_dialog():
-    async def scenario(app, pilot):
-        await settle(app, pilot)
-        (alarm,) = app.alarms.in_order
-        assert not alarm.acknowledged
-        await pressed(app, pilot, "u")
-        assert alarm.silenced
-        await pressed(app, pilot, "v")
-        assert isinstance(app.screen, Alarms)
-        await pressed(app, pilot, "k", "escape")
-        assert alarm.acknowledged
-        assert not app.screen.is_modal
-
-    supervisor = FakeSupervisor()
-    supervisor.records_lost = 3
-    run(scenario, supervisor=supervisor)

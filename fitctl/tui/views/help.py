@@ -24,7 +24,7 @@ _SIGNS = (
     ),
     ("diamond", "the mirror's range, |az| + |el|, with its way of the last 10 s; ✗ when saturated"),
     (
-        "sider.",
+        "sider",
         "the siderostat on the sky, az and el, in arcsec; to go: to its set-point, at the motors",
     ),
     ("median/worst", "of the last second, in ms: compute time, frame age, servo lateness"),

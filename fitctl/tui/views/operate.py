@@ -93,8 +93,7 @@ class OperateView(View):
         self.hand = hand
         if hand != "aim":
             self._plane.cursor_px = None
-        self.query_one(Hand).display = hand == "jog"
-        self.query_one(Events).display = hand != "jog"
+        self.set_class(hand == "jog", "jogging")  # the stylesheet puts the hand where events are
         self.call_after_refresh(self.console.draw_all)
 
     # ------------------------------------------------------------ target and window

@@ -50,7 +50,7 @@ class View(Screen[None]):
         yield AlarmBar(self.state, self.console.alarms)
         with Container(id="body"):
             yield from self.parts()
-        yield Keys(self.state, self.view_name, self.keys_now)
+        yield Keys(self.state, self.view_name, self.console.alarms, self.keys_now)
 
     @abstractmethod
     def parts(self) -> ComposeResult:

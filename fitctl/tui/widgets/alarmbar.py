@@ -63,7 +63,7 @@ class AlarmBar(Panel):
             keys += [text(f" +{more}", INK, bold=True)]
         if first:
             keys += clickable([text(" v", SKY, bold=True), text(" all", DIM)], "app.alarms")
-            if not all(each.acknowledged for each in self._book.alarms.values()):
+            if self._book.unseen:
                 keys += clickable(
                     [text(" k", SKY, bold=True), text(" seen", DIM)], "app.acknowledge"
                 )

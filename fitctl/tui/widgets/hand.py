@@ -18,7 +18,6 @@ class Hand(Panel):
     def __init__(self, state: ConsoleState, pad: JogPad) -> None:
         super().__init__(state, "By hand")
         self._pad = pad
-        self.display = False
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """Stage and step, where it is, the steps to choose from."""

@@ -31,7 +31,8 @@ from fitctl.tui.widgets.panel import Panel
 
 HIGH_RANGE = 0.8
 NUMBER_COLUMNS = 28
-LIMIT_FROM_COLUMNS = 34
+NAME_COLUMNS = 6
+STACKS_LIMIT_FROM_COLUMNS = 38
 TRAIL_S = 10.0
 
 
@@ -128,14 +129,14 @@ def _numbers(loop: LoopView, tick: Tick, columns: int, rows: int) -> list[Line]:
     lines.append(stacks)
     if loop.piezo is not None:
         measured_v = (loop.piezo.stack1_v, loop.piezo.stack2_v, loop.piezo.stack3_v)
-        unit = f"V, limit {loop.piezo.limit_v:g}" if columns >= LIMIT_FROM_COLUMNS else "V"
+        unit = f"V, limit {loop.piezo.limit_v:g}" if columns >= STACKS_LIMIT_FROM_COLUMNS else "V"
         lines.append(_row("stacks", " ".join(number(v, ".1f") for v in measured_v), unit))
     lines += [siderostat, behind]
     return [*lines, _search_bar(tick, columns)] if tick.mode == "ACQUISITION" else lines
 
 
 def _row(name: str, values: str, unit: str) -> Line:
-    return [text(name.ljust(6), DIM), text(values.rjust(17), INK), text(f" {unit}", DIM)]
+    return [text(name.ljust(NAME_COLUMNS), DIM), text(values.rjust(17), INK), text(f" {unit}", DIM)]
 
 
 def _pair(az: float, el: float, form: str) -> str:
@@ -143,21 +144,26 @@ def _pair(az: float, el: float, form: str) -> str:
 
 
 def _siderostat(loop: LoopView, tick: Tick, columns: int) -> Line:
-    """On the sky, beside how far it may go."""
+    """On the sky, beside how far it may go, in the widest form that has room."""
     az_arcsec, el_arcsec = tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec
+    wide = _pair(az_arcsec, el_arcsec, "+.1f").rjust(17)
     limits = loop.state.limits
-    unit = "″"
-    line = _row("sider.", _pair(az_arcsec, el_arcsec, "+.1f"), unit)
     if limits is None:
-        return line
-    travel_arcsec = limits.siderostat_travel_sky_arcsec
-    used = max(abs(az_arcsec), abs(el_arcsec)) / travel_arcsec
-    if used > HIGH_RANGE:
-        line[1] = text(line[1].text, ORANGE, bold=True)
-        line.append(text("!", ORANGE, bold=True))
-    if columns >= LIMIT_FROM_COLUMNS:
-        line.append(text(f" of ±{travel_arcsec:g}″", DIM))
-    return line
+        return _row("sider", wide, "″")
+    limit = f"of ±{limits.siderostat_travel_sky_arcsec:g}″"
+    used = max(abs(az_arcsec), abs(el_arcsec)) / limits.siderostat_travel_sky_arcsec
+    high = used > HIGH_RANGE
+    sign = "!" if high else " "
+    close = f"{number(az_arcsec, '+.1f'):>6}{number(el_arcsec, '+.1f'):>7}"
+    forms = ((wide, f" ″{sign}", limit), (close, sign, limit), (wide, sign, "″"))
+    room = columns - NAME_COLUMNS
+    values, mark, told = next((form for form in forms if len("".join(form)) <= room), forms[-1])
+    return [
+        text("sider".ljust(NAME_COLUMNS), DIM),
+        text(values, ORANGE if high else INK, bold=high),
+        text(mark, ORANGE if high else DIM, bold=high),
+        text(told, DIM),
+    ]
 
 
 def _range_colour(fraction: float) -> str:

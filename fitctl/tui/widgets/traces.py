@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.segment import Segment
 
 from fitctl.tui.draw import braille
 from fitctl.tui.look import (
@@ -28,8 +29,7 @@ from fitctl.tui.widgets.searchmap import search_lines
 
 AXIS_COLUMNS = 6
 STEPS = (1.0, 2.0, 5.0)
-TIME_AXIS_FROM_ROWS = 12
-LONG_HEADINGS_FROM_COLUMNS = 68
+TIME_AXIS_FROM_ROWS = 9
 TITLES = {True: "Search on the sky", False: "Pointing error"}
 
 
@@ -37,7 +37,7 @@ class Traces(Panel):
     """Azimuth above elevation: value now, RMS against the requirement, and the trace."""
 
     def draw(self, columns: int, rows: int) -> list[Line]:
-        """Both axes with equal room, and a time axis where it does not cost too much.
+        """Both axes with equal room, and a time axis; without room for it the headings have its span.
 
         The scale is that of the present mode's errors; larger ones from before lie on the edge.
         """
@@ -53,6 +53,7 @@ class Traces(Panel):
         errors = loop.errors(max(window))
         since_s = loop.state.since_s
         rms = error_rms(errors, max(since_s, now_s - window.rms_s))
+        span = f" · {window.trace_s:g} s"
         time_axis = rows >= TIME_AXIS_FROM_ROWS
         trace_rows = max(1, (rows - 2 - time_axis) // 2)
         in_mode_px = errors[errors[:, 0] >= max(since_s, now_s - window.trace_s), 1:]
@@ -62,7 +63,12 @@ class Traces(Panel):
             (("az", SKY, rms.az_px), ("el", ORANGE, rms.el_px)), start=1
         ):
             now_px = float(errors[-1, index]) if len(errors) else math.nan
-            lines.append(_heading(name, colour, now_px, rms_px, rms, window, loop, columns))
+            heading = [text(f"{name} ", colour, bold=True)]
+            heading.append(text(f"{number(now_px, '+.3f')} px", INK, bold=True))
+            right = _rms_told(rms_px, rms, window, loop, columns - width(heading) - 1)
+            if not time_axis and width(heading) + len(span) + width(right) < columns:
+                heading.append(text(span, DIM))
+            lines.append(spread(heading, right, columns))
             lines += trace_lines(
                 errors[:, 0],
                 errors[:, index],
@@ -114,66 +120,55 @@ def trace_lines(
         braille.guide(guides, sign * requirement_px, limit_px, 2)
     labels = _axis_labels(rows, limit_px, requirement_px)
     return [
-        [text(label.rjust(AXIS_COLUMNS - 1), DIM), text("▕", FAINT), *line]
+        [label, text("▕", FAINT), *line]
         for label, line in zip(
             labels, braille.layered([(guides, GREEN), (trace, colour)]), strict=True
         )
     ]
 
 
-def _axis_labels(rows: int, limit_px: float, requirement_px: float) -> list[str]:
-    labels = [""] * rows
-    wanted = [(limit_px, "+"), (-limit_px, "−"), (0.0, "")]
-    if requirement_px < 0.8 * limit_px:
-        wanted += [(requirement_px, "+"), (-requirement_px, "−")]
-    for value, sign in wanted:
+def _axis_labels(rows: int, limit_px: float, requirement_px: float) -> list[Segment]:
+    """What has no row of its own goes: first the ends of the scale, then the requirement."""
+    labels = [text(" " * (AXIS_COLUMNS - 1))] * rows
+    ends = ((limit_px, "+", DIM), (-limit_px, "−", DIM))
+    band = ((requirement_px, "+", GREEN), (-requirement_px, "−", GREEN))
+    for value, sign, colour in ((0.0, "", DIM), *band, *ends):
         y = min(rows - 1, int((1 - value / limit_px) / 2 * rows))
-        if not labels[y]:
-            labels[y] = f"{sign}{abs(value):g}"
+        if labels[y].text.isspace():
+            labels[y] = text(f"{sign}{abs(value):g}".rjust(AXIS_COLUMNS - 1), colour)
     return labels
 
 
-def _heading(
-    name: str,
-    colour: str,
-    now_px: float,
-    rms_px: float,
-    rms: Rms,
-    window: Window,
-    loop: LoopView,
-    columns: int,
-) -> Line:
-    requirement_px = loop.state.requirement_px
-    line = [
-        text(f"{name} ", colour, bold=True),
-        text(f"{number(now_px, '+.3f')} px", INK, bold=True),
-    ]
+def _rms_told(rms_px: float, rms: Rms, window: Window, loop: LoopView, room: int) -> Line:
+    """The RMS of one axis: in px, as a part of the requirement, and on the sky."""
     if math.isnan(rms_px):
-        return spread(line, [text("no star, no RMS", DIM)], columns)
+        return [text("no star, no RMS", DIM)]
+    requirement_px = loop.state.requirement_px
     sign = mark(good=rms_px <= requirement_px)
     part = rms_px / requirement_px
     ratio = f"{100 * part:.0f} %" if part < 10 else f"{part:.0f}×"
+    named = f"{'of ' if part < 10 else ''}{requirement_px:g} px "
     on_sky = f"{1000 * loop.state.sky_arcsec_per_px * rms_px:.0f} mas"
-    if columns < LONG_HEADINGS_FROM_COLUMNS:
-        usual = rms.span_s >= 0.9 * window.rms_s and window.rms_s == 10.0
-        right = [
-            text("rms " if usual else f"rms {rms.span_s:.0f} s ", DIM),
-            text(f"{rms_px:.3f}", INK, bold=True),
-            text(f" {ratio} ", INK),
-            sign,
-        ]
-        room = columns - width(line) - width(right) - 1
-        if len(on_sky) < room:
-            right.append(text(f" {on_sky}", DIM))
-        return spread(line, right, columns)
-    right = [
-        text(f"RMS {rms.span_s:.0f} s  ", DIM),
-        text(f"{rms_px:.3f} px", INK, bold=True),
-        text(f" = {ratio} {'of ' if part < 10 else ''}{requirement_px:g} px ", INK),
-        sign,
-        text(f"  {on_sky} on the sky", DIM),
+    usual = rms.span_s >= 0.9 * window.rms_s and window.rms_s == 10.0
+    head = [
+        text("rms " if usual else f"rms {rms.span_s:.0f} s ", DIM),
+        text(f"{rms_px:.3f}", INK, bold=True),
+        text(f" {ratio} ", INK),
     ]
-    return spread(line, right, columns)
+    sky = text(f" {on_sky}", DIM)
+    forms = (
+        [
+            text(f"RMS {rms.span_s:.0f} s  ", DIM),
+            text(f"{rms_px:.3f} px", INK, bold=True),
+            text(f" = {ratio} {named}", INK),
+            sign,
+            text(f"  {on_sky} on the sky", DIM),
+        ],
+        [*head, text(named, INK), sign, sky],
+        [*head, sign, sky],
+        [*head, sign],
+    )
+    return next((form for form in forms if width(form) <= room), forms[-1])
 
 
 def _time_axis(columns: int, span_s: float) -> Line:
