@@ -137,12 +137,21 @@ def test_the_siderostat_is_told_with_its_limits_and_warned_of_near_them(size):
     assert len(row.rstrip()) <= size[0]
 
 
-def test_a_limit_without_room_is_left_out_and_never_cut():
+@pytest.mark.parametrize(
+    ("travel_arcsec", "narrow", "wide"),
+    [(1200.0, " ±1200″", "of ±1200″"), (12e5, " ″", "of ±1.2e+06″")],
+)
+def test_a_limit_without_room_is_told_shorter_or_left_out_but_never_cut(
+    travel_arcsec, narrow, wide
+):
     state = shown(FakeSupervisor())
-    limits = msgspec.structs.replace(state.loop.state.limits, siderostat_travel_sky_arcsec=12000.0)
+    limits = state.loop.state.limits
+    limits = msgspec.structs.replace(limits, siderostat_travel_sky_arcsec=travel_arcsec)
     state.loop.state = msgspec.structs.replace(state.loop.state, limits=limits)
-    assert "±" not in "".join(plain(Stages(state).draw(40, 8)))
-    assert "of ±12000″" in "".join(plain(Stages(state).draw(100, 9)))
+    for columns, rows, ends in ((40, 8, narrow), (100, 9, wide)):
+        lines = plain(Stages(state).draw(columns, rows))
+        (row,) = (line.rstrip() for line in lines if "sider " in line)
+        assert row.endswith(ends)
 
 
 @pytest.mark.parametrize("size", [(39, 9), (79, 19)])  # as at 80x24 and 120x40

@@ -150,12 +150,18 @@ def _siderostat(loop: LoopView, tick: Tick, columns: int) -> Line:
     limits = loop.state.limits
     if limits is None:
         return _row("sider", wide, "″")
-    limit = f"of ±{limits.siderostat_travel_sky_arcsec:g}″"
+    short = f"±{limits.siderostat_travel_sky_arcsec:g}″"
     used = max(abs(az_arcsec), abs(el_arcsec)) / limits.siderostat_travel_sky_arcsec
     high = used > HIGH_RANGE
     sign = "!" if high else " "
     close = f"{number(az_arcsec, '+.1f'):>6}{number(el_arcsec, '+.1f'):>7}"
-    forms = ((wide, f" ″{sign}", limit), (close, sign, limit), (wide, sign, "″"))
+    limit = f"of {short}"
+    forms = (
+        (wide, f" ″{sign}", limit),
+        (close, sign, limit),
+        (close, sign, short),
+        (wide, sign, "″"),
+    )
     room = columns - NAME_COLUMNS
     values, mark, told = next((form for form in forms if len("".join(form)) <= room), forms[-1])
     return [
