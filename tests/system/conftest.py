@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from served import free_port
 
 from fitctl.config import default_rig_path
 from fitctl.processes import rig_arguments
@@ -53,7 +54,12 @@ class Rig:
         self.folder = folder
         self.sockets = Path(f"/tmp/fitctl-test-{os.getpid()}-{time.monotonic_ns()}")
         self.file = file or default_rig_path()
-        self.settings = [f"logging.folder={folder}", f"service.folder={self.sockets}"]
+        # The bench has a port of its own: another test's could take the usual one while mocks are started anew.
+        self.settings = [
+            f"logging.folder={folder}",
+            f"service.folder={self.sockets}",
+            f"mocks.bench_port={free_port()}",
+        ]
         self.before = ()  # what goes before the supervisor on its command line
         self.errors = None  # where the error output of mocks and supervisor goes; None is our own
         self.mocks = self.supervisor = None

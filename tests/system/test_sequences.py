@@ -35,6 +35,13 @@ steps = [{ step = "wait", duration_s = 600.0 }]
 """
 
 
+@pytest.fixture
+def rig(tmp_path):
+    """It is the sequence that is tried here, not how soon the instrument takes a slow machine for a fault."""
+    with running(tmp_path, *PATIENT) as rig:
+        yield rig
+
+
 def sequence(rig, *arguments):
     return fitctl(
         "sequence", *arguments, *rig.common, stdout=subprocess.PIPE, stderr=subprocess.PIPE
