@@ -55,11 +55,15 @@ def run_replay(
     try:
         with whole_run(logs) as info, logged_files(info) as files:
             rig = _rig(info, files, rig_path, overrides, controller)
+            dark_file = dark_of_today(info, rig)
+            if dark_file is not None and not Path(dark_file).exists():
+                msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
+                raise ConfigError(msg)
             result = _shown(info, rig)
     except LogError as error:
         raise ConfigError(str(error)) from None
     named = ", ".join(map(str, logs))
-    if dark_file := dark_of_today(info, rig):
+    if dark_file is not None:
         today = f"{dark_file} was read as it is today; if it was measured anew since, {_NAME_IT}"
         typer.echo(f"{named}: {_OLD_DARK}; {today}", err=True)
     if as_json:
@@ -113,10 +117,6 @@ def _rig(
             f"replay: loops, camera.width_px and camera.height_px must be those of the log, {needed}, are "
             f"{given}; replace other values, or none"
         )
-        raise ConfigError(msg)
-    dark_file = dark_of_today(info, rig)
-    if dark_file is not None and not Path(dark_file).exists():
-        msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
         raise ConfigError(msg)
     return rig
 
