@@ -24,7 +24,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.event_loop import run_on_time
-from fitctl.supervisor.realtime import become_realtime, lock_memory, quiet_interpreter
+from fitctl.stages.realtime import become_realtime, lock_memory, quiet_interpreter
 
 PRIORITY = 60
 PERCENTILES = (50, 99, 100)

@@ -28,8 +28,8 @@ import numpy as np
 from benchmarks.recorder import processor_s
 from fitctl import demo
 from fitctl.config import default_rig_path
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import Telemetry
+from fitctl.messages.client import Client
+from fitctl.messages.telemetry import Telemetry
 
 SETTLE_S = 8.0
 WAIT_S = 120.0

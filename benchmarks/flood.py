@@ -25,8 +25,8 @@ from benchmarks.recorder import processor_s
 from fitctl import demo
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import LoopTiming, Tick
-from fitctl.supervisor.keys import new_key
-from fitctl.supervisor.messages import Acquire, Recover
+from fitctl.messages.commands import Acquire, Recover
+from fitctl.messages.keys import new_key
 
 SETTLING_S = 1.0
 HOLD_S = 120.0

@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, tcp_endpoint
-from fitctl.supervisor.keys import read_remote
-from fitctl.supervisor.messages import SetTarget
+from fitctl.messages.commands import SetTarget
+from fitctl.messages.endpoints import COMMAND_SOCKET, tcp_endpoint
+from fitctl.messages.keys import read_remote
 
 BURST_S = 0.005
 LARGEST_BURST = 200

@@ -23,10 +23,10 @@ from mcap.reader import SeekingReader
 from mcap.writer import CompressionType, Writer
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.daemon.run import run_info
 from fitctl.logging.records import AnyRecord
 from fitctl.logging.writer import LogWriter
-from fitctl.supervisor.run import run_info
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.simulation import Simulation
 
 PART_S = 600.0
 PARTS_A_FILE = 6

@@ -18,8 +18,8 @@ from fitctl.model.air_path import NODE_S
 from fitctl.model.compiled import jit
 from fitctl.model.kernels import mix
 from fitctl.model.pixel_noise import quantiles
-from fitctl.supervisor.batch import Batch
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.simulation import Simulation
 
 RUN_S = 120.0
 PIECE_S = 2.0  # of the interactive simulation

@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import ConfigError, Rig, load_rig
+from fitctl.daemon.last_records import HELLO_S
+from fitctl.daemon.run import only_supervisor
 from fitctl.logging.records import LoopTiming, Tick
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Acquire, AnyCommand, Standby
+from fitctl.messages.endpoints import make_service_folder
+from fitctl.messages.modes import Mode
+from fitctl.messages.telemetry import Telemetry
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.model.optics import scales
 from fitctl.processes import (
@@ -30,13 +37,7 @@ from fitctl.processes import (
     signals_ignored,
     start_process,
 )
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import make_service_folder
-from fitctl.supervisor.last_records import HELLO_S
-from fitctl.supervisor.messages import Acquire, AnyCommand, Standby, Telemetry
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.run import only_supervisor
-from fitctl.supervisor.simulate import pair, rms
+from fitctl.simulation.statistics import pair, rms
 
 JUDGED_S = 30.0
 _START_TIMEOUT_S = 60.0

@@ -3,7 +3,7 @@
 The first byte chooses who sends: somebody on this machine, a commander's key, a viewer's, a revoked one, or the
 gateway itself. The second chooses one of the commands, of the gateway one of its envelopes, the third a place
 in it, and the rest is written over what is there; or the rest is all. Only ZeroMQ is left out: see
-``tests/supervisor/test_service_garbage.py``. The instrument is simulated and lives on from one input to the
+``tests/service/test_service_garbage.py``. The instrument is simulated and lives on from one input to the
 next, so that commands meet it in every mode.
 """
 
@@ -18,15 +18,8 @@ import numpy as np
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import RecorderStatus
-from fitctl.model.drives import Drive
-from fitctl.supervisor.admission import Sender
-from fitctl.supervisor.command_table import COMMANDS
-from fitctl.supervisor.doors import Door
-from fitctl.supervisor.envelope import Passed, Report, decode_envelope
-from fitctl.supervisor.gateway import judge
-from fitctl.supervisor.intake import Intake
-from fitctl.supervisor.keys import AllowedKey
-from fitctl.supervisor.messages import (
+from fitctl.messages.command_table import COMMANDS
+from fitctl.messages.commands import (
     RecentEvents,
     RecorderReport,
     Reply,
@@ -36,9 +29,16 @@ from fitctl.supervisor.messages import (
     Status,
     decode_command,
 )
-from fitctl.supervisor.service import Service, Waiting
-from fitctl.supervisor.simulate import Simulation
-from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
+from fitctl.messages.keys import AllowedKey
+from fitctl.model.drives import Drive
+from fitctl.service.admission import Sender
+from fitctl.service.doors import Door
+from fitctl.service.envelope import Passed, Report, decode_envelope
+from fitctl.service.gateway import judge
+from fitctl.service.intake import Intake
+from fitctl.service.service import Service, Waiting
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.simulation.simulation import Simulation
 
 _OWNER = Sender("owner@here", "process 1", "commander", is_local=True)
 _KEYS = (

@@ -9,6 +9,8 @@ import pytest
 
 from fitctl.config import Rig, default_rig_path, load_rig
 
+pytest_plugins = ["virtual_instrument"]
+
 # The machine itself may stand still for 100 ms: an example's time says nothing about the code.
 hypothesis.settings.register_profile("fitctl", deadline=None)
 hypothesis.settings.load_profile("fitctl")

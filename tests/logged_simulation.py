@@ -2,9 +2,9 @@
 
 import msgspec
 
+from fitctl.daemon.run import run_info
 from fitctl.logging.writer import LogWriter
-from fitctl.supervisor.run import run_info
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.simulation import Simulation
 
 WALL_S = 1_795_000_000.0
 NEAR_PX = (2.0, -1.0)

@@ -11,14 +11,14 @@ import zmq
 from fitctl.clock import MonotonicClock
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import CommandRecord, Event
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, make_service_folder
-from fitctl.supervisor.gateway import Gateway
-from fitctl.supervisor.keys import new_key
-from fitctl.supervisor.messages import Reply
-from fitctl.supervisor.service import Service
-from fitctl.supervisor.simulate import Simulation
-from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Reply
+from fitctl.messages.endpoints import COMMAND_SOCKET, make_service_folder
+from fitctl.messages.keys import new_key
+from fitctl.service.gateway import Gateway
+from fitctl.service.service import Service
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.simulation.simulation import Simulation
 
 
 def free_port():

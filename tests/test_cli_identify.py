@@ -8,13 +8,13 @@ import pytest
 
 from fitctl.cli import main
 from fitctl.commands import identify as commands
+from fitctl.daemon.run import run_info
 from fitctl.identify import run as runs
 from fitctl.identify.experiments import EXPERIMENTS
 from fitctl.identify.run import on_simulation
 from fitctl.logging.writer import LogWriter
+from fitctl.messages.commands import Experiment, Hold, Reply
 from fitctl.model.drives import Drive
-from fitctl.supervisor.messages import Experiment, Hold, Reply
-from fitctl.supervisor.run import run_info
 
 WALL_S = 1_795_000_000.0
 

@@ -9,7 +9,7 @@ from served import Served
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path
-from fitctl.supervisor.messages import Status, TakeOver
+from fitctl.messages.commands import Status, TakeOver
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.widgets.margins import Margins
 from tests.tui.live import notifications, until

@@ -78,7 +78,7 @@ def test_a_dark_frame_that_is_not_in_the_log_is_read_from_its_file_with_a_warnin
     for keeps in (True, False):
         with monkeypatch.context() as patched:
             if not keeps:  # as an older fitctl did
-                patched.setattr("fitctl.supervisor.run.dark_bytes", lambda _path: None)
+                patched.setattr("fitctl.daemon.run.dark_bytes", lambda _path: None)
             simulation = LoggedSimulation(rig, log)
         simulation.acquire()
         simulation.run(0.5)
@@ -101,7 +101,7 @@ def test_a_dark_frame_that_is_neither_in_the_log_nor_on_the_disk_is_asked_for(
 ):
     file, log = tmp_path / "dark.npy", tmp_path / "run.mcap"
     np.save(file, np.full((40, 40), 1000.0))
-    monkeypatch.setattr("fitctl.supervisor.run.dark_bytes", lambda _path: None)
+    monkeypatch.setattr("fitctl.daemon.run.dark_bytes", lambda _path: None)
     LoggedSimulation(load_rig(default_rig_path(), [f"camera.dark_file={file}"]), log).writer.close()
     file.unlink()
     status, _, errors = replay(log)

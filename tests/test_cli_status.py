@@ -11,8 +11,8 @@ from fitctl.commands import watch
 from fitctl.commands.printing import to_json
 from fitctl.commands.status import duration, status_document, status_lines, utc
 from fitctl.logging.records import Event
-from fitctl.supervisor.messages import TrippedInterlock
-from fitctl.supervisor.troubles import RECORDER_SILENT_S, troubles
+from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
 from tests.tui.fake import FakeSupervisor
 
 TRIPPED = TrippedInterlock(

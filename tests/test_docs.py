@@ -22,13 +22,13 @@ from documents import (
 
 from fitctl.cli import app, main
 from fitctl.config import default_rig_path, load_rig
+from fitctl.daemon.run import run_info
 from fitctl.logging.records import QuantityReading, RecorderStatus
 from fitctl.logging.writer import LogWriter
-from fitctl.supervisor.command_table import command_of
-from fitctl.supervisor.messages import Acquire, Shutdown, Status
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.run import run_info
-from fitctl.supervisor.simulate import Simulation
+from fitctl.messages.command_table import command_of
+from fitctl.messages.commands import Acquire, Shutdown, Status
+from fitctl.messages.modes import Mode
+from fitctl.simulation.simulation import Simulation
 
 MAKE_TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 CLI = typer.main.get_command(app)

@@ -8,11 +8,11 @@ from documents import ROOT, between, blocks, table
 from fitctl.commands.fault import kinds as fault_kinds
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.schemas import MESSAGES, TOPICS
+from fitctl.messages.command_table import COMMANDS as COMMAND_ROWS
+from fitctl.messages.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
+from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.mocks.faults import WIRE_FAULTS
-from fitctl.supervisor.command_table import COMMANDS as COMMAND_ROWS
-from fitctl.supervisor.messages import TrippedInterlock
-from fitctl.supervisor.metrics import InstrumentCollector
-from fitctl.supervisor.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
+from fitctl.service.metrics import InstrumentCollector
 from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from tests.tui.fake import FakeSupervisor
 

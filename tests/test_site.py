@@ -14,7 +14,7 @@ import fitctl
 from fitctl.cli import app
 from fitctl.config import default_rig_path
 from fitctl.logging.schemas import MESSAGES, TOPICS
-from fitctl.supervisor.messages import AnyCommand
+from fitctl.messages.commands import AnyCommand
 
 
 @pytest.fixture(scope="module")

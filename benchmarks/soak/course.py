@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitctl.logging.records import Event, LoopTiming, Losses, Tick
-from fitctl.supervisor.messages import Telemetry
+from fitctl.messages.telemetry import Telemetry
 
 _EVENTS_KEPT = 60
 

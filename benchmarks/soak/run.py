@@ -17,7 +17,7 @@ from benchmarks.soak.logs import Audit
 from benchmarks.soak.strikes import Bench, shuffled
 from fitctl.config import default_rig_path
 from fitctl.demo import Instrument, instrument
-from fitctl.supervisor.messages import Acquire, AnyCommand, Recover, Shutdown, Standby
+from fitctl.messages.commands import Acquire, AnyCommand, Recover, Shutdown, Standby
 
 _LOGGING = (  # files end and go within the soak, so that disk use is bounded and both are tried
     "logging.rotate_bytes=10000000",

@@ -14,9 +14,9 @@ import psutil
 from benchmarks.soak.consoles import Console
 from fitctl.commands.fault import kinds
 from fitctl.demo import Instrument
+from fitctl.messages.commands import Off, Stop
 from fitctl.mocks.bench import ClearFaults, SetFault, ask_faults
 from fitctl.mocks.faults import WIRE_FAULTS
-from fitctl.supervisor.messages import Off, Stop
 
 _LOOP = "right"
 _DEVICES = {  # the default rig's, and which table of kinds is theirs

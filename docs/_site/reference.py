@@ -17,7 +17,7 @@ from typer.cli import get_docs_for_click
 from fitctl.cli import app
 from fitctl.config import Rig, default_rig_path
 from fitctl.logging.schemas import MESSAGES, TOPICS
-from fitctl.supervisor.messages import AnyCommand
+from fitctl.messages.commands import AnyCommand
 
 LOOP = "right"
 
@@ -154,7 +154,7 @@ def commands() -> str:
     parts = [
         "# Commands of the service",
         "What a client may send to a supervisor: msgpack, made by `msgspec` from the structs of "
-        "`fitctl.supervisor.messages`. Each has `version` and `loop` (empty for all loops). Unknown fields are "
+        "`fitctl.messages.commands`. Each has `version` and `loop` (empty for all loops). Unknown fields are "
         "refused. `fitctl send` and the console give those that people need.",
     ]
     for kind in sorted(get_args(AnyCommand), key=lambda kind: kind.__name__):
@@ -233,7 +233,7 @@ are read.
 
 ## Simulation
 
-::: fitctl.supervisor.simulate.Simulation
+::: fitctl.simulation.simulation.Simulation
 """
 
 PAGES: dict[str, Callable[[], str]] = {

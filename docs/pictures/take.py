@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fitctl import demo
 from fitctl.config import default_rig_path
-from fitctl.supervisor.client import Client
+from fitctl.messages.client import Client
 from fitctl.tui.app import ConsoleApp
 
 SECONDS = 32.0

@@ -76,7 +76,7 @@ class SendCommand(TyperCommand):
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Add them."""
-        from fitctl.supervisor.command_table import WORDS
+        from fitctl.messages.command_table import WORDS
 
         with formatter.section("Commands"):
             formatter.write_dl([(row.usage, row.help) for row in WORDS.values()])
@@ -95,7 +95,7 @@ def send(
 ) -> None:
     """Give one command to the running supervisor of a rig."""
     from fitctl.commands.send import give
-    from fitctl.supervisor.command_table import command_of
+    from fitctl.messages.command_table import command_of
 
     wanted = command_of(command, values or [], loop)
     if remote is None and loop:

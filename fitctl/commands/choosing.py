@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 
 if TYPE_CHECKING:
-    from fitctl.supervisor.client import Client
+    from fitctl.messages.client import Client
 
 
 def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
@@ -87,9 +87,9 @@ def client_of(rig: Rig, remote: Path | None = None) -> Client:
     ConfigError
         If no supervisor can be there, or the key file cannot be used or is for another rig.
     """
-    from fitctl.supervisor.client import Client
-    from fitctl.supervisor.endpoints import service_folder
-    from fitctl.supervisor.keys import read_key_of
+    from fitctl.messages.client import Client
+    from fitctl.messages.endpoints import service_folder
+    from fitctl.messages.keys import read_key_of
 
     return Client(service_folder(rig) if remote is None else read_key_of(rig, remote))
 
@@ -109,7 +109,7 @@ def connect(path: Path | None, overrides: list[str] | None, remote: Path | None)
     if overrides:
         msg = f"--remote {remote}: --set changes a rig file; give that too, with --rig, or leave out --set"
         raise ConfigError(msg)
-    from fitctl.supervisor.client import Client
-    from fitctl.supervisor.keys import read_remote
+    from fitctl.messages.client import Client
+    from fitctl.messages.keys import read_remote
 
     return Client(read_remote(remote))

@@ -12,6 +12,7 @@ from fitctl import demo as demos
 from fitctl.commands.exits import FAILED
 from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import Rig
+from fitctl.messages.telemetry import Telemetry
 from fitctl.processes import (
     end_process,
     ended_by_signals,
@@ -19,7 +20,6 @@ from fitctl.processes import (
     rig_arguments,
     show_process,
 )
-from fitctl.supervisor.messages import Telemetry
 
 _CONSOLE_END_S = 3.0
 

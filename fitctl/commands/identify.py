@@ -29,8 +29,8 @@ from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
+from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
-from fitctl.supervisor.modes import Mode
 
 _PLOT_SUFFIXES = (".png", ".svg")
 _MOCK_VERNIER_S = 60.0

@@ -36,7 +36,7 @@ def new(
     overrides: SetOption = None,
 ) -> None:
     """Allow somebody in, and write the key file that they need: whoever has it is them."""
-    from fitctl.supervisor.keys import new_key
+    from fitctl.messages.keys import new_key
 
     settings = rig_of(rig, overrides)
     path = out or Path(f"{name}.key.toml")
@@ -51,7 +51,7 @@ def new(
 @app.command("list")
 def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Print whose keys are allowed, and what each may do."""
-    from fitctl.supervisor.keys import allowed_keys
+    from fitctl.messages.keys import allowed_keys
 
     keys, problems = allowed_keys(rig_of(rig, overrides))
     for key in keys.values():
@@ -64,7 +64,7 @@ def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
 @app.command()
 def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
     """Let a key in no more; a running supervisor drops its holder at once."""
-    from fitctl.supervisor.keys import revoke_key
+    from fitctl.messages.keys import revoke_key
 
     revoke_key(rig_of(rig, overrides), name)
     typer.echo(f"{name} is let in no more")

@@ -20,7 +20,7 @@ from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.faults import UnknownFault
 from fitctl.mocks.testbed import Testbed
 from fitctl.processes import ENDING_SIGNALS, end_with_parent
-from fitctl.supervisor.realtime import become_realtime
+from fitctl.stages.realtime import become_realtime
 
 Picture = Callable[[float], NDArray[np.uint16]]
 

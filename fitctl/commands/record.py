@@ -9,10 +9,10 @@ from fitctl.config import ConfigError, Rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.recorder import record
 from fitctl.logging.records import RecorderStatus
+from fitctl.messages.client import Client
+from fitctl.messages.commands import RecorderReport
+from fitctl.messages.endpoints import RECORDS_SOCKET, service_folder
 from fitctl.processes import ended_by_signals
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import RECORDS_SOCKET, service_folder
-from fitctl.supervisor.messages import RecorderReport
 
 _REPORT_TIMEOUT_S = 0.5
 

@@ -17,10 +17,10 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import design_json
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo
-from fitctl.supervisor.replay import replay
-from fitctl.supervisor.replay_files import dark_of_today, logged_files
-from fitctl.supervisor.replay_log import read_steps, whole_run
-from fitctl.supervisor.replay_result import LoopReplay, ReplayResult
+from fitctl.replay.files import dark_of_today, logged_files
+from fitctl.replay.log import read_steps, whole_run
+from fitctl.replay.replay import replay
+from fitctl.replay.result import LoopReplay, ReplayResult
 
 DIFFERS = 1
 _ROWS = {

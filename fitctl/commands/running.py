@@ -87,8 +87,8 @@ def run(
     parent_pid: ParentOption = None,
 ) -> None:
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
+    from fitctl.daemon.run import run_supervisor
     from fitctl.processes import end_with_parent, rig_arguments
-    from fitctl.supervisor.run import run_supervisor
 
     overrides = with_controller(rig, overrides, controller)
     settings = rig_of(rig, overrides)
@@ -114,7 +114,7 @@ def metrics(
 ) -> None:
     """Serve metrics of the running instrument; the supervisor starts this by itself."""
     from fitctl.processes import end_with_parent, ended_by_signals
-    from fitctl.supervisor.metrics import serve_metrics
+    from fitctl.service.metrics import serve_metrics
 
     settings = rig_of(rig, overrides)
     end_with_parent(parent_pid)
@@ -132,9 +132,9 @@ def gateway(
 ) -> None:
     """Let keys in by TCP; the supervisor starts this by itself."""
     from fitctl.clock import MonotonicClock
+    from fitctl.messages.endpoints import service_folder
     from fitctl.processes import end_with_parent, ended_by_signals
-    from fitctl.supervisor.endpoints import service_folder
-    from fitctl.supervisor.gateway import Gateway, be_modest, show_life
+    from fitctl.service.gateway import Gateway, be_modest, show_life
 
     settings = rig_of(rig, overrides)
     be_modest()

@@ -9,8 +9,8 @@ import typer
 
 from fitctl.commands.exits import FAILED
 from fitctl.logging.records import Event
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import AnyCommand
+from fitctl.messages.client import Client
+from fitctl.messages.commands import AnyCommand
 
 
 def give(client: Client, command: AnyCommand, said_by: str) -> int:

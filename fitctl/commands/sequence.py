@@ -17,9 +17,9 @@ from fitctl.config import Rig
 
 if TYPE_CHECKING:
     from fitctl.logging.records import SequenceAttempt
+    from fitctl.messages.commands import SequenceStatus
     from fitctl.sequences.links import Link
     from fitctl.sequences.steps import Sequence
-    from fitctl.supervisor.messages import SequenceStatus
 
 app = typer.Typer(
     help="Run, check and steer sequences of acquisition and experiment steps.",
@@ -164,7 +164,7 @@ def _steer(
     remote: Path | None,
 ) -> None:
     from fitctl.commands.send import give
-    from fitctl.supervisor.messages import SequenceControl
+    from fitctl.messages.commands import SequenceControl
 
     command = SequenceControl(action=action)
     raise typer.Exit(give(connect(rig, overrides, remote), command, "sequence"))

@@ -8,8 +8,8 @@ import msgspec
 
 from fitctl.commands.printing import to_json
 from fitctl.logging.records import SequenceAttempt
+from fitctl.messages.commands import SequenceStatus
 from fitctl.sequences.stars import StarResult, star_results
-from fitctl.supervisor.messages import SequenceStatus
 
 
 def where(status: SequenceStatus) -> str:

@@ -12,7 +12,7 @@ from fitctl.commands.exits import FAILED
 from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import Rig
 from fitctl.processes import ended_by_signals, interrupt
-from fitctl.supervisor.campaign import (
+from fitctl.simulation.campaign import (
     PERCENTILES,
     CampaignError,
     LoopSummary,
@@ -22,7 +22,8 @@ from fitctl.supervisor.campaign import (
     run_campaign,
     summarize,
 )
-from fitctl.supervisor.simulate import SimulationResult, simulate
+from fitctl.simulation.simulation import simulate
+from fitctl.simulation.statistics import SimulationResult
 
 
 def run_simulation(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:

@@ -9,10 +9,10 @@ import msgspec
 import typer
 
 from fitctl.commands.printing import to_json
-from fitctl.supervisor import messages
-from fitctl.supervisor.client import REPLY_TIMEOUT_S, Client
-from fitctl.supervisor.messages import Telemetry
-from fitctl.supervisor.troubles import troubles
+from fitctl.messages.client import REPLY_TIMEOUT_S, Client
+from fitctl.messages.commands import Status
+from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.troubles import troubles
 
 WELL = 0
 NOT_WELL = 1
@@ -45,7 +45,7 @@ def newest_telemetry(client: Client) -> Telemetry:
     ConnectionError
         If nobody answers, or no telemetry comes.
     """
-    client.send(messages.Status())  # who is not there is told sooner, and by name
+    client.send(Status())  # who is not there is told sooner, and by name
     telemetry = client.receive(REPLY_TIMEOUT_S)
     if telemetry is None:
         msg = f"the supervisor answers, but sends no telemetry ({REPLY_TIMEOUT_S:g} s); see its output"

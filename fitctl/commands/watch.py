@@ -14,11 +14,11 @@ import msgspec
 from fitctl.commands.printing import to_json
 from fitctl.commands.status import NO_SUPERVISOR, utc
 from fitctl.logging.records import Severity
+from fitctl.messages.client import Client
+from fitctl.messages.modes import Mode
+from fitctl.messages.tally import Tally, add_ticks
+from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.processes import ended_by_signals, interrupt
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import LoopState, Telemetry
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.tally import Tally, add_ticks
 
 _LINE_S = 1.0
 _POLL_S = 0.2

@@ -13,10 +13,10 @@ from scipy.signal import welch
 from fitctl.config import Fsm, Rig
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.records import Tick
+from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import displacement_series, raised_displacement
 from fitctl.model.optics import mirror_angles, mirror_from_stacks, scales
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import SETTLE_S
+from fitctl.simulation.statistics import SETTLE_S
 
 Floats = NDArray[np.float64]
 Ticks = Mapping[str, NDArray[Any]]

@@ -19,7 +19,7 @@ from fitctl.figures.plate import Plate
 from fitctl.figures.report import write_figures, write_performance
 from fitctl.figures.stacks import figure_3
 from fitctl.figures.steps import figure_11, figure_12
-from fitctl.supervisor.campaign import local_executor
+from fitctl.simulation.campaign import local_executor
 
 # Matrices here are small: a second BLAS thread makes them many times slower when cores are shared.
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")

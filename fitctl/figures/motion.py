@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.figures.attenuation import tick_columns
+from fitctl.messages.commands import SetTarget
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import mirror_from_stacks, scales
-from fitctl.supervisor.messages import SetTarget
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.simulation import Simulation
 
 Floats = NDArray[np.float64]
 _NEAR_PX = np.array(

@@ -34,8 +34,8 @@ from fitctl.figures.steps import (
     target_step,
 )
 from fitctl.model.optics import scales
-from fitctl.supervisor.campaign import Results, run_seeds
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.campaign import Results, run_seeds
+from fitctl.simulation.simulation import Simulation
 
 ROUGH_HYSTERESIS, ROUGH_BACKLASH_TIMES = 0.30, 2.0
 AT_HZ = 1.0

@@ -23,8 +23,8 @@ from fitctl.figures.plate import (
 )
 from fitctl.figures.settling import decayed_s, settling, smoothed
 from fitctl.identify.errors import IdentifyError
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
-from fitctl.supervisor.modes import Mode
 
 Floats = NDArray[np.float64]
 AZ, EL = 0, 1

@@ -9,11 +9,12 @@ from pathlib import Path
 from fitctl.config import Rig
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.records import AnyRecord
+from fitctl.messages.client import Client
+from fitctl.messages.commands import AnyCommand, Experiment, Hold, Status
+from fitctl.messages.modes import Mode
+from fitctl.messages.telemetry import Telemetry
 from fitctl.model.drives import Drive, experiment_s
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import AnyCommand, Experiment, Hold, Status, Telemetry
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.simulation import Simulation
 
 _ACQUIRE_LIMIT_S = 120.0
 _SETTLE_S = 5.0  # in vernier, before the loop is opened: what the search left behind decays

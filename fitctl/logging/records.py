@@ -7,13 +7,14 @@ A field's unit is in its name; a value that does not exist at a tick is NaN.
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 
 RECORD_VERSION = 1
 Severity = Literal["info", "warning", "error"]
 FailingDevice = Literal["camera", "siderostat", "D/A", "injector", "piezo"]
+CAMERA: Final = "camera"
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, tag=True):

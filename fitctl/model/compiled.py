@@ -13,8 +13,8 @@ _COMPILED_FROM = (
     "config/*.py",
     "model/*.py",
     "controllers/*.py",
-    "supervisor/batch*.py",
-    "supervisor/modes.py",
+    "simulation/batch/*.py",
+    "messages/modes.py",
 )
 
 

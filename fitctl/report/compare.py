@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fitctl.messages.modes import Mode
 from fitctl.report import tables
 from fitctl.report.drawing import INK, SERIES, Plot, decimal, panels, styled
 from fitctl.report.findings import AXES, Findings, LoopFindings
@@ -16,7 +17,6 @@ from fitctl.report.page import SIGNS, Section
 from fitctl.report.residual import Estimate
 from fitctl.report.tables import Table, number, seconds
 from fitctl.report.timeline import WINDOW_S, running_rms
-from fitctl.supervisor.modes import Mode
 
 Night = tuple[str, LoopFindings]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from fitctl.config import Rig
 from fitctl.logging.reading import Columns
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.report.gather import Gathered, gather
 from fitctl.report.judged import Judged, judge_by
@@ -18,7 +19,6 @@ from fitctl.report.rejection import Rejection, rejections
 from fitctl.report.residual import Estimate, Verdict, Word, night_verdict, rms_estimate, verdict
 from fitctl.report.run import Run
 from fitctl.report.stages import Stacks, Stages, stacks, stages
-from fitctl.supervisor.modes import Mode
 
 AXES = ("az", "el")
 _Tell = Callable[[Any], Any]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.reading import Columns
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import SETTLE_S
+from fitctl.messages.modes import Mode
+from fitctl.simulation.statistics import SETTLE_S
 
 TARGET_SETTLE_S = 2.0
 LONGEST_GAP_S = 0.5

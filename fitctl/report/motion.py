@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.figures.plate import GREEN, PURPLE, SKY
+from fitctl.messages.modes import Mode
 from fitctl.report.drawing import (
     AZ,
     COLORS,
@@ -24,7 +25,6 @@ from fitctl.report.drawing import (
 from fitctl.report.findings import AXES, Findings, LoopFindings
 from fitctl.report.judged import last_marked
 from fitctl.report.stages import motion_px
-from fitctl.supervisor.modes import Mode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

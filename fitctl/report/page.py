@@ -14,7 +14,7 @@ from fitctl.report.findings import Findings, LoopFindings
 from fitctl.report.judged import TARGET_SETTLE_S
 from fitctl.report.residual import Word
 from fitctl.report.tables import Table
-from fitctl.supervisor.simulate import SETTLE_S
+from fitctl.simulation.statistics import SETTLE_S
 
 SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
 JUDGED = (

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.figures.plate import GREEN, ORANGE, PURPLE, SKY
+from fitctl.messages.modes import Mode
 from fitctl.report.drawing import (
     AZ,
     COLORS,
@@ -22,7 +23,6 @@ from fitctl.report.drawing import (
     trace,
 )
 from fitctl.report.findings import AXES, Findings, LoopFindings
-from fitctl.supervisor.modes import Mode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,13 +8,13 @@ import numpy as np
 
 from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_spiral
+from fitctl.loop.search import refused_search
+from fitctl.messages.commands import Acquire, Hold, Standby
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, let_go
 from fitctl.sequences.view import Figures, StepFailed, View
-from fitctl.supervisor.messages import Acquire, Hold, Standby
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.search import refused_search
 
 _FOUND = ("found_az_sky_arcsec", "found_el_sky_arcsec", "found_flux_dn")
 

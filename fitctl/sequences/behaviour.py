@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.messages.commands import Hold
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences.steps import Moving
 from fitctl.sequences.view import Figures, View
-from fitctl.supervisor.messages import Hold
-from fitctl.supervisor.modes import Mode
 
 
 class Calibration(NamedTuple):

@@ -11,10 +11,11 @@ from typing import Literal
 import msgspec
 
 from fitctl.config import Rig
+from fitctl.messages.commands import Reply, SequenceReport, SequenceStatus
+from fitctl.messages.modes import Mode
+from fitctl.messages.telemetry import Telemetry
 from fitctl.sequences.links import Link
 from fitctl.sequences.view import SequenceError, View
-from fitctl.supervisor.messages import Reply, SequenceReport, SequenceStatus, Telemetry
-from fitctl.supervisor.modes import Mode
 
 MESSAGE_CHARS = 300
 _RECEIVE_S = 0.5

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.logging.records import FrameRecord
+from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.view import Figures, StepFailed, View
-from fitctl.supervisor.modes import Mode
 
 Floats = NDArray[np.float64]
 _BRIGHT_NOISES = 5.0  # above the bias, and a pixel is bright

@@ -16,6 +16,11 @@ import msgspec
 
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.logging.records import SequenceAttempt
+from fitctl.messages.client import Client
+from fitctl.messages.commands import AnyCommand, Reply, Status, Stop
+from fitctl.messages.endpoints import service_folder
+from fitctl.messages.keys import RemoteKey, read_key_of
+from fitctl.messages.telemetry import Telemetry
 from fitctl.sequences import steps
 from fitctl.sequences.calibration import write_calibration
 from fitctl.sequences.files import find_sequence
@@ -24,10 +29,6 @@ from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import load_sequence
 from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import Figures, SequenceError
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import service_folder
-from fitctl.supervisor.keys import RemoteKey, read_key_of
-from fitctl.supervisor.messages import AnyCommand, Reply, Status, Stop, Telemetry
 
 NAME = "python"  # under which consoles see steps that a program runs
 
@@ -155,7 +156,7 @@ class Instrument(StepMethods[Figures]):
         return [write_calibration(each, self.rig, Path(folder)) for each in measured]
 
     def send(self, command: AnyCommand) -> Reply:
-        """Give one command of :mod:`fitctl.supervisor.messages`; from any thread."""
+        """Give one command of :mod:`fitctl.messages.commands`; from any thread."""
         return self._link.send(command)
 
     def telemetry(self) -> Telemetry:
@@ -273,7 +274,7 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         return await self._in_thread(self._instrument.telemetry)
 
     async def send(self, command: AnyCommand) -> Reply:
-        """Give one command of :mod:`fitctl.supervisor.messages`, at once, also while a step runs."""
+        """Give one command of :mod:`fitctl.messages.commands`, at once, also while a step runs."""
         instrument = self._instrument
         return await self._at_once(lambda: instrument.send(command))
 

@@ -8,15 +8,16 @@ from concurrent.futures import Future
 from typing import Protocol
 
 from fitctl.config import Rig
-from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
-from fitctl.supervisor.simulate import Simulation
-from fitctl.supervisor.telemetry import ServiceState, TelemetryBuffer
+from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.telemetry import Telemetry
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.simulation.simulation import Simulation
 
 _TURN_S = 0.01
 
 
 class Link(Protocol):
-    """Commands in, telemetry out; :class:`fitctl.supervisor.client.Client` is the one to a running rig."""
+    """Commands in, telemetry out; :class:`fitctl.messages.client.Client` is the one to a running rig."""
 
     def now_s(self) -> float:
         """The supervisor's time."""

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from fitctl.config import Rig
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import EXPERIMENTS
+from fitctl.messages.commands import Experiment
+from fitctl.messages.modes import Mode, Trigger
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, Drive, channel_values, experiment_s
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, let_go, too_far
 from fitctl.sequences.view import Figures, StepFailed, View, columns
-from fitctl.supervisor.drives import refused_drives
-from fitctl.supervisor.injector import stack_v_per_px
-from fitctl.supervisor.messages import Experiment
-from fitctl.supervisor.modes import Mode, Trigger
+from fitctl.stages.drives import refused_drives
+from fitctl.stages.injector import stack_v_per_px
 
 Floats = NDArray[np.float64]
 Plan = Callable[[Any, Rig, str], list[Drive]]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from fitctl.config import Rig
+from fitctl.messages.commands import Hold, Off, SetController, Standby
+from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import POWERED, Behaviour, Result, let_go
 from fitctl.sequences.view import StepFailed, View
-from fitctl.supervisor.messages import Hold, Off, SetController, Standby
-from fitctl.supervisor.modes import Mode
 
 
 def _run_standby(_step: steps.Standby, view: View) -> None:

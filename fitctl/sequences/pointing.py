@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.figures.settling import settling
+from fitctl.messages.commands import SetTarget
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, too_far
 from fitctl.sequences.view import Figures, Squares, StepFailed, View, columns
-from fitctl.supervisor.messages import SetTarget
-from fitctl.supervisor.modes import Mode
 
 Floats = NDArray[np.float64]
 AXES = ("az", "el")

@@ -10,6 +10,8 @@ import msgspec
 
 from fitctl.config import Rig
 from fitctl.logging.records import SequenceAttempt
+from fitctl.messages.commands import Hold, SequenceStatus
+from fitctl.messages.modes import Mode
 from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
@@ -17,8 +19,6 @@ from fitctl.sequences.links import Link
 from fitctl.sequences.stars import judge, star_results, steps_of
 from fitctl.sequences.steps import Sequence, Standby, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
-from fitctl.supervisor.messages import Hold, SequenceStatus
-from fitctl.supervisor.modes import Mode
 
 _RETRY_S = 1.0  # between attempts
 # Modes that lead on by themselves, so that a step may wait in them for the one that it needs.

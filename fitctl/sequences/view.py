@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from fitctl.config import Loop, Rig
 from fitctl.logging.records import FrameRecord, SequenceAttempt, Tick
+from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.modes import TRACKING, Mode
+from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.sequences.links import Link
-from fitctl.supervisor.messages import AnyCommand, LoopState, Reply, Telemetry
-from fitctl.supervisor.modes import TRACKING, Mode
 
 Floats = NDArray[np.float64]
 Figures = dict[str, float]

@@ -11,12 +11,13 @@ from typing import NamedTuple
 from fitctl.clock import Clock
 from fitctl.drivers.interface import DeviceIdentity, Devices
 from fitctl.logging.records import AnyRecord, DevicesOpened, Severity
+from fitctl.loop.loop import StellarLoop
+from fitctl.messages.modes import Mode, Trigger
+from fitctl.stages.failures import error_text
+from fitctl.stages.servo import SiderostatServo
 from fitctl.supervisor.camera_watch import CameraWatch
-from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.modes import Mode, Trigger
 from fitctl.supervisor.piezo import PiezoWatch
-from fitctl.supervisor.power import Opened, close_devices, open_devices, told
-from fitctl.supervisor.servo import SiderostatServo
+from fitctl.supervisor.power import Opened, close_devices, open_devices
 
 Tell = Callable[[Severity, str, str], None]
 _CLOSE_TIMEOUT_S = 30.0
@@ -135,9 +136,11 @@ class DeviceJobs:
     ) -> None:
         abandoned, self._opening, self._abandoned = self._abandoned, set(), False
         error = future.exception()
-        self._log_opened(names, None if error else future.result(), told(error) if error else "")
+        self._log_opened(
+            names, None if error else future.result(), error_text(error) if error else ""
+        )
         if error is not None:
-            self._event("error", _SOURCE, f"{trigger.name.lower()} failed: {told(error)}")
+            self._event("error", _SOURCE, f"{trigger.name.lower()} failed: {error_text(error)}")
             self._close(names, with_camera)
             return
         if abandoned:
@@ -181,4 +184,4 @@ class DeviceJobs:
         )
 
     def _closed_badly(self, device: str, error: Exception) -> None:
-        self._note("warning", _SOURCE, f"{device} did not close well: {told(error)}")
+        self._note("warning", _SOURCE, f"{device} did not close well: {error_text(error)}")

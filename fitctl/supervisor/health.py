@@ -6,9 +6,8 @@ from collections.abc import Mapping
 
 from fitctl.config import Rig
 from fitctl.drivers.interface import CameraCounts, DeviceIdentity
-from fitctl.logging.records import DeviceHealth
-from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.power import CAMERA
+from fitctl.logging.records import CAMERA, DeviceHealth
+from fitctl.loop.loop import StellarLoop
 
 Identities = Mapping[str, DeviceIdentity]
 

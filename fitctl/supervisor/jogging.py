@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.loop.loop import StellarLoop
+from fitctl.messages.commands import Jog, SetBiasOffset
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
-from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.messages import Jog, SetBiasOffset
-from fitctl.supervisor.modes import Mode
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import Rig
-from fitctl.supervisor.drives import refused_drives
-from fitctl.supervisor.jogging import move_by_hand
-from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.messages import (
+from fitctl.loop.loop import StellarLoop
+from fitctl.loop.search import refused_search
+from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
     Experiment,
@@ -21,8 +20,9 @@ from fitctl.supervisor.messages import (
     SetBiasOffset,
     SetTarget,
 )
-from fitctl.supervisor.modes import WITH_WINDOW, Trigger, transition
-from fitctl.supervisor.search import refused_search
+from fitctl.messages.modes import WITH_WINDOW, Trigger, transition
+from fitctl.stages.drives import refused_drives
+from fitctl.supervisor.jogging import move_by_hand
 
 Loops = Sequence[StellarLoop]
 

@@ -12,8 +12,8 @@ from fitctl.clock import Clock
 from fitctl.config import Mdt693Device
 from fitctl.drivers.interface import DeviceMismatch, PiezoAmplifier
 from fitctl.logging.records import AnyRecord, Event, PiezoReading
-from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.power import failure_record, told
+from fitctl.loop.loop import StellarLoop
+from fitctl.stages.failures import error_text, failure_record
 
 Floats = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ class PiezoWatch:
             error = disagreement(reading, self._settings, *told_v)
         else:
             self._record(failure_record(self._clock.now_s(), self._loop.name, "piezo", error))
-        before, self.error = self.error, "" if error is None else told(error)
+        before, self.error = self.error, "" if error is None else error_text(error)
         if error is None:
             return
         if before or isinstance(error, DeviceMismatch):

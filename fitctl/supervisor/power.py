@@ -1,18 +1,17 @@
-"""Opening and closing all devices of some loops: slow work, done by the executor; and how errors are told."""
+"""Opening and closing all devices of some loops: slow work, which the executor does."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.drivers.interface import DeviceError, DeviceIdentity, Devices
-from fitctl.logging.records import DeviceFailure, FailingDevice
-from fitctl.supervisor.servo import SiderostatServo
+from fitctl.drivers.interface import DeviceIdentity, Devices
+from fitctl.logging.records import CAMERA
+from fitctl.stages.servo import SiderostatServo
 
-CAMERA: Final = "camera"
 ClosedBadly = Callable[[str, Exception], None]
 
 
@@ -74,17 +73,3 @@ def close_devices(
             close()
         except Exception as error:
             closed_badly(device, error)
-
-
-def told(error: BaseException) -> str:
-    """A device's error tells itself; any other is told with its type."""
-    return str(error) if isinstance(error, DeviceError) else repr(error)
-
-
-def failure_record(
-    now_s: float, loop_name: str, device: FailingDevice, error: BaseException
-) -> DeviceFailure:
-    """For the log: which device, and its error."""
-    return DeviceFailure(
-        time_s=now_s, loop=loop_name, device=device, kind=type(error).__name__, error=told(error)
-    )

@@ -9,7 +9,7 @@ import msgspec
 
 from fitctl.clock import Clock
 from fitctl.logging.records import AnyRecord, Event, Severity
-from fitctl.supervisor.messages import Reply, SequenceStatus
+from fitctl.messages.commands import Reply, SequenceStatus
 
 SILENCE_S = 3.0
 _UNDER_WAY = ("running", "paused")

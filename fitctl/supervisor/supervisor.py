@@ -1,7 +1,7 @@
 """The supervisor: frames in, ticks of every loop out, commands and device work in between.
 
-:meth:`Supervisor.step` is the whole of it, run once a frame by the process (:mod:`fitctl.supervisor.run`)
-on the machine's clock and by the simulation (:mod:`fitctl.supervisor.simulate`) on the virtual one. What
+:meth:`Supervisor.step` is the whole of it, run once a frame by the process (:mod:`fitctl.daemon.run`)
+on the machine's clock and by the simulation (:mod:`fitctl.simulation.simulation`) on the virtual one. What
 may take longer than a tick (opening, closing and polling devices) is handed to `executor`.
 """
 
@@ -18,6 +18,7 @@ from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import DeviceError, Devices
 from fitctl.logging.records import (
+    CAMERA,
     AnyRecord,
     Event,
     FrameRecord,
@@ -25,13 +26,9 @@ from fitctl.logging.records import (
     QuantityReading,
     Severity,
 )
-from fitctl.supervisor.camera_watch import CameraWatch
-from fitctl.supervisor.command_table import ROWS, command_record
-from fitctl.supervisor.device_jobs import DeviceJobs, Job
-from fitctl.supervisor.health import camera_health, loop_health
-from fitctl.supervisor.loop import StellarLoop
-from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
-from fitctl.supervisor.messages import (
+from fitctl.loop.loop import StellarLoop
+from fitctl.messages.command_table import ROWS, command_record
+from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
     Hold,
@@ -45,12 +42,16 @@ from fitctl.supervisor.messages import (
     Standby,
     Stop,
 )
-from fitctl.supervisor.modes import Mode, Trigger, usable_commands
-from fitctl.supervisor.periodic import Periodic
+from fitctl.messages.modes import Mode, Trigger, usable_commands
+from fitctl.stages.failures import error_text
+from fitctl.stages.periodic import Periodic
+from fitctl.stages.servo import SiderostatServo
+from fitctl.supervisor.camera_watch import CameraWatch
+from fitctl.supervisor.device_jobs import DeviceJobs, Job
+from fitctl.supervisor.health import camera_health, loop_health
+from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
 from fitctl.supervisor.piezo import PiezoWatch
-from fitctl.supervisor.power import CAMERA, told
 from fitctl.supervisor.sequence_board import SequenceBoard
-from fitctl.supervisor.servo import SiderostatServo
 from fitctl.supervisor.timing import TimingBook
 
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
@@ -333,7 +334,7 @@ class Supervisor:
         if error is None:
             self.loops[name].use(future.result())
         else:
-            self._event("error", name, f"no design {controller}: {told(error)}")
+            self._event("error", name, f"no design {controller}: {error_text(error)}")
 
     # ------------------------------------------------------------ beside the ticks
 

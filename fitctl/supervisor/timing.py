@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.logging.records import LoopTiming, Tick
-from fitctl.supervisor.servo import SiderostatServo
+from fitctl.stages.servo import SiderostatServo
 
 
 class TimingBook:

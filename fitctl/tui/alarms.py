@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fitctl.logging.records import DeviceHealth, ModeChange
-from fitctl.supervisor.messages import LoopState, Telemetry, TrippedInterlock
+from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 from fitctl.tui.state import ConsoleState
 
 BELL_EVERY_S = 10.0

@@ -14,8 +14,8 @@ from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.screen import Screen
 
-from fitctl.supervisor.command_table import ROWS, command_of
-from fitctl.supervisor.messages import (
+from fitctl.messages.command_table import ROWS, command_of
+from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
     Reply,
@@ -23,8 +23,8 @@ from fitctl.supervisor.messages import (
     Status,
     Stop,
     TakeOver,
-    Telemetry,
 )
+from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from textual.binding import Binding
 
-from fitctl.supervisor.command_table import COMMANDS
+from fitctl.messages.command_table import COMMANDS
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.state import ConsoleState
 

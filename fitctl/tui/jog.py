@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from fitctl.supervisor.messages import Jog, SetBiasOffset, SetTarget
+from fitctl.messages.commands import Jog, SetBiasOffset, SetTarget
 from fitctl.tui.state import LoopView
 
 AGAIN_S = 1.0

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
+from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.telemetry import Telemetry
 
 
 class Link(Protocol):

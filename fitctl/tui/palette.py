@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, cast
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 
 from fitctl.config import CONTROLLERS
-from fitctl.supervisor.command_table import ROWS
-from fitctl.supervisor.messages import AnyCommand, Look, Reset, SetController, SetTarget
+from fitctl.messages.command_table import ROWS
+from fitctl.messages.commands import AnyCommand, Look, Reset, SetController, SetTarget
 
 if TYPE_CHECKING:
     from fitctl.tui.app import ConsoleApp

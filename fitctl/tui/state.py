@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.records import Event, LoopTiming, ModeChange, PiezoReading, Tick
-from fitctl.supervisor.messages import LoopState, Telemetry
+from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.tui.history import Past
 
 STALE_S = 1.0

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import msgspec
 
-from fitctl.supervisor.messages import AnyCommand, Reply, Telemetry
+from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.link import Link
 
 RECEIVE_TIMEOUT_S = 0.2

@@ -9,9 +9,9 @@ from collections.abc import Callable, Coroutine
 from typing import Any, NamedTuple
 
 from fitctl import config
+from fitctl.daemon.devices import AMPLIFIERS
 from fitctl.drivers.interface import ServoAmplifiers
 from fitctl.mocks.amplifiers import amplifier_mock, endpoint_keys
-from fitctl.supervisor.devices import AMPLIFIERS
 
 RIGS = config.default_rig_path().parent
 LOOP = "right"

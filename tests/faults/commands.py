@@ -5,9 +5,9 @@ import math
 import msgspec
 import zmq
 
+from fitctl.messages.commands import Acquire, Experiment, Reply, Reset, SetTarget, Standby, Status
+from fitctl.messages.endpoints import COMMAND_SOCKET
 from fitctl.model.drives import Drive
-from fitctl.supervisor.endpoints import COMMAND_SOCKET
-from fitctl.supervisor.messages import Acquire, Experiment, Reply, Reset, SetTarget, Standby, Status
 
 from .entry import STAYED, Entry
 

@@ -7,9 +7,9 @@ import time
 from contextlib import contextmanager, suppress
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.messages.commands import Jog, Reset, Shutdown, Stop
 from fitctl.mocks.bench import ClearFaults, SetFault
 from fitctl.model.optics import scales
-from fitctl.supervisor.messages import Jog, Reset, Shutdown, Stop
 
 from .commands import FLOOD, FLOODED, SENT, answers
 

@@ -9,20 +9,11 @@ import psutil
 from system.conftest import Rig
 
 from fitctl.config import load_rig
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Acquire, Experiment, Hold, Off, Recover, Standby, Status, Stop
+from fitctl.messages.keys import new_key
 from fitctl.mocks.bench import ClearFaults, SetFault, StagesQuestion, ask_faults, ask_stages
 from fitctl.model.drives import Drive
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.keys import new_key
-from fitctl.supervisor.messages import (
-    Acquire,
-    Experiment,
-    Hold,
-    Off,
-    Recover,
-    Standby,
-    Status,
-    Stop,
-)
 
 from .console import Console
 

@@ -5,6 +5,7 @@ from scipy.signal import lfilter
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import DESIGNS
 from fitctl.controllers.design.loopshape import sampled_response
+from fitctl.daemon.run import run_info
 from fitctl.figures.attenuation import (
     Rebuilt,
     attenuation,
@@ -18,8 +19,7 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.logging.reading import tick_arrays
 from fitctl.logging.writer import LogWriter
 from fitctl.model.plant import Plant
-from fitctl.supervisor.run import run_info
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.simulation import Simulation
 
 BACKLASH_PX = 0.37
 NEAR_PX = np.array([2.0, 1.0])

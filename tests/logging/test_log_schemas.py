@@ -11,6 +11,7 @@ from log_samples import RUN_INFO, filled, one_of_each
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
+from fitctl.daemon.run import run_info
 from fitctl.logging.records import AnyRecord, Event, FrameRecord, RunInfo, Tick
 from fitctl.logging.schemas import (
     TOPICS,
@@ -20,7 +21,6 @@ from fitctl.logging.schemas import (
     to_message,
     topic_of,
 )
-from fitctl.supervisor.run import run_info
 
 WALL_NS = 1_795_000_000_250_000_001
 

@@ -5,8 +5,8 @@ import time
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.daemon.devices import AMPLIFIERS
 from fitctl.mocks.testbed import Testbed as MockTestbed
-from fitctl.supervisor.devices import AMPLIFIERS
 
 FREE = {
     "fit-mock": "mocks.loops.right.slcan_port=0",

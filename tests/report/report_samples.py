@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from fitctl.daemon.run import run_info
 from fitctl.logging.records import FrameRecord, RecorderStatus
 from fitctl.logging.writer import LogWriter
+from fitctl.messages.commands import SetTarget
+from fitctl.messages.modes import Mode
 from fitctl.report.gather import TICK_FIELDS
-from fitctl.supervisor.messages import SetTarget
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.run import run_info
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.simulation import Simulation
 
 NEARBY_PX = np.array([5.0, -3.0])
 PERIOD_S = 0.02

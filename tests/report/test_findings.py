@@ -6,11 +6,11 @@ from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.loopshape import sampled_response
 from fitctl.figures.rigs import with_controller
+from fitctl.messages.commands import SetController
 from fitctl.model.hysteresis import half_widths_v, stack_gains
 from fitctl.report.findings import find
 from fitctl.report.run import find_run
 from fitctl.report.stages import stacks
-from fitctl.supervisor.messages import SetController
 
 
 def test_the_residual_is_that_of_the_ticks(held, findings):

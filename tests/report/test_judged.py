@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_samples import PERIOD_S, ticks_of
 
+from fitctl.messages.modes import Mode
 from fitctl.report.judged import TARGET_SETTLE_S, judge_by, regular
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import SETTLE_S
+from fitctl.simulation.statistics import SETTLE_S
 
 FRAMES = 3000  # a minute
 

@@ -10,6 +10,7 @@ from mcap.writer import Writer
 from report_samples import record
 
 from fitctl.config import ConfigError
+from fitctl.daemon.run import run_info
 from fitctl.logging.copying import cut
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
@@ -18,7 +19,6 @@ from fitctl.logging.writer import LogWriter
 from fitctl.report.findings import find
 from fitctl.report.gather import gather
 from fitctl.report.run import find_run
-from fitctl.supervisor.run import run_info
 
 
 @pytest.fixture

@@ -4,11 +4,11 @@ import msgspec
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.messages.commands import SequenceReport
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import sequence_from_document
 from fitctl.sequences.runner import run_sequence
 from fitctl.sequences.view import SequenceError
-from fitctl.supervisor.messages import SequenceReport
 
 # A star in the middle of the field is found at once.
 NEAR = ("plant.loops.right.star_offset_sky_arcsec_max=5.0",)

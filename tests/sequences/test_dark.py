@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from fitctl import Instrument
 from fitctl.config import default_rig_path, load_rig
+from fitctl.messages.modes import Mode
 from fitctl.sequences.dark import measure_dark
-from fitctl.supervisor.batch import Batch
-from fitctl.supervisor.batch_settings import TooLargeForBatchError
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import Simulation
+from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.batch.settings import TooLargeForBatchError
+from fitctl.simulation.simulation import Simulation
 
 NEAR = ["plant.loops.right.star_offset_sky_arcsec_max=5.0"]
 

@@ -11,10 +11,10 @@ import pytest
 import fitctl
 from fitctl import AsyncInstrument, Instrument
 from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.messages.commands import Reply, Status, Stop
 from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import STEPS
 from fitctl.sequences.view import SequenceError
-from fitctl.supervisor.messages import Reply, Status, Stop
 
 NEAR = load_rig(default_rig_path(), ["plant.loops.right.star_offset_sky_arcsec_max=5.0"])
 

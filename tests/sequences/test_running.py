@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.messages.commands import Acquire, Hold, SequenceControl, Stop
 from fitctl.sequences import pointing, view
 from fitctl.sequences.files import find_sequence, shipped_sequences
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import load_sequence
 from fitctl.sequences.runner import run_sequence
-from fitctl.supervisor.messages import Acquire, Hold, SequenceControl, Stop
 
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}

@@ -4,7 +4,7 @@ import msgspec
 
 from fitctl.clock import VirtualClock
 from fitctl.logging.records import Event, SequenceAttempt
-from fitctl.supervisor.messages import SequenceStatus
+from fitctl.messages.commands import SequenceStatus
 from fitctl.supervisor.sequence_board import SILENCE_S, SequenceBoard
 
 FIRST = SequenceStatus(run="a", name="first", state="running", steps=3, step_number=1)

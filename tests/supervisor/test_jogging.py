@@ -5,17 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from fitctl.supervisor.messages import (
-    Acquire,
-    Hold,
-    Jog,
-    Off,
-    Recover,
-    SetBiasOffset,
-    Standby,
-    Stop,
-)
-from fitctl.supervisor.modes import Mode
+from fitctl.messages.commands import Acquire, Hold, Jog, Off, Recover, SetBiasOffset, Standby, Stop
+from fitctl.messages.modes import Mode
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.bound import bound
-from fitctl.supervisor.batch import Batch
+from fitctl.simulation.batch.batch import Batch
 
 pytest.importorskip("numba")
 SEEDS = range(6)

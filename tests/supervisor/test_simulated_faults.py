@@ -5,9 +5,9 @@ import pytest
 from simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
-from fitctl.supervisor.messages import Acquire, Hold, Off, Recover, Standby, Stop
-from fitctl.supervisor.modes import Mode
-from fitctl.supervisor.simulate import InlineExecutor
+from fitctl.messages.commands import Acquire, Hold, Off, Recover, Standby, Stop
+from fitctl.messages.modes import Mode
+from fitctl.simulation.devices import InlineExecutor
 
 FAULTS = {
     "camera": ("camera", "next_frame"),

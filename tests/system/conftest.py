@@ -14,9 +14,9 @@ import pytest
 from served import free_port
 
 from fitctl.config import default_rig_path
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Acquire, Shutdown, Standby
 from fitctl.processes import rig_arguments
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import Acquire, Shutdown, Standby
 
 START_S = 60.0
 WITH_US = ("--parent-pid", os.getpid())  # they end when the tests are killed

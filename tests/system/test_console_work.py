@@ -2,7 +2,7 @@
 
 import pytest
 
-from fitctl.supervisor.messages import Shutdown, Status
+from fitctl.messages.commands import Shutdown, Status
 
 from .conftest import running
 from .test_console import LIMIT_S, PATIENT, terminal

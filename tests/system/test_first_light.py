@@ -14,8 +14,8 @@ import pytest
 from stalls import stalls
 
 from fitctl.logging.reading import log_info, tick_arrays
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.messages import Recover
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Recover
 
 from .conftest import Rig, end, fitctl
 

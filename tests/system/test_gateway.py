@@ -14,11 +14,11 @@ import zmq
 from served import free_port
 
 from fitctl.config import load_rig
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Status
+from fitctl.messages.endpoints import tcp_endpoint
+from fitctl.messages.keys import new_key
 from fitctl.processes import rig_arguments
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import tcp_endpoint
-from fitctl.supervisor.keys import new_key
-from fitctl.supervisor.messages import Status
 
 from .conftest import START_S, Rig
 

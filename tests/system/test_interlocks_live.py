@@ -2,7 +2,7 @@
 
 import pytest
 
-from fitctl.supervisor.messages import Reset
+from fitctl.messages.commands import Reset
 
 from .conftest import Rig
 

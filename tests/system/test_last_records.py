@@ -7,10 +7,10 @@ import psutil
 import pytest
 
 from fitctl.config import default_rig_path
+from fitctl.daemon.last_records import HELLO_S
 from fitctl.logging.reading import log_info, read_records
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.last_records import HELLO_S
-from fitctl.supervisor.messages import Shutdown
+from fitctl.messages.client import Client
+from fitctl.messages.commands import Shutdown
 
 from .conftest import START_S, end, fitctl
 

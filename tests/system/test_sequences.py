@@ -9,7 +9,7 @@ import pytest
 
 from fitctl.config import default_rig_path
 from fitctl.logging.reading import log_info, read_records
-from fitctl.supervisor.messages import SequenceControl
+from fitctl.messages.commands import SequenceControl
 
 from .conftest import end, fitctl, running
 from .test_console import PATIENT

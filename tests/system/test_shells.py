@@ -15,7 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from served import free_port
 
-from fitctl.supervisor.messages import Stop
+from fitctl.messages.commands import Stop
 
 from .conftest import START_S, Rig, end, fitctl
 

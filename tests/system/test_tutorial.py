@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from documents import blocks, commands
 
-from fitctl.supervisor.client import Client
+from fitctl.messages.client import Client
 
 from .conftest import end
 

@@ -18,10 +18,10 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.supervisor.messages import (
+from fitctl.messages.commands import SequenceStatus
+from fitctl.messages.telemetry import (
     LoopLimits,
     LoopState,
-    SequenceStatus,
     SpotPlace,
     Telemetry,
     TrippedInterlock,

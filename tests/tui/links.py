@@ -5,7 +5,8 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable
 
-from fitctl.supervisor.messages import AnyCommand, RecentEvents, Reply, Status, Telemetry
+from fitctl.messages.commands import AnyCommand, RecentEvents, Reply, Status
+from fitctl.messages.telemetry import Telemetry
 
 
 class FakeLink:

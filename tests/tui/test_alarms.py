@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from fitctl.supervisor.messages import TrippedInterlock
+from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
 from fitctl.tui.dialogs import alarms_text
 from fitctl.tui.state import ConsoleState

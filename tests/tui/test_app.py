@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from textual.command import CommandPalette
 
-from fitctl.supervisor.messages import (
+from fitctl.messages.commands import (
     Hold,
     Off,
     Reply,
@@ -14,8 +14,8 @@ from fitctl.supervisor.messages import (
     Shutdown,
     Stop,
     TakeOver,
-    TrippedInterlock,
 )
+from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.tui.dialogs import Confirm
 from tests.tui.fake import START_S, FakeSupervisor
 from tests.tui.links import FakeLink

@@ -1,6 +1,6 @@
 """A console of a rig on another machine: what it may say and run with a rig file, and what not without one."""
 
-from fitctl.supervisor.messages import SequenceControl
+from fitctl.messages.commands import SequenceControl
 from fitctl.tui.dialogs import Confirm
 from fitctl.tui.widgets.margins import Margins
 from fitctl.tui.widgets.printed import Printed

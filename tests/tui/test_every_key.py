@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from fitctl.supervisor.messages import (
+from fitctl.messages.commands import (
     Acquire,
     Hold,
     Off,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fitctl.supervisor.messages import Jog, SetBiasOffset, SetTarget
+from fitctl.messages.commands import Jog, SetBiasOffset, SetTarget
 from fitctl.tui.jog import AGAIN_S, STAGES, JogPad
 from fitctl.tui.state import ConsoleState
 from tests.tui.fake import START_S, FakeSupervisor

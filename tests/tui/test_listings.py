@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from textual.widgets import Input
 
-from fitctl.supervisor.messages import Reset, SequenceControl, SequenceStatus
+from fitctl.messages.commands import Reset, SequenceControl, SequenceStatus
 from fitctl.tui.dialogs import Ask, Confirm, Reader
 from fitctl.tui.views.sequences import parsed
 from fitctl.tui.widgets.loglist import LogList

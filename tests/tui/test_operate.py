@@ -2,12 +2,7 @@
 
 import pytest
 
-from fitctl.supervisor.messages import (
-    Jog,
-    Look,
-    SetBiasOffset,
-    SetTarget,
-)
+from fitctl.messages.commands import Jog, Look, SetBiasOffset, SetTarget
 from fitctl.tui.widgets.events import Events
 from fitctl.tui.widgets.focalplane import FocalPlane
 from fitctl.tui.widgets.hand import Hand

@@ -4,7 +4,8 @@ import msgspec
 import pytest
 
 from fitctl.logging.records import Event
-from fitctl.supervisor.messages import Look, SequenceStatus, SetTarget, TrippedInterlock
+from fitctl.messages.commands import Look, SequenceStatus, SetTarget
+from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.jog import JogPad

@@ -2,10 +2,7 @@
 
 import pytest
 
-from fitctl.supervisor.messages import (
-    Hold,
-    Stop,
-)
+from fitctl.messages.commands import Hold, Stop
 from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.widgets.keys import Keys
 from tests.tui.fixed import settle

@@ -10,9 +10,9 @@ import pytest
 import zmq
 
 from fitctl.logging.records import Event
-from fitctl.supervisor.client import Client
-from fitctl.supervisor.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
-from fitctl.supervisor.messages import RecentEvents, Reply, Stop
+from fitctl.messages.client import Client
+from fitctl.messages.commands import RecentEvents, Reply, Stop
+from fitctl.messages.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET
 from fitctl.tui import app as console_app
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.dialogs import events_text

@@ -9,7 +9,7 @@ from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import BindingType
 
-from fitctl.supervisor.messages import Reset
+from fitctl.messages.commands import Reset
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Reader
 from fitctl.tui.look import DIM, INK

@@ -10,7 +10,7 @@ from textual.app import ComposeResult
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
-from fitctl.supervisor.modes import MEANING
+from fitctl.messages.modes import MEANING
 from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.look import INK, MODES, SKY, WHITE
 from fitctl.tui.views.view import View

@@ -7,7 +7,7 @@ from typing import ClassVar
 from textual.app import ComposeResult
 from textual.binding import BindingType
 
-from fitctl.supervisor.messages import LoopState
+from fitctl.messages.telemetry import LoopState
 from fitctl.tui.commands import keys_of
 from fitctl.tui.jobs import Job
 from fitctl.tui.views.view import View

@@ -8,7 +8,7 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Container
 
-from fitctl.supervisor.messages import Look, SetBiasOffset, SetTarget
+from fitctl.messages.commands import Look, SetBiasOffset, SetTarget
 from fitctl.tui.commands import Key, keys_of
 from fitctl.tui.jog import JogPad
 from fitctl.tui.views.view import View

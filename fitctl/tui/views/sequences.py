@@ -12,7 +12,7 @@ import tomli_w
 from textual.app import ComposeResult
 from textual.binding import BindingType
 
-from fitctl.supervisor.messages import SequenceControl
+from fitctl.messages.commands import SequenceControl
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Ask
 from fitctl.tui.jobs import Job

@@ -9,7 +9,7 @@ from typing import ClassVar
 import msgspec
 
 from fitctl.logging.records import DeviceHealth, LoopTiming
-from fitctl.supervisor.messages import Telemetry
+from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.look import (
     DEVICES,
     DIM,

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from fitctl.supervisor.messages import LoopState
+from fitctl.messages.telemetry import LoopState
 from fitctl.tui.look import DIM, INK, ORANGE, RED, Line, mark, number, shorten, text
 from fitctl.tui.state import ConsoleState, error_rms
 from fitctl.tui.widgets.panel import Panel

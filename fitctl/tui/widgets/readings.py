@@ -8,7 +8,7 @@ from rich.segment import Segment
 
 from fitctl.config import QUANTITIES
 from fitctl.logging.records import DeviceHealth
-from fitctl.supervisor.messages import TrippedInterlock, Watched
+from fitctl.messages.telemetry import TrippedInterlock, Watched
 from fitctl.tui.look import (
     DEVICES,
     DIM,

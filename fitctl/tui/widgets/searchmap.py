@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fitctl.supervisor.messages import LoopLimits
+from fitctl.messages.telemetry import LoopLimits
 from fitctl.tui.draw import braille
 from fitctl.tui.look import DIM, FAINT, GREEN, INK, SKY, YELLOW, Line, in_columns, number, text
 from fitctl.tui.state import LoopView

@@ -6,7 +6,7 @@ import pytest
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.bound import bound
-from fitctl.supervisor.simulate import simulate
+from fitctl.simulation.simulation import simulate
 
 WORSE_STAGES = (
     "plant.loops.right.hysteresis.loop_width_fraction=0.30",

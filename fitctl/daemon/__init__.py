@@ -1,0 +1,1 @@
+"""The supervisor's process: real clock, real devices, threads, and the processes beside it."""

@@ -1,0 +1,265 @@
+"""The supervisor process: real clock, real devices, threads for servos and service, a recorder beside it."""
+
+from __future__ import annotations
+
+import gc
+import importlib.metadata
+import os
+import platform
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+
+from fitctl.clock import MonotonicClock
+from fitctl.config import ConfigError, Rig
+from fitctl.controllers.dark import dark_bytes
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import design_json
+from fitctl.daemon.children import Child
+from fitctl.daemon.devices import rig_devices
+from fitctl.daemon.last_records import finish_log
+from fitctl.daemon.machine import Machine
+from fitctl.daemon.service_manager import (
+    ALIVE,
+    ENDING,
+    READY,
+    status_line,
+    tell_service_manager,
+)
+from fitctl.logging.queue import RecordQueue
+from fitctl.logging.records import AnyRecord, RunInfo, Severity
+from fitctl.messages.endpoints import (
+    COMMAND_SOCKET,
+    GATEWAY_SOCKET,
+    RECORDS_SOCKET,
+    TELEMETRY_SOCKET,
+    make_service_folder,
+    service_folder,
+)
+from fitctl.processes import ended_by_signals, lock_held
+from fitctl.service.keyed_door import check_keyed_door
+from fitctl.service.service import Service
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.stages.periodic import PeriodicThread
+from fitctl.stages.realtime import (
+    become_realtime,
+    collect_young,
+    lock_memory,
+    quiet_interpreter,
+)
+from fitctl.supervisor.supervisor import Supervisor
+
+_SOCKETS = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET)
+_HOUSEKEEPING_S = 1.0
+_WIND_DOWN_S = 1.0
+_DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
+_VERSIONED = (
+    "fitctl",
+    "numpy",
+    "scipy",
+    "control",
+    "pyzmq",
+    "mcap",
+    "python-can",
+    "pymodbus",
+    "genicam",
+)
+
+
+def check_log_folder(folder: Path) -> None:
+    """Make the log folder.
+
+    Raises
+    ------
+    ConfigError
+        If nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        msg = f"logging.folder: {folder}: nothing can be written there: {error}; choose another"
+        raise ConfigError(msg) from None
+
+
+@contextmanager
+def only_supervisor(folder: Path) -> Iterator[None]:
+    """Hold the rig's lock; a second supervisor on the same rig is refused.
+
+    Raises
+    ------
+    ConfigError
+        If another holds it; the text names its process.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(lock_held(folder / "lock"))
+        except BlockingIOError as error:
+            msg = (
+                f"{folder}: another supervisor ({error.strerror}) has this rig; attach to it with "
+                "`fitctl console`, or end it first"
+            )
+            raise ConfigError(msg) from None
+        yield
+
+
+def run_supervisor(
+    rig: Rig, rig_arguments: Sequence[str], on_ready: Callable[[Path], None]
+) -> None:
+    """Supervise a rig until told to shut down, by a command or a signal.
+
+    Parameters
+    ----------
+    rig : Rig
+    rig_arguments : sequence of str
+        ``fitctl`` options that describe the same rig to the processes beside the supervisor.
+    on_ready : callable
+        Called with the socket folder once commands are answered.
+
+    Raises
+    ------
+    ConfigError
+        If the socket folder, the TCP ports or the keys cannot be used, or another supervisor has this rig.
+    """
+    service_folder(rig)  # refused before anything is made
+    log_folder = Path(rig.logging.folder).expanduser()
+    check_log_folder(log_folder)
+    folder = make_service_folder(rig)
+    with ExitStack() as stack:
+        ending = threading.Event()
+        stack.enter_context(ended_by_signals(ending.set))
+        stack.enter_context(only_supervisor(folder))
+        check_keyed_door(rig)  # what the gateway will need
+        for name in _SOCKETS:
+            stack.callback((folder / name).unlink, missing_ok=True)
+        clock = MonotonicClock()
+        queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
+        stack.callback(queue.close)  # in case what follows fails
+        buffer = TelemetryBuffer()
+
+        def record(record: AnyRecord) -> None:
+            queue.offer(record)
+            buffer.add(record)
+
+        executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
+        supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
+        children = _children(rig, rig_arguments, folder, supervisor.note)
+        for child in children:
+            stack.callback(child.end)
+        machine = Machine(
+            log_folder,
+            lambda: queue.waiting / rig.logging.queue_records,
+            supervisor.measured,
+            supervisor.note,
+        )
+        scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
+        info = run_info(rig, scheduling, clock.now_s())
+        record(info)
+        state = ServiceState(
+            pid=os.getpid(),
+            wall_minus_monotonic_s=info.wall_minus_monotonic_s,
+            scheduling=scheduling,
+            records_lost=lambda: queue.lost,
+            records_offered=lambda: queue.offered,
+        )
+
+        def housekeep() -> None:
+            queue.pump()
+            record(buffer.losses(state, clock.now_s()))
+            collect_young()
+
+        service = Service(supervisor, buffer, folder, state, clock)
+        threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
+        quiet_interpreter()
+        service.start()
+        for thread in threads:
+            thread.start()
+        on_ready(folder)
+        tell_service_manager(READY)
+        try:
+            _loop(supervisor, service, housekeep, children, machine, executor, clock, ending)
+        finally:
+            gc.enable()
+            for thread in threads:
+                thread.stop()
+            service.stop()
+            finish_log(queue, children[0], partial(print, file=sys.stderr, flush=True))
+
+
+def _children(
+    rig: Rig,
+    rig_arguments: Sequence[str],
+    folder: Path,
+    note: Callable[[Severity, str, str], None],
+) -> list[Child]:
+    """The recorder, and then what else the rig asks for."""
+    beside = (
+        (True, "recorder", "record", "a new one begins a new file"),
+        (rig.service.metrics_port, "metrics server", "metrics", "a new one is started"),
+        (rig.service.tcp_address, "gateway", "gateway", "a new one is started"),
+    )
+    return [
+        Child(name, [command, *rig_arguments], folder / f"{command}.err", again, note)
+        for wanted, name, command, again in beside
+        if wanted
+    ]
+
+
+def _modes(supervisor: Supervisor) -> str:
+    return ", ".join(f"{name} {loop.mode.name}" for name, loop in supervisor.loops.items())
+
+
+def _loop(
+    supervisor: Supervisor,
+    service: Service,
+    housekeep: Callable[[], None],
+    children: Sequence[Child],
+    machine: Machine,
+    executor: ThreadPoolExecutor,
+    clock: MonotonicClock,
+    ending: threading.Event,
+) -> None:
+    housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
+    try:
+        while not (supervisor.shutdown_wanted or ending.is_set()):
+            supervisor.step()
+            if clock.now_s() >= housekeeping_s:
+                housekeeping_s += _HOUSEKEEPING_S
+                housekeep()
+                for child in children:
+                    executor.submit(child.check)
+                machine.look()
+                if not service.is_alive():
+                    raise RuntimeError(_DEAF)
+                tell_service_manager(ALIVE, status_line(_modes(supervisor)))
+        tell_service_manager(ENDING)
+        supervisor.shutdown_wanted = True
+        supervisor.stop("shutting down")
+        end_s = clock.now_s() + _WIND_DOWN_S
+        while clock.now_s() < end_s and not supervisor.at_rest():
+            supervisor.step()
+    finally:
+        supervisor.close()
+
+
+def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
+    """What is needed to understand this run's records; a dark frame's file is read (ConfigError)."""
+    dark_file = rig.camera.dark_file
+    versions = {name: importlib.metadata.version(name) for name in _VERSIONED}
+    return RunInfo(
+        time_s=now_s,
+        wall_minus_monotonic_s=time.time() - time.monotonic(),
+        rig_name=rig.name,
+        rig_json=rig.model_dump_json(indent=1),
+        versions=versions | {"python": platform.python_version()},
+        designs={name: design_json(design_for(rig, name)) for name in rig.loops},
+        scheduling=scheduling,
+        dark_npy=None if dark_file is None else dark_bytes(Path(dark_file)),
+    )

@@ -1,0 +1,1 @@
+"""One loop's tick, from a frame to a command."""

@@ -1,0 +1,60 @@
+"""Whether a star that is followed is still there, and within the mirror's reach."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Loop
+from fitctl.controllers.centroid import Star
+from fitctl.messages.modes import Finding, Mode, Trigger
+from fitctl.model.optics import Scales
+
+
+class Following:
+    """One loop's; :meth:`begin` begins it anew.
+
+    Parameters
+    ----------
+    loop : Loop
+    scale : Scales
+
+    Attributes
+    ----------
+    lost, in_reach, out_of_reach : int
+        Frames in a row without the star; with an error that the mirror has room for; with one that it has not.
+    """
+
+    def __init__(self, loop: Loop, scale: Scales) -> None:
+        self._lost_frames = loop.acquisition.lost_frames
+        self._reach_frames = loop.coarse.reach_frames
+        self._reach_fraction = loop.coarse.reach_fraction
+        self._range_px = scale.mirror_px_per_rad * loop.fsm.range_rad
+        self._mirror_turn = scale.mirror_turn
+        self.begin()
+
+    def begin(self) -> None:
+        """Count anew."""
+        self.lost = self.in_reach = self.out_of_reach = 0
+
+    def judge(
+        self, mode: Mode, star: Star | None, target_px: NDArray[np.float64]
+    ) -> Finding | None:
+        """What a frame showed, if it leads to another mode; `target_px` has shape (2,)."""
+        if star is None:
+            self.lost += 1
+            self.in_reach = self.out_of_reach = 0
+            if self.lost >= self._lost_frames:
+                return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")
+            return None
+        self.lost = 0
+        error_px = star.position_px - target_px
+        # The mirror's diamond lies along its own axes.
+        need = float(np.abs(error_px.dot(self._mirror_turn)).sum()) / self._range_px
+        self.in_reach = self.in_reach + 1 if need <= self._reach_fraction else 0
+        self.out_of_reach = self.out_of_reach + 1 if need > 1.0 else 0
+        if mode is Mode.COARSE and self.in_reach >= self._reach_frames:
+            return Finding(Trigger.IN_REACH, f"error needs {need:.0%} of the mirror's range")
+        if mode is Mode.VERNIER and self.out_of_reach >= self._reach_frames:
+            return Finding(Trigger.OUT_OF_REACH, f"error needs {need:.0%} of the mirror's range")
+        return None

@@ -1,0 +1,33 @@
+"""What a tick goes by."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.controllers.centroid import Star
+from fitctl.stages.servo import ServoState
+
+
+class Seen(NamedTuple):
+    """One tick's view of star and stages.
+
+    Attributes
+    ----------
+    star : Star or None
+        On the frame, if there is one and it shows the star.
+    mirror_rad, motor_rad : arrays, shape (2,)
+        Where the stages were at the frame's mid-exposure; without a frame, now.
+    servo : ServoState
+        How the servo is now.
+    now_s : float
+        When that is: the tick's beginning.
+    """
+
+    star: Star | None
+    mirror_rad: NDArray[np.float64]
+    motor_rad: NDArray[np.float64]
+    servo: ServoState
+    now_s: float

@@ -1,0 +1,82 @@
+"""The control laws that hold a star on its target: coarse, and the pair of a design, behind one prefilter."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.pair import Design, Measurement, Pair, PairCommand
+from fitctl.controllers.prefilter import Prefilter
+from fitctl.loop.observation import Seen
+from fitctl.model.optics import scales
+from fitctl.stages.stages import Stages
+
+Floats = NDArray[np.float64]
+
+
+class Pointing:
+    """One loop's.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    target_px : array, shape (2,)
+        Where the star is held at first.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str, target_px: Floats) -> None:
+        loop, period_s = rig.loops[loop_name], rig.camera.period_s
+        self._scale = scales(rig, loop)
+        self._range_rad = loop.fsm.range_rad
+        self._prefilter = Prefilter(loop.prefilter.time_constant_s, period_s, target_px)
+        self._coarse_step_rad_per_px = (
+            loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * period_s
+        )
+        self.use(design_for(rig, loop_name))
+
+    @property
+    def design(self) -> Design:
+        """At work in VERNIER."""
+        return self._pair.design
+
+    @property
+    def command_px(self) -> Floats:
+        """The target as the prefilter has it now, shape (2,)."""
+        return self._prefilter.value_px
+
+    @property
+    def saturated(self) -> bool:
+        """The pair last wanted more than the mirror's range."""
+        return self._pair.saturated
+
+    def use(self, design: Design) -> None:
+        """Work with another design; where the star is held, :meth:`start_pair` is next."""
+        self._pair = Pair(design, self._scale, self._range_rad)
+
+    def start_coarse(self, target_px: Floats) -> None:
+        """Rest on the target, shape (2,)."""
+        self._prefilter.reset(target_px)
+
+    def start_pair(self, stages: Stages, motor_rad: Floats) -> None:
+        """Go on from where the mirror is held, with the motors at `motor_rad`, shape (2,)."""
+        held_rad = stages.mirror_held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
+        self._pair.start(held_rad, motor_rad, self.command_px)
+
+    def step_coarse(self, seen: Seen, target_px: Floats) -> Floats | None:
+        """One frame: the step of the motors' set-point, shape (2,); None where no star is seen."""
+        command_px = self._prefilter.step(target_px)
+        if seen.star is None:
+            return None
+        error_px = seen.star.position_px - command_px
+        return -self._coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_turn)
+
+    def step_pair(self, seen: Seen, target_px: Floats) -> PairCommand | None:
+        """One frame: what both stages shall do; None where no star is seen."""
+        command_px = self._prefilter.step(target_px)
+        if seen.star is None:
+            return None
+        error_px = seen.star.position_px - command_px
+        return self._pair.step(Measurement(error_px, command_px, seen.mirror_rad, seen.motor_rad))

@@ -1,0 +1,124 @@
+"""What interlocks judge: measured once a tick, or handed in about once a second, into one flat record."""
+
+from __future__ import annotations
+
+import math
+
+from fitctl.config import Rig
+from fitctl.controllers.centroid import Star
+from fitctl.drivers.interface import Frame, ServoReading
+from fitctl.logging.records import LoopTiming, PiezoReading
+from fitctl.loop.interlocks import Reading
+from fitctl.stages.servo import ServoState
+from fitctl.stages.stages import Stages
+
+
+class Quantities:
+    """One loop's; the names are those of :data:`fitctl.config.QUANTITIES`.
+
+    Attributes
+    ----------
+    readings : dict
+        The newest of each quantity: value, time in s, note.
+    star_flux_dn : float
+        Of the star that is searched for or held.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        loop = rig.loops[loop_name]
+        self.readings: dict[str, Reading] = {}
+        self._period_s = rig.camera.period_s
+        self._delay_s = rig.camera.frame_delay_s
+        self.star_flux_dn = loop.star_flux_dn
+        self._range_rad = loop.fsm.range_rad
+        self._servo_period_s = 1.0 / loop.siderostat.servo.rate_hz
+        self._velocity_limit_rad_s = loop.siderostat.velocity_limit_rad_s
+        self._limit_v = loop.fsm.piezo.limit_v
+        self._exposed_s: float | None = None
+        self._read: ServoReading | None = None
+
+    def put(self, name: str, value: float, time_s: float) -> None:
+        """One value; may be called from any thread."""
+        self.readings[name] = (value, time_s, "")
+
+    def begin(self) -> None:
+        """Devices were opened anew: what was measured before says nothing about what comes now."""
+        self._exposed_s = self._read = None
+
+    def of_frame(self, frame: Frame, star: Star | None, now_s: float) -> None:
+        """What a frame tells."""
+        readings, exposed_s = self.readings, frame.mid_exposure_s
+        late_s = frame.received_s - exposed_s - self._delay_s
+        readings["frame_late_s"] = (late_s, now_s, "")
+        if self._exposed_s is not None:
+            periods = (exposed_s - self._exposed_s) / self._period_s
+            readings["frame_interval_periods"] = (periods, now_s, "")
+        self._exposed_s = exposed_s
+        if star is not None:
+            readings["star_flux_fraction"] = (star.flux_dn / self.star_flux_dn, now_s, "")
+
+    def of_stages(self, servo: ServoState, stages: Stages, now_s: float) -> None:
+        """Where mirror and siderostat are, and how their devices are."""
+        readings = self.readings
+        az_rad, el_rad = stages.mirror_rad.tolist()
+        fraction = (abs(az_rad) + abs(el_rad)) / self._range_rad
+        readings["fsm_range_fraction"] = (fraction, now_s, "")
+        readings["siderostat_asked_fraction"] = (stages.asked_fraction, now_s, "")
+        readings["dac_unwritten_s"] = (now_s - stages.written_s, now_s, "")
+        readings["dac_round_trip_s"] = (stages.round_trip_s, now_s, "")
+        fault = servo.fault
+        # Made a text only when there is something to say.
+        readings["amplifier_fault"] = (
+            (0.0, now_s, "") if fault is None else (1.0, now_s, str(fault))
+        )
+        periods = servo.round_trip_s / self._servo_period_s
+        readings["amplifier_round_trip_periods"] = (periods, now_s, "")
+        if not math.isnan(servo.following_rad):
+            readings["following_error_rad"] = (servo.following_rad, now_s, "")
+        reading, before = servo.reading, self._read
+        if reading is None or reading is before:
+            return
+        self._read = reading
+        az_rad, el_rad = reading.position_rad
+        travelled = max(abs(az_rad), abs(el_rad)) / stages.travel_rad
+        readings["siderostat_travel_fraction"] = (travelled, reading.time_s, "")
+        if before is not None and reading.time_s > before.time_s:
+            before_az_rad, before_el_rad = before.position_rad
+            moved_rad = max(abs(az_rad - before_az_rad), abs(el_rad - before_el_rad))
+            rate_rad_s = moved_rad / (reading.time_s - before.time_s)
+            readings["siderostat_rate_fraction"] = (
+                rate_rad_s / self._velocity_limit_rad_s,
+                reading.time_s,
+                "",
+            )
+
+    def of_tick(self, compute_s: float, now_s: float) -> None:
+        """How long the tick took; judged at the next."""
+        self.readings["tick_period_fraction"] = (compute_s / self._period_s, now_s, "")
+
+    def of_piezo_error(self, told: str, now_s: float) -> None:
+        """Whether the piezo amplifier has an error, and what it says."""
+        self.readings["piezo_fault"] = (1.0 if told else 0.0, now_s, told)
+
+    def of_piezo(self, record: PiezoReading) -> None:
+        """What the piezo amplifier said."""
+        self.put("piezo_limit_error_v", record.limit_v - self._limit_v, record.time_s)
+
+    def of_timing(self, record: LoopTiming) -> None:
+        """Whether the servo kept its pace, where it has a pace of its own."""
+        periods = record.servo_periods + record.servo_skipped
+        if periods:
+            self.put("servo_skipped_fraction", record.servo_skipped / periods, record.time_s)
+
+
+def places(rig: Rig, loop_name: str) -> dict[str, str]:
+    """Each part of the rig by name and endpoint, as errors of devices call it."""
+    loop = rig.loops[loop_name]
+    return {
+        "camera": f"camera at {rig.camera.device.endpoint}",
+        "mirror": f"mirror {loop_name}",
+        "star": f"star of {loop_name}",
+        "siderostat": f"siderostat {loop_name} at {loop.siderostat.device.endpoint}",
+        "D/A": f"D/A at {loop.fsm.dac.endpoint}",
+        "piezo amplifier": f"piezo amplifier at {loop.fsm.piezo.port}",
+    }

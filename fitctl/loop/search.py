@@ -1,0 +1,199 @@
+"""The search for a star: a spiral about where it is expected, and a second look at what may be it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
+from fitctl.controllers.centroid import LARGEST_PEAK, Star
+from fitctl.controllers.estimator import StarEstimator
+from fitctl.controllers.spiral import Spiral, plan_spiral
+from fitctl.messages.commands import Acquire
+from fitctl.messages.modes import Finding, Trigger
+from fitctl.model.optics import scales
+
+Floats = NDArray[np.float64]
+_SLEWS = 10.0  # the siderostat may take as many times as long to begin as its limits would let it
+NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
+
+
+@dataclass
+class _Sighting:
+    """A star seen during the search: the siderostat goes back to where it saw it, and looks again."""
+
+    motor_rad: Floats
+    since_s: float
+    frames: int = 0
+
+
+class Search:
+    """One loop's; :meth:`begin` begins it anew.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    estimator : StarEstimator
+        Knows where the star is expected, and where what is seen is.
+
+    Attributes
+    ----------
+    centre_rad : array, shape (2,)
+        Motor angles about which the spiral runs.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str, estimator: StarEstimator) -> None:
+        loop = rig.loops[loop_name]
+        self.centre_rad = np.zeros(2)
+        self._settings = loop.acquisition
+        self._estimator = estimator
+        self._target_px = np.array([loop.target_px.az, loop.target_px.el])
+        self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
+        scale = scales(rig, loop)
+        self._scale = scale
+        self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        self._slew_limit_s = _SLEWS * 2 * self._travel_rad / loop.siderostat.velocity_limit_rad_s
+        self._plan_spiral = partial(plan_spiral, rig, loop_name)
+        self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
+        self._plan = self._plan_spiral()
+        self._spiral = Spiral(self._plan)
+        self._there = False
+        self._since_s = math.nan
+        self._asked = Acquire()
+        self._sighting: _Sighting | None = None
+
+    @property
+    def progress(self) -> float:
+        """Part of the searched area, 0 to 1."""
+        return self._spiral.progress
+
+    def ask(self, asked: Acquire) -> None:
+        """Make the next search, and no other, as a command asks that was not refused."""
+        self._asked = asked
+
+    def begin(self) -> None:
+        """A new spiral, about where the star is expected now, or as asked."""
+        asked, self._asked = self._asked, Acquire()
+        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
+            offset = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
+            place_px = self._target_px + self._scale.sky_px(offset)
+            self._estimator.place(place_px, np.zeros(2), np.zeros(2))
+        self._radius_sky_arcsec = (
+            asked.search_radius_sky_arcsec or self._settings.search_radius_sky_arcsec
+        )
+        self._plan = self._plan_spiral(
+            radius_sky_arcsec=self._radius_sky_arcsec, field_overlap=asked.field_overlap
+        )
+        self.centre_rad = self._star_in_the_middle_rad()
+        self._spiral = Spiral(self._plan)
+        self._there = False
+        self._since_s = math.nan
+        self._sighting = None
+
+    def is_there(self, motor_rad: Floats) -> bool:
+        """Whether the siderostat, which was at `motor_rad`, has come near the spiral's middle.
+
+        On its way from another star it would see that one, and a spiral that had begun would have passed
+        the middle by.
+        """
+        if not self._there:
+            middle_rad = np.clip(self.centre_rad, -self._travel_rad, self._travel_rad)
+            away_px = float(np.abs(motor_rad - middle_rad).max()) * self._scale.motor_px_per_rad
+            self._there = away_px <= NEAR * self._plan.field_radius_px
+        return self._there
+
+    def judge(self, star: Star | None, now_s: float) -> Finding | None:
+        """What a frame exposed at `now_s` showed, if it is anything to tell."""
+        settings, sighting = self._settings, self._sighting
+        if not self._there:
+            return self._wait_for_siderostat(now_s)
+        if sighting is None:
+            if star is not None:
+                self._sighting = _Sighting(self._star_in_the_middle_rad(), now_s)
+            elif self._spiral.exhausted:
+                return Finding(
+                    Trigger.SEARCH_EXHAUSTED,
+                    f"no star within {self._radius_sky_arcsec:g} arcsec of the start; "
+                    "check shutter and pointing, then acquire again",
+                )
+            return None
+        settled = now_s >= sighting.since_s + settings.settle_s
+        sighting.frames = sighting.frames + 1 if star is not None and settled else 0
+        if sighting.frames >= settings.found_frames:
+            return Finding(Trigger.STAR_FOUND, f"star on {sighting.frames} frames in a row")
+        if now_s > sighting.since_s + settings.settle_s + settings.confirm_timeout_s:
+            self._sighting = None
+            return Finding(None, "a sighting was not confirmed; the search goes on")
+        return None
+
+    def _wait_for_siderostat(self, now_s: float) -> Finding | None:
+        if math.isnan(self._since_s):
+            self._since_s = now_s
+        if now_s - self._since_s <= self._slew_limit_s:
+            return None
+        return Finding(
+            Trigger.SEARCH_EXHAUSTED,
+            f"the siderostat did not come to where the search begins within {self._slew_limit_s:.0f} s; "
+            "look whether its motors turn, then stop, recover and acquire again",
+        )
+
+    def advance(self, duration_s: float, motor_rad: Floats) -> Floats:
+        """Go on for `duration_s`, or wait where something was seen; motor set-point, shape (2,)."""
+        if self._sighting is not None:
+            return self._sighting.motor_rad
+        if not self.is_there(motor_rad):
+            return self.centre_rad
+        return self.centre_rad + self._scale.motor_rad(self._spiral.advance(duration_s))
+
+    def _star_in_the_middle_rad(self) -> Floats:
+        """With the star in the middle of the field, the search sees farthest."""
+        return self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
+
+
+def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
+    """Why a star of this flux could not be found, or nothing."""
+    if star_flux_dn is None:
+        return ""
+    if not 0 < star_flux_dn < math.inf:
+        return f"star_flux_dn must be above 0 (is {star_flux_dn:g})"
+    acquisition = rig.loops[loop_name].acquisition
+    least_dn = acquisition.detection_sigma * rig.camera.pixel_noise_dn / LARGEST_PEAK
+    if star_flux_dn < least_dn:
+        return (
+            f"a star of {star_flux_dn:g} DN could not be told from noise; loops.{loop_name}.acquisition."
+            f"detection_sigma needs at least {least_dn:.0f} DN"
+        )
+    return ""
+
+
+def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
+    """Why a search cannot be made as asked, or nothing."""
+    loop = rig.loops[loop_name]
+    expected = [asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec]
+    given = [place for place in expected if place is not None]
+    if len(given) == 1:
+        return "expected_az_sky_arcsec and expected_el_sky_arcsec belong together"
+    radius, overlap = asked.search_radius_sky_arcsec, asked.field_overlap
+    if radius is not None and not 0 < radius < math.inf:
+        return f"search_radius_sky_arcsec must be above 0 (is {radius:g})"
+    if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
+        return f"field_overlap must lie in {LEAST_OVERLAP:g} to {MOST_OVERLAP:g} (is {overlap:g})"
+    too_faint = _too_faint(rig, loop_name, asked.star_flux_dn)
+    if too_faint or (radius is None and not given):
+        return too_faint
+    radius = radius or loop.acquisition.search_radius_sky_arcsec
+    travel = loop.siderostat.travel_sky_arcsec
+    for place in given or [0.0]:
+        reach = abs(place) + radius
+        # Written so that what is no number is refused too.
+        if not reach <= travel:
+            return (
+                f"the search would reach {reach:g} arcsec from where the encoders read zero; "
+                f"travel_sky_arcsec of loops.{loop_name}.siderostat is {travel:g}"
+            )
+    return ""

@@ -1,0 +1,87 @@
+"""Where one loop's star is on a frame: where it is expected, where somebody said, or anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.controllers.centroid import Star, StarSensor
+from fitctl.controllers.estimator import StarEstimator
+from fitctl.logging.records import Severity
+from fitctl.messages.modes import TRACKING, WITH_WINDOW, Mode
+from fitctl.model.optics import scales
+
+Floats = NDArray[np.float64]
+
+
+class Sighting:
+    """One loop's.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    target_px : array, shape (2,)
+        Where a star of which nothing is known is taken to be.
+    tell : callable
+        Takes the severity and the text of an event.
+
+    Attributes
+    ----------
+    estimator : StarEstimator
+    look_at_px : tuple of float or None
+        Where the star is looked for on the next frame, and then no more.
+    """
+
+    def __init__(
+        self, rig: Rig, loop_name: str, target_px: Floats, tell: Callable[[Severity, str], None]
+    ) -> None:
+        loop = rig.loops[loop_name]
+        self.estimator = StarEstimator(scales(rig, loop), target_px)
+        self.look_at_px: tuple[float, float] | None = None
+        self._sensor = StarSensor(rig.camera, loop)
+        self._tell = tell
+
+    def expect_flux(self, flux_dn: float) -> None:
+        """What the star's light is to be from now on."""
+        self._sensor.expect(flux_dn)
+
+    def find(
+        self,
+        image: NDArray[np.uint16],
+        mode: Mode,
+        motor_rad: Floats,
+        mirror_rad: Floats,
+        *,
+        follows: bool,
+    ) -> Star | None:
+        """The star on a frame that was exposed with the stages as given, each shape (2,).
+
+        Where it `follows`, the star is expected where it was; otherwise it may be anywhere.
+        """
+        stages_px = self.estimator.stages_px(motor_rad, mirror_rad)
+        star = self._looked_for(image, mode)
+        if star is None and follows:
+            expected_px = self.estimator.predict_px(stages_px)
+            star = self._sensor.follow(image, *expected_px.tolist())
+        elif star is None:
+            star = self._sensor.find(image)
+        if star is not None and mode in TRACKING:
+            self.estimator.observe(star.position_px, stages_px)
+        return star
+
+    def _looked_for(self, image: NDArray[np.uint16], mode: Mode) -> Star | None:
+        """The star where somebody told the loop to look, if there is one."""
+        look_px, self.look_at_px = self.look_at_px, None
+        if look_px is None or mode not in WITH_WINDOW:
+            return None
+        star = self._sensor.find_at(image, *look_px)
+        place = f"az {look_px[0]:g}, el {look_px[1]:g} px"
+        if star is None:
+            self._tell("warning", f"no star in the window at {place}; nothing changes")
+        else:
+            self._tell("info", f"the star at {place} is followed from now on")
+        return star

@@ -1,0 +1,189 @@
+"""The other side of the service: what consoles, scripts and the recorder use."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+import zmq
+
+from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply
+from fitctl.messages.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, keep_alive, tcp_endpoint
+from fitctl.messages.keys import RemoteKey
+from fitctl.messages.telemetry import Telemetry
+
+REPLY_TIMEOUT_S = 2.0
+_REFUSED_TIMEOUT_S = 1.0
+_CLOCK_MESSAGES = 100
+
+_T = TypeVar("_T")
+
+
+class Client:
+    """Talks to a running supervisor; reconnects by itself when one comes back.
+
+    Telemetry is received on one thread; commands may be sent from any, each on a socket of its own, so
+    that none waits behind another. A socket whose command was answered is kept for the next one.
+
+    Parameters
+    ----------
+    where : Path or RemoteKey
+        The supervisor's socket folder on this machine, or the key to one elsewhere.
+    """
+
+    def __init__(self, where: Path | RemoteKey) -> None:
+        self._where = where
+        self._context = zmq.Context()
+        self._tags = itertools.count(1)
+        self._closed = False
+        self._idle: deque[zmq.Socket[bytes]] = deque()
+        self._ahead_s: deque[float] = deque(maxlen=_CLOCK_MESSAGES)
+        self._decode_telemetry = msgspec.msgpack.Decoder(Telemetry).decode
+        self._decode_reply = msgspec.msgpack.Decoder(Reply).decode
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._subscriber = self._socket(zmq.SUB)
+        self._subscriber.setsockopt(zmq.RCVHWM, 200)
+        self._subscriber.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+        self._subscriber.subscribe(b"")
+        self._connect(self._subscriber, TELEMETRY_SOCKET)
+
+    def now_s(self) -> float:
+        """The supervisor's time.
+
+        Processes of one machine share their monotonic clock. Another machine's is estimated from what was
+        heard last, less what the quickest of it took to come.
+        """
+        return time.monotonic() + max(self._ahead_s, default=0.0)
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        """The next telemetry message, or None when none came in time.
+
+        Raises
+        ------
+        ConnectionError
+            If what came cannot be read; the next message may be readable again.
+        """
+        if not self._subscriber.poll(int(timeout_s * 1000)):
+            return None
+        telemetry = _decoded(self._decode_telemetry, self._subscriber.recv(), "telemetry")
+        self._hear(telemetry.time_s)
+        return telemetry
+
+    def send(self, command: AnyCommand, timeout_s: float = REPLY_TIMEOUT_S) -> Reply:
+        """Give a command and wait for its reply; one that is too long is refused here.
+
+        Raises
+        ------
+        ConnectionError
+            If no supervisor answers in time, or its reply cannot be read.
+        """
+        payload, name = self._encode(command), type(command).__name__
+        if len(payload) > MAX_COMMAND_BYTES:
+            text = f"{name} takes {len(payload)} bytes; a command may take {MAX_COMMAND_BYTES}: make it shorter"
+            return Reply(accepted=False, text=text)
+        dealer = self._dealer()
+        timeout_ms = int(timeout_s * 1000)
+        try:
+            # A socket that was refused since its last command has no way out; sending would wait for ever.
+            dealer.setsockopt(zmq.SNDTIMEO, timeout_ms)
+            dealer.send_multipart([next(self._tags).to_bytes(8, "big"), payload])
+            if not dealer.poll(timeout_ms):
+                raise ConnectionError(self._why_silent(timeout_s))
+            _, answer = dealer.recv_multipart()
+        except zmq.Again:
+            dealer.close()
+            raise ConnectionError(self._why_silent(timeout_s)) from None
+        except BaseException:  # also Ctrl-C: a socket left open would hold up close()
+            dealer.close()
+            raise
+        self._idle.append(dealer)
+        if self._closed:
+            self._close_idle()
+        reply = _decoded(self._decode_reply, answer, f"the reply to {name}")
+        self._hear(reply.time_s)
+        return reply
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._closed = True
+        self._subscriber.close()
+        self._close_idle()
+        self._context.term()
+
+    def _close_idle(self) -> None:
+        with suppress(IndexError):  # another thread may take the last one
+            while True:
+                self._idle.pop().close()
+
+    def _dealer(self) -> zmq.Socket[bytes]:
+        with suppress(IndexError):
+            return self._idle.pop()
+        dealer = self._socket(zmq.DEALER)
+        self._connect(dealer, COMMAND_SOCKET)
+        return dealer
+
+    def _socket(self, kind: int) -> zmq.Socket[bytes]:
+        new = self._context.socket(kind)
+        new.setsockopt(zmq.LINGER, 0)
+        if isinstance(self._where, RemoteKey):
+            new.curve_serverkey = self._where.server_public.encode()
+            new.curve_publickey = self._where.public.encode()
+            new.curve_secretkey = self._where.secret.encode()
+            new.setsockopt(zmq.IPV6, ":" in self._where.host)
+            keep_alive(new)
+        return new
+
+    def _connect(self, unconnected: zmq.Socket[bytes], which: str) -> None:
+        where = self._where
+        if isinstance(where, RemoteKey):
+            port = where.command_port if which == COMMAND_SOCKET else where.telemetry_port
+            unconnected.connect(tcp_endpoint(where.host, port))
+        else:
+            unconnected.connect(f"ipc://{where / which}")
+
+    def _hear(self, time_s: float) -> None:
+        """Learn from a message how far the supervisor's clock is ahead, at least."""
+        if isinstance(self._where, RemoteKey):
+            self._ahead_s.append(time_s - time.monotonic())
+
+    def _why_silent(self, timeout_s: float) -> str:
+        where = self._where
+        if not isinstance(where, RemoteKey):
+            return f"no supervisor answers at {where} within {timeout_s:g} s; start one with: fitctl run"
+        place = f"{where.host} port {where.command_port}"
+        if self._is_refused():
+            return (
+                f"{place} does not let the key {where.name} in; was it revoked, or the server given a new "
+                "key? Ask the rig's owner for: fitctl keys new"
+            )
+        return (
+            f"no supervisor answers at {place} within {timeout_s:g} s; see that rig {where.rig} runs with "
+            "service.tcp_address, and that nothing between blocks its ports"
+        )
+
+    def _is_refused(self) -> bool:
+        """Whether there is a server that ends the handshake."""
+        refusals = (
+            zmq.EVENT_HANDSHAKE_FAILED_AUTH
+            | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+            | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+        )
+        with self._socket(zmq.DEALER) as dealer, dealer.get_monitor_socket(refusals) as monitor:
+            self._connect(dealer, COMMAND_SOCKET)
+            refused = bool(monitor.poll(int(_REFUSED_TIMEOUT_S * 1000)))
+            dealer.disable_monitor()
+        return refused
+
+
+def _decoded(decode: Callable[[bytes], _T], payload: bytes, what: str) -> _T:
+    try:
+        return decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        msg = f"{what} ({error}) is unreadable; is the supervisor of another version of fitctl?"
+        raise ConnectionError(msg) from error

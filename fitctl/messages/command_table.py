@@ -1,0 +1,165 @@
+"""Every command: how people call it, and who may give it.
+
+Command line, console and documentation are made from this table and from the structs of
+:mod:`fitctl.messages.commands`, which say what a command does and which values it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import msgspec
+
+from fitctl.config import ConfigError
+from fitctl.logging.records import CommandRecord
+from fitctl.messages import commands
+from fitctl.messages.commands import AnyCommand, Command, Reply
+
+Needs = Literal["any key", "the Unix socket", "a commander's key", "the instrument"]
+
+
+class CommandRow(NamedTuple):
+    """One command.
+
+    Attributes
+    ----------
+    make : type
+        Its message.
+    needs : str
+        "the instrument" is a commander's key, and that nobody else has the lease.
+    word : str
+        On a command line; empty for what programs alone send.
+    key, label : str
+        In the console.
+    question : str
+        What the console asks first, where the command is laborious to undo.
+    logged : bool
+        Each gets a record of its own in the log; reports, which come every second, do not.
+    """
+
+    make: type[AnyCommand]
+    needs: Needs
+    word: str = ""
+    key: str = ""
+    label: str = ""
+    question: str = ""
+    logged: bool = True
+
+    @property
+    def name(self) -> str:
+        """As ``LoopState.usable_commands`` calls it."""
+        return self.make.__name__
+
+    @property
+    def fields(self) -> dict[str, bool]:
+        """Names of its values, and whether each must be given."""
+        common = {field.name for field in msgspec.structs.fields(Command)}
+        return {
+            field.name: field.required
+            for field in msgspec.structs.fields(self.make)
+            if field.name not in common
+        }
+
+    @property
+    def values(self) -> list[str]:
+        """Names of the values that it needs, in the order in which they are given."""
+        return [name for name, required in self.fields.items() if required]
+
+    @property
+    def options(self) -> list[str]:
+        """Names of the values that it may be given, as NAME=VALUE."""
+        return [name for name, required in self.fields.items() if not required]
+
+    @property
+    def usage(self) -> str:
+        """Its word and what must follow."""
+        may = [f"[{name}=]" for name in self.options]
+        return " ".join([self.word, *(value.upper() for value in self.values), *may])
+
+    @property
+    def help(self) -> str:
+        """What it does, as a part of a sentence."""
+        text = (self.make.__doc__ or "").partition("\n")[0].removesuffix(".")
+        return text if text[:2].isupper() else text[:1].lower() + text[1:]
+
+
+COMMANDS = (
+    CommandRow(commands.Stop, "a commander's key", "stop", "s", "STOP"),
+    CommandRow(commands.Standby, "the instrument", "standby", "b", "Standby"),
+    CommandRow(commands.Acquire, "the instrument", "acquire", "a", "Acquire"),
+    CommandRow(commands.Hold, "the instrument", "hold", "h", "Hold"),
+    CommandRow(commands.Recover, "the instrument", "recover", "r", "Recover"),
+    CommandRow(
+        commands.Off,
+        "the instrument",
+        "off",
+        "o",
+        "Off",
+        question="Disable the amplifiers and let go of all devices?",
+    ),
+    CommandRow(commands.SetTarget, "the instrument", "target"),
+    CommandRow(commands.Look, "the instrument", "look"),
+    CommandRow(commands.Jog, "the instrument", "jog"),
+    CommandRow(commands.SetBiasOffset, "the instrument", "bias-offset"),
+    CommandRow(commands.SetController, "the instrument", "controller"),
+    CommandRow(commands.Reset, "the instrument", "reset"),
+    CommandRow(commands.Status, "any key", "status", logged=False),
+    CommandRow(commands.RecentEvents, "any key", "events", logged=False),
+    CommandRow(commands.TakeOver, "a commander's key", "take-over"),
+    CommandRow(commands.Shutdown, "the instrument", "shutdown"),
+    CommandRow(commands.Experiment, "the instrument"),
+    CommandRow(commands.SequenceControl, "a commander's key"),
+    CommandRow(commands.SequenceReport, "a commander's key", logged=False),
+    CommandRow(commands.RecorderReport, "the Unix socket", logged=False),
+)
+ROWS = {row.make: row for row in COMMANDS}
+WORDS = {row.word: row for row in COMMANDS if row.word}
+
+
+def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
+    """The command that words on a command line ask for.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such command, or its values are not what it needs.
+    """
+    if word not in WORDS:
+        msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
+        raise ConfigError(msg)
+    row = WORDS[word]
+    named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]
+    plain = [text for text in values if text not in named]
+    if len(plain) != len(row.values):
+        needs = " ".join(row.values) or "no values"
+        may = (
+            f", and may have {', '.join(f'{name}=' for name in row.options)}" if row.options else ""
+        )
+        msg = f"send: {word} needs {needs}{may} (is {' '.join(values) or 'nothing'})"
+        raise ConfigError(msg)
+    options = dict(text.split("=", 1) for text in named)
+    given = dict(zip(row.values, plain, strict=True)) | options | {"loop": loop}
+    try:
+        # Numbers come as text here; msgspec reads them, and checks what they may be.
+        return msgspec.convert(given, row.make, strict=False)
+    except msgspec.ValidationError as error:
+        msg = f"send: {word} {' '.join(values)}: {error}"
+        raise ConfigError(msg) from None
+
+
+def command_record(
+    command: AnyCommand, reply: Reply, sender: str, address: str, now_s: float
+) -> CommandRecord:
+    """What the log keeps of a command and its answer."""
+    values = {name: getattr(command, name) for name in ROWS[type(command)].fields}
+    return CommandRecord(
+        time_s=now_s,
+        sender=sender,
+        address=address,
+        command=type(command).__name__,
+        loop=command.loop,
+        values_json=msgspec.json.encode(values).decode(),
+        accepted=reply.accepted,
+        text=reply.text,
+    )

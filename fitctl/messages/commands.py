@@ -1,0 +1,215 @@
+"""Commands that clients send to a supervisor, and its replies.
+
+:mod:`fitctl.messages.command_table` lists how people write each command and who may send it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+
+from fitctl.config import ControllerName
+from fitctl.logging.records import Event, RecorderStatus, SequenceAttempt
+from fitctl.model.drives import Drive
+
+PROTOCOL_VERSION = 1
+MAX_COMMAND_BYTES = 4096  # what is longer never reaches the supervisor
+
+
+class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
+    """The common base of commands; ``loop`` is empty for all loops."""
+
+    version: int = PROTOCOL_VERSION
+    loop: str = ""
+
+
+class Standby(Command, frozen=True, kw_only=True):
+    """From OFF: connect and enable all devices."""
+
+
+class Acquire(Command, frozen=True, kw_only=True):
+    """Search for the star, pull it in, hold it.
+
+    What is given stands in place of the rig file's, this once.
+
+    Attributes
+    ----------
+    search_radius_sky_arcsec, field_overlap : float, optional
+        As the rig file's.
+    expected_az_sky_arcsec, expected_el_sky_arcsec : float, optional
+        Where the star is, from where the encoders read zero; without it, on the target or where it was last.
+    star_flux_dn : float, optional
+        As the rig file's, until the next time that one is searched for by command.
+    """
+
+    search_radius_sky_arcsec: float | None = None
+    field_overlap: float | None = None
+    expected_az_sky_arcsec: float | None = None
+    expected_el_sky_arcsec: float | None = None
+    star_flux_dn: float | None = None
+
+
+class Hold(Command, frozen=True, kw_only=True):
+    """Stop tracking where the stages are."""
+
+
+class Stop(Command, frozen=True, kw_only=True):
+    """SAFE, at once, from every mode."""
+
+
+class Recover(Command, frozen=True, kw_only=True):
+    """From SAFE: reconnect, reset faults, then STANDBY."""
+
+
+class Off(Command, frozen=True, kw_only=True):
+    """From STANDBY or SAFE: disable amplifiers, let go of devices."""
+
+
+class SetTarget(Command, frozen=True, kw_only=True):
+    """Move the point where the star is held, through the prefilter."""
+
+    az_px: float
+    el_px: float
+
+
+class Look(Command, frozen=True, kw_only=True):
+    """In COARSE and VERNIER: put the window on another place, and follow the star there from now on."""
+
+    az_px: float
+    el_px: float
+
+
+class Jog(Command, frozen=True, kw_only=True):
+    """In STANDBY: move the siderostat from where it is held, by angles on the sky."""
+
+    az_sky_arcsec: float
+    el_sky_arcsec: float
+
+
+class SetBiasOffset(Command, frozen=True, kw_only=True):
+    """In STANDBY: how far from its bias the mirror rests, until it is powered up anew or made safe."""
+
+    az_urad: float
+    el_urad: float
+
+
+class SetController(Command, frozen=True, kw_only=True):
+    """Work with another design; in VERNIER the mirror goes on where it is. Files cannot be named here."""
+
+    name: ControllerName
+
+
+class Reset(Command, frozen=True, kw_only=True):
+    """Let a tripped interlock go, by its name in the rig file."""
+
+    name: str
+
+
+class Experiment(Command, frozen=True, kw_only=True):
+    """From COARSE or VERNIER: move the stages of one loop as told, open loop, and go back to COARSE."""
+
+    name: str
+    drives: list[Drive]
+
+
+class Status(Command, frozen=True, kw_only=True):
+    """Tell the mode of every loop; from whoever has the instrument, keep it."""
+
+
+class RecentEvents(Command, frozen=True, kw_only=True):
+    """Tell the last events, also those from before you were there."""
+
+
+class TakeOver(Command, frozen=True, kw_only=True):
+    """Take the instrument over from whoever has it."""
+
+
+class Shutdown(Command, frozen=True, kw_only=True):
+    """SAFE, OFF, then end the supervisor process."""
+
+
+class RecorderReport(Command, frozen=True, kw_only=True):
+    """The recorder tells what it has written."""
+
+    status: RecorderStatus
+
+
+class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a sequence is; ``run`` tells two runs apart, ``wanted`` is what people ask of it."""
+
+    run: str
+    name: str
+    state: Literal["running", "paused", "done", "failed", "stopped"]
+    steps: int
+    step_number: int = 0
+    step: str = ""
+    loop: str = ""
+    attempt: int = 0
+    message: str = ""
+    last_attempt: SequenceAttempt | None = None
+    wanted: Literal["run", "pause", "stop"] = "run"
+
+
+class SequenceReport(Command, frozen=True, kw_only=True):
+    """A sequence tells where it is, at least once a second."""
+
+    status: SequenceStatus
+
+
+class SequenceControl(Command, frozen=True, kw_only=True):
+    """Pause, resume or stop the sequence that is running, wherever it runs."""
+
+    action: Literal["pause", "resume", "stop"]
+
+
+AnyCommand = (
+    Standby
+    | Acquire
+    | Hold
+    | Stop
+    | Recover
+    | Off
+    | SetTarget
+    | Look
+    | Jog
+    | SetBiasOffset
+    | SetController
+    | Reset
+    | Experiment
+    | Status
+    | RecentEvents
+    | TakeOver
+    | Shutdown
+    | RecorderReport
+    | SequenceReport
+    | SequenceControl
+)
+
+
+class Reply(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to every command; ``text`` says why not, and what to do.
+
+    ``events`` are those that were asked for, oldest first.
+    """
+
+    accepted: bool
+    text: str = ""
+    time_s: float = 0.0  # the supervisor's monotonic clock, for a client on another machine
+    events: list[Event] = []
+
+
+def decode_command(payload: bytes) -> AnyCommand | Reply:
+    """A command as it came, or the refusal that tells what is wrong with it."""
+    try:
+        command = _decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        return Reply(accepted=False, text=f"not a command: {error}")
+    if command.version != PROTOCOL_VERSION:
+        text = f"this supervisor speaks version {PROTOCOL_VERSION}, not {command.version}"
+        return Reply(accepted=False, text=text)
+    return command
+
+
+_decode: Callable[[bytes], AnyCommand] = msgspec.msgpack.Decoder(AnyCommand).decode

@@ -1,0 +1,118 @@
+"""Telemetry that a supervisor publishes: what consoles, `fitctl watch` and the metrics show."""
+
+from __future__ import annotations
+
+import msgspec
+
+from fitctl.config import Action, ResetBy
+from fitctl.logging.records import (
+    DeviceHealth,
+    Event,
+    FrameRecord,
+    LoopTiming,
+    Losses,
+    ModeChange,
+    PiezoReading,
+    RecorderStatus,
+    Tick,
+)
+from fitctl.messages.commands import PROTOCOL_VERSION, SequenceStatus
+
+
+class TrippedInterlock(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of the table of interlocks that is in force; ``reason`` ends with what to do."""
+
+    name: str
+    since_s: float
+    action: Action
+    reset: ResetBy
+    reason: str
+
+
+class Watched(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of the table of interlocks beside what is measured; NaN where nothing was."""
+
+    name: str
+    quantity: str
+    value: float
+    age_s: float
+    low: float | None
+    high: float | None
+    stale_s: float | None
+    action: Action
+    judged: bool
+
+
+class LoopLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """How far a loop's stages go, and what its search does, from the rig file."""
+
+    fsm_range_rad: float
+    siderostat_travel_sky_arcsec: float
+    search_radius_sky_arcsec: float
+    spiral_pitch_sky_arcsec: float
+
+
+class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
+    """A spot that moves with a loop's star, and how far from it, by the rig file."""
+
+    name: str
+    az_offset_px: float
+    el_offset_px: float
+
+
+class LoopState(msgspec.Struct, frozen=True, kw_only=True):
+    """One loop as consoles show it.
+
+    ``controller_file`` is the saved design that is at work, on the supervisor's machine; it is empty when the
+    design was made from the rig's values.
+    """
+
+    name: str
+    mode: str
+    since_s: float
+    requirement_px: float
+    sky_arcsec_per_px: float
+    usable_commands: list[str]
+    controller: str = ""
+    last_change: ModeChange | None = None
+    interlocks: list[TrippedInterlock] = []
+    limits: LoopLimits | None = None
+    watched: list[Watched] = []
+    bias_offset_urad: tuple[float, float] = (0.0, 0.0)
+    search_centre_sky_arcsec: tuple[float, float] | None = None
+    other_spots: list[SpotPlace] = []
+    controller_file: str = ""
+
+
+class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
+    """Sent `telemetry_hz` times a second.
+
+    Ticks, events and mode changes are those since the last message; of everything else it has the newest.
+    ``commander`` is who has the instrument, empty while nobody has.
+    ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
+    """
+
+    version: int = PROTOCOL_VERSION
+    sequence: int
+    time_s: float
+    wall_minus_monotonic_s: float
+    rig_name: str
+    pid: int
+    loops: list[LoopState]
+    ticks: list[Tick]
+    events: list[Event]
+    mode_changes: list[ModeChange]
+    frame: FrameRecord | None
+    devices: list[DeviceHealth]
+    piezo: list[PiezoReading]
+    timing: list[LoopTiming]
+    recorder: RecorderStatus | None
+    losses: Losses
+    scheduling: str
+    running_sequence: SequenceStatus | None = None
+    commander: str = ""
+
+    @property
+    def records_lost(self) -> int:
+        """Records missing from the log: the supervisor's count and the recorder's are of the same gaps."""
+        return max(self.losses.records_lost, 0 if self.recorder is None else self.recorder.lost)

@@ -1,0 +1,1 @@
+"""A logged run, made again by today's code."""

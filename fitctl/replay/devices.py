@@ -1,0 +1,385 @@
+"""What stands in for the devices in a replay: each says and does what the log tells of its original."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.clock import Clock
+from fitctl.config import Rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.drivers import interface
+from fitctl.drivers.interface import (
+    AzEl,
+    CameraCounts,
+    DeviceError,
+    DeviceIdentity,
+    Frame,
+    ServoReading,
+)
+from fitctl.logging.records import (
+    CAMERA,
+    ControllerChange,
+    DeviceFailure,
+    DevicesOpened,
+    ExperimentStart,
+    InjectionRecord,
+    ModeChange,
+)
+from fitctl.replay.log import LoggedStep
+from fitctl.stages.injector import Injection, Injector
+from fitctl.stages.servo import ServoState, ServoTiming, SiderostatServo
+from fitctl.stages.stages import Stages
+from fitctl.supervisor.power import Opened, close_devices, open_devices
+
+Floats = NDArray[np.float64]
+_NOBODY = DeviceIdentity("fitctl", "log", "", "")
+
+
+class LoggedClock:
+    """A clock that is told the time; nobody waits by it."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+
+    def tell(self, now_s: float) -> None:
+        """It is this late; what is not a number changes nothing."""
+        if not math.isnan(now_s):
+            self._now_s = now_s
+
+    def now_s(self) -> float:
+        """What it was told."""
+        return self._now_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """At once."""
+
+
+def logged_error(kind: str, text: str) -> DeviceError:
+    """An error of a device as it was logged: its class, and all of its text."""
+    of = getattr(interface, kind, DeviceError)
+    return of.__new__(of, text)  # its parts are in the text already
+
+
+def failures(step: LoggedStep, loop: str) -> dict[str, DeviceError]:
+    """By device, what failed in a step."""
+    return {
+        told.device: logged_error(told.kind, told.error) for told in step.of(DeviceFailure, loop)
+    }
+
+
+class NoDevice:
+    """Any device, as far as a replay never speaks to it."""
+
+    def open(self) -> DeviceIdentity:
+        """Nothing to connect."""
+        return _NOBODY
+
+    def close(self) -> None:
+        """Nothing to disconnect; the same for whatever else a device can be told."""
+
+    start = stop = enable = disable = reset_fault = close
+
+    def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
+        """Silence."""
+        return None
+
+    def write_v(self, volts: Floats) -> None:
+        """Nothing to write to."""
+
+    def read_v(self) -> Floats:
+        """Not a number; the same for whatever else a device can be asked."""
+        return np.full(3, math.nan)
+
+    stack_volts = read_v
+
+    def limit_v(self) -> float:
+        """Not a number."""
+        return math.nan
+
+
+class LoggedCamera(NoDevice):
+    """Gives each step the frame that it had, or none, or the camera's error."""
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._error: DeviceError | None = None
+
+    def tell(self, step: LoggedStep) -> None:
+        """What :meth:`next_frame` gives next."""
+        self._error = next(
+            (errors[CAMERA] for loop in step.ticks if CAMERA in (errors := failures(step, loop))),
+            None,
+        )
+        self._frame = None
+        if step.frame is not None:
+            tick = next(iter(step.ticks.values()))
+            shape = step.frame.height, step.frame.width
+            image = np.frombuffer(step.frame.data, "<u2").reshape(shape)
+            exposed_s = tick.mid_exposure_s
+            # To the last bit: the age was had by subtracting times that lie close together.
+            self._frame = Frame(tick.number, exposed_s, exposed_s + tick.frame_age_s, image)
+
+    def next_frame(self, timeout_s: float) -> Frame | None:
+        """The step's."""
+        if self._error is not None:
+            raise self._error
+        return self._frame
+
+    def counts(self) -> CameraCounts:
+        """Nobody decides by them."""
+        return CameraCounts(0, 0, 0)
+
+
+class LoggedServo(SiderostatServo):
+    """Where the motors were, and what the servo told, at each tick; nothing moves.
+
+    Parameters
+    ----------
+    name : str
+    rig : Rig
+    clock : LoggedClock
+        Told when a tick begins.
+    """
+
+    def __init__(self, name: str, rig: Rig, clock: LoggedClock) -> None:
+        super().__init__(name, rig.loops[name], NoDevice(), clock, rig.camera.period_s)
+        self._told = clock
+        self._tick: Any = None
+        self._ticked = False
+        self._moments: deque[Floats] = deque()
+        self._timing = ServoTiming([], 0, 0)
+
+    def tell(self, step: LoggedStep) -> None:
+        """What is known of it in a step."""
+        if self._ticked:  # else what was told may still be to come
+            self._moments.clear()
+        self._ticked = self.name in step.ticks
+        self._tick = step.ticks.get(self.name, self._tick)
+        changes = (ModeChange, ControllerChange)
+        self._moments.extend(
+            _az_el(record.message, "siderostat")
+            for record in step.before_tick.get(self.name, ())
+            if record.kind in changes
+        )
+        self.fault = failures(step, self.name).get("siderostat", self.fault)
+        for opened in step.of(DevicesOpened):
+            if opened.loop == self.name:
+                self.encoders_jumped = opened.encoders_jumped
+        timing = step.timing.get(self.name)
+        if timing is not None:
+            late_s = [0.0] * timing.servo_periods
+            self._timing = ServoTiming(late_s, timing.servo_missed, timing.servo_skipped)
+
+    def changed(self) -> None:
+        """A mode or a controller has changed: the next change has motor angles of its own."""
+        if self._moments:
+            self._moments.popleft()
+
+    @property
+    def position_rad(self) -> Floats:
+        """As it was taken at the step's next change of mode or controller; else the tick's, shape (2,)."""
+        if self._moments:
+            return self._moments[0]
+        return np.zeros(2) if self._tick is None else _az_el(self._tick, "siderostat")
+
+    def position_at(self, time_s: float) -> Floats:
+        """As the tick had it, shape (2,)."""
+        return _az_el(self._tick, "siderostat")
+
+    def look(self) -> ServoState:
+        """As the tick found it; its time begins here."""
+        tick = self._tick
+        if tick is None:
+            return super().look()
+        self._told.tell(tick.time_s - tick.compute_s)  # exact, as these are close together
+        read = not math.isnan(tick.encoder_read_s)
+        if read and (not self._history or self._history[-1].time_s != tick.encoder_read_s):
+            position_rad = (tick.encoder_az_rad, tick.encoder_el_rad)
+            self._history.append(ServoReading(tick.encoder_read_s, position_rad, True, ""))
+        return ServoState(
+            _az_el(tick, "siderostat"),
+            self._history[-1] if read else None,
+            self.fault,
+            tick.following_error_rad,
+            tick.amplifier_round_trip_s,
+        )
+
+    def open(self) -> DeviceIdentity:
+        """Nothing to connect."""
+        return _NOBODY
+
+    def disable(self) -> None:
+        """Nothing to switch off."""
+
+    def close(self) -> None:
+        """Nothing to disconnect."""
+
+    def take_timing(self) -> ServoTiming:
+        """As the log has it of this second."""
+        return self._timing
+
+
+class LoggedStages(Stages):
+    """Stages that end up, at each tick, where the log says they were sent.
+
+    What today's code wants is kept aside: the frames that follow show the stages as they were sent then, and
+    not otherwise.
+    """
+
+    def __init__(self, name: str, rig: Rig, servo: LoggedServo, clock: LoggedClock) -> None:
+        self._written = LoggedDac(clock)
+        super().__init__(rig, name, servo, self._written, clock)
+        self.injector: LoggedInjector = LoggedInjector(self._written, clock)
+        self._wanted_v: Floats | None = None
+        self._name = name
+        self._tick: Any = None
+
+    def tell(self, step: LoggedStep) -> None:
+        """What is known of them in a step."""
+        self._tick = step.ticks.get(self._name)
+        failed = failures(step, self._name)
+        self._written.tell(self._tick, failed.get("D/A"))
+        self.injector.tell(step, self._name)
+        self.injector.fault = failed.get("injector", self.injector.fault)
+
+    @property
+    def wanted_v(self) -> Floats:
+        """What today's code wants at the D/A, shape (3,)."""
+        return self.stack_v if self._wanted_v is None else self._wanted_v
+
+    def write(self) -> None:
+        """Take what was written then for written now."""
+        self._wanted_v = self.stack_v
+        if self._tick is not None:
+            self.stack_v = _stacks(self._tick)
+        super().write()
+
+    def follow(self) -> None:
+        """After the tick: go on from where they were sent then."""
+        tick = self._tick
+        self.stack_v, self._wanted_v = _stacks(tick), None
+        self.mirror_rad = _az_el(tick, "fsm")
+        self.setpoint_rad = _az_el(tick, "siderostat_setpoint")
+        self.written_s, self.round_trip_s = tick.fsm_written_s, tick.dac_round_trip_s
+
+
+class LoggedDac(NoDevice):
+    """Takes voltages when the log says so, or fails as it says."""
+
+    def __init__(self, clock: LoggedClock) -> None:
+        self._clock = clock
+        self._written_s = math.nan
+        self._error: DeviceError | None = None
+
+    def tell(self, tick: Any, error: DeviceError | None) -> None:
+        """How the next write ends."""
+        self._written_s = math.nan if tick is None else tick.fsm_written_s
+        self._error = error
+
+    def write_v(self, volts: Floats) -> None:
+        """At the time of the log."""
+        if self._error is not None:
+            raise self._error
+        self._clock.tell(self._written_s)
+
+
+class LoggedInjector(Injector):
+    """What an experiment wrote, as the log has it."""
+
+    def __init__(self, dac: LoggedDac, clock: Clock) -> None:
+        super().__init__(dac, clock, np.zeros((3, 2)), 0.0, 0.0)
+        self._logged: list[Injection] = []
+
+    def tell(self, step: LoggedStep, loop: str) -> None:
+        """What was written in a step; the first after a start is where the voltages were before."""
+        injections = step.of(InjectionRecord, loop)
+        skipped = len(step.of(ExperimentStart, loop))
+        self._logged = [Injection(told.time_s, _stacks(told)) for told in injections[skipped:]]
+
+    def take_written(self) -> list[Injection]:
+        """What was written since last asked."""
+        logged, self._logged = self._logged, []
+        return logged
+
+
+class _Waiting(NamedTuple):
+    """Work that will be done at the step at which it was done then."""
+
+    future: Future
+    loops: Sequence[str]
+    work: Callable[[], Any]
+
+
+class LoggedExecutor(Executor):
+    """Device work ends in the step, and with the result, of the log; designs are made anew by today's code."""
+
+    def __init__(self) -> None:
+        self._opened: defaultdict[str, deque[Any]] = defaultdict(deque)
+        self._designed: list[tuple[str, str]] = []
+        self._openings: list[_Waiting] = []
+        self._designs: list[tuple[tuple[str, str], _Waiting]] = []
+
+    def tell(self, step: LoggedStep) -> None:
+        """What ends in a step."""
+        for told in step.of(DevicesOpened):
+            self._opened[told.loop].append(told)
+        self._designed = [(told.loop, told.target) for told in step.of(ControllerChange)]
+        self._end_what_ends()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
+        """Begin; what ended at once then ends at once now."""
+        future: Future = Future()
+        if fn is open_devices:
+            _, servos, loops, *_ = args
+            for loop in loops:
+                servos[loop].fault = None
+            self._openings.append(_Waiting(future, loops, lambda: self._found(loops)))
+        elif fn is design_for:
+            _, loop, controller = args
+            waiting = _Waiting(future, [loop], lambda: fn(*args))
+            self._designs.append(((loop, controller), waiting))
+        elif fn is close_devices:
+            future.set_result(None)
+        # What the piezo amplifier answers is told to its watch as the log has it.
+        self._end_what_ends()
+        return future
+
+    def _end_what_ends(self) -> None:
+        while self._openings and all(self._opened[loop] for loop in self._openings[0].loops):
+            _end(self._openings.pop(0))
+        while any(key in self._designed for key, _ in self._designs):
+            key, waiting = self._designs.pop(0)
+            if key in self._designed:
+                self._designed.remove(key)
+                _end(waiting)
+            else:
+                waiting.future.set_exception(DeviceError("design", "", "one", "none then"))
+
+    def _found(self, loops: Sequence[str]) -> Opened:
+        opened = [self._opened[loop].popleft() for loop in loops]
+        for told in opened:
+            if told.error:
+                raise logged_error("DeviceError", told.error)
+        return Opened({}, {told.loop: _stacks(told) for told in opened})
+
+
+def _end(waiting: _Waiting) -> None:
+    try:
+        waiting.future.set_result(waiting.work())
+    except Exception as error:
+        waiting.future.set_exception(error)
+
+
+def _stacks(message: Any) -> Floats:
+    return np.array([message.stack1_v, message.stack2_v, message.stack3_v])
+
+
+def _az_el(message: Any, name: str) -> Floats:
+    return np.array([getattr(message, f"{name}_az_rad"), getattr(message, f"{name}_el_rad")])

@@ -1,0 +1,220 @@
+"""A run's log taken apart into what the supervisor had at each step, for replay."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fitctl.logging.copying import merge
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import LogInfo, log_info, read_records
+from fitctl.logging.records import (
+    CAMERA,
+    AnyRecord,
+    CommandRecord,
+    ControllerChange,
+    DeviceFailure,
+    DeviceHealth,
+    DevicesOpened,
+    ExperimentStart,
+    FrameRecord,
+    InjectionRecord,
+    LoopTiming,
+    ModeChange,
+    PiezoReading,
+    QuantityReading,
+    RecorderStatus,
+    Tick,
+)
+from fitctl.logging.schemas import TOPICS
+from fitctl.messages.modes import Mode
+
+_AT_THE_START_S = 10.0  # the first record of a run comes within this
+# What a step begins with; then come its ticks, each after what led to it; then the frame, and the rest.
+_BEGIN = {CommandRecord, ControllerChange, DevicesOpened, PiezoReading, QuantityReading}
+_BEFORE_TICK = {ControllerChange, DeviceFailure, ExperimentStart, InjectionRecord, ModeChange}
+_AT_THE_END = {DeviceHealth, LoopTiming, RecorderStatus}
+KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | {Tick, FrameRecord}
+
+
+class Logged(NamedTuple):
+    """One record: which kind of :mod:`fitctl.logging.records`, and its protobuf message."""
+
+    kind: type[AnyRecord]
+    message: Any
+
+
+@dataclass
+class LoggedStep:
+    """What one step of the supervisor had and made, by its log.
+
+    Attributes
+    ----------
+    begin : list of Logged
+        Commands, answers of devices, quantities: what came before the ticks.
+    before_tick : dict of str to list of Logged
+        By loop: what its tick, or a command, made known in this step, in order.
+    ticks : dict of str to Message
+        By loop; of a loop that is OFF only those with a frame.
+    frame : Message or None
+    records_lost : int
+        On the way to the log until then, where the recorder said so in this step.
+    timing : dict of str to Message
+        By loop, once a second.
+    reported_s : float
+        When that was, by the camera's health; NaN in most steps.
+    """
+
+    begin: list[Logged] = field(default_factory=list)
+    before_tick: dict[str, list[Logged]] = field(default_factory=lambda: defaultdict(list))
+    ticks: dict[str, Any] = field(default_factory=dict)
+    frame: Any = None
+    records_lost: int = 0
+    timing: dict[str, Any] = field(default_factory=dict)
+    reported_s: float = math.nan
+
+    def of(self, kind: type[AnyRecord], loop: str | None = None) -> list[Any]:
+        """Messages of one kind, of the beginning, or of what came before a loop's tick."""
+        records = self.begin if loop is None else self.before_tick[loop]
+        return [record.message for record in records if record.kind is kind]
+
+
+@contextmanager
+def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
+    """One log of a run out of the files that it was rotated into, or cut in by a crash.
+
+    Raises
+    ------
+    LogError
+        If a file cannot be read or is damaged, they are of several runs, or what they hold does not begin
+        where the run did.
+    """
+    runs = {path: log_info(path).metadata.get("clock", {}) for path in paths}
+    first = runs[paths[0]]
+    for path, run in runs.items():
+        if run.get("run_start_monotonic_s") != first.get("run_start_monotonic_s"):
+            msg = f"{path}: is of another run than {paths[0]}; replay one run at a time"
+            raise LogError(msg)
+    if len(paths) == 1:
+        yield log_info(paths[0])
+        return
+    with tempfile.TemporaryDirectory(prefix="fitctl-replay-") as folder:
+        together = Path(folder) / paths[0].name
+        merge(paths, together)
+        try:
+            yield log_info(together)
+        except LogError as error:  # of files that the user knows
+            raise LogError(str(error).replace(str(together), ", ".join(map(str, paths)))) from None
+
+
+def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
+    """Step by step what is in a log.
+
+    Raises
+    ------
+    LogError
+        If it cannot be replayed: it begins in the midst of a run, has no ticks or no frames, or was recorded
+        before ticks told what a replay needs.
+    """
+    step, before_tick = LoggedStep(), defaultdict[str, list[Logged]](list)
+    powered: dict[str, bool] = {}
+    for record, sequence in _records(info, loops):
+        kind, message = record
+        loop = getattr(message, "loop", "")
+        if _is_over(step, record, any(powered.values())):
+            if not step.ticks:
+                step.before_tick, before_tick = before_tick, defaultdict(list)
+            yield step
+            step = LoggedStep()
+        if kind in _BEGIN:
+            step.begin.append(record)
+        if kind is ModeChange and message.target_number == Mode.OFF:
+            powered[loop] = False
+        if kind in _BEFORE_TICK:
+            before_tick[loop].append(record)
+        elif kind is Tick:
+            powered[loop] = message.mode_number != Mode.OFF
+            step.before_tick[loop] = before_tick.pop(loop, [])
+            step.ticks[loop] = message
+        elif kind is FrameRecord:
+            numbers = {tick.number % 2**32 for tick in step.ticks.values()}
+            whole = len(message.data) == message.step * message.height
+            step.frame = message if sequence in numbers and whole else None
+        elif kind is LoopTiming:
+            step.timing[loop] = message
+        elif kind is RecorderStatus:
+            step.records_lost = message.lost
+        elif kind is DeviceHealth and message.device == CAMERA:
+            step.reported_s = message.time_s
+    yield step
+
+
+def _records(info: LogInfo, loops: Sequence[str]) -> Iterator[tuple[Logged, int]]:
+    """What of a log a replay goes by, and its sequence numbers; LogError if that cannot do."""
+    kinds = {TOPICS[kind].format(loop=loop): kind for kind in KINDS for loop in loops}
+    for topic in (TOPICS[FrameRecord], *(TOPICS[Tick].format(loop=loop) for loop in loops)):
+        if topic not in info.counts:
+            there = ", ".join(sorted(info.counts)) or "none"
+            msg = f"{info.path}: has no {topic}, so there is nothing to replay; topics: {there}"
+            raise LogError(msg)
+    begun: set[str] = set()
+    is_first = True
+    for entry in read_records(info.path, list(kinds)):
+        kind = kinds[entry.topic]
+        message: Any = entry.message
+        if is_first:
+            _insist_on_start(info, entry.publish_time_ns)
+            is_first = False
+        if kind is DevicesOpened or (kind is ModeChange and message.source == Mode.OFF.name):
+            begun.add(message.loop)
+        elif kind is Tick:
+            _insist_on_fields(info, message)
+            if message.mode_number != Mode.OFF and message.loop not in begun:
+                raise _midst(info, f"loop {message.loop} is in {message.mode} at its first tick")
+        yield Logged(kind, message), entry.sequence
+
+
+def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
+    """Whether a record is of the next step."""
+    if not step.ticks:
+        # Without a powered loop no tick is logged: what comes between commands is steps all the same.
+        again = record.kind is CommandRecord and record.message.command == "Standby"
+        return again and not powered and bool(step.of(CommandRecord))
+    if record.kind is Tick:
+        return record.message.loop in step.ticks or step.frame is not None
+    return record.kind in _BEGIN
+
+
+def _insist_on_fields(info: LogInfo, tick: Any) -> None:
+    if "fsm_written_s" not in tick.DESCRIPTOR.fields_by_name:
+        version = info.metadata.get("versions", {}).get("fitctl", "of unknown version")
+        msg = (
+            f"{info.path}: was recorded by an older fitctl ({version}), whose logs have neither commands "
+            "nor when voltages took effect; without these a run cannot be replayed"
+        )
+        raise LogError(msg)
+
+
+def _insist_on_start(info: LogInfo, first_ns: int) -> None:
+    clock = info.metadata.get("clock", {})
+    try:
+        start_s = float(clock["run_start_monotonic_s"]) + float(clock["wall_minus_monotonic_s"])
+    except (KeyError, ValueError):
+        msg = f"{info.path}: does not say when its run began (metadata clock); name a log that fitctl recorded"
+        raise LogError(msg) from None
+    late_s = first_ns / 1e9 - start_s
+    if late_s > _AT_THE_START_S:
+        raise _midst(info, f"its first record is of {late_s:.0f} s after the run's start")
+
+
+def _midst(info: LogInfo, why: str) -> LogError:
+    return LogError(
+        f"{info.path}: begins in the midst of a run ({why}), and what was before decides too; give all files "
+        "of the run, from its first on: fitctl replay FIRST SECOND ..."
+    )

@@ -1,0 +1,1 @@
+"""How a supervisor is reached: commands in, telemetry out, keys, metrics."""

@@ -1,0 +1,214 @@
+"""The gateway: a process of its own between the network and the supervisor.
+
+It holds the TCP ports, lets the allowed keys in, and passes on what they say, in envelopes that name them. So
+encryption, strangers who knock, slow clients and whatever libzmq does when a client misbehaves are its own, and
+the supervisor has no socket on the network. Who may command is decided there; here only what is no command, and
+what is too much, is turned back.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import zmq
+
+from fitctl.clock import Clock
+from fitctl.config import Rig
+from fitctl.logging.records import Severity
+from fitctl.messages.commands import Reply
+from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET
+from fitctl.messages.keys import AllowedKey
+from fitctl.service.doors import QUEUED, Parcel, frame_property
+from fitctl.service.envelope import Passed, Report
+from fitctl.service.intake import Intake
+from fitctl.service.keyed_door import KeyedDoor
+
+_NICENESS = 10
+_MOST_BYTES = 512 * 2**20
+_ROUND_MS = 5
+_MESSAGES_A_ROUND = 8
+_HANDSHAKES_A_ROUND = 4
+_LOOK_S = 0.25
+_HUNG_S = 10
+_REVOKED = Reply(accepted=False, text="this key has been revoked")
+_NO_SUPERVISOR = Reply(accepted=False, text="the supervisor takes no commands just now; try again")
+_UNTOLD = 100  # lines that wait for a supervisor that takes none
+
+Route = tuple[bytes, bytes]
+"""Identity and tag of whoever asked; the supervisor hands it back with its reply."""
+
+
+def be_modest() -> None:
+    """Give way to every other process of the instrument, and have a limit to memory.
+
+    Of threads that exist already it speaks to this one alone, so it is for the beginning of a process.
+    """
+    os.nice(_NICENESS)
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard == resource.RLIM_INFINITY or hard > _MOST_BYTES:
+        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))
+
+
+def show_life() -> None:
+    """Have SIGALRM end the process if this is not called again in time: then it hangs, whatever it hangs in."""
+    signal.alarm(_HUNG_S)
+
+
+def judge(
+    key: AllowedKey | None, address: str, payload: bytes, intake: Intake, now_s: float
+) -> Passed | Reply:
+    """What becomes of a message: it is passed on for its key (None if that was revoked), or turned back."""
+    if key is None:
+        return _REVOKED
+    taken = intake.take(key.name, payload, now_s)
+    if isinstance(taken, Reply):
+        return taken
+    return Passed(name=key.name, role=key.role, address=address, payload=payload)
+
+
+class Gateway:
+    """Passes commands, replies and telemetry on.
+
+    Parameters
+    ----------
+    rig : Rig
+    folder : Path
+        Where the supervisor's Unix sockets are.
+    clock : Clock
+    alive : callable
+        Called a few times a second, while it works.
+
+    Raises
+    ------
+    ConfigError
+        If the rig's TCP address or its keys cannot be used.
+    """
+
+    def __init__(
+        self, rig: Rig, folder: Path, clock: Clock, alive: Callable[[], None] = lambda: None
+    ) -> None:
+        service = rig.service
+        self._clock = clock
+        self._alive = alive
+        self._intake = Intake(service.commands_per_s)
+        self._told: deque[tuple[Severity, str]] = deque(maxlen=_UNTOLD)
+        self._reported: dict[str, AllowedKey] | None = None
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._decode_route = msgspec.msgpack.Decoder(Route).decode
+        self._context = zmq.Context()
+        try:
+            self._keyed = KeyedDoor(rig, self._context, partial(self._tell, "warning"))
+        except BaseException:
+            self._context.destroy(linger=0)
+            raise
+        self._supervisor = self._context.socket(zmq.DEALER)
+        self._supervisor.setsockopt(zmq.SNDHWM, QUEUED)
+        # Nothing waits for a supervisor that is not there.
+        self._supervisor.setsockopt(zmq.IMMEDIATE, 1)
+        self._supervisor.setsockopt(zmq.LINGER, 0)
+        self._supervisor.connect(f"ipc://{folder / GATEWAY_SOCKET}")
+        self._telemetry = self._context.socket(zmq.SUB)
+        self._telemetry.setsockopt(zmq.RCVHWM, QUEUED)
+        self._telemetry.subscribe(b"")
+        self._telemetry.connect(f"ipc://{folder / TELEMETRY_SOCKET}")
+        ports = f"ports {service.command_port} and {service.telemetry_port}"
+        self._tell("info", f"listening at {service.tcp_address}, {ports}")
+
+    def run(self, ending: threading.Event) -> None:
+        """Serve until `ending`; however much comes in, a bounded part of it is taken in each round."""
+        poller = zmq.Poller()
+        for one in (self._keyed.zap, self._keyed.door.router, self._supervisor, self._telemetry):
+            poller.register(one, zmq.POLLIN)
+        look_s = self._clock.now_s()
+        try:
+            while not ending.is_set():
+                busy = poller.poll(int(_LOOK_S * 1000))
+                now_s = self._clock.now_s()
+                if now_s >= look_s:
+                    self._alive()
+                    self._keyed.refresh()
+                    for line in self._intake.dropped(now_s):
+                        self._tell("warning", line)
+                    look_s = now_s + _LOOK_S
+                self._keyed.admit(_HANDSHAKES_A_ROUND)
+                self._report()  # of a key first, then what it says
+                self._pass_commands()
+                self._pass_replies()
+                self._pass_telemetry()
+                if busy:
+                    ending.wait(_ROUND_MS / 1000)
+        finally:
+            self._supervisor.close()
+            self._telemetry.close()
+            self._keyed.close()
+            self._context.term()
+
+    def _pass_commands(self) -> None:
+        """Take some, as long as the supervisor takes them too; the rest waits with its sender."""
+        for _ in range(_MESSAGES_A_ROUND):
+            if not self._supervisor.poll(0, zmq.POLLOUT):
+                return
+            for parcel in self._keyed.door.take(1):
+                self._receive(parcel)
+
+    def _receive(self, parcel: Parcel) -> None:
+        key = self._keyed.key_of(parcel.payload)
+        address = frame_property(parcel.payload, "Peer-Address")
+        payload, now_s = bytes(parcel.payload.buffer), self._clock.now_s()
+        judged = judge(key, address, payload, self._intake, now_s)
+        if isinstance(judged, Reply):
+            self._answer(parcel, judged)
+        elif not self._send(self._encode((parcel.identity, parcel.tag)), judged):
+            self._answer(parcel, _NO_SUPERVISOR)
+
+    def _pass_replies(self) -> None:
+        for _ in range(QUEUED):
+            try:
+                route, payload = self._supervisor.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            identity, tag = self._decode_route(route)
+            self._reply(identity, tag, payload)
+
+    def _answer(self, parcel: Parcel, reply: Reply) -> None:
+        timed = msgspec.structs.replace(reply, time_s=self._clock.now_s())
+        self._reply(parcel.identity, parcel.tag, self._encode(timed))
+
+    def _reply(self, identity: bytes, tag: bytes, payload: bytes) -> None:
+        if not self._keyed.door.answer(identity, tag, payload):
+            self._intake.drop("replies", "whoever asked has gone, or does not read")
+
+    def _pass_telemetry(self) -> None:
+        for _ in range(QUEUED):
+            try:
+                telemetry = self._telemetry.recv(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            self._keyed.publish(telemetry)
+
+    def _report(self) -> None:
+        """Tell the supervisor what is new; what it does not take now waits."""
+        keys = self._keyed.allowed
+        if self._told or keys is not self._reported:
+            report = Report(keys=list(keys.values()), told=list(self._told))
+            if self._send(b"", report):
+                self._told.clear()
+                self._reported = keys
+
+    def _tell(self, severity: Severity, text: str) -> None:
+        self._told.append((severity, text))
+
+    def _send(self, route: bytes, envelope: Passed | Report) -> bool:
+        try:
+            self._supervisor.send_multipart([route, self._encode(envelope)], zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True

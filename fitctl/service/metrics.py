@@ -1,0 +1,264 @@
+"""What Prometheus may ask: a process of its own, which listens to the telemetry as a console does.
+
+It is no part of the supervisor's process, because a scrape there would hold the interpreter that the
+loops need. It serves on 127.0.0.1 only, and takes no command.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import get_args, get_type_hints
+
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.metrics_core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    InfoMetricFamily,
+    Metric,
+)
+from prometheus_client.registry import Collector
+
+from fitctl.config import ConfigError
+from fitctl.logging.records import DeviceHealth, LoopTiming, Severity
+from fitctl.messages.client import Client
+from fitctl.messages.modes import Mode
+from fitctl.messages.tally import Tally, add_ticks
+from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.troubles import troubles
+
+HOST = "127.0.0.1"
+STALE_S = 2.0  # nothing is told of an instrument that has been silent for so long, but that it is
+_POLL_S = 0.25
+STATES = get_args(get_type_hints(DeviceHealth)["state"])
+SEVERITIES = get_args(Severity)
+
+# name, help, value of a loop's newest tick
+OF_TICK: list[tuple[str, str, str]] = [
+    ("fitctl_star_visible", "1 while the star is seen.", "star_visible"),
+    ("fitctl_star_flux_dn", "Flux of the star.", "star_flux_dn"),
+    ("fitctl_mirror_range_fraction", "Used part of the mirror's range.", "fsm_range_fraction"),
+    ("fitctl_frame_age_seconds", "Mid-exposure to use, newest frame.", "frame_age_s"),
+]
+# name, help, value of a loop's sums
+OF_TALLY: list[tuple[str, str, Callable[[Tally], float]]] = [
+    ("fitctl_ticks", "Ticks with a frame.", lambda tally: tally.ticks),
+    ("fitctl_late_ticks", "Ticks whose command came late.", lambda tally: tally.late_ticks),
+    ("fitctl_star_ticks", "Ticks that saw the star.", lambda tally: tally.star_ticks),
+    (
+        "fitctl_frames_lost",
+        "Frames that the camera sent and nobody got, since it was opened.",
+        lambda tally: 0 if tally.newest is None else tally.newest.frames_lost,
+    ),
+]
+# name, help, value of the last second
+OF_TIMING: list[tuple[str, str, str]] = [
+    ("fitctl_tick_compute_worst_seconds", "Slowest tick of a second.", "compute_worst_s"),
+    ("fitctl_servo_late_worst_seconds", "Latest servo wake-up of a second.", "servo_late_worst_s"),
+]
+# name, help, what of every second is summed
+OF_TIMINGS: list[tuple[str, str, str]] = [
+    ("fitctl_servo_periods", "Periods of the position servo.", "servo_periods"),
+    ("fitctl_servo_missed", "Periods without a reading.", "servo_missed"),
+    ("fitctl_servo_skipped", "Periods that were skipped.", "servo_skipped"),
+    ("fitctl_stalls", "Times that the machine itself stood still.", "stalls"),
+]
+
+
+class InstrumentCollector(Collector):
+    """Turns telemetry into metrics; one thread gives it messages, others ask."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest: Telemetry | None = None
+        self._received_s = -STALE_S
+        self._messages_missed = 0
+        self._tallies: dict[str, Tally] = {}
+        self._timings: dict[str, LoopTiming] = {}
+        self._timed: Counter[tuple[str, str]] = Counter()
+        self._events: Counter[str] = Counter(dict.fromkeys(SEVERITIES, 0))
+
+    def accept(self, telemetry: Telemetry, now_s: float) -> None:
+        """Take one message that came at `now_s`."""
+        with self._lock:
+            before = self._newest
+            if before is not None and before.pid == telemetry.pid:
+                self._messages_missed += telemetry.sequence - before.sequence - 1
+            self._newest, self._received_s = telemetry, now_s
+            add_ticks(self._tallies, telemetry.ticks)
+            for row in telemetry.timing:
+                before_it = self._timings.get(row.loop)
+                if before_it is None or before_it.time_s != row.time_s:
+                    self._timings[row.loop] = row
+                    for _, _, field in OF_TIMINGS:
+                        self._timed[field, row.loop] += getattr(row, field)
+            self._events.update(event.severity for event in telemetry.events)
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics, as of the newest message; of a silent instrument only that it is silent."""
+        with self._lock:
+            silent = time.monotonic() - self._received_s > STALE_S
+            yield GaugeMetricFamily(
+                "fitctl_up", "1 while the supervisor sends telemetry.", value=float(not silent)
+            )
+            if self._newest is None or silent:
+                return
+            yield from _of_instrument(self._newest)
+            yield from _of_loops(self._newest, self._tallies)
+            yield from _of_timing(self._timings, self._timed)
+            yield from _of_devices(self._newest)
+            yield _counters(
+                "fitctl_events",
+                "Events since the metrics began.",
+                ["severity"],
+                [([severity], count) for severity, count in self._events.items()],
+            )
+            yield CounterMetricFamily(
+                "fitctl_telemetry_missed",
+                "Messages of telemetry that did not come; their ticks are in no counter.",
+                value=self._messages_missed,
+            )
+
+
+def serve_metrics(client: Client, port: int, rig_name: str, stop: threading.Event) -> None:
+    """Answer ``http://127.0.0.1:PORT/metrics`` until `stop`.
+
+    Raises
+    ------
+    ConfigError
+        If the port cannot be had.
+    """
+    registry = CollectorRegistry(auto_describe=False)
+    collector = InstrumentCollector()
+    registry.register(collector)
+    try:
+        server, thread = start_http_server(port, HOST, registry)
+    except OSError as error:
+        msg = (
+            f"service.metrics_port: {HOST}:{port}: {error.strerror}; give {rig_name} another, or 0"
+        )
+        raise ConfigError(msg) from None
+    try:
+        while not stop.is_set():
+            try:
+                telemetry = client.receive(_POLL_S)
+            except ConnectionError:
+                continue  # fitctl_up tells that nothing readable comes
+            if telemetry is not None:
+                collector.accept(telemetry, time.monotonic())
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+Rows = Iterable[tuple[list[str], float]]
+"""Values of labels, and the value."""
+
+
+def _gauges(name: str, text: str, labels: list[str], rows: Rows) -> Metric:
+    return _filled(GaugeMetricFamily(name, text, labels=labels), rows)
+
+
+def _counters(name: str, text: str, labels: list[str], rows: Rows) -> Metric:
+    return _filled(CounterMetricFamily(name, text, labels=labels), rows)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: Rows) -> Metric:
+    for labels, value in rows:
+        family.add_metric(labels, value)
+    return family
+
+
+def _of_instrument(newest: Telemetry) -> Iterator[Metric]:
+    about = {"rig": newest.rig_name, "scheduling": newest.scheduling}
+    yield InfoMetricFamily("fitctl_rig", "Which rig this is.", value=about)
+    well = not troubles(newest)
+    yield GaugeMetricFamily("fitctl_well", "1 while `fitctl status` finds nothing.", value=well)
+    lost = newest.records_lost
+    yield CounterMetricFamily("fitctl_records_lost", "Records missing from the log.", value=lost)
+    unsent = [([queue], count) for queue, count in newest.losses.unsent.items()]
+    yield _counters("fitctl_unsent", "Telemetry and replies let go.", ["queue"], unsent)
+    recorder = newest.recorder
+    if recorder is not None:
+        for name, text, value in (
+            ("fitctl_log_records", "Records written to this log.", recorder.records),
+            ("fitctl_log_bytes", "Bytes written to this log.", recorder.bytes_written),
+        ):
+            yield CounterMetricFamily(name, text, value=value)
+    running = newest.running_sequence
+    under_way = running is not None and running.state in {"running", "paused"}
+    text = "1 while a sequence is running or paused."
+    yield GaugeMetricFamily("fitctl_sequence_under_way", text, value=under_way)
+
+
+def _of_loops(newest: Telemetry, tallies: dict[str, Tally]) -> Iterator[Metric]:
+    yield _gauges(
+        "fitctl_mode",
+        "1 for the mode that the loop is in.",
+        ["loop", "mode"],
+        [([at.name, mode.name], at.mode == mode.name) for at in newest.loops for mode in Mode],
+    )
+    yield _gauges(
+        "fitctl_mode_since_timestamp_seconds",
+        "When the mode began, Unix time.",
+        ["loop"],
+        [([loop.name], loop.since_s + newest.wall_minus_monotonic_s) for loop in newest.loops],
+    )
+    yield _gauges(
+        "fitctl_interlocks_tripped",
+        "How many interlocks are in force.",
+        ["loop"],
+        [([loop.name], len(loop.interlocks)) for loop in newest.loops],
+    )
+    yield _gauges(
+        "fitctl_interlock_tripped",
+        "1 for each interlock that is in force.",
+        ["loop", "interlock", "action"],
+        [([at.name, row.name, row.action], 1) for at in newest.loops for row in at.interlocks],
+    )
+    ticks = {loop: tally.newest for loop, tally in tallies.items()}
+    for name, text, field in OF_TICK:
+        rows = [([loop], getattr(tick, field)) for loop, tick in ticks.items()]
+        yield _gauges(name, text, ["loop"], rows)
+    for name, text, total in OF_TALLY:
+        yield _counters(name, text, ["loop"], [([at], total(one)) for at, one in tallies.items()])
+    yield _counters(
+        "fitctl_error_pixels_squared",
+        "Squared pointing error, summed over fitctl_star_ticks.",
+        ["loop", "axis"],
+        [
+            ([loop, axis], value)
+            for loop, tally in tallies.items()
+            for axis, value in (("az", tally.az_px2), ("el", tally.el_px2))
+        ],
+    )
+
+
+def _of_timing(newest: dict[str, LoopTiming], sums: Counter[tuple[str, str]]) -> Iterator[Metric]:
+    for name, text, field in OF_TIMING:
+        rows = [([loop], getattr(row, field)) for loop, row in newest.items()]
+        yield _gauges(name, text, ["loop"], rows)
+    for name, text, field in OF_TIMINGS:
+        yield _counters(name, text, ["loop"], [([loop], sums[field, loop]) for loop in newest])
+
+
+def _of_devices(newest: Telemetry) -> Iterator[Metric]:
+    yield _gauges(
+        "fitctl_device_state",
+        "1 for the state that the device is in.",
+        ["device", "state"],
+        [([of.device, state], of.state == state) for of in newest.devices for state in STATES],
+    )
+    yield _gauges(
+        "fitctl_stack_volts",
+        "Measured at the stack.",
+        ["loop", "stack"],
+        [
+            ([row.loop, str(stack)], value)
+            for row in newest.piezo
+            for stack, value in enumerate((row.stack1_v, row.stack2_v, row.stack3_v), start=1)
+        ],
+    )

@@ -1,0 +1,261 @@
+"""The supervisor's service: commands come in by its doors, are admitted or refused, and telemetry goes out.
+
+One thread, so that nothing here can hold the loop: records are left in bounded buffers and picked up
+from there, replies likewise. However much comes in, it takes a bounded part of the interpreter. Everything
+here is a Unix socket: what comes by TCP is brought by the gateway (:mod:`fitctl.service.gateway`), in
+envelopes that are taken from its socket alone.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import NamedTuple
+
+import msgspec
+import zmq
+
+from fitctl.clock import Clock
+from fitctl.messages.command_table import ROWS, command_record
+from fitctl.messages.commands import (
+    AnyCommand,
+    RecentEvents,
+    RecorderReport,
+    Reply,
+    Status,
+    Stop,
+    TakeOver,
+)
+from fitctl.messages.endpoints import COMMAND_SOCKET, GATEWAY_SOCKET, TELEMETRY_SOCKET
+from fitctl.messages.keys import AllowedKey
+from fitctl.service.admission import Admission, Sender
+from fitctl.service.doors import Door, local_sender, publisher_socket, router_socket
+from fitctl.service.envelope import MAX_ENVELOPE_BYTES, Passed, Report, decode_envelope
+from fitctl.service.intake import Intake
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.supervisor.supervisor import Supervisor
+
+SOURCE = "service"  # of its events
+GATEWAY = "gateway"  # of what that tells
+_ROUND_MS = 5
+_MESSAGES_A_ROUND = 8
+_JOINED_STOPS = 1000
+_TELL_S = 0.25
+
+
+class Waiting(NamedTuple):
+    """Whom an answer is for."""
+
+    door: Door
+    identity: bytes
+    tag: bytes
+    sender: Sender
+
+
+class Service(threading.Thread):
+    """Answers commands and publishes telemetry until :meth:`stop`.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+    buffer : TelemetryBuffer
+    folder : Path
+        Where the Unix sockets are made.
+    state : ServiceState
+    clock : Clock
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        buffer: TelemetryBuffer,
+        folder: Path,
+        state: ServiceState,
+        clock: Clock,
+    ) -> None:
+        super().__init__(name="service", daemon=True)
+        settings = supervisor.rig.service
+        self._supervisor = supervisor
+        self._buffer = buffer
+        self._state = state
+        self._clock = clock
+        self._period_s = 1.0 / supervisor.rig.supervisor.telemetry_hz
+        self._ending = threading.Event()
+        self._replies: SimpleQueue[tuple[Waiting, Reply, str | None]] = SimpleQueue()
+        self._stops: dict[str, deque[Waiting]] = {}  # by loop: who waits with one that is under way
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._intake = Intake(settings.commands_per_s)
+        self._admission = Admission(settings.lease_s)
+        self._keys: dict[str, AllowedKey] = {}  # by name, as the gateway last reported
+        self._context = zmq.Context()
+        self._local = Door(router_socket(self._context))
+        self._local.router.bind(f"ipc://{folder / COMMAND_SOCKET}")
+        self._gateway = Door(router_socket(self._context, MAX_ENVELOPE_BYTES))
+        if settings.tcp_address:
+            self._gateway.router.bind(f"ipc://{folder / GATEWAY_SOCKET}")
+        self._publisher = publisher_socket(self._context)
+        self._publisher.bind(f"ipc://{folder / TELEMETRY_SOCKET}")
+
+    def stop(self) -> None:
+        """Publish once more, send what replies there are, and end."""
+        self._ending.set()
+        self.join(timeout=5.0)
+
+    def run(self) -> None:
+        """Serve; this is the thread."""
+        poller = zmq.Poller()
+        for door in (self._local, self._gateway):
+            poller.register(door.router, zmq.POLLIN)
+        publish_s = tell_s = self._clock.now_s()
+        try:
+            while not self._ending.is_set():
+                if poller.poll(_ROUND_MS):
+                    self._serve()
+                    self._send_replies()
+                    self._ending.wait(_ROUND_MS / 1000)  # however much more there is
+                self._send_replies()
+                now_s = self._clock.now_s()
+                if now_s >= publish_s:
+                    self._publish(now_s)
+                    publish_s = max(publish_s + self._period_s, now_s)
+                if now_s >= tell_s:
+                    for line in self._intake.dropped(now_s):
+                        self._supervisor.note("warning", SOURCE, line)
+                    tell_s = now_s + _TELL_S
+            self._send_replies()
+            self._publish(self._clock.now_s())
+        finally:
+            for socket in (self._local.router, self._gateway.router, self._publisher):
+                socket.close()
+            self._context.term()
+
+    # ------------------------------------------------------------ commands
+
+    def _serve(self) -> None:
+        """Take a bounded number of messages from each door."""
+        for parcel in self._local.take(_MESSAGES_A_ROUND):
+            waiting = Waiting(
+                self._local, parcel.identity, parcel.tag, local_sender(parcel.payload)
+            )
+            self._receive(waiting, bytes(parcel.payload.buffer))
+        for parcel in self._gateway.take(_MESSAGES_A_ROUND):
+            self._open(parcel.identity, parcel.tag, bytes(parcel.payload.buffer))
+
+    def _open(self, identity: bytes, tag: bytes, payload: bytes) -> None:
+        """Take an envelope of the gateway."""
+        match decode_envelope(payload):
+            case Passed() as passed:
+                sender = Sender(passed.name, passed.address, passed.role, is_local=False)
+                self._receive(Waiting(self._gateway, identity, tag, sender), passed.payload)
+            case Report() as report:
+                self._heed(report)
+            case None:
+                self._intake.drop(GATEWAY, "no envelopes")
+
+    def _heed(self, report: Report) -> None:
+        """Take the instrument from whoever is no longer let in, and tell what the gateway has to say."""
+        before, self._keys = self._keys, {key.name: key for key in report.keys}
+        for name, key in before.items():
+            if self._keys.get(name) != key:
+                self._admission.release(name)
+                self._supervisor.note("warning", SOURCE, f"the key {name} was revoked or changed")
+        for severity, text in report.told:
+            self._supervisor.note(severity, GATEWAY, text)
+
+    def _receive(self, waiting: Waiting, payload: bytes) -> None:
+        sender, now_s = waiting.sender, self._clock.now_s()
+        taken = self._intake.take(sender.name, payload, now_s)
+        if isinstance(taken, Reply):
+            self._answer(waiting, taken)
+        elif taken.is_too_many and self._joins_a_stop(waiting, taken.command):
+            self._intake.drop(sender.name, "stops besides one under way")
+        else:
+            self._obey(waiting, taken.command, now_s)
+
+    def _joins_a_stop(self, waiting: Waiting, command: AnyCommand) -> bool:
+        """Whether this stop, of too many, waits for the answer to one that is under way."""
+        if waiting.sender.role != "commander" or command.loop not in self._stops:
+            return False
+        self._stops[command.loop].append(waiting)
+        return True
+
+    def _obey(self, waiting: Waiting, command: AnyCommand, now_s: float) -> None:
+        sender = waiting.sender
+        commander = self._admission.commander(now_s)
+        refusal = self._admission.refusal(sender, command, now_s)
+        match command:
+            case _ if refusal:
+                self._answer_here(waiting, command, Reply(accepted=False, text=refusal))
+            case Status():
+                text = self._status_text()
+                self._answer_here(waiting, command, Reply(accepted=True, text=text))
+            case RecentEvents():
+                events = self._buffer.recent_events()
+                text = f"the last {len(events)} events"
+                told = Reply(accepted=True, text=text, events=events)
+                self._answer_here(waiting, command, told)
+            case RecorderReport():
+                self._buffer.recorder = command.status
+                self._answer_here(waiting, command, Reply(accepted=True))
+            case TakeOver():
+                text = self._taken_over(commander, sender.name)
+                self._answer_here(waiting, command, Reply(accepted=True, text=text))
+            case _:
+                stops = isinstance(command, Stop)
+                if stops:
+                    self._stops.setdefault(command.loop, deque(maxlen=_JOINED_STOPS))
+                done = partial(self._done, waiting, command.loop if stops else None)
+                self._supervisor.post(command, done, sender.name, sender.address)
+
+    def _taken_over(self, before: str, now: str) -> str:
+        told = f"{now} has the instrument"
+        if before not in {"", now}:
+            told += f", taken over from {before}"
+            self._supervisor.note("warning", SOURCE, told)
+        return told
+
+    def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
+        """Leave the reply for this thread; called from the supervisor's."""
+        self._replies.put((waiting, reply, stopped))
+
+    def _answer_here(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
+        """Answer what does not reach the supervisor, and keep who asked."""
+        if ROWS[type(command)].logged:
+            sender, now_s = waiting.sender, self._clock.now_s()
+            self._supervisor.leave(
+                command_record(command, reply, sender.name, sender.address, now_s)
+            )
+        self._answer(waiting, reply)
+
+    def _status_text(self) -> str:
+        return ", ".join(
+            f"{name} {loop.mode.name}" for name, loop in self._supervisor.loops.items()
+        )
+
+    def _send_replies(self) -> None:
+        while True:
+            try:
+                waiting, reply, stopped = self._replies.get_nowait()
+            except Empty:
+                return
+            self._answer(waiting, reply)
+            for joined in self._stops.pop(stopped, ()) if stopped is not None else ():
+                self._answer(joined, reply)
+
+    def _answer(self, waiting: Waiting, reply: Reply) -> None:
+        timed = msgspec.structs.replace(reply, time_s=self._clock.now_s())
+        if not waiting.door.answer(waiting.identity, waiting.tag, self._encode(timed)):
+            self._state.replies_unsent += 1
+
+    # ------------------------------------------------------------ telemetry
+
+    def _publish(self, now_s: float) -> None:
+        self._state.sequence += 1
+        self._state.commander = self._admission.commander(now_s)
+        payload = self._encode(self._buffer.telemetry(self._supervisor, self._state, now_s))
+        with suppress(zmq.Again):
+            self._publisher.send(payload, zmq.NOBLOCK)

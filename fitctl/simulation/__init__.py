@@ -1,0 +1,1 @@
+"""The instrument on the virtual clock, one run or many."""

@@ -1,0 +1,248 @@
+"""Many runs of one rig, on every core or on a Dask cluster, and what they say together.
+
+A run of a campaign with seed s is the run that `fitctl simulate --seed s` makes.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from fitctl.config import ConfigError, Rig
+from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.batch.settings import TooLargeForBatchError
+from fitctl.simulation.simulation import simulate
+from fitctl.simulation.statistics import SimulationResult
+
+PERCENTILES = (5, 50, 95, 99)
+_WORST_SEEDS = 5
+_TASKS_PER_CORE = 8  # enough that no core waits long for the last
+_MOST_RUNS_PER_TASK = 50
+_RETRIES = 10  # of a task whose worker was lost
+_CONNECT_TIMEOUT_S = 10.0
+
+Results = dict[int, dict[str, SimulationResult]]
+
+
+class CampaignError(Exception):
+    """A campaign cannot be run, or not to its end; what is wrong and the next step."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of one figure over all runs that were judged."""
+
+    mean: float
+    percentiles: dict[str, float]
+    worst: float
+
+
+@dataclass(frozen=True)
+class SeedRms:
+    """One run's true residual RMS, of its worst axis."""
+
+    seed: int
+    rms_px: float
+
+
+@dataclass(frozen=True)
+class LoopSummary:
+    """What the runs say of one loop.
+
+    Attributes
+    ----------
+    runs, held, judged : int
+        How many there were, how many came to hold their star, and how many for long enough to be judged.
+    rms_px : dict
+        True residual RMS: ``az``, ``el``, and ``worst_axis``, the larger of each run.
+    measured_rms_px : dict
+        As the camera saw it: ``az`` and ``el``.
+    acquired_s, vernier_s, piston_rms_m : Statistics
+    worst_seeds : list of SeedRms
+        Runs that could not be judged come first, with nan.
+    """
+
+    runs: int
+    held: int
+    judged: int
+    rms_px: dict[str, Statistics]
+    measured_rms_px: dict[str, Statistics]
+    acquired_s: Statistics
+    vernier_s: Statistics
+    piston_rms_m: Statistics
+    worst_seeds: list[SeedRms]
+
+
+def run_seeds(rig_json: str, seeds: Sequence[int], duration_s: float) -> Results:
+    """Some runs one after the other; what a worker does."""
+    run = _runner(rig_json)
+    return {seed: run(seed, duration_s) for seed in seeds}
+
+
+@functools.lru_cache(maxsize=4)
+def _runner(rig_json: str) -> Callable[[int, float], dict[str, SimulationResult]]:
+    """The quickest way to a rig's runs. Its designs and tables take longer to make than a run."""
+    rig = Rig.model_validate_json(rig_json)
+    if len(rig.loops) == 1:
+        with suppress(ImportError, TooLargeForBatchError):
+            (name,), batch = rig.loops, Batch(rig)
+            return lambda seed, duration_s: {name: batch.result(seed, duration_s)}
+    # Without numba, or with more than a batch holds: the same runs, slower.
+    return partial(simulate, rig)
+
+
+def run_campaign(
+    rig: Rig,
+    seeds: Sequence[int],
+    duration_s: float,
+    executor: Executor,
+    workers: int,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> Results:
+    """All runs on an executor's workers; by seed, in the order of `seeds`.
+
+    `on_progress` is called with the number of runs done, as they come.
+
+    Raises
+    ------
+    CampaignError
+        If a worker fails in a way that trying again does not mend.
+    """
+    per_task = max(1, min(_MOST_RUNS_PER_TASK, math.ceil(len(seeds) / (workers * _TASKS_PER_CORE))))
+    tasks = [seeds[first : first + per_task] for first in range(0, len(seeds), per_task)]
+    rig_json = rig.model_dump_json()
+    futures = [executor.submit(run_seeds, rig_json, task, duration_s) for task in tasks]
+    done: Results = {}
+    try:
+        for future in as_completed(futures):
+            done |= future.result()
+            on_progress(len(done))
+    except ConfigError:
+        raise
+    except Exception as error:
+        msg = f"after {len(done)} of {len(seeds)} runs: {error!r}; look at the workers, and start again"
+        raise CampaignError(msg) from error
+    finally:
+        for future in futures:
+            future.cancel()
+    return {seed: done[seed] for seed in seeds}
+
+
+@contextmanager
+def local_executor() -> Iterator[tuple[Executor, int]]:
+    """A process on every core that is ours, and their number."""
+    workers = len(os.sched_getaffinity(0))
+    # A server forks the workers before any thread is there that a fork would leave behind.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_as_a_worker)
+    try:
+        yield executor, workers
+    except BaseException:
+        # Nobody waits any more for what they do, which without numba may take minutes.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _as_a_worker() -> None:
+    """Ctrl-C is for the parent, who then ends its workers; should it be killed, they end by themselves."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, name="parent-watch", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """The server that forked us lives as long as we do; it is the parent who started it that counts."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@contextmanager
+def dask_executor(address: str, workers: int = 1) -> Iterator[tuple[Executor, int]]:
+    """The workers of a Dask scheduler, once so many are there, and how many threads they have together.
+
+    A run whose worker is lost goes to another.
+
+    Raises
+    ------
+    CampaignError
+        If distributed is not installed, nothing answers at `address`, or no worker comes.
+    """
+    try:
+        from distributed import Client
+        from distributed.comm.addressing import get_address_host_port
+    except ImportError:
+        msg = "--scheduler needs Dask: pip install 'fitctl[cluster]'"
+        raise CampaignError(msg) from None
+    try:
+        get_address_host_port(address)  # or the client would try to close what it never opened
+        client = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        msg = f"scheduler {address}: {error}; start one with: dask scheduler"
+        raise CampaignError(msg) from None
+    with client:
+        try:
+            client.wait_for_workers(workers, timeout=_CONNECT_TIMEOUT_S)
+        except TimeoutError:
+            msg = f"scheduler {address} has no worker; start one with: dask worker {address}"
+            raise CampaignError(msg) from None
+        threads = sum(client.nthreads().values())
+        with client.get_executor(retries=_RETRIES, pure=False) as executor:
+            yield executor, threads
+
+
+def summarize(results: Results) -> dict[str, LoopSummary]:
+    """What all runs say of each loop."""
+    loops = next(iter(results.values()))
+    return {
+        name: _summarize({seed: loops[name] for seed, loops in results.items()}) for name in loops
+    }
+
+
+def _summarize(runs: dict[int, SimulationResult]) -> LoopSummary:
+    all_runs = list(runs.values())
+    worst_axis = {seed: max(run.rms_px.values()) for seed, run in runs.items()}
+    ranked = sorted(worst_axis, key=lambda seed: -np.nan_to_num(worst_axis[seed], nan=np.inf))
+    axes = ("az", "el")
+    return LoopSummary(
+        runs=len(all_runs),
+        held=sum(not math.isnan(run.vernier_s) for run in all_runs),
+        judged=sum(not math.isnan(value) for value in worst_axis.values()),
+        rms_px={axis: _statistics([run.rms_px[axis] for run in all_runs]) for axis in axes}
+        | {"worst_axis": _statistics(list(worst_axis.values()))},
+        measured_rms_px={
+            axis: _statistics([run.measured_rms_px[axis] for run in all_runs]) for axis in axes
+        },
+        acquired_s=_statistics([run.acquired_s for run in all_runs]),
+        vernier_s=_statistics([run.vernier_s for run in all_runs]),
+        piston_rms_m=_statistics([run.piston_rms_m for run in all_runs]),
+        worst_seeds=[SeedRms(seed, worst_axis[seed]) for seed in ranked[:_WORST_SEEDS]],
+    )
+
+
+def _statistics(values: Sequence[float]) -> Statistics:
+    """Of the values that are there; all nan where none is."""
+    there = np.array([value for value in values if not math.isnan(value)])
+    if there.size == 0:
+        return Statistics(math.nan, dict.fromkeys(map(str, PERCENTILES), math.nan), math.nan)
+    percentiles = np.percentile(there, PERCENTILES)
+    return Statistics(
+        mean=float(there.mean()),
+        percentiles={str(p): float(v) for p, v in zip(PERCENTILES, percentiles, strict=True)},
+        worst=float(there.max()),
+    )

@@ -1,0 +1,71 @@
+"""Statistics of simulated runs: true residual, piston, and the time spent in each mode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.logging.records import ModeChange
+from fitctl.messages.modes import Mode
+from fitctl.model.plant import Plant
+
+Floats = NDArray[np.float64]
+SETTLE_S = 10.0  # after vernier is reached, before its residual counts
+
+
+class SimulationResult(NamedTuple):
+    """What a simulated run gave; RMS about the target over `judged_s`, nan if that is empty.
+
+    The piston's RMS is about its mean: what path-length control has to follow.
+    """
+
+    acquired_s: float
+    vernier_s: float
+    rms_px: dict[str, float]
+    measured_rms_px: dict[str, float]
+    judged_s: float
+    piston_rms_m: float
+    mode_times: dict[str, float]
+    frames: int
+    speed_x: float
+
+
+def true_residual_rms(plant: Plant, target_px: Floats, start_s: float, end_s: float) -> Floats:
+    """RMS distance of the pointing spot from `target_px` in continuous time, shape (2,); nan if empty."""
+    if not start_s < end_s:
+        return np.full(2, math.nan)
+    return rms(plant.history_px(start_s, end_s)[:, 0, 0, :] - target_px)
+
+
+def piston_rms_m(plant: Plant, start_s: float, end_s: float) -> float:
+    """RMS of the mirror's piston (Eq. 4) about its mean; nan if the time is empty."""
+    if not start_s < end_s:
+        return math.nan
+    return float(np.std(plant.history_piston_m(start_s, end_s)[:, 0]))
+
+
+def rms(values: Floats) -> Floats:
+    """Root of the mean square down the first axis; nan without values."""
+    if len(values) == 0:
+        return np.full(values.shape[1:], math.nan)
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
+
+
+def pair(values: Floats) -> dict[str, float]:
+    """Two axes by name."""
+    return {"az": float(values[0]), "el": float(values[1])}
+
+
+def mode_times(changes: Iterable[ModeChange], end_s: float) -> dict[str, float]:
+    """Seconds spent in each mode."""
+    times = dict.fromkeys((mode.name for mode in Mode), 0.0)
+    mode, since_s = Mode.OFF.name, 0.0
+    for change in changes:
+        times[mode] += change.time_s - since_s
+        mode, since_s = change.target, change.time_s
+    times[mode] += end_s - since_s
+    return times

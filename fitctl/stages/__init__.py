@@ -1,0 +1,1 @@
+"""A loop's stages: mirror, siderostat, and the threads that drive them."""

@@ -1,0 +1,83 @@
+"""One schema of commands: nothing is missing from the table, nothing is there twice."""
+
+from typing import get_args
+
+import pytest
+
+from fitctl.cli import main
+from fitctl.config import ConfigError
+from fitctl.messages.command_table import COMMANDS, ROWS, WORDS, command_of
+from fitctl.messages.commands import Acquire, AnyCommand, Reset, SetTarget, Stop
+
+
+def test_every_command_is_in_the_table_once():
+    assert sorted(row.name for row in COMMANDS) == sorted(c.__name__ for c in get_args(AnyCommand))
+
+
+def test_words_and_keys_are_not_ambiguous():
+    words = [row.word for row in COMMANDS if row.word]
+    keys = [row.key for row in COMMANDS if row.key]
+
+    assert len(words) == len(set(words)) == len(WORDS)
+    assert len(keys) == len(set(keys))
+
+
+def test_what_needs_no_values_can_be_on_a_key():
+    assert all(not row.values and row.word for row in COMMANDS if row.key)
+
+
+@pytest.mark.parametrize("row", COMMANDS, ids=lambda row: row.name)
+def test_every_command_says_what_it_does(row):
+    assert row.help
+    assert not row.help.endswith(".")
+
+
+def test_values_come_in_the_order_of_the_struct():
+    assert ROWS[SetTarget].usage == "target AZ_PX EL_PX"
+    assert command_of("target", ["22.5", "19"], "right") == SetTarget(
+        az_px=22.5, el_px=19.0, loop="right"
+    )
+
+
+def test_a_name_that_looks_like_a_number_stays_a_name():
+    assert command_of("reset", ["7"], "") == Reset(name="7")
+
+
+def test_a_word_alone_is_a_command():
+    assert command_of("stop", [], "") == Stop()
+
+
+def test_what_may_be_left_out_is_given_by_its_name():
+    assert command_of("acquire", [], "") == Acquire()
+    assert command_of("acquire", ["field_overlap=0.3"], "right") == Acquire(
+        field_overlap=0.3, loop="right"
+    )
+
+
+def test_a_value_below_zero_is_no_option(tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["send", "jog", "-1.5", "0", "--set", f"service.folder={tmp_path}"])
+
+    assert end.value.code == 1
+    assert "no supervisor answers" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "values", "complaint"),
+    [
+        ("acquire", ["wide"], "needs no values, and may have search_radius_sky_arcsec="),
+        ("acquire", ["field_overlap"], "needs no values"),
+        ("acquire", ["field_overlap=much"], "acquire field_overlap=much"),
+        ("explode", [], "is no command; there are stop, "),
+        ("target", ["1"], "needs az_px el_px"),
+        ("target", ["far", "1"], "target far 1"),
+        ("stop", ["now"], "needs no values"),
+        ("controller", ["best"], "controller best"),
+    ],
+)
+def test_what_cannot_be_a_command_is_refused_in_one_line(word, values, complaint):
+    with pytest.raises(ConfigError) as refused:
+        command_of(word, values, "")
+
+    assert complaint in str(refused.value)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,50 @@
+"""A log through today's code is the same to the last bit."""
+
+import math
+
+import pytest
+from replay_courses import COURSES, hold_a_star, replayed, two_loops
+
+from fitctl.logging.records import ModeChange
+from fitctl.messages.commands import Acquire, Standby, Stop
+
+
+@pytest.mark.parametrize(("course", "overrides", "happens"), COURSES.values(), ids=COURSES.keys())
+def test_a_run_replayed_is_the_same_to_the_last_bit(logged, course, overrides, happens):
+    path, simulation = logged(course, *overrides)
+    result = replayed(path)
+
+    assert happens <= {change.trigger for change in simulation.mode_changes}
+    assert result.same, result
+    loop = result.loops["right"]
+    assert loop.ticks == sum(tick.number >= 0 or tick.mode != "OFF" for tick in simulation.ticks)
+    assert all(found.compared >= 2 * loop.ticks for found in loop.differences.values())
+
+
+def test_two_loops_that_do_different_things_are_replayed_together(logged):
+    def course(simulation):
+        simulation.command(Standby(loop="right"))
+        simulation.command(Acquire(loop="right"))
+        simulation.run(2.0)
+        simulation.command(Standby(loop="left"))
+        simulation.command(Acquire(loop="left"))
+        simulation.run(4.0)
+        simulation.command(Stop(loop="right"))
+        simulation.run(0.5)
+
+    path, simulation = logged(course, rig=two_loops())
+    result = replayed(path)
+
+    found = {(change.loop, change.trigger) for change in simulation.mode_changes}
+    assert {("left", "IN_REACH"), ("right", "IN_REACH"), ("right", "STOP")} <= found
+    assert result.same, result
+    assert result.loops["left"].ticks > 200
+
+
+def test_every_mode_change_of_the_log_says_where_the_motors_were(logged):
+    changes = []
+    logged(hold_a_star, change=lambda r: changes.append(r) or r)
+    found = [record for record in changes if isinstance(record, ModeChange)]
+
+    assert len(found) == 4
+    assert not any(math.isnan(change.siderostat_az_rad) for change in found)

@@ -1,0 +1,183 @@
+"""What a simulation does while it is logged, and the replay of such a log."""
+
+import pytest
+from simulated import TWO_STARS, darken, failing, until
+
+from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_json
+from fitctl.drivers.interface import DeviceMismatch, DeviceTimeout
+from fitctl.messages.commands import (
+    Acquire,
+    Experiment,
+    Hold,
+    Look,
+    Off,
+    Recover,
+    Reset,
+    SetController,
+    SetTarget,
+    Standby,
+    Stop,
+)
+from fitctl.messages.modes import Mode
+from fitctl.model.drives import Drive
+from fitctl.replay.files import logged_files
+from fitctl.replay.log import read_steps, whole_run
+from fitctl.replay.replay import replay
+
+SOON = "loops.right.coarse.reach_fraction=0.7"  # seconds less in COARSE
+TIMEOUT = DeviceTimeout("device", "here", "an answer", "none", "look")
+MOVED = DeviceMismatch("piezo", "here", "its limit", "another", "set it back")
+SCAN = [
+    Drive(channel="fsm_az", shape="triangle", amplitude=2.0, frequency_hz=1.0, duration_s=1.0),
+    Drive(channel="siderostat_el", shape="sine", amplitude=2.0, frequency_hz=1.0, duration_s=1.5),
+]
+
+
+def replayed(*paths, change=()):
+    with whole_run(paths) as info, logged_files(info) as files:
+        rig = rig_from_json(info.metadata["rig"]["json"], "the log", [*files, *change])
+        return replay(rig, read_steps(info, list(rig.loops)))
+
+
+def hold_a_star(simulation):
+    simulation.acquire()
+    until(simulation, Mode.VERNIER, limit_s=20.0)
+    simulation.run(2.0)
+
+
+def every_command(simulation):
+    hold_a_star(simulation)
+    simulation.command(SetTarget(az_px=22.0, el_px=18.5))
+    simulation.run(1.0)
+    simulation.command(SetController(name="minimum-variance"))
+    simulation.run(1.0)
+    for command in (Hold(), Acquire(), Stop(), Recover(), Acquire(), Stop()):
+        simulation.command(command)
+        simulation.run(0.7)
+    simulation.command(Off())
+    simulation.run(0.1)
+    simulation.command(Standby())
+    simulation.run(0.3)
+
+
+def another_star(simulation):
+    hold_a_star(simulation)
+    az_px, el_px = simulation.plants["right"].spots_px(simulation.clock.now_s())[0][1].tolist()
+    assert simulation.command(Look(az_px=az_px, el_px=el_px)).accepted
+    simulation.run(3.0)
+    assert simulation.ticks[-1].star_flux_dn == pytest.approx(24_000, rel=0.02)
+
+
+def an_experiment(simulation):
+    hold_a_star(simulation)
+    simulation.command(Experiment(loop="right", name="try", drives=SCAN))
+    simulation.run(2.5)
+    simulation.command(Experiment(loop="right", name="again", drives=SCAN))
+    simulation.run(0.5)
+    simulation.command(Stop())
+    simulation.run(0.3)
+
+
+def a_star_that_is_lost(simulation):
+    hold_a_star(simulation)
+    flux_dn = simulation.camera._scene._flux_dn
+    darken(simulation)
+    simulation.run(1.0)
+    simulation.camera._scene._flux_dn = flux_dn
+    simulation.run(3.0)
+
+
+def nothing_that_opens(simulation):
+    amplifiers = simulation.devices.loops["right"].amplifiers
+    opening, amplifiers.open = amplifiers.open, failing(TIMEOUT)
+    for _ in range(2):
+        simulation.command(Standby())
+        simulation.run(0.1)
+    amplifiers.open = opening
+    hold_a_star(simulation)
+
+
+def _fails(part, method, error=TIMEOUT):
+    """While a star is held a device fails; it recovers, and the star is held again."""
+
+    def course(simulation):
+        hold_a_star(simulation)
+        devices = simulation.devices
+        device = devices.camera if part == "camera" else getattr(devices.loops["right"], part)
+        well = getattr(device, method)
+        setattr(device, method, failing(error))
+        simulation.run(2.5)
+        setattr(device, method, well)
+        simulation.command(Recover())
+        simulation.command(Acquire())
+        simulation.run(2.0)
+
+    return course
+
+
+def off_and_on_in_one_breath(simulation):
+    """Without a camera no tick is logged between the two."""
+    hold_a_star(simulation)
+    simulation.command(Stop())
+    camera = simulation.devices.camera
+    well, camera.next_frame = camera.next_frame, failing(TIMEOUT)
+    simulation.run(0.5)
+    camera.next_frame = well
+    simulation.command(Off())
+    hold_a_star(simulation)
+
+
+def interlocks(simulation):
+    """One flattens for a while, one holds until it is reset, one makes safe."""
+    hold_a_star(simulation)
+    supervisor = simulation.supervisor
+    for quantity, value in (
+        ("disk_free_bytes", 0.0),
+        ("disk_free_bytes", 1e12),
+        ("recorder_backlog_fraction", 0.9),
+        ("recorder_backlog_fraction", 0.0),
+    ):
+        supervisor.measured(quantity, value)
+        simulation.run(0.5)
+    assert simulation.command(Reset(name="recorder_behind")).accepted
+    simulation.run(0.5)
+    supervisor.measured("clock_step_s", 9.0)
+    simulation.run(0.5)
+
+
+def two_loops():
+    document = load_rig(default_rig_path(), [SOON]).model_dump(mode="json")
+    for loops in (document[part]["loops"] for part in ("plant", "mocks")):
+        loops["left"] = dict(loops["right"])
+    document["loops"]["left"] = document["loops"]["right"] | {
+        "star_flux_dn": 84000.0,
+        "target_px": {"az": 12.0, "el": 19.5},
+    }
+    (spot, *_) = document["plant"]["loops"]["left"]["spots"]
+    document["plant"]["loops"]["left"]["spots"] = [spot | {"flux_dn": 84000.0}]
+    return rig_from_document(document, "two loops")
+
+
+INTERLOCKS = [
+    "interlocks.disk_space.action=flatten",
+    "interlocks.recorder_behind={ quantity = 'recorder_backlog_fraction', high = 0.5, for_s = 0.0, "
+    "modes = ['VERNIER'], action = 'hold', reset = 'hand' }",
+    "interlocks.clock={ quantity = 'clock_step_s', high = 1.0, for_s = 0.1, modes = ['VERNIER'], "
+    "action = 'safe', reset = 'hand' }",
+]
+FAULT = {"STAR_FOUND", "IN_REACH", "FAULT", "RECOVER"}
+# What is done, with which rig, and what must have happened for it to say anything.
+COURSES = {
+    "every command": (every_command, [], {"HOLD", "STOP", "RECOVER", "OFF", "IN_REACH"}),
+    "another star": (another_star, [TWO_STARS], {"IN_REACH"}),
+    "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),
+    "a lost star": (a_star_that_is_lost, [], {"STAR_LOST", "STAR_FOUND", "IN_REACH"}),
+    "nothing opens": (nothing_that_opens, [], {"STANDBY", "IN_REACH"}),
+    "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),
+    "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
+    "the D/A fails": (_fails("dac", "write_v"), [], FAULT),
+    "the amplifiers fail": (_fails("amplifiers", "exchange"), [], FAULT),
+    "the camera fails": (_fails("camera", "next_frame"), [], FAULT),
+    "the piezo amplifier is silent": (_fails("piezo", "stack_volts"), [], FAULT),
+    "the piezo amplifier's switch moved": (_fails("piezo", "limit_v", MOVED), [], FAULT),
+}

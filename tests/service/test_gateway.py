@@ -1,0 +1,226 @@
+"""The gateway between the network and the supervisor: what it passes on, for whom, and what only it may say."""
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+import msgspec
+import pytest
+import zmq
+from hypothesis import given
+from hypothesis import strategies as st
+from served import Served, rig_in, until
+
+from fitctl.clock import VirtualClock
+from fitctl.config import ConfigError
+from fitctl.messages.commands import Hold, Status, Stop, TakeOver
+from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, tcp_endpoint
+from fitctl.messages.keys import AllowedKey, new_key, revoke_key
+from fitctl.service.envelope import Passed, Report, decode_envelope
+from fitctl.service.keyed_door import check_keyed_door
+
+STOP = msgspec.msgpack.encode(Stop())
+OF_ANNA = Passed(name="anna", role="commander", address="10.0.0.1", payload=STOP)
+
+
+@pytest.fixture
+def served(tmp_path):
+    served = Served(tmp_path, "service.commands_per_s=5.0", tcp=True)
+    served.start()
+    yield served
+    served.close()
+
+
+@pytest.fixture
+def say(served):
+    """Say something on the gateway's own socket."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+        dealer.setsockopt(zmq.LINGER, 1000)
+        dealer.connect(f"ipc://{served.folder / GATEWAY_SOCKET}")
+        yield lambda payload: dealer.send_multipart([b"route", payload])
+
+
+def test_an_envelope_is_no_command_on_the_socket_for_everybody(served):
+    reply = served.raw(b"tag", msgspec.msgpack.encode(OF_ANNA))
+
+    assert not reply.accepted
+    assert "not a command" in reply.text
+    assert served.client.send(Status()).text == "right OFF"
+    assert served.commands("Stop") == []
+
+
+def test_an_envelope_is_no_command_from_the_network(served):
+    anna = served.person("anna")
+    dealer = anna._dealer()
+    dealer.send_multipart([b"tag", msgspec.msgpack.encode(OF_ANNA)])
+
+    assert dealer.poll(5000)
+    reply = msgspec.msgpack.decode(dealer.recv_multipart()[1])
+    dealer.close()
+    assert not reply["accepted"]
+    assert "not a command" in reply["text"]
+
+
+def test_on_its_own_socket_the_gateway_speaks_for_a_key(served, say):
+    say(msgspec.msgpack.encode(OF_ANNA))
+
+    until(lambda: served.commands("Stop") == [("anna", True)])
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",
+        STOP,
+        msgspec.msgpack.encode(msgspec.structs.replace(OF_ANNA, name="root@here")),
+        msgspec.msgpack.encode(msgspec.structs.replace(OF_ANNA, role="owner")),
+        msgspec.msgpack.encode(msgspec.to_builtins(OF_ANNA) | {"is_local": True}),
+    ],
+)
+def test_the_gateway_speaks_for_nobody_of_this_machine_and_in_envelopes_alone(payload):
+    assert decode_envelope(payload) is None
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_an_envelope_or_none(payload):
+    assert isinstance(decode_envelope(payload), Passed | Report | None)
+
+
+def test_what_is_no_envelope_is_counted(served, say):
+    for _ in range(3):
+        say(b"garbage")
+
+    until(lambda: any("gateway: " in told and "no envelopes" in told for told in served.events()))
+    assert served.client.send(Status()).accepted
+
+
+def test_telemetry_is_passed_on_as_it_is(served):
+    key = served.key("anna")
+    service = served.rig.service
+    with zmq.Context() as context:
+        near, far = context.socket(zmq.SUB), context.socket(zmq.SUB)
+        far.curve_serverkey = key.server_public.encode()
+        far.curve_publickey, far.curve_secretkey = key.public.encode(), key.secret.encode()
+        near.connect(f"ipc://{served.folder / TELEMETRY_SOCKET}")
+        far.connect(tcp_endpoint("127.0.0.1", service.telemetry_port))
+        for subscriber in (near, far):
+            subscriber.subscribe(b"")
+        assert far.poll(20_000)
+        passed = far.recv()
+        there = [passed]
+        until(lambda: there.append(near.recv()) or there.count(passed) == 2 or len(there) > 40)
+        near.close(linger=0)
+        far.close(linger=0)
+
+    assert there.count(passed) == 2
+
+
+def test_who_sends_too_much_is_turned_back_before_the_supervisor_but_for_stops(served, monkeypatch):
+    served.stop_gateway()
+    served.start_gateway(VirtualClock())
+    reached, take = [], served.service._intake.take
+    monkeypatch.setattr(
+        served.service._intake,
+        "take",
+        lambda name, *rest: reached.append(name) or take(name, *rest),
+    )
+    anna = served.person("anna")
+
+    replies = [anna.send(Status()) for _ in range(20)]
+    assert [reply.accepted for reply in replies] == [True] * 5 + [False] * 15
+    assert all("more than 5 commands a second" in reply.text for reply in replies[5:])
+    assert reached == ["anna"] * 5
+
+    assert all(anna.send(Stop()).accepted for _ in range(20))
+    assert served.simulation.supervisor.loops["right"].mode.name == "SAFE"
+    served.gateway._clock.sleep_until(10.0)
+    until(lambda: "anna: 15 messages, over the rate limit" in served.events())
+
+
+def test_clients_come_back_to_a_new_gateway_and_a_key_revoked_meanwhile_does_not(served):
+    anna, bob = served.person("anna"), served.person("bob")
+    assert anna.send(TakeOver()).accepted
+    assert bob.send(Status()).accepted
+    served.follow(lambda t: t.commander == "anna", client=bob)
+
+    served.stop_gateway()
+    revoke_key(served.rig, "anna")
+    served.start_gateway()
+
+    assert served.follow(lambda t: t.commander == "", client=bob)
+    assert bob.send(Hold()).text  # from the supervisor: there is nothing to hold
+    assert "the key anna was revoked or changed" in served.events()
+    with pytest.raises(ConnectionError, match="does not let the key anna in"):
+        anna.send(Stop(), timeout_s=0.5)
+
+
+def test_a_report_of_keys_takes_the_instrument_from_nobody_else(served, say):
+    anna = AllowedKey(name="anna", role="commander", public="x" * 40)
+    assert served.client.send(TakeOver()).accepted
+    say(msgspec.msgpack.encode(Report(keys=[anna], told=[("info", "one key")])))
+    say(msgspec.msgpack.encode(Report(keys=[], told=[])))
+
+    until(lambda: "the key anna was revoked or changed" in served.events())
+    assert "one key" in served.events()
+    assert served.follow(lambda t: "@" in t.commander)
+
+
+HANGING = """
+import sys, time
+from fitctl.cli import main
+from fitctl.service import gateway, keyed_door
+
+gateway._HUNG_S = 2
+keyed_door.KeyedDoor.admit = lambda *_: time.sleep(600)
+main(sys.argv[1:])
+"""
+
+
+def test_a_gateway_that_hangs_is_ended_by_its_alarm(tmp_path):
+    rig = rig_in(tmp_path, "service.tcp_address=127.0.0.1")
+    new_key(rig, "anna", "commander", "", tmp_path / "anna.key.toml")
+    settings = ("tcp_address", "folder", "keys_folder", "command_port", "telemetry_port")
+    given = [f"--set=service.{name}={getattr(rig.service, name)}" for name in settings]
+
+    done = subprocess.run(
+        [sys.executable, "-c", HANGING, "gateway", *given],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+    assert done.returncode == -signal.SIGALRM
+    assert not done.stderr
+
+
+# ---------------------------------------------------------------- ports
+
+
+def test_a_port_that_is_about_to_be_free_is_waited_for(tmp_path):
+    rig = rig_in(tmp_path, "service.tcp_address=127.0.0.1")
+    with socket.socket() as before_us:
+        before_us.bind(("127.0.0.1", rig.service.telemetry_port))
+        before_us.listen()
+        threading.Timer(0.2, before_us.close).start()
+
+        check_keyed_door(rig)
+
+
+@pytest.mark.parametrize("address", ["192.0.2.1", "2001:db8::1"])
+def test_an_address_that_is_not_ours_is_named(tmp_path, address):
+    rig = rig_in(tmp_path, f"service.tcp_address={address}")
+
+    with pytest.raises(
+        ConfigError, match=rf"service\.tcp_address: {address}, ports .*choose others"
+    ):
+        check_keyed_door(rig)
+
+
+def test_without_an_address_there_are_neither_ports_nor_keys(tmp_path):
+    check_keyed_door(rig_in(tmp_path))
+
+    assert not (tmp_path / "keys").exists()

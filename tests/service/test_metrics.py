@@ -1,0 +1,172 @@
+"""Metrics as Prometheus meets them: a real scrape, read by its own parser."""
+
+import math
+import socket
+import threading
+import time
+import urllib.request
+
+import msgspec
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from fitctl.config import ConfigError
+from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.service.metrics import HOST, InstrumentCollector, serve_metrics
+from tests.tui.fake import WALL_MINUS_MONOTONIC_S, FakeSupervisor
+
+
+class Line:
+    """A client whose messages the test gives."""
+
+    def __init__(self):
+        self.messages = []
+        self.empty = threading.Event()
+
+    def receive(self, timeout_s):
+        if self.messages:
+            message = self.messages.pop(0)
+            if isinstance(message, Exception):
+                raise message
+            return message
+        self.empty.set()
+        time.sleep(0.002)
+        return None
+
+
+class Served:
+    """Metrics on a free port, fed by a :class:`Line`."""
+
+    def __init__(self):
+        with socket.socket() as free:
+            free.bind((HOST, 0))
+            self.port = free.getsockname()[1]
+        self.line = Line()
+        self.stop = threading.Event()
+        self.thread = threading.Thread(
+            target=serve_metrics, args=(self.line, self.port, "fit-mock", self.stop)
+        )
+        self.thread.start()
+        assert self.line.empty.wait(10)  # it is asked only once the port is open
+
+    def tell(self, *messages):
+        self.line.messages.extend(messages)
+        self.line.empty.clear()
+        assert self.line.empty.wait(10)
+
+    def scrape(self):
+        """Samples by name and labels, the labels as a set of pairs."""
+        url = f"http://{HOST}:{self.port}/metrics"
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            text = answer.read().decode()
+        return {
+            (sample.name, frozenset(sample.labels.items())): sample.value
+            for family in text_string_to_metric_families(text)
+            for sample in family.samples
+        }
+
+    def close(self):
+        self.stop.set()
+        self.thread.join(10)
+        assert not self.thread.is_alive()
+
+
+@pytest.fixture
+def served():
+    served = Served()
+    yield served
+    served.close()
+
+
+def of(name, **labels):
+    return name, frozenset(labels.items())
+
+
+def test_nothing_is_told_of_an_instrument_that_was_never_heard(served):
+    assert served.scrape() == {of("fitctl_up"): 0.0}
+
+
+def test_a_scrape_tells_mode_devices_and_recorder(served):
+    message = FakeSupervisor().message()
+    served.tell(message)
+    seen = served.scrape()
+
+    assert seen[of("fitctl_up")] == seen[of("fitctl_well")] == 1
+    assert seen[of("fitctl_mode", loop="right", mode="VERNIER")] == 1
+    assert sum(value for (name, _), value in seen.items() if name == "fitctl_mode") == 1
+    since_s = message.loops[0].since_s + WALL_MINUS_MONOTONIC_S
+    assert seen[of("fitctl_mode_since_timestamp_seconds", loop="right")] == since_s
+    for device in message.devices:
+        assert seen[of("fitctl_device_state", device=device.device, state=device.state)] == 1
+    assert seen[of("fitctl_log_records_total")] == message.recorder.records
+    assert seen[of("fitctl_stack_volts", loop="right", stack="2")] == message.piezo[0].stack2_v
+
+
+def test_the_rms_of_any_time_can_be_had_from_two_counters(served):
+    messages = FakeSupervisor(error_px=0.05).messages(100)
+    served.tell(*messages)
+    seen = served.scrape()
+
+    errors = [tick.error_az_px for message in messages for tick in message.ticks]
+    squares = seen[of("fitctl_error_pixels_squared_total", loop="right", axis="az")]
+    ticks = seen[of("fitctl_star_ticks_total", loop="right")]
+    assert ticks == len(errors)
+    rms_px = math.sqrt(sum(error**2 for error in errors) / len(errors))
+    assert math.sqrt(squares / ticks) == pytest.approx(rms_px, rel=1e-9)
+
+
+def test_a_second_of_timing_counts_once_however_often_it_is_sent(served):
+    message = FakeSupervisor().message()
+    served.tell(message, msgspec.structs.replace(message, sequence=2))
+
+    seen = served.scrape()[of("fitctl_servo_periods_total", loop="right")]
+
+    assert seen == message.timing[0].servo_periods > 0
+
+
+def test_what_is_tripped_lost_or_missed_is_counted(served):
+    supervisor = FakeSupervisor()
+    first = supervisor.message()
+    supervisor.messages(3)  # that never come
+    supervisor.records_lost = 12
+    supervisor.interlocks = [
+        TrippedInterlock(name="fsm_edge", since_s=0, action="warn", reset="itself", reason="")
+    ]
+    served.tell(first, supervisor.message())
+    seen = served.scrape()
+
+    assert seen[of("fitctl_telemetry_missed_total")] == 3
+    assert seen[of("fitctl_records_lost_total")] == 12
+    queues = {dict(labels)["queue"] for name, labels in seen if name == "fitctl_unsent_total"}
+    assert queues == {"ticks", "events", "mode_changes", "replies"}
+    assert seen[of("fitctl_interlocks_tripped", loop="right")] == 1
+    assert (
+        seen[of("fitctl_interlock_tripped", loop="right", interlock="fsm_edge", action="warn")] == 1
+    )
+    assert seen[of("fitctl_well")] == 0
+    told = {event.severity for event in first.events}
+    assert all(seen[of("fitctl_events_total", severity=severity)] for severity in told)
+
+
+def test_an_instrument_that_falls_silent_is_not_told_as_it_was():
+    collector = InstrumentCollector()
+    collector.accept(FakeSupervisor().message(), time.monotonic() - 60.0)
+
+    (up,) = collector.collect()
+
+    assert up.samples[0].value == 0
+
+
+def test_a_message_that_cannot_be_read_ends_nothing(served):
+    served.tell(ConnectionError("of another version"), FakeSupervisor().message())
+
+    assert served.scrape()[of("fitctl_up")] == 1
+
+
+def test_a_taken_port_is_told_in_one_line():
+    with socket.socket() as taken:
+        taken.bind((HOST, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=rf"service.metrics_port: {HOST}:{port}: .*another"):
+            serve_metrics(Line(), port, "fit-mock", threading.Event())
