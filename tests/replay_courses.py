@@ -137,11 +137,11 @@ def interlocks(simulation):
         ("recorder_backlog_fraction", 0.9),
         ("recorder_backlog_fraction", 0.0),
     ):
-        supervisor.measured(quantity, value)
+        supervisor.report_quantity(quantity, value)
         simulation.run(0.5)
     assert simulation.command(Reset(name="recorder_behind")).accepted
     simulation.run(0.5)
-    supervisor.measured("clock_step_s", 9.0)
+    supervisor.report_quantity("clock_step_s", 9.0)
     simulation.run(0.5)
 
 

@@ -64,15 +64,15 @@ class Experiments:
         offset_px = channel_values(motions.drives, SIDEROSTAT, now_s - motions.start_s)
         return motions.held_rad + offset_px / self._motor_px_per_rad
 
-    def note_injections(self, stages: Stages) -> None:
+    def record_injections(self, stages: Stages) -> None:
         """Log what was written to the D/A since last asked."""
-        for time_s, stack_v in stages.take_injections():
+        for time_s, stack_v in stages.drain_injections():
             self._report_injection(time_s, stack_v)
 
     def end(self, stages: Stages) -> Floats | None:
         """Write no more; where the siderostat was held before, shape (2,), if an experiment was under way."""
         stages.injector.end()
-        self.note_injections(stages)
+        self.record_injections(stages)
         motions, self._motions = self._motions, None
         return None if motions is None else motions.held_rad
 

@@ -37,7 +37,7 @@ class Following:
         """Count anew."""
         self.lost = self.in_reach = self.out_of_reach = 0
 
-    def judge(
+    def evaluate(
         self, mode: Mode, star: Star | None, target_px: NDArray[np.float64]
     ) -> Finding | None:
         """What a frame showed, if it leads to another mode; `target_px` has shape (2,)."""

@@ -28,11 +28,11 @@ from fitctl.logging.records import (
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
 from fitctl.loop.interlocks import Interlocks
-from fitctl.loop.observation import Seen
+from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.quantities import Quantities, places
 from fitctl.loop.search import Search
-from fitctl.loop.star_finder import Sighting
+from fitctl.loop.star_finder import StarFinder
 from fitctl.loop.tick_record import TickRecords, TickTimes
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import (
@@ -93,23 +93,23 @@ class StellarLoop:
         self._report = report
         scale = scales(rig, loop)
         self._period_s = rig.camera.period_s
-        self.sighting = Sighting(rig, name, self.target_px, self._event)
-        self.search = Search(rig, name, self.sighting.estimator)
+        self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
+        self.search = Search(rig, name, self.star_finder.estimator)
         self.following = Following(loop, scale)
         self.pointing = Pointing(rig, name, self.target_px)
         self.stages = Stages(rig, name, servo, dac, clock)
         self._experiments = Experiments(name, scale.motor_px_per_rad, report)
         self._tick_records = TickRecords(rig, name)
         self._flattened = False
-        self.measured = Quantities(rig, name)
+        self.quantities = Quantities(rig, name)
         self.interlocks = Interlocks(rig.interlocks, places(rig, name))
-        self._laws: dict[Mode, Callable[[Seen], None]] = {
+        self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
             Mode.STANDBY: self._stand_by,
             Mode.ACQUISITION: self._search,
             Mode.COARSE: self._pull_in,
             Mode.VERNIER: self._hold_star,
-            Mode.EXPERIMENT: self._move_as_told,
+            Mode.EXPERIMENT: self._run_experiment,
             Mode.SAFE: self._rest,
         }
 
@@ -117,88 +117,97 @@ class StellarLoop:
 
     def tick(self, frame: Frame | None, frames_lost: int) -> Tick:
         """One tick, with the newest frame or without one."""
-        servo = self.servo.look()
+        servo = self.servo.read_state()
         started_s = self._clock.now_s()
-        self._experiments.note_injections(self.stages)
-        seen = self._sense(frame, servo, started_s)
+        self._experiments.record_injections(self.stages)
+        observation = self._sense(frame, servo, started_s)
         sensed_s = self._clock.now_s()
-        self._judge(frame, seen)
-        self._judge_interlocks(frame, seen)
-        self._move(frame, seen)
+        self._evaluate_findings(frame, observation)
+        self._evaluate_interlocks(frame, observation)
+        self._move(frame, observation)
         decided_s = self._clock.now_s()
         self._write()
         times = TickTimes(sensed_s, decided_s, self._clock.now_s())
         tick = self._tick_records.make(
-            self.mode, frame, frames_lost, seen, self.stages, self.pointing, self.search, times
+            self.mode,
+            frame,
+            frames_lost,
+            observation,
+            self.stages,
+            self.pointing,
+            self.search,
+            times,
         )
-        self.measured.of_tick(tick.compute_s, tick.time_s)
+        self.quantities.record_tick(tick.compute_s, tick.time_s)
         return tick
 
-    def _move(self, frame: Frame | None, seen: Seen) -> None:
+    def _move(self, frame: Frame | None, observation: Observation) -> None:
         """By the mode's law, unless an interlock holds or flattens."""
         action = self.interlocks.action if self.mode in TRACKING else None
         if action == "flatten":
             self.stages.mirror_to_bias()
         elif self._flattened and self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.stages, seen.motor_rad)
+            self.pointing.start_pair(self.stages, observation.motor_rad)
         self._flattened = action == "flatten"
         # Without a frame to track by, the stages wait where they are.
         waits = frame is None and self.mode in TRACKING
         if action not in {"hold", "flatten"} and not waits:
-            self._laws[self.mode](seen)
+            self._laws[self.mode](observation)
 
-    def _sense(self, frame: Frame | None, servo: ServoState, now_s: float) -> Seen:
+    def _sense(self, frame: Frame | None, servo: ServoState, now_s: float) -> Observation:
         """What a frame shows belongs to where the stages were when it was exposed."""
         if frame is None:
-            return Seen(None, self.stages.mirror_now_rad, servo.position_rad, servo, now_s)
+            return Observation(None, self.stages.mirror_now_rad, servo.position_rad, servo, now_s)
         motor_rad = self.servo.position_at(frame.mid_exposure_s)
         mirror_rad = self.stages.mirror_at(frame.mid_exposure_s)
         star = self._find(frame, mirror_rad, motor_rad)
-        return Seen(star, mirror_rad, motor_rad, servo, now_s)
+        return Observation(star, mirror_rad, motor_rad, servo, now_s)
 
     def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
-        if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
+        if self.mode is Mode.ACQUISITION and not self.search.has_arrived(motor_rad):
             return None  # what is seen on the way is another star
         follows = self.mode in FOLLOWING and self.following.lost == 0
-        return self.sighting.find(frame.image, self.mode, motor_rad, mirror_rad, follows=follows)
+        return self.star_finder.find(frame.image, self.mode, motor_rad, mirror_rad, follows=follows)
 
-    def _judge(self, frame: Frame | None, seen: Seen) -> None:
+    def _evaluate_findings(self, frame: Frame | None, observation: Observation) -> None:
         """Errors of devices and findings: what leads to another mode."""
-        if seen.servo.fault is not None:
-            self.device_failed("siderostat", seen.servo.fault)
+        if observation.servo.fault is not None:
+            self.device_failed("siderostat", observation.servo.fault)
         elif self.mode is Mode.EXPERIMENT and self.stages.injector.fault is not None:
             self.stages.ready = False
             self.device_failed("injector", self.stages.injector.fault)
-        elif frame is not None and (found := self._found(frame, seen.star)) is not None:
+        elif (
+            frame is not None and (found := self._find_trigger(frame, observation.star)) is not None
+        ):
             if found.trigger is None:
-                self._event("warning", found.reason)
+                self._report_event("warning", found.reason)
             else:
                 self.fire(found.trigger, found.reason)
 
-    def _found(self, frame: Frame, star: Star | None) -> Finding | None:
+    def _find_trigger(self, frame: Frame, star: Star | None) -> Finding | None:
         if self.mode is Mode.ACQUISITION:
-            return self.search.judge(star, frame.mid_exposure_s)
+            return self.search.evaluate(star, frame.mid_exposure_s)
         if self.mode in FOLLOWING:
-            return self.following.judge(self.mode, star, self.pointing.command_px)
+            return self.following.evaluate(self.mode, star, self.pointing.command_px)
         return None
 
-    def _judge_interlocks(self, frame: Frame | None, seen: Seen) -> None:
+    def _evaluate_interlocks(self, frame: Frame | None, observation: Observation) -> None:
         """Measure, judge by the rig file's table, and tell; what holds or flattens, :meth:`_move` asks for."""
-        now_s, measured, interlocks = seen.now_s, self.measured, self.interlocks
+        now_s, measured, interlocks = observation.now_s, self.quantities, self.interlocks
         if frame is not None:
-            measured.of_frame(frame, seen.star, now_s)
-        measured.of_stages(seen.servo, self.stages, now_s)
-        for trip, over in interlocks.judge(self.mode.name, now_s, measured.readings):
+            measured.record_frame(frame, observation.star, now_s)
+        measured.record_stages(observation.servo, self.stages, now_s)
+        for trip, over in interlocks.evaluate(self.mode.name, now_s, measured.readings):
             if over:
-                self._event("info", f"interlock {trip.name} is over")
+                self._report_event("info", f"interlock {trip.name} is over")
             elif trip.action == "safe":
                 self.fail(trip.reason)
             else:
-                self._event("warning", f"{trip.reason} ({trip.action})")
+                self._report_event("warning", f"{trip.reason} ({trip.action})")
         if interlocks.tripped:
-            self._obey_interlocks()
+            self._enforce_interlocks()
 
-    def _obey_interlocks(self) -> None:
+    def _enforce_interlocks(self) -> None:
         """What is tripped stays in force, whatever mode the loop is put in."""
         action = self.interlocks.action
         reason = next(trip.reason for trip in self.interlocks.tripped if trip.action == action)
@@ -210,9 +219,9 @@ class StellarLoop:
     def reset_interlock(self, name: str) -> str:
         """Let one go by hand; why not, if it cannot be."""
         now_s = self._clock.now_s()
-        why_not = self.interlocks.reset(name, now_s, self.measured.readings)
+        why_not = self.interlocks.reset(name, now_s, self.quantities.readings)
         if not why_not:
-            self._event("info", f"interlock {name} is reset by hand")
+            self._report_event("info", f"interlock {name} is reset by hand")
         return why_not
 
     # ------------------------------------------------------------ modes
@@ -241,13 +250,15 @@ class StellarLoop:
             siderostat_el_rad=motor_el_rad,
         )
         self._report(self.last_change)
-        self._event(_SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}")
+        self._report_event(
+            _SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}"
+        )
         return True
 
     def fail(self, reason: str) -> None:
         """Something is wrong: SAFE, or, where that changes nothing, an event; the same is told once."""
         if not self.fire(Trigger.FAULT, reason) and reason != self._last_failure:
-            self._event("error", reason)
+            self._report_event("error", reason)
         self._last_failure = reason
 
     def device_failed(self, device: FailingDevice, error: Exception) -> None:
@@ -264,7 +275,7 @@ class StellarLoop:
             self.servo.stop()
         elif self.mode is Mode.STANDBY:
             self.servo.hold(motor_rad)
-            self.stages.siderostat_held()
+            self.stages.keep_siderostat()
         elif self.mode is Mode.ACQUISITION:
             self._start_search(motor_rad)
         elif self.mode is Mode.COARSE:
@@ -272,48 +283,48 @@ class StellarLoop:
         elif self.mode is Mode.VERNIER:
             self.pointing.start_pair(self.stages, motor_rad)
 
-    def look_for(self, asked: Acquire) -> None:
+    def configure_search(self, asked: Acquire) -> None:
         """What the next search is to find, and how, as a command asks that was not refused."""
         flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
-        self.sighting.expect_flux(flux_dn)
-        self.measured.star_flux_dn = flux_dn
-        self.search.ask(asked)
+        self.star_finder.expect_flux(flux_dn)
+        self.quantities.star_flux_dn = flux_dn
+        self.search.configure(asked)
 
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""
-        self.sighting.estimator.expect(self.target_px, motor_rad, np.zeros(2))
+        self.star_finder.estimator.expect(self.target_px, motor_rad, np.zeros(2))
         self.search.begin()
 
     # ------------------------------------------------------------ control laws
 
-    def _rest(self, _seen: Seen) -> None:
+    def _rest(self, _observation: Observation) -> None:
         """Mirror back to its bias; the siderostat is held or stopped by its servo."""
         self.stages.mirror_to_bias()
 
-    def _stand_by(self, _seen: Seen) -> None:
+    def _stand_by(self, _observation: Observation) -> None:
         """Both stages rest where the operator has put them."""
         self.stages.mirror_to_rest()
 
-    def _search(self, seen: Seen) -> None:
+    def _search(self, observation: Observation) -> None:
         self.stages.mirror_to_rest()
-        self.stages.siderostat_to(self.search.advance(self._period_s, seen.motor_rad))
+        self.stages.siderostat_to(self.search.advance(self._period_s, observation.motor_rad))
 
-    def _pull_in(self, seen: Seen) -> None:
+    def _pull_in(self, observation: Observation) -> None:
         self.stages.mirror_to_rest()
-        step_rad = self.pointing.step_coarse(seen, self.target_px)
+        step_rad = self.pointing.step_coarse(observation, self.target_px)
         if step_rad is not None:
             self._siderostat_by(step_rad)
 
-    def _hold_star(self, seen: Seen) -> None:
-        command = self.pointing.step_pair(seen, self.target_px)
+    def _hold_star(self, observation: Observation) -> None:
+        command = self.pointing.step_pair(observation, self.target_px)
         if command is not None:
             self._siderostat_by(command.motor_step_rad)
             self.stages.mirror_to(
                 command.mirror_rad, hysteresis_inverse=self.pointing.design.hysteresis_inverse
             )
 
-    def _move_as_told(self, seen: Seen) -> None:
-        setpoint_rad = self._experiments.setpoint_rad(seen.now_s)
+    def _run_experiment(self, observation: Observation) -> None:
+        setpoint_rad = self._experiments.setpoint_rad(observation.now_s)
         if setpoint_rad is None:
             self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
         else:
@@ -346,7 +357,7 @@ class StellarLoop:
                 siderostat_el_rad=el_rad,
             )
         )
-        self._event("info", f"controller {before} -> {design.name}")
+        self._report_event("info", f"controller {before} -> {design.name}")
 
     def start_experiment(self, name: str, drives: list[Drive]) -> bool:
         """Move the stages as told, from the next tick on; False where this mode has no star to watch."""
@@ -371,11 +382,11 @@ class StellarLoop:
         """
         self.stages.start_from(stack_v)
         self._last_failure = ""
-        self.measured.begin()
+        self.quantities.begin()
         self.interlocks.reset_all(self._clock.now_s())
         if self.servo.encoders_jumped:
-            self.sighting.estimator.forget()
-            self._event(
+            self.star_finder.estimator.forget()
+            self._report_event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
             )
 
@@ -388,7 +399,7 @@ class StellarLoop:
         except DeviceError as error:
             self.device_failed("D/A", error)
 
-    def _event(self, severity: Severity, message: str) -> None:
+    def _report_event(self, severity: Severity, message: str) -> None:
         self._report(
             Event(
                 time_s=self._clock.now_s(),

@@ -27,7 +27,7 @@ def loop_state(rig: Rig, loop: StellarLoop, now_s: float) -> LoopState:
         last_change=loop.last_change,
         interlocks=list(loop.interlocks.tripped),
         limits=_limits(rig, loop.name),
-        watched=loop.interlocks.watched(now_s, loop.measured.readings),
+        watched=loop.interlocks.watched(now_s, loop.quantities.readings),
         bias_offset_urad=(az_urad, el_urad),
         search_centre_sky_arcsec=tuple(centre_sky_arcsec) if mode is Mode.ACQUISITION else None,
         other_spots=[

@@ -11,7 +11,7 @@ from fitctl.controllers.centroid import Star
 from fitctl.stages.servo import ServoState
 
 
-class Seen(NamedTuple):
+class Observation(NamedTuple):
     """One tick's view of star and stages.
 
     Attributes

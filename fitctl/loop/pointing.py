@@ -9,7 +9,7 @@ from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design, Measurement, Pair, PairCommand
 from fitctl.controllers.prefilter import Prefilter
-from fitctl.loop.observation import Seen
+from fitctl.loop.observation import Observation
 from fitctl.model.optics import scales
 from fitctl.stages.stages import Stages
 
@@ -65,18 +65,20 @@ class Pointing:
         held_rad = stages.mirror_held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
         self._pair.start(held_rad, motor_rad, self.command_px)
 
-    def step_coarse(self, seen: Seen, target_px: Floats) -> Floats | None:
-        """One frame: the step of the motors' set-point, shape (2,); None where no star is seen."""
+    def step_coarse(self, observation: Observation, target_px: Floats) -> Floats | None:
+        """One frame: the step of the motors' set-point, shape (2,); None where no star is visible."""
         command_px = self._prefilter.step(target_px)
-        if seen.star is None:
+        if observation.star is None:
             return None
-        error_px = seen.star.position_px - command_px
+        error_px = observation.star.position_px - command_px
         return -self._coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_turn)
 
-    def step_pair(self, seen: Seen, target_px: Floats) -> PairCommand | None:
-        """One frame: what both stages shall do; None where no star is seen."""
+    def step_pair(self, observation: Observation, target_px: Floats) -> PairCommand | None:
+        """One frame: what both stages shall do; None where no star is visible."""
         command_px = self._prefilter.step(target_px)
-        if seen.star is None:
+        if observation.star is None:
             return None
-        error_px = seen.star.position_px - command_px
-        return self._pair.step(Measurement(error_px, command_px, seen.mirror_rad, seen.motor_rad))
+        error_px = observation.star.position_px - command_px
+        return self._pair.step(
+            Measurement(error_px, command_px, observation.mirror_rad, observation.motor_rad)
+        )

@@ -45,7 +45,7 @@ class Quantities:
         """Devices were opened anew: what was measured before says nothing about what comes now."""
         self._exposed_s = self._read = None
 
-    def of_frame(self, frame: Frame, star: Star | None, now_s: float) -> None:
+    def record_frame(self, frame: Frame, star: Star | None, now_s: float) -> None:
         """What a frame tells."""
         readings, exposed_s = self.readings, frame.mid_exposure_s
         late_s = frame.received_s - exposed_s - self._delay_s
@@ -57,7 +57,7 @@ class Quantities:
         if star is not None:
             readings["star_flux_fraction"] = (star.flux_dn / self.star_flux_dn, now_s, "")
 
-    def of_stages(self, servo: ServoState, stages: Stages, now_s: float) -> None:
+    def record_stages(self, servo: ServoState, stages: Stages, now_s: float) -> None:
         """Where mirror and siderostat are, and how their devices are."""
         readings = self.readings
         az_rad, el_rad = stages.mirror_rad.tolist()
@@ -92,19 +92,19 @@ class Quantities:
                 "",
             )
 
-    def of_tick(self, compute_s: float, now_s: float) -> None:
+    def record_tick(self, compute_s: float, now_s: float) -> None:
         """How long the tick took; judged at the next."""
         self.readings["tick_period_fraction"] = (compute_s / self._period_s, now_s, "")
 
-    def of_piezo_error(self, told: str, now_s: float) -> None:
+    def record_piezo_error(self, error: str, now_s: float) -> None:
         """Whether the piezo amplifier has an error, and what it says."""
-        self.readings["piezo_fault"] = (1.0 if told else 0.0, now_s, told)
+        self.readings["piezo_fault"] = (1.0 if error else 0.0, now_s, error)
 
-    def of_piezo(self, record: PiezoReading) -> None:
+    def record_piezo(self, record: PiezoReading) -> None:
         """What the piezo amplifier said."""
         self.put("piezo_limit_error_v", record.limit_v - self._limit_v, record.time_s)
 
-    def of_timing(self, record: LoopTiming) -> None:
+    def record_timing(self, record: LoopTiming) -> None:
         """Whether the servo kept its pace, where it has a pace of its own."""
         periods = record.servo_periods + record.servo_skipped
         if periods:

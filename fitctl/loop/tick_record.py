@@ -8,7 +8,7 @@ from typing import NamedTuple
 from fitctl.config import Rig
 from fitctl.drivers.interface import Frame, ServoReading
 from fitctl.logging.records import Tick
-from fitctl.loop.observation import Seen
+from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.search import Search
 from fitctl.messages.modes import Mode
@@ -47,7 +47,7 @@ class TickRecords:
         mode: Mode,
         frame: Frame | None,
         frames_lost: int,
-        seen: Seen,
+        observation: Observation,
         stages: Stages,
         pointing: Pointing,
         search: Search,
@@ -55,14 +55,18 @@ class TickRecords:
     ) -> Tick:
         """What a tick went by, and what it did."""
         sensed_s, decided_s, done_s = times
-        star, servo, sky_arcsec_per_rad = seen.star, seen.servo, self._sky_arcsec_per_rad
+        star, servo, sky_arcsec_per_rad = (
+            observation.star,
+            observation.servo,
+            self._sky_arcsec_per_rad,
+        )
         read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or _NO_READING
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
         star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
         target_az_px, target_el_px = pointing.command_px.tolist()
         fsm_az_rad, fsm_el_rad = stages.mirror_rad.tolist()
         stack1_v, stack2_v, stack3_v = stages.stack_v.tolist()
-        motor_az_rad, motor_el_rad = seen.motor_rad.tolist()
+        motor_az_rad, motor_el_rad = observation.motor_rad.tolist()
         setpoint_az_rad, setpoint_el_rad = stages.setpoint_rad.tolist()
         return Tick(
             time_s=done_s,
@@ -72,7 +76,7 @@ class TickRecords:
             mode_number=int(mode),
             mid_exposure_s=exposed_s,
             frame_age_s=math.nan if frame is None else frame.received_s - exposed_s,
-            compute_s=done_s - seen.now_s,
+            compute_s=done_s - observation.now_s,
             late=frame is not None and done_s - exposed_s > self._due_after_s,
             frames_lost=frames_lost,
             star_visible=star is not None,
@@ -106,6 +110,6 @@ class TickRecords:
             encoder_read_s=read_s,
             encoder_az_rad=encoder_az_rad,
             encoder_el_rad=encoder_el_rad,
-            sense_s=sensed_s - seen.now_s,
+            sense_s=sensed_s - observation.now_s,
             decide_s=decided_s - sensed_s,
         )

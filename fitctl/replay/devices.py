@@ -43,18 +43,18 @@ _NOBODY = DeviceIdentity("fitctl", "log", "", "")
 
 
 class LoggedClock:
-    """A clock that is told the time; nobody waits by it."""
+    """A clock that stands at the time last set; nobody waits by it."""
 
     def __init__(self) -> None:
         self._now_s = 0.0
 
-    def tell(self, now_s: float) -> None:
+    def set(self, now_s: float) -> None:
         """It is this late; what is not a number changes nothing."""
         if not math.isnan(now_s):
             self._now_s = now_s
 
     def now_s(self) -> float:
-        """What it was told."""
+        """As last set."""
         return self._now_s
 
     def sleep_until(self, deadline_s: float) -> None:
@@ -70,7 +70,8 @@ def logged_error(kind: str, text: str) -> DeviceError:
 def failures(step: LoggedStep, loop: str) -> dict[str, DeviceError]:
     """By device, what failed in a step."""
     return {
-        told.device: logged_error(told.kind, told.error) for told in step.of(DeviceFailure, loop)
+        message.device: logged_error(message.kind, message.error)
+        for message in step.of(DeviceFailure, loop)
     }
 
 
@@ -82,7 +83,7 @@ class NoDevice:
         return _NOBODY
 
     def close(self) -> None:
-        """Nothing to disconnect; the same for whatever else a device can be told."""
+        """Nothing to disconnect; the same for every other command."""
 
     start = stop = enable = disable = reset_fault = close
 
@@ -111,7 +112,7 @@ class LoggedCamera(NoDevice):
         self._frame: Frame | None = None
         self._error: DeviceError | None = None
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What :meth:`next_frame` gives next."""
         self._error = next(
             (errors[CAMERA] for loop in step.ticks if CAMERA in (errors := failures(step, loop))),
@@ -145,20 +146,20 @@ class LoggedServo(SiderostatServo):
     name : str
     rig : Rig
     clock : LoggedClock
-        Told when a tick begins.
+        Set when a tick begins.
     """
 
     def __init__(self, name: str, rig: Rig, clock: LoggedClock) -> None:
         super().__init__(name, rig.loops[name], NoDevice(), clock, rig.camera.period_s)
-        self._told = clock
+        self._logged_clock = clock
         self._tick: Any = None
         self._ticked = False
         self._moments: deque[Floats] = deque()
         self._timing = ServoTiming([], 0, 0)
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What is known of it in a step."""
-        if self._ticked:  # else what was told may still be to come
+        if self._ticked:  # else what was logged may still be to come
             self._moments.clear()
         self._ticked = self.name in step.ticks
         self._tick = step.ticks.get(self.name, self._tick)
@@ -193,12 +194,12 @@ class LoggedServo(SiderostatServo):
         """As the tick had it, shape (2,)."""
         return _az_el(self._tick, "siderostat")
 
-    def look(self) -> ServoState:
+    def read_state(self) -> ServoState:
         """As the tick found it; its time begins here."""
         tick = self._tick
         if tick is None:
-            return super().look()
-        self._told.tell(tick.time_s - tick.compute_s)  # exact, as these are close together
+            return super().read_state()
+        self._logged_clock.set(tick.time_s - tick.compute_s)  # exact, as these are close together
         read = not math.isnan(tick.encoder_read_s)
         if read and (not self._history or self._history[-1].time_s != tick.encoder_read_s):
             position_rad = (tick.encoder_az_rad, tick.encoder_el_rad)
@@ -221,7 +222,7 @@ class LoggedServo(SiderostatServo):
     def close(self) -> None:
         """Nothing to disconnect."""
 
-    def take_timing(self) -> ServoTiming:
+    def drain_timing(self) -> ServoTiming:
         """As the log has it of this second."""
         return self._timing
 
@@ -241,12 +242,12 @@ class LoggedStages(Stages):
         self._name = name
         self._tick: Any = None
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What is known of them in a step."""
         self._tick = step.ticks.get(self._name)
         failed = failures(step, self._name)
-        self._written.tell(self._tick, failed.get("D/A"))
-        self.injector.tell(step, self._name)
+        self._written.load_tick(self._tick, failed.get("D/A"))
+        self.injector.load_step(step, self._name)
         self.injector.fault = failed.get("injector", self.injector.fault)
 
     @property
@@ -278,7 +279,7 @@ class LoggedDac(NoDevice):
         self._written_s = math.nan
         self._error: DeviceError | None = None
 
-    def tell(self, tick: Any, error: DeviceError | None) -> None:
+    def load_tick(self, tick: Any, error: DeviceError | None) -> None:
         """How the next write ends."""
         self._written_s = math.nan if tick is None else tick.fsm_written_s
         self._error = error
@@ -287,7 +288,7 @@ class LoggedDac(NoDevice):
         """At the time of the log."""
         if self._error is not None:
             raise self._error
-        self._clock.tell(self._written_s)
+        self._clock.set(self._written_s)
 
 
 class LoggedInjector(Injector):
@@ -297,13 +298,15 @@ class LoggedInjector(Injector):
         super().__init__(dac, clock, np.zeros((3, 2)), 0.0, 0.0)
         self._logged: list[Injection] = []
 
-    def tell(self, step: LoggedStep, loop: str) -> None:
+    def load_step(self, step: LoggedStep, loop: str) -> None:
         """What was written in a step; the first after a start is where the voltages were before."""
         injections = step.of(InjectionRecord, loop)
         skipped = len(step.of(ExperimentStart, loop))
-        self._logged = [Injection(told.time_s, _stacks(told)) for told in injections[skipped:]]
+        self._logged = [
+            Injection(message.time_s, _stacks(message)) for message in injections[skipped:]
+        ]
 
-    def take_written(self) -> list[Injection]:
+    def drain_written(self) -> list[Injection]:
         """What was written since last asked."""
         logged, self._logged = self._logged, []
         return logged
@@ -326,11 +329,11 @@ class LoggedExecutor(Executor):
         self._openings: list[_Waiting] = []
         self._designs: list[tuple[tuple[str, str], _Waiting]] = []
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What ends in a step."""
-        for told in step.of(DevicesOpened):
-            self._opened[told.loop].append(told)
-        self._designed = [(told.loop, told.target) for told in step.of(ControllerChange)]
+        for message in step.of(DevicesOpened):
+            self._opened[message.loop].append(message)
+        self._designed = [(message.loop, message.target) for message in step.of(ControllerChange)]
         self._end_what_ends()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
@@ -347,7 +350,7 @@ class LoggedExecutor(Executor):
             self._designs.append(((loop, controller), waiting))
         elif fn is close_devices:
             future.set_result(None)
-        # What the piezo amplifier answers is told to its watch as the log has it.
+        # What the piezo amplifier answers reaches its watch as the log has it.
         self._end_what_ends()
         return future
 
@@ -364,10 +367,10 @@ class LoggedExecutor(Executor):
 
     def _found(self, loops: Sequence[str]) -> Opened:
         opened = [self._opened[loop].popleft() for loop in loops]
-        for told in opened:
-            if told.error:
-                raise logged_error("DeviceError", told.error)
-        return Opened({}, {told.loop: _stacks(told) for told in opened})
+        for message in opened:
+            if message.error:
+                raise logged_error("DeviceError", message.error)
+        return Opened({}, {message.loop: _stacks(message) for message in opened})
 
 
 def _end(waiting: _Waiting) -> None:

@@ -54,11 +54,11 @@ class CountingBuffer(Generic[T]):
 
     def drain(self) -> list[T]:
         """Take all of them, oldest first."""
-        taken: list[T] = []
+        drained: list[T] = []
         with suppress(IndexError):
             while True:
-                taken.append(self._waiting.popleft())
-        return taken
+                drained.append(self._waiting.popleft())
+        return drained
 
 
 class TelemetryBuffer:
@@ -122,14 +122,14 @@ class TelemetryBuffer:
 
     def recent_events(self) -> list[Event]:
         """The newest that were published, oldest first, as many as one answer may hold."""
-        told: deque[Event] = deque()
+        newest: deque[Event] = deque()
         room_bytes = _REMEMBERED_BYTES
         for event in reversed(self._published):
             room_bytes -= len(msgspec.msgpack.encode(event))
             if room_bytes < 0:
                 break
-            told.appendleft(event)
-        return list(told)
+            newest.appendleft(event)
+        return list(newest)
 
     def losses(self, state: ServiceState, now_s: float) -> Losses:
         """What every queue has let go so far."""

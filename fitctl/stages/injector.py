@@ -86,7 +86,7 @@ class Injector:
         with self._turn:
             pass
 
-    def take_written(self) -> list[Injection]:
+    def drain_written(self) -> list[Injection]:
         """What was written since last asked."""
         return [self._written.popleft() for _ in range(len(self._written))]
 

@@ -153,7 +153,7 @@ class SiderostatServo:
         self.move_to(position_rad)
         self._stopped = False
 
-    def look(self) -> ServoState:
+    def read_state(self) -> ServoState:
         """How it is now; the following error is taken anew from here on."""
         following_rad, self._least_following_rad = self._least_following_rad, math.nan
         try:
@@ -178,19 +178,19 @@ class SiderostatServo:
 
     def open(self) -> DeviceIdentity:
         """Connect, clear a latched fault, read the encoders and enable; the motors stand still."""
-        return self._ask(self._open)
+        return self._request(self._open)
 
     def disable(self) -> None:
         """Take power from the motors, without waiting for it; a failure shows as a fault."""
         if self.opened and self.enabled and not self._disabling:
             self._disabling = True
-            self._post(self._disable)
+            self._queue_request(self._disable)
 
     def close(self) -> None:
         """Disable and disconnect."""
-        self._ask(self._close)
+        self._request(self._close)
 
-    def take_timing(self) -> ServoTiming:
+    def drain_timing(self) -> ServoTiming:
         """Lateness, missed readings and skipped periods since the last call."""
         late = [self.late_s.popleft() for _ in range(len(self.late_s))]
         missed, self._missed_readings = self._missed_readings, 0
@@ -230,7 +230,7 @@ class SiderostatServo:
         if reading is None:
             self._missed_readings += 1
         else:
-            self._take(reading, now_s)
+            self._accept_reading(reading, now_s)
         if now_s - self._timely_s > self._settings.reading_timeout_s:
             raise self._no_reading()
         if reading is None:
@@ -263,7 +263,7 @@ class SiderostatServo:
             return _STILL  # blind motors stand still, and the reference waits for them
         return self._servo.step(self._position_rad)
 
-    def _take(self, reading: ServoReading, now_s: float) -> None:
+    def _accept_reading(self, reading: ServoReading, now_s: float) -> None:
         self._read_s = reading.time_s
         if now_s - reading.time_s <= self._blind_s:
             self._timely_s = now_s
@@ -321,7 +321,7 @@ class SiderostatServo:
         while (reading := self._amplifiers.exchange(_STILL)) is None:
             if self._clock.now_s() > deadline_s:
                 raise self._no_reading()
-        self._take(reading, self._clock.now_s())
+        self._accept_reading(reading, self._clock.now_s())
         az_rad, el_rad = reading.position_rad
         self._servo.reset(reading.position_rad)
         jump_rad = max(abs(az_rad - last_az_rad), abs(el_rad - last_el_rad))
@@ -343,13 +343,13 @@ class SiderostatServo:
         self.opened = self.enabled = False
         self._amplifiers.close()
 
-    def _post(self, action: Callable[[], DeviceIdentity | None]) -> Future:
+    def _queue_request(self, action: Callable[[], DeviceIdentity | None]) -> Future:
         future: Future = Future()
         self._requests.append((action, future))
         return future
 
-    def _ask(self, action: Callable[[], DeviceIdentity | None]) -> DeviceIdentity:
-        future = self._post(action)
+    def _request(self, action: Callable[[], DeviceIdentity | None]) -> DeviceIdentity:
+        future = self._queue_request(action)
         if not self.threaded:
             self.period()
         try:

@@ -112,7 +112,7 @@ class Stages:
         self._mirror.assume(stack_v)
         self.stack_v = self._mirror.stack_v
         self.mirror_rad = self._mirror.angles_rad
-        self.take_told_range()
+        self.drain_commanded_range()
         self.written_s = self._clock.now_s()
         self.ready = True
 
@@ -165,25 +165,25 @@ class Stages:
         self.written_s = self._clock.now_s()
         self.round_trip_s = self.written_s - begun_s
         self._mirror.written(self.stack_v)
-        self._extend_told_range(self.stack_v)
+        self._extend_commanded_range(self.stack_v)
         self._mirror_history.append((self.written_s, self._mirror.angles_rad))
 
-    def take_told_range(self) -> tuple[Floats, Floats]:
+    def drain_commanded_range(self) -> tuple[Floats, Floats]:
         """Lowest and highest voltages, shape (3,) each, that the D/A was told since last asked."""
-        told = self._lowest_v, self._highest_v
+        commanded = self._lowest_v, self._highest_v
         self._lowest_v, self._highest_v = self.stack_v.copy(), self.stack_v.copy()
-        return told
+        return commanded
 
-    def _extend_told_range(self, stack_v: Floats) -> None:
+    def _extend_commanded_range(self, stack_v: Floats) -> None:
         np.minimum(self._lowest_v, stack_v, out=self._lowest_v)
         np.maximum(self._highest_v, stack_v, out=self._highest_v)
 
-    def take_injections(self) -> list[Injection]:
+    def drain_injections(self) -> list[Injection]:
         """What an experiment has written since last asked."""
-        injections = self.injector.take_written()
+        injections = self.injector.drain_written()
         for time_s, stack_v in injections:
             self._mirror.written(stack_v)
-            self._extend_told_range(stack_v)
+            self._extend_commanded_range(stack_v)
             self.stack_v, self.mirror_rad = stack_v, self._mirror.angles_rad
             self._mirror_history.append((time_s, self.mirror_rad))
             self.written_s = time_s
@@ -191,7 +191,7 @@ class Stages:
 
     # ------------------------------------------------------------ siderostat
 
-    def siderostat_held(self) -> None:
+    def keep_siderostat(self) -> None:
         """The servo holds the siderostat where it is."""
         self.setpoint_rad = self._servo.setpoint_rad
         self.asked_fraction = 0.0

@@ -155,7 +155,7 @@ class DeviceJobs:
             loop.start_from(opened.stack_v[name])
             self._piezos[name].begin()
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
-            self._servos[name].take_timing()
+            self._servos[name].drain_timing()
             loop.fire(trigger, "all devices open, checked and enabled")
 
     def _log_opened(self, names: list[str], opened: Opened | None, error: str) -> None:

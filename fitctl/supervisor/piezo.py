@@ -73,22 +73,22 @@ class PiezoWatch:
                 read_piezo, self._piezo, self._loop.name, self._clock
             )
 
-    def judge(self) -> None:
+    def collect(self) -> None:
         """Take its answer, if it has come."""
         answer = self._answer
         if answer is None or not answer.done():
             return
         self._answer = None
-        self.take(answer)
+        self.evaluate(answer)
 
-    def take(self, answer: Future[PiezoReading]) -> None:
+    def evaluate(self, answer: Future[PiezoReading]) -> None:
         """Judge an answer: SAFE where a stack is not as told, or at the second bad one."""
-        error, told_v = answer.exception(), self._loop.stages.take_told_range()
+        error, commanded_v = answer.exception(), self._loop.stages.drain_commanded_range()
         if error is None:
             reading = answer.result()
-            self._loop.measured.of_piezo(reading)
+            self._loop.quantities.record_piezo(reading)
             self._record(reading)
-            error = disagreement(reading, self._settings, *told_v)
+            error = disagreement(reading, self._settings, *commanded_v)
         else:
             self._record(failure_record(self._clock.now_s(), self._loop.name, "piezo", error))
         before, self.error = self.error, "" if error is None else error_text(error)
@@ -144,10 +144,10 @@ def disagreement(
         Of the first stack that is outside its range by more than `follow_tolerance_v`.
     """
     measured_v = (reading.stack1_v, reading.stack2_v, reading.stack3_v)
-    told_v = np.clip(settings.gain * np.array([lowest_v, highest_v]), 0.0, settings.limit_v)
+    commanded_v = np.clip(settings.gain * np.array([lowest_v, highest_v]), 0.0, settings.limit_v)
     tolerance_v = settings.follow_tolerance_v
     for stack, volts in enumerate(measured_v):
-        low_v, high_v = told_v[:, stack]
+        low_v, high_v = commanded_v[:, stack]
         if not low_v - tolerance_v <= volts <= high_v + tolerance_v:
             return DeviceMismatch(
                 "piezo amplifier",

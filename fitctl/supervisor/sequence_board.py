@@ -21,7 +21,7 @@ _WANTED: dict[str, Literal["run", "pause", "stop"]] = {
 
 
 class SequenceBoard:
-    """What the newest sequence told; at most one is under way.
+    """What the newest sequence detail; at most one is under way.
 
     Reports and orders come from the loop's thread; :meth:`status` may be asked from any.
 
@@ -59,7 +59,7 @@ class SequenceBoard:
         self._status = msgspec.structs.replace(
             status, wanted="run" if before is None else before.wanted
         )
-        self._tell_change(before, status)
+        self._report_change(before, status)
         return Reply(accepted=True)
 
     def control(self, action: Literal["pause", "resume", "stop"]) -> Reply:
@@ -73,7 +73,7 @@ class SequenceBoard:
         self._event("info", f"{known.name}: {action}, asked for by the operator")
         return Reply(accepted=True)
 
-    def _tell_change(self, before: SequenceStatus | None, now: SequenceStatus) -> None:
+    def _report_change(self, before: SequenceStatus | None, now: SequenceStatus) -> None:
         if now.last_attempt is not None and (
             before is None or before.last_attempt != now.last_attempt
         ):
@@ -82,8 +82,8 @@ class SequenceBoard:
             self._event("info", f"{now.name} begins, {now.steps} steps")
         elif before.state != now.state:
             severity: Severity = "warning" if now.state in {"failed", "stopped"} else "info"
-            told = f": {now.message}" if now.message else ""
-            self._event(severity, f"{now.name} {now.state}{told}")
+            detail = f": {now.message}" if now.message else ""
+            self._event(severity, f"{now.name} {now.state}{detail}")
 
     def _event(self, severity: Severity, message: str) -> None:
         self._record(

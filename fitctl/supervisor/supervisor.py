@@ -114,7 +114,7 @@ class Supervisor:
         self._record = record
         self._commands: deque[Posted] = deque()
         self._left: deque[AnyRecord] = deque()
-        self._measured: deque[QuantityReading] = deque()
+        self._quantities: deque[QuantityReading] = deque()
         self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
         self.piezos = {
@@ -132,7 +132,7 @@ class Supervisor:
             executor,
             record,
             self._event,
-            self.note,
+            self.report_event,
         )
         self._timing = TimingBook(clock, rig, self._timed)
 
@@ -154,7 +154,7 @@ class Supervisor:
                 self.servos[name].stop()
         self._commands.append(Posted(command, reply, sender, address))
 
-    def note(self, severity: Severity, source: str, message: str) -> None:
+    def report_event(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
         now_s = self._clock.now_s()
         self.leave(Event(time_s=now_s, severity=severity, source=source, message=message))
@@ -163,10 +163,10 @@ class Supervisor:
         """Leave a record for the next step, from any thread."""
         self._left.append(record)
 
-    def measured(self, name: str, value: float) -> None:
+    def report_quantity(self, name: str, value: float) -> None:
         """Leave a quantity of all loops, for their interlocks, for the next step; from any thread."""
         reading = QuantityReading(time_s=self._clock.now_s(), name=name, value=value)
-        self._measured.append(reading)
+        self._quantities.append(reading)
 
     @property
     def periodic(self) -> list[Periodic]:
@@ -180,9 +180,9 @@ class Supervisor:
         frame = self._camera.next_frame()
         self._finish_jobs()
         self._obey_posted()
-        self._take_left()
-        while self._measured:
-            self._take_measured(self._measured.popleft())
+        self._record_left()
+        while self._quantities:
+            self._record_quantity(self._quantities.popleft())
         lost = self._camera.counts.lost if self._camera.ready else 0
         for loop in self.loops.values():
             was_safe = loop.mode is Mode.SAFE
@@ -230,19 +230,19 @@ class Supervisor:
         self.shutdown_wanted = True
         self._device_jobs.close_all()
         self._obey_posted()
-        self._take_left()
+        self._record_left()
 
     def _camera_failed(self, error: DeviceError) -> None:
         for loop in self.loops.values():
             loop.device_failed(CAMERA, error)
 
-    def _take_left(self) -> None:
+    def _record_left(self) -> None:
         while self._left:
             self._record(self._left.popleft())
 
-    def _take_measured(self, reading: QuantityReading) -> None:
+    def _record_quantity(self, reading: QuantityReading) -> None:
         for loop in self.loops.values():
-            loop.measured.put(reading.name, reading.value, reading.time_s)
+            loop.quantities.put(reading.name, reading.value, reading.time_s)
         self._record(reading)
 
     # ------------------------------------------------------------ commands
@@ -312,7 +312,7 @@ class Supervisor:
                 self._device_jobs.abandon(usable)
             for name in usable:
                 if isinstance(command, Acquire):
-                    self.loops[name].look_for(command)
+                    self.loops[name].configure_search(command)
                 self.loops[name].fire(trigger, "operator")
         return Reply(accepted=True)
 
@@ -351,7 +351,7 @@ class Supervisor:
             design = self._designs.popleft()
             design.done(design.future)
         for piezo in self.piezos.values():
-            piezo.judge()
+            piezo.collect()
 
     # ------------------------------------------------------------ once a second
 
@@ -370,12 +370,12 @@ class Supervisor:
         self._record(camera_health(self.rig, camera.counts, camera.well, identities, now_s))
         for name, loop in self.loops.items():
             trouble = self.piezos[name].error
-            loop.measured.of_piezo_error(trouble, now_s)
+            loop.quantities.record_piezo_error(trouble, now_s)
             for row in loop_health(loop, trouble, identities, now_s):
                 self._record(row)
 
     def _timed(self, record: LoopTiming) -> None:
-        self.loops[record.loop].measured.of_timing(record)
+        self.loops[record.loop].quantities.record_timing(record)
         self._record(record)
 
     def _event(self, severity: Severity, source: str, message: str) -> None:

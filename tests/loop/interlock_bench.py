@@ -84,7 +84,7 @@ def mirror_at_its_edge(bench):
     edge_rad = np.array([0.95 * bench.loop.settings.fsm.range_rad, 0.0])
     move = bench.loop.stages.mirror_to
     bench.laws(lambda _seen: move(edge_rad, hysteresis_inverse=False))
-    bench.replace(bench.loop.following, "judge", lambda *_: None)  # else it goes back to COARSE
+    bench.replace(bench.loop.following, "evaluate", lambda *_: None)  # else it goes back to COARSE
 
 
 def set_point_beyond_the_travel(bench):
@@ -200,7 +200,7 @@ def every_second_frame(bench):
 
 def computer(name, ill, well, bench):
     def say(value):
-        bench.each_step = lambda: bench.supervisor.measured(name, value)
+        bench.each_step = lambda: bench.supervisor.report_quantity(name, value)
 
     say(ill)
     bench._healing.append(lambda: say(well))

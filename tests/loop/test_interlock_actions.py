@@ -96,7 +96,7 @@ def test_encoders_that_count_anew_after_opening_are_no_runaway():
     assert bench.simulation.command(Standby()).accepted
     rates = []
     bench.each_step = lambda: rates.append(
-        bench.loop.measured.readings["siderostat_rate_fraction"][0]
+        bench.loop.quantities.readings["siderostat_rate_fraction"][0]
     )
     bench.run(1.0)
 
@@ -125,11 +125,13 @@ def test_hold_by_command_is_no_interlock():
 def test_everything_that_a_row_may_be_about_is_measured(tmp_path):
     bench = Bench()
     servo_that_skips(bench)
-    Machine(tmp_path, lambda: 0.0, bench.supervisor.measured, bench.supervisor.note).look()
-    until(lambda: any(row.name == "disk_free_bytes" for row in bench.supervisor._measured))
+    Machine(
+        tmp_path, lambda: 0.0, bench.supervisor.report_quantity, bench.supervisor.report_event
+    ).look()
+    until(lambda: any(row.name == "disk_free_bytes" for row in bench.supervisor._quantities))
     bench.run(2.0)
 
-    assert set(bench.loop.measured.readings) == set(QUANTITIES)
+    assert set(bench.loop.quantities.readings) == set(QUANTITIES)
 
 
 def test_the_computer_is_measured_and_an_interrupted_look_at_the_clocks_does_not_count(tmp_path):
@@ -211,11 +213,11 @@ def raised(error):
 def test_measuring_and_judging_costs_a_small_part_of_a_tick():
     bench = Bench()
     loop, frame = bench.loop, bench.camera.next_frame(0.04)
-    seen = loop._sense(frame, loop.servo.look(), frame.received_s)
+    observation = loop._sense(frame, loop.servo.read_state(), frame.received_s)
 
     def least_s(work):
         return min(timeit.repeat(work, number=100, repeat=20))
 
-    assert least_s(lambda: loop._judge_interlocks(frame, seen)) < 0.3 * least_s(
+    assert least_s(lambda: loop._evaluate_interlocks(frame, observation)) < 0.3 * least_s(
         lambda: loop.tick(frame, 0)
     )

@@ -131,7 +131,7 @@ def test_a_missing_reading_is_bridged_and_many_are_a_fault(servo, amplifiers):
     run(servo, 200)
 
     assert isinstance(servo.fault, DeviceTimeout)
-    assert servo.take_timing().missed_readings > 100
+    assert servo.drain_timing().missed_readings > 100
 
 
 def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
@@ -298,7 +298,7 @@ def test_the_thread_keeps_its_rate_and_ends(amplifiers):
     servo.open()
     begun_s = clock.now_s()
     clock.sleep_until(begun_s + 0.5)
-    periods = len(servo.take_timing().late_s)
+    periods = len(servo.drain_timing().late_s)
     gone_s = clock.now_s() - begun_s
     servo.close()
     thread.stop()
