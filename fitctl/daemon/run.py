@@ -67,7 +67,6 @@ _VERSIONED = (
     "pyzmq",
     "mcap",
     "python-can",
-    "pymodbus",
     "genicam",
 )
 

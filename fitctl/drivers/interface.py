@@ -197,8 +197,19 @@ class MirrorDac(Protocol):
         """Connect; outputs stay as they are."""
         ...
 
-    def write_v(self, volts: NDArray[np.float64]) -> None:
-        """Set all three channels at once; shape (3,), stack 1 first."""
+    def send_v(self, volts: NDArray[np.float64]) -> None:
+        """Send the command that sets all three channels at once; shape (3,), stack 1 first.
+
+        Returns as soon as it is on its way. One that was not confirmed yet is confirmed first.
+        """
+        ...
+
+    def confirm(self) -> None:
+        """Wait, within the device's time limit, until it confirms the last :meth:`send_v`.
+
+        Returns at once where nothing is to be confirmed. Raises DeviceError when no confirmation comes,
+        or a refusal.
+        """
         ...
 
     def read_v(self) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from fitctl.controllers.pair import Design, Measurement, Pair, PairCommand
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.loop.observation import Observation
 from fitctl.model.optics import scales
-from fitctl.stages.stages import Stages
+from fitctl.stages.mirror import MirrorStage
 
 Floats = NDArray[np.float64]
 
@@ -60,9 +60,9 @@ class Pointing:
         """Rest on the target, shape (2,)."""
         self._prefilter.reset(target_px)
 
-    def start_pair(self, stages: Stages, motor_rad: Floats) -> None:
+    def start_pair(self, mirror: MirrorStage, motor_rad: Floats) -> None:
         """Go on from where the mirror is held, with the motors at `motor_rad`, shape (2,)."""
-        held_rad = stages.mirror_held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
+        held_rad = mirror.held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
         self._pair.start(held_rad, motor_rad, self.command_px)
 
     def step_coarse(self, observation: Observation, target_px: Floats) -> Floats | None:

@@ -21,7 +21,6 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.loop.loop_state import loop_state
 from fitctl.messages.telemetry import Telemetry
 from fitctl.supervisor.supervisor import Supervisor
 
@@ -105,7 +104,7 @@ class TelemetryBuffer:
             wall_minus_monotonic_s=state.wall_minus_monotonic_s,
             rig_name=supervisor.rig.name,
             pid=state.pid,
-            loops=[loop_state(supervisor.rig, loop, now_s) for loop in supervisor.loops.values()],
+            loops=[loop.state(now_s) for loop in supervisor.loops.values()],
             ticks=self._ticks.drain(),
             events=events,
             mode_changes=self._changes.drain(),

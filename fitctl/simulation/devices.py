@@ -103,11 +103,14 @@ class SimulatedMirror:
         """Nothing to connect."""
         return _identity("mirror")
 
-    def write_v(self, volts: Floats) -> None:
+    def send_v(self, volts: Floats) -> None:
         """Set the stacks at the present virtual time."""
         self._plant.advance(self._clock.now_s())
         step_v, most_v = self._step_v, self._most_v
         self._stack_v[:] = [min(round(volt / step_v) * step_v, most_v) for volt in volts.tolist()]
+
+    def confirm(self) -> None:
+        """Done when it was sent."""
 
     def read_v(self) -> Floats:
         """What the D/A is set to."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import Rig
-from fitctl.loop.loop import StellarLoop
 from fitctl.loop.search import refused_search
+from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,

@@ -13,10 +13,11 @@ from fitctl.logging.records import CAMERA
 from fitctl.stages.servo import SiderostatServo
 
 ClosedBadly = Callable[[str, Exception], None]
+Servos = Mapping[str, SiderostatServo]
 
 
 class Opened(NamedTuple):
-    """What opening the devices found: who they are, and what the D/As are set to."""
+    """What opening the devices found: who they are, and by loop what its D/A is set to."""
 
     identities: dict[str, DeviceIdentity]
     stack_v: dict[str, NDArray[np.float64]]
@@ -24,7 +25,7 @@ class Opened(NamedTuple):
 
 def open_devices(
     devices: Devices,
-    servos: Mapping[str, SiderostatServo],
+    servos: Servos,
     names: Sequence[str],
     with_camera: bool,
     closed_badly: ClosedBadly,
@@ -54,7 +55,7 @@ def open_devices(
 
 def close_devices(
     devices: Devices,
-    servos: Mapping[str, SiderostatServo],
+    servos: Servos,
     names: Sequence[str],
     with_camera: bool,
     closed_badly: ClosedBadly,

@@ -20,9 +20,7 @@ from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, held, reach_rad
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
-    EXCEPTION_FLAG,
     EXCEPTIONS,
-    Message,
     decode_registers,
     encode_exchange,
     lines,
@@ -41,6 +39,7 @@ from fitctl.drivers.interface import (
     DeviceUnreachable,
     ServoReading,
 )
+from fitctl.drivers.modbus import EXCEPTION_FLAG, Message
 
 _STILL = (0.0, 0.0)
 _MOST_OUTSTANDING = 100

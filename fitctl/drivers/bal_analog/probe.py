@@ -8,12 +8,12 @@ from fitctl.config import BalAnalogDevice, Siderostat
 from fitctl.drivers.amplifiers import AXES, DEVICE
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
-    READ_HOLDING_REGISTERS,
     decode_registers,
     encode_read,
     lines,
 )
 from fitctl.drivers.interface import DeviceRefused, DeviceTimeout
+from fitctl.drivers.modbus import READ_HOLDING_REGISTERS
 from fitctl.drivers.probe import Probe, round_trip_s
 
 

@@ -82,7 +82,7 @@ def move_plant_stacks(s: Any, w: Any, c: Any, plant: Any) -> None:
 
 @jit
 def set_stacks(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
-    """``SimulatedMirror.write_v`` and ``Stages.write``."""
+    """``SimulatedMirror.send_v``, ``MirrorStage.send`` and ``confirm``."""
     for stack in range(3):
         output_v = np.rint(r.stack_v[stack] / s.dac_step_v) * s.dac_step_v
         plant.stack_v[stack] = min(output_v, s.dac_most_v)
@@ -96,7 +96,7 @@ def set_stacks(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
 
 @jit
 def mirror_at(s: Any, r: Any, w: Any, time_s: float) -> None:
-    """``Stages.mirror_at``."""
+    """``MirrorStage.at``."""
     oldest = max(0, r.writes - s.writes)
     for write in range(r.writes - 1, oldest - 1, -1):
         entry = write & _HISTORY

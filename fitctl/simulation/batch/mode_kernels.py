@@ -107,7 +107,7 @@ def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
 
 @jit
 def judge(s: Any, r: Any, exposed_s: float, step_s: float, settle_s: float) -> bool:
-    """``StellarLoop._judge``; False where the search has ended without a star."""
+    """``StellarLoop._evaluate_findings``; False where the search has ended without a star."""
     if r.star_visible:
         az_px, el_px = stages_px(s, r)
         r.star_origin_px[0], r.star_origin_px[1] = r.star_px[0] - az_px, r.star_px[1] - el_px

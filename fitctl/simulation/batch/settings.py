@@ -27,8 +27,8 @@ from fitctl.model.plant_constants import PlantConstants
 from fitctl.model.scene import FULL_WELL_DN
 from fitctl.simulation.batch.interlocks import acting_interlocks
 from fitctl.stages.injector import PERIOD_S
+from fitctl.stages.mirror import HISTORY_S as MIRROR_HISTORY_S
 from fitctl.stages.servo import FOLLOWING_S, HISTORY_S
-from fitctl.stages.stages import HISTORY_S as MIRROR_HISTORY_S
 
 Floats = NDArray[np.float64]
 DONE, FOLLOWING_ERROR, NOT_FOUND = 0, 1, 2  # how a run ends; others than the first are simulated

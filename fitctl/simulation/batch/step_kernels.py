@@ -268,7 +268,7 @@ def mirror_to(s: Any, r: Any, w: Any, az_rad: float, el_rad: float) -> None:
 
 @jit
 def mirror_to_bias(s: Any, r: Any) -> None:
-    """``Stages.mirror_to_bias``."""
+    """``MirrorStage.step_to_bias``."""
     for stack in range(3):
         r.stack_v[stack] += limited(s.bias_v - r.stack_v[stack], s.slew_v)
     r.mirror_command_rad[0], r.mirror_command_rad[1] = r.mirror_rad[0], r.mirror_rad[1]
@@ -276,7 +276,7 @@ def mirror_to_bias(s: Any, r: Any) -> None:
 
 @jit
 def siderostat_to(s: Any, r: Any, axis: int, setpoint_rad: float) -> None:
-    """``Stages.siderostat_to``, one axis."""
+    """``SiderostatStage.move_to``, one axis."""
     r.setpoint_rad[axis] = limited(setpoint_rad, s.travel_rad)
     r.wish = 1
 
@@ -307,7 +307,7 @@ def angular_rate(s: Any, angle: float) -> float:
 
 @jit
 def spiral_is_there(s: Any, r: Any) -> bool:
-    """``Search.is_there``."""
+    """``Search.has_arrived``."""
     if not r.spiral_there:
         away_rad = 0.0
         for axis in range(2):

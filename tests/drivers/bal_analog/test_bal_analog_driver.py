@@ -10,7 +10,6 @@ from scripted_server import scripted_server
 from fitctl import config
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
 from fitctl.drivers.bal_analog.probe import probe_bal_analog
-from fitctl.drivers.bal_analog.protocol import frame, take_message
 from fitctl.drivers.interface import (
     DeviceFault,
     DeviceProtocolError,
@@ -18,6 +17,7 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
+from fitctl.drivers.modbus import frame, take_message
 
 STILL = (0.0, 0.0)
 MOCK = "mocks.loops.right.bal_analog"
