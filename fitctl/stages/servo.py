@@ -115,20 +115,22 @@ class SiderostatServo:
         )
         self._stopped = True
         self._position_rad: AzEl = (0.0, 0.0)
-        self._wish_rad: AzEl | None = None
+        self._wanted_rad: AzEl | None = None  # written by other threads, never by the servo's
+        self._applied_rad: AzEl | None = None  # the newest of those that the servo has read
         self._requests: deque[tuple[Callable[[], DeviceIdentity | None], Future]] = deque()
         self._history: deque[ServoReading] = deque(maxlen=round(HISTORY_S / self.period_s))
         self._blind_s = 1.0 / siderostat.servo.gain_per_s  # an older reading would make it swing
         self._read_s = -math.inf
         self._timely_s = 0.0
         self._missed_readings = 0
+        self._drained = (0, 0)  # missed and skipped, as last asked
         self._followed_s = 0.0
         self.encoders_jumped = False
         self._disabling = False
         self.late_s: deque[float] = deque(maxlen=4096)
         self.skipped = 0
         self.round_trip_s = 0.0
-        self._least_following_rad = math.nan
+        self._following_rad: deque[float] = deque(maxlen=4096)
 
     # ------------------------------------------------------------ from any thread
 
@@ -141,12 +143,12 @@ class SiderostatServo:
         """Wanted motor angles one set-point period from now, shape (2,)."""
         self.setpoint_rad = setpoint_rad
         az_rad, el_rad = setpoint_rad.tolist()
-        self._wish_rad = (az_rad, el_rad)
+        self._wanted_rad = (az_rad, el_rad)
 
     def stop(self) -> None:
         """Velocity zero from the next period on, until :meth:`hold`."""
         self._stopped = True
-        self._wish_rad = None
+        self._wanted_rad = None
 
     def hold(self, position_rad: Floats) -> None:
         """Servo about where the motors are, shape (2,), by their newest reading."""
@@ -155,7 +157,11 @@ class SiderostatServo:
 
     def read_state(self) -> ServoState:
         """How it is now; the following error is taken anew from here on."""
-        following_rad, self._least_following_rad = self._least_following_rad, math.nan
+        following_rad = math.nan
+        for _ in range(len(self._following_rad)):
+            following_error_rad = self._following_rad.popleft()
+            if not following_rad <= following_error_rad:  # not a number fails this too
+                following_rad = following_error_rad
         try:
             reading = self._history[-1]
         except IndexError:  # none since it was opened
@@ -193,9 +199,10 @@ class SiderostatServo:
     def drain_timing(self) -> ServoTiming:
         """Lateness, missed readings and skipped periods since the last call."""
         late = [self.late_s.popleft() for _ in range(len(self.late_s))]
-        missed, self._missed_readings = self._missed_readings, 0
-        skipped, self.skipped = self.skipped, 0
-        return ServoTiming(late, missed, skipped)
+        # The servo's thread counts on and on: what it counts meanwhile is in the next difference.
+        missed, skipped = self._missed_readings, self.skipped
+        before, self._drained = self._drained, (missed, skipped)
+        return ServoTiming(late, missed - before[0], skipped - before[1])
 
     # ------------------------------------------------------------ on the servo's thread
 
@@ -245,8 +252,7 @@ class SiderostatServo:
             self._servo.reset(reading.position_rad)
             return
         following_rad = self._servo.following_error_rad(reading.position_rad)
-        if not self._least_following_rad <= following_rad:  # not a number fails this too
-            self._least_following_rad = following_rad
+        self._following_rad.append(following_rad)
         if following_rad <= self._settings.following_error_limit_rad:
             self._followed_s = reading.time_s
         # A reversal at full speed is behind for a moment; a stuck axis stays behind.
@@ -254,11 +260,13 @@ class SiderostatServo:
             raise self._not_following(following_rad)
 
     def _velocity_rad_s(self, now_s: float) -> AzEl:
-        wish, self._wish_rad = self._wish_rad, None
+        wanted_rad = self._wanted_rad  # read once: another thread may replace it at any moment
+        is_new = wanted_rad is not self._applied_rad
+        self._applied_rad = wanted_rad
         if self._stopped or not self.enabled:
             return _STILL
-        if wish is not None:
-            self._servo.move_to(wish)
+        if is_new and wanted_rad is not None:
+            self._servo.move_to(wanted_rad)
         if now_s - self._read_s > self._blind_s:
             return _STILL  # blind motors stand still, and the reference waits for them
         return self._servo.step(self._position_rad)
