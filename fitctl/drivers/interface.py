@@ -243,11 +243,11 @@ class PiezoAmplifier(Protocol):
 
 @dataclass(frozen=True)
 class LoopDevices:
-    """What one stellar loop acts through."""
+    """What one loop acts through; a loop without a mirror has neither D/A nor piezo amplifier."""
 
     amplifiers: ServoAmplifiers
-    dac: MirrorDac
-    piezo: PiezoAmplifier
+    dac: MirrorDac | None = None
+    piezo: PiezoAmplifier | None = None
 
 
 @dataclass(frozen=True)

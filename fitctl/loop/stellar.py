@@ -346,7 +346,16 @@ class StellarLoop(Loop):
 
 
 def stellar_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) -> StellarLoop:
-    """A stellar loop on its devices."""
+    """A stellar loop on its devices.
+
+    Raises
+    ------
+    ValueError
+        If there is no D/A among them.
+    """
+    if devices.dac is None:
+        msg = f"loop {name}: a stellar loop needs the D/A of its mirror"
+        raise ValueError(msg)
     servo = SiderostatServo(
         name, rig.loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
     )

@@ -41,9 +41,11 @@ def open_devices(
     opened = Opened({}, {})
     for name in names:
         loop = devices.loops[name]
-        opened.identities[f"{name} piezo"] = loop.piezo.open()
-        opened.identities[f"{name} D/A"] = loop.dac.open()
-        opened.stack_v[name] = loop.dac.read_v()
+        if loop.piezo is not None:
+            opened.identities[f"{name} piezo"] = loop.piezo.open()
+        if loop.dac is not None:
+            opened.identities[f"{name} D/A"] = loop.dac.open()
+            opened.stack_v[name] = loop.dac.read_v()
     if with_camera:
         opened.identities[CAMERA] = devices.camera.open()
     for name in names:
@@ -65,8 +67,10 @@ def close_devices(
     for name in names:
         loop = devices.loops[name]
         closing[f"{name} siderostat"] = servos[name].close
-        closing[f"{name} D/A"] = loop.dac.close
-        closing[f"{name} piezo"] = loop.piezo.close
+        if loop.dac is not None:
+            closing[f"{name} D/A"] = loop.dac.close
+        if loop.piezo is not None:
+            closing[f"{name} piezo"] = loop.piezo.close
     if with_camera:
         closing[CAMERA] = devices.camera.close
     for device, close in closing.items():

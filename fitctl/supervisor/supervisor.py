@@ -118,8 +118,9 @@ class Supervisor:
         self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
         self.piezos = {
-            name: PiezoWatch(loop, devices.loops[name].piezo, executor, journal)
+            name: PiezoWatch(loop, piezo, executor, journal)
             for name, loop in self.loops.items()
+            if (piezo := devices.loops[name].piezo) is not None
         }
         self._camera = CameraWatch(rig, devices.camera, clock, self._camera_failed)
         self._device_jobs = DeviceJobs(
@@ -371,10 +372,11 @@ class Supervisor:
         )
         for name, loop in self.loops.items():
             self._record(siderostat_health(loop, identities, now_s))
-            piezo = self.piezos[name]
-            loop.quantities.record_piezo_error(piezo.error, now_s)
-            for row in mirror_health(loop, piezo, identities, now_s):
-                self._record(row)
+            if name in self.piezos:
+                piezo = self.piezos[name]
+                loop.quantities.record_piezo_error(piezo.error, now_s)
+                for row in mirror_health(loop, piezo, identities, now_s):
+                    self._record(row)
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)
