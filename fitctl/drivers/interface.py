@@ -74,8 +74,7 @@ class DeviceIdentity:
     firmware: str
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """One camera frame.
 
     Attributes
@@ -95,8 +94,7 @@ class Frame:
     image: NDArray[np.uint16]
 
 
-@dataclass(frozen=True, slots=True)
-class CameraCounts:
+class CameraCounts(NamedTuple):
     """Since the stream was started."""
 
     frames: int

@@ -36,7 +36,7 @@ class RunInfo(Record, frozen=True, kw_only=True):
     dark_npy: bytes | None = None  # the file that camera.dark_file names, as it was read
 
 
-class Tick(Record, frozen=True, kw_only=True):
+class Tick(Record, frozen=True, kw_only=True, gc=False):
     """One tick of one loop: a frame came (or did not), and a command was made from it."""
 
     loop: str
@@ -90,7 +90,7 @@ class Tick(Record, frozen=True, kw_only=True):
     frames_skipped: int = 0  # since the camera was opened: a newer frame was there already
 
 
-class FrameRecord(Record, frozen=True, kw_only=True):
+class FrameRecord(Record, frozen=True, kw_only=True, gc=False):
     """One whole camera frame; ``data`` is little-endian 16 bit, row by row. ``time_s`` is mid-exposure."""
 
     camera: str

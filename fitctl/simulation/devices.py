@@ -164,8 +164,10 @@ class SimulatedCamera:
         """Go on to the next frame's arrival, or by `timeout_s`."""
         exposed_s = self._start_s + self._frames * self._camera.period_s
         arrives_s = exposed_s + self._camera.frame_delay_s
-        if arrives_s > self._clock.now_s() + timeout_s + 1e-9:
-            self._go_on_to(self._clock.now_s() + timeout_s)
+        now_s = self._clock.now_s()
+        if arrives_s > now_s + timeout_s + 1e-9:
+            if timeout_s > 0.0:
+                self._go_on_to(now_s + timeout_s)
             return None
         self._go_on_to(arrives_s)
         self._frames += 1
@@ -185,11 +187,11 @@ class SimulatedCamera:
         """Nothing to disconnect."""
 
     def _go_on_to(self, time_s: float) -> None:
-        due = self._due
+        due, works, sleep_until = self._due, self.on_servo_period, self._clock.sleep_until
         while due[0][0] <= time_s:
             due_s, which = due[0]
-            period_s, run = self.on_servo_period[which]
-            self._clock.sleep_until(due_s)
+            period_s, run = works[which]
+            sleep_until(due_s)
             run()
             heapq.heapreplace(due, (due_s + period_s, which))
-        self._clock.sleep_until(time_s)
+        sleep_until(time_s)

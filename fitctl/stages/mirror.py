@@ -161,7 +161,6 @@ class MirrorStage:
         """
         self.ready = False
         begun_s = self._clock.now_s()
-        self._extend_commanded_range(self.stack_v)  # it may arrive even if nothing confirms it
         self._dac.send_v(self.stack_v)
         self.sent_s, self._begun_s = self._clock.now_s(), begun_s
         self.ready = True
@@ -182,6 +181,7 @@ class MirrorStage:
         self.ready = True
         self.written_s = self._clock.now_s()
         self.round_trip_s = self.written_s - begun_s
+        self._extend_commanded_range(self.stack_v)
         self._mirror.written(self.stack_v)
         self._history.append((self.written_s, self._mirror.angles_rad))
 

@@ -1,6 +1,5 @@
 """An instrument that holds its star, and a way to strike each interlock of the shipped rig file."""
 
-import dataclasses
 from functools import partial
 
 import numpy as np
@@ -188,7 +187,7 @@ def no_frames(bench):
 def late_frames(bench):
     def next_frame(old, timeout_s):
         frame = old(timeout_s)
-        return frame and dataclasses.replace(frame, received_s=frame.received_s + 0.05)
+        return frame and frame._replace(received_s=frame.received_s + 0.05)
 
     bench.replace(bench.camera, "next_frame", next_frame)
 
