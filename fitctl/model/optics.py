@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import ARCSEC_PER_RAD, Loop, Rig
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
 
@@ -105,6 +106,18 @@ def rotation(angle_deg: float) -> Floats:
     """The matrix, shape (2, 2), that turns from azimuth towards elevation."""
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.array([[cos, -sin], [sin, cos]])
+
+
+@compilable(inline=True)
+def turned(turn: Floats, az: float, el: float) -> tuple[float, float]:
+    """A pair, by a matrix of shape (2, 2)."""
+    return turn[0, 0] * az + turn[0, 1] * el, turn[1, 0] * az + turn[1, 1] * el
+
+
+@compilable(inline=True)
+def turned_back(turn: Floats, az: float, el: float) -> tuple[float, float]:
+    """A pair, by the transpose of a matrix of shape (2, 2)."""
+    return turn[0, 0] * az + turn[1, 0] * el, turn[0, 1] * az + turn[1, 1] * el
 
 
 def stack_matrix(stack_radius_m: float) -> Floats:

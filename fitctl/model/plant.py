@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.model import air_path
-from fitctl.model.compiled import kernels
+from fitctl.model.compiled import compiled, numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import (
     AdvanceKernel,
     PlantState,
     PlantTrace,
-    bind_reference,
-    compiled_advance,
+    bind_compiled,
+    bind_plain,
 )
 from fitctl.model.randomness import place_star, run_randomness
 
@@ -41,8 +41,8 @@ class Plant:
     seeds : sequence of int
         One for each run; everything random in a run follows from its seed.
     kernel : callable, optional
-        :func:`~fitctl.model.plant_step.bind_reference` or a compiled one; by default compiled where
-        numba is installed.
+        :func:`~fitctl.model.plant_step.bind_plain` or, by default where numba is installed,
+        :func:`~fitctl.model.plant_step.bind_compiled`.
     star_offset_px : array, shape (runs, 2), optional
         Where the star is at the start, from the target; by default drawn from the seed.
     history_s : float, optional
@@ -88,7 +88,7 @@ class Plant:
         kept = max(1, round(kept_s / truth.step_s))
         self._trace = PlantTrace(np.empty((kept, runs, spots, 2)), np.empty((kept, runs)))
         self._kept = kept
-        bind = kernel or compiled_advance() or bind_reference
+        bind = kernel or (bind_compiled if numba_installed() else bind_plain)
         self._step = bind(self.constants, self.state, self._air_px, self._trace)
 
     @property
@@ -164,20 +164,16 @@ class Plant:
 
     def _draw_air(self) -> None:
         # One draw for each run and spot, so that a run is the same whichever others are beside it.
-        air, compiled = self.constants.air, kernels()
+        air, air_motion = self.constants.air, compiled(air_path.air_motion)
         shape = (BLOCK_NODES, 2, 2)
         for run, randoms in enumerate(self._air_random):
             for spot, random in enumerate(randoms):
-                arguments = (
+                air_motion(
                     self._air[run, spot],
                     random.standard_normal(shape),
                     air.transition,
                     air.noise_gain,
                     air.weights,
+                    self._air_px[:, run, spot],
                 )
-                motion_px = self._air_px[:, run, spot]
-                if compiled is None:
-                    motion_px[:] = air_path.air_motion(*arguments)
-                else:
-                    compiled.air_motion(*arguments, motion_px)
         self._air_px[:, :, 1:] *= air.relative

@@ -2,12 +2,14 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from plant_references import bind_reference
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.controllers.position_servo import PositionServo
+from fitctl.model.compiled import numba_installed
 from fitctl.model.optics import piston_m, scales, stack_volts
 from fitctl.model.plant import Plant
-from fitctl.model.plant_step import PlantState, PlantTrace, bind_reference, compiled_advance
+from fitctl.model.plant_step import PlantState, PlantTrace, bind_compiled, bind_plain
 
 STILL_AIR = "plant.loops.right.air_path.gain_px=0.0"
 STRAIGHT_STACKS = [
@@ -34,7 +36,13 @@ def from_target(plant, rig, time_s):
 # ---------------------------------------------------------------- one result, however it is computed
 
 
-@pytest.mark.skipif(compiled_advance() is None, reason="numba is not installed (extra `fast`)")
+NEEDS_NUMBA = pytest.mark.skipif(
+    not numba_installed(), reason="numba is not installed (extra `fast`)"
+)
+STEPS = [pytest.param(bind_compiled, marks=NEEDS_NUMBA), bind_plain]
+
+
+@pytest.mark.parametrize("step", STEPS)
 @settings(max_examples=15)
 @given(
     seed=seeds,
@@ -42,7 +50,7 @@ def from_target(plant, rig, time_s):
     steps=st.integers(1, 60),
     turned_deg=st.sampled_from([(0.0, 0.0), (30.0, 30.0), (-70.0, 120.0)]),
 )
-def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turned_deg):
+def test_the_step_does_what_the_reference_does(step, seed, runs, steps, turned_deg):
     siderostat_deg, mirror_deg = turned_deg
     rig = rig_with(
         f"loops.right.siderostat.rotation_deg={siderostat_deg}",
@@ -59,7 +67,7 @@ def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turne
     state.stack_v[:] = random.uniform(0, 10, (runs, 3))
     air_px = 0.3 * random.standard_normal((steps + 5, runs, 2, 2))
     outcomes = []
-    for kernel in (compiled_advance(), bind_reference):
+    for kernel in (step, bind_reference):
         own = PlantState(runs, state.plays_v.shape[-1])
         own.rows[:], own.plays_v[:] = state.rows, state.plays_v
         trace = PlantTrace(np.zeros((steps + 3, runs, 2, 2)), np.zeros((steps + 3, runs)))
@@ -71,8 +79,8 @@ def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turne
                 *(own.rows[name] for name in own.rows.dtype.names if name != "stacks_at_v"),
             )
         )
-    for compiled, reference in zip(*outcomes, strict=True):
-        assert compiled == pytest.approx(reference, rel=1e-9, abs=1e-12)
+    for found, reference in zip(*outcomes, strict=True):
+        assert found == pytest.approx(reference, rel=1e-9, abs=1e-12)
 
 
 @settings(max_examples=20)
@@ -94,7 +102,7 @@ def test_the_motion_does_not_depend_on_how_the_time_is_cut(rig, cuts):
     assert np.array_equal(cut[1], whole[1])
 
 
-@pytest.mark.parametrize("kernel", [None, bind_reference])
+@pytest.mark.parametrize("kernel", STEPS)
 def test_a_run_does_not_depend_on_the_runs_beside_it(rig, kernel):
     together = Plant(rig, "right", [3, 4, 5], kernel=kernel)
     alone = Plant(rig, "right", [4], kernel=kernel)

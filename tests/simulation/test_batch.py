@@ -7,13 +7,15 @@ import pytest
 
 from fitctl.config import StackHysteresis, default_rig_path, load_rig
 from fitctl.messages.modes import Mode
-from fitctl.model.compiled import kernels
+from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.batch.settings import TooLargeForBatchError
 from fitctl.simulation.simulation import Simulation, simulate
 
-pytestmark = pytest.mark.skipif(kernels() is None, reason="numba is not installed (extra `fast`)")
+pytestmark = pytest.mark.skipif(
+    not numba_installed(), reason="numba is not installed (extra `fast`)"
+)
 
 CONTROLLER = "loops.right.vernier.controller={}"
 FIELDS = {

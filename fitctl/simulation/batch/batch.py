@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.messages.modes import Mode
+from fitctl.model.compiled import compiled
 from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import PlantState
 from fitctl.model.randomness import place_star, run_randomness
+from fitctl.simulation.batch.run_kernel import run
 from fitctl.simulation.batch.settings import DONE, RUN, WORK, batch_settings
 from fitctl.simulation.simulation import simulate
 from fitctl.simulation.statistics import SETTLE_S, SimulationResult, pair
@@ -46,11 +48,9 @@ class Batch:
     """
 
     def __init__(self, rig: Rig) -> None:
-        from fitctl.simulation.batch.run_kernel import run
-
         (self._name,) = rig.loops
         self._rig = rig
-        self._run = run
+        self._run = compiled(run)
         self._constants = plant_constants(rig, self._name, np.zeros((1, 2)))
         self._settings = batch_settings(rig, self._name, self._constants)
         self._frames_dn = np.empty((2, rig.camera.height_px, rig.camera.width_px))

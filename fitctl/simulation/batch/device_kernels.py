@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.model.compiled import jit, jit_inlined
-from fitctl.model.kernels import air_motion, move_stacks, piston_m, step_run
+from fitctl.model.air_path import air_motion
+from fitctl.model.compiled import compilable
+from fitctl.model.plant_step import move_stacks, stack_piston_m, step_run
 from fitctl.simulation.batch.settings import MOST_HISTORY
 from fitctl.simulation.batch.step_kernels import (
     following_error_rad,
@@ -27,7 +28,7 @@ _HISTORY = MOST_HISTORY - 1  # a power of two less one
 # ---------------------------------------------------------------- the plant
 
 
-@jit
+@compilable()
 def air_block(s: Any, w: Any, random: Any, spot: int, motion_px: Floats) -> None:
     """The next block of a spot's air path, drawn as ``Plant`` draws it."""
     for node in range(w.normals.shape[0]):
@@ -38,7 +39,7 @@ def air_block(s: Any, w: Any, random: Any, spot: int, motion_px: Floats) -> None
     air_motion(w.air[spot], w.normals, s.air_transition, s.air_noise_gain, weights, motion_px)
 
 
-@jit
+@compilable()
 def judge_steps(s: Any, r: Any, w: Any, plant: Any) -> None:
     """Add the steps since the last call to what is judged, as far as they are late enough."""
     first = max(r.judged_to, r.judged_from - 1)
@@ -49,16 +50,16 @@ def judge_steps(s: Any, r: Any, w: Any, plant: Any) -> None:
             az_sum += az_px * az_px
             el_sum += el_px * el_px
             row = row + 1 if row + 1 < s.ring_steps else 0
-        steps, stack_piston_m = r.steps - first, piston_m(plant)
+        steps, piston_m = r.steps - first, stack_piston_m(plant)
         r.true_sum_px2[0] += az_sum
         r.true_sum_px2[1] += el_sum
-        r.piston_sum_m += steps * stack_piston_m
-        r.piston_sum_m2 += steps * stack_piston_m**2
+        r.piston_sum_m += steps * piston_m
+        r.piston_sum_m2 += steps * piston_m**2
         r.judged_steps += steps
     r.judged_to = r.steps
 
 
-@jit_inlined
+@compilable(inline=True)
 def advance_to(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
     """``Plant.advance`` to now; the air must be there."""
     missing = int(np.rint(r.now_s / c.step_s)) - r.steps
@@ -73,14 +74,14 @@ def advance_to(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
             r.row = 0
 
 
-@jit_inlined
+@compilable(inline=True)
 def move_plant_stacks(s: Any, w: Any, c: Any, plant: Any) -> None:
     """Take the stacks to their volts."""
     n = s.plays
     move_stacks(c, plant, w.plays_v[:, :n], s.play_half_v[:n], s.play_gain_m_per_v[:n])
 
 
-@jit
+@compilable()
 def set_stacks(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
     """``SimulatedMirror.send_v``, ``MirrorStage.send`` and ``confirm``."""
     for stack in range(3):
@@ -94,7 +95,7 @@ def set_stacks(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
     r.writes += 1
 
 
-@jit
+@compilable()
 def mirror_at(s: Any, r: Any, w: Any, time_s: float) -> None:
     """``MirrorStage.at``."""
     oldest = max(0, r.writes - s.writes)
@@ -109,7 +110,7 @@ def mirror_at(s: Any, r: Any, w: Any, time_s: float) -> None:
 # ---------------------------------------------------------------- the siderostat
 
 
-@jit_inlined
+@compilable(inline=True)
 def read_encoders(s: Any, r: Any, w: Any, plant: Any) -> None:
     """``SimulatedAmplifiers.exchange`` but for the command, and ``SiderostatServo._take``."""
     entry = r.readings & _HISTORY
@@ -121,7 +122,7 @@ def read_encoders(s: Any, r: Any, w: Any, plant: Any) -> None:
     r.readings += 1
 
 
-@jit_inlined
+@compilable(inline=True)
 def servo_period(s: Any, r: Any, w: Any, c: Any, plant: Any) -> bool:
     """``SiderostatServo.period``; False where the motors do not follow."""
     if r.wish:
@@ -136,7 +137,7 @@ def servo_period(s: Any, r: Any, w: Any, c: Any, plant: Any) -> bool:
     return r.now_s - r.followed_s <= s.following_s
 
 
-@jit
+@compilable()
 def position_at(s: Any, r: Any, w: Any, time_s: float) -> None:
     """``SiderostatServo.position_at``."""
     oldest = max(0, r.readings - s.readings)

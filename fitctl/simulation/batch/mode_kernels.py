@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from fitctl.messages.modes import Mode
-from fitctl.model.compiled import jit
-from fitctl.model.kernels import turned_back
+from fitctl.model.compiled import compilable
+from fitctl.model.optics import turned_back
 from fitctl.simulation.batch.step_kernels import (
     motor_px,
     pair_start,
@@ -24,7 +24,7 @@ OFF, STANDBY = int(Mode.OFF), int(Mode.STANDBY)
 ACQUISITION, COARSE, VERNIER = int(Mode.ACQUISITION), int(Mode.COARSE), int(Mode.VERNIER)
 
 
-@jit
+@compilable()
 def change_mode(r: Any, mode: int) -> None:
     """``StellarLoop.fire``, but for what a mode begins with."""
     r.mode_times_s[r.mode] += r.now_s - r.mode_since_s
@@ -32,7 +32,7 @@ def change_mode(r: Any, mode: int) -> None:
     r.lost = r.in_reach = r.out_of_reach = 0
 
 
-@jit
+@compilable()
 def start_search(s: Any, r: Any) -> None:
     """``StellarLoop._start_search`` and ``Search.begin``."""
     change_mode(r, ACQUISITION)
@@ -44,7 +44,7 @@ def start_search(s: Any, r: Any) -> None:
     r.sighted = 0
 
 
-@jit
+@compilable()
 def start_coarse(s: Any, r: Any) -> None:
     """COARSE begins with the prefilter at rest on the target."""
     change_mode(r, COARSE)
@@ -55,7 +55,7 @@ def start_coarse(s: Any, r: Any) -> None:
         r.acquired_s = r.now_s
 
 
-@jit
+@compilable()
 def start_vernier(s: Any, r: Any, step_s: float, settle_s: float) -> None:
     """VERNIER begins with the pair holding what is."""
     change_mode(r, VERNIER)
@@ -65,7 +65,7 @@ def start_vernier(s: Any, r: Any, step_s: float, settle_s: float) -> None:
         r.judged_from = max(1, int(np.rint((r.now_s + settle_s) / step_s)))
 
 
-@jit
+@compilable()
 def judge_search(s: Any, r: Any, exposed_s: float) -> bool:
     """``Search.judge``; False where the search has ended without a star."""
     if not r.sighted:
@@ -83,7 +83,7 @@ def judge_search(s: Any, r: Any, exposed_s: float) -> bool:
     return True
 
 
-@jit
+@compilable()
 def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
     """``Following.judge``."""
     if not r.star_visible:
@@ -105,7 +105,7 @@ def judge_tracking(s: Any, r: Any, step_s: float, settle_s: float) -> None:
         start_coarse(s, r)
 
 
-@jit
+@compilable()
 def judge(s: Any, r: Any, exposed_s: float, step_s: float, settle_s: float) -> bool:
     """``StellarLoop._evaluate_findings``; False where the search has ended without a star."""
     if r.star_visible:
@@ -118,7 +118,7 @@ def judge(s: Any, r: Any, exposed_s: float, step_s: float, settle_s: float) -> b
     return True
 
 
-@jit
+@compilable()
 def count_measured(r: Any, settle_s: float) -> None:
     """Add a tick to what is judged, if it is late enough."""
     if r.star_visible and r.now_s >= r.vernier_s + settle_s:

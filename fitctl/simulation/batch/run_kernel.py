@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
-from fitctl.model.compiled import jit
-from fitctl.model.kernels import turned_back
+from fitctl.model.compiled import compilable
 from fitctl.model.light import REACH_SIGMAS
+from fitctl.model.optics import turned_back
 from fitctl.simulation.batch.device_kernels import (
     advance_to,
     air_block,
@@ -58,7 +58,7 @@ Floats = NDArray[np.float64]
 _SEEN, _LOOK = 1_000_001, 1_000_002
 
 
-@jit
+@compilable()
 def power_up(s: Any, r: Any, w: Any, plant: Any) -> None:
     """Devices open, which reads the encoders twice, and the siderostat is held where it is."""
     read_encoders(s, r, w, plant)
@@ -67,7 +67,7 @@ def power_up(s: Any, r: Any, w: Any, plant: Any) -> None:
     r.wish = 1
 
 
-@jit
+@compilable()
 def spots_over(s: Any, r: Any, w: Any, left: int, top: int, width: int, height: int) -> int:
     """Spots of an exposure with light on some pixels: how many; NaN for the others.
 
@@ -95,7 +95,7 @@ def spots_over(s: Any, r: Any, w: Any, left: int, top: int, width: int, height: 
     return lit
 
 
-@jit
+@compilable()
 def sense(s: Any, r: Any, w: Any) -> int:
     """``StellarLoop._find`` as far as a window tells: SEEN, or whether the whole frame must be looked at.
 
@@ -121,7 +121,7 @@ def sense(s: Any, r: Any, w: Any) -> int:
     return lit
 
 
-@jit
+@compilable()
 def command(s: Any, r: Any, w: Any) -> None:
     """The mode's control law."""
     if r.mode == VERNIER:
@@ -146,7 +146,7 @@ def command(s: Any, r: Any, w: Any) -> None:
         spiral_advance(s, r)
 
 
-@jit
+@compilable()
 def keep_run(s: Any, r: Any, w: Any, first: int, ticks: Any, true_px: Floats) -> None:
     """Keep a frame's state and the true spot since the step `first`, as far as there is room."""
     if 0 < r.frames <= ticks.shape[0]:
@@ -156,7 +156,7 @@ def keep_run(s: Any, r: Any, w: Any, first: int, ticks: Any, true_px: Floats) ->
             true_px[step, axis] = w.trace_px[step % s.ring_steps, axis]
 
 
-@jit
+@compilable()
 def run(
     settings: Any,
     state: Any,

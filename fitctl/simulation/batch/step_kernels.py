@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.controllers.centroid import EDGE_PX, LARGEST_PEAK, MAX_CANDIDATES
-from fitctl.model.compiled import jit, jit_inlined
-from fitctl.model.kernels import play_output, render, turned, turned_back
+from fitctl.model.compiled import compilable
+from fitctl.model.hysteresis import play_output
+from fitctl.model.optics import turned, turned_back
+from fitctl.model.scene import render
 from fitctl.simulation.batch.settings import SIDE_PX
 
 Floats = NDArray[np.float64]
@@ -25,13 +27,13 @@ Floats = NDArray[np.float64]
 # ---------------------------------------------------------------- position servo
 
 
-@jit_inlined
+@compilable(inline=True)
 def limited(value: float, most: float) -> float:
     """`value` within +-`most`."""
     return most if value > most else -most if value < -most else value
 
 
-@jit
+@compilable()
 def servo_move_to(s: Any, r: Any) -> None:
     """``PositionServo.move_to`` the set-point."""
     for axis in range(2):
@@ -40,7 +42,7 @@ def servo_move_to(s: Any, r: Any) -> None:
         r.servo_step_rad[axis] = limited(step_rad, s.velocity_limit_rad_s * s.servo_period_s)
 
 
-@jit_inlined
+@compilable(inline=True)
 def servo_step(s: Any, r: Any) -> None:
     """``PositionServo.step``, from the last reading to a velocity command."""
     for axis in range(2):
@@ -59,7 +61,7 @@ def servo_step(s: Any, r: Any) -> None:
         )
 
 
-@jit_inlined
+@compilable(inline=True)
 def following_error_rad(r: Any) -> float:
     """``PositionServo.following_error_rad``."""
     return max(
@@ -71,7 +73,7 @@ def following_error_rad(r: Any) -> float:
 # ---------------------------------------------------------------- what a frame shows
 
 
-@jit_inlined
+@compilable(inline=True)
 def centroid(
     s: Any, light_dn: Floats, first_row: int, first_column: int, window_az: int, window_el: int
 ) -> Any:
@@ -98,26 +100,26 @@ def centroid(
     return window_az + az_moment / flux, window_el + el_moment / flux, flux
 
 
-@jit
+@compilable()
 def window_about(px: float, largest: int) -> int:
     """The nearest pixel about which the window fits."""
     return min(max(int(np.rint(px)), HALF_WINDOW_PX), largest)
 
 
-@jit
+@compilable()
 def accepted(s: Any, flux_dn: float) -> bool:
     """``StarSensor._accepted``."""
     return s.flux_low_dn <= flux_dn <= s.flux_high_dn
 
 
-@jit
+@compilable()
 def see(s: Any, r: Any, az_px: float, el_px: float) -> None:
     """A star is on the frame."""
     r.star_visible = 1
     r.star_px[0], r.star_px[1] = az_px, el_px
 
 
-@jit
+@compilable()
 def measure(s: Any, r: Any, w: Any, window_az: int, window_el: int) -> bool:
     """``StarSensor.measure``; False where the whole frame must decide (``StarSensor.follow``)."""
     first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
@@ -135,7 +137,7 @@ def measure(s: Any, r: Any, w: Any, window_az: int, window_el: int) -> bool:
     return True
 
 
-@jit
+@compilable()
 def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
     """``StarSensor.find`` over a whole frame."""
     render(
@@ -165,28 +167,28 @@ def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
 # ---------------------------------------------------------------- where the stages are
 
 
-@jit_inlined
+@compilable(inline=True)
 def motor_px(s: Any, az_rad: float, el_rad: float) -> Any:
     """``Scales.motor_px``."""
     az, el = turned(s.siderostat_turn, az_rad, el_rad)
     return s.motor_px_per_rad * az, s.motor_px_per_rad * el
 
 
-@jit_inlined
+@compilable(inline=True)
 def motor_rad(s: Any, az_px: float, el_px: float) -> Any:
     """``Scales.motor_rad``."""
     az, el = turned_back(s.siderostat_turn, az_px, el_px)
     return az / s.motor_px_per_rad, el / s.motor_px_per_rad
 
 
-@jit_inlined
+@compilable(inline=True)
 def mirror_px(s: Any, az_rad: float, el_rad: float) -> Any:
     """``Scales.mirror_px``."""
     az, el = turned(s.mirror_turn, az_rad, el_rad)
     return s.mirror_px_per_rad * az, s.mirror_px_per_rad * el
 
 
-@jit
+@compilable()
 def stages_px(s: Any, r: Any) -> Any:
     """``StarEstimator.stages_px`` at the exposure."""
     az_px, el_px = motor_px(s, r.motor_rad[0], r.motor_rad[1])
@@ -194,13 +196,13 @@ def stages_px(s: Any, r: Any) -> Any:
     return az_px + mirror_az_px, el_px + mirror_el_px
 
 
-@jit
+@compilable()
 def star_in_the_middle_rad(s: Any, r: Any) -> Any:
     """``Search._star_in_the_middle_rad``."""
     return motor_rad(s, s.middle_px[0] - r.star_origin_px[0], s.middle_px[1] - r.star_origin_px[1])
 
 
-@jit
+@compilable()
 def known_output(s: Any, w: Any, stack: int, volts: float) -> float:
     """Displacement of a stack by its identified hysteresis, once it has met `volts`."""
     n = s.known_plays
@@ -209,7 +211,7 @@ def known_output(s: Any, w: Any, stack: int, volts: float) -> float:
     )
 
 
-@jit
+@compilable()
 def angle_of_volts(s: Any, r: Any, axis: int) -> float:
     """Eq. 5: a mirror angle of the voltages at the D/A."""
     angle_rad = 0.0
@@ -218,7 +220,7 @@ def angle_of_volts(s: Any, r: Any, axis: int) -> float:
     return angle_rad
 
 
-@jit
+@compilable()
 def mirror_written(s: Any, r: Any, w: Any) -> None:
     """``Mirror.written`` and ``Mirror.angles_rad``."""
     v1, v2, v3 = r.stack_v[0], r.stack_v[1], r.stack_v[2]
@@ -232,7 +234,7 @@ def mirror_written(s: Any, r: Any, w: Any) -> None:
         r.mirror_rad[0], r.mirror_rad[1] = angle_of_volts(s, r, 0), angle_of_volts(s, r, 1)
 
 
-@jit
+@compilable()
 def inverse_volts(s: Any, w: Any, stack: int, wanted_m: float) -> float:
     """:func:`fitctl.model.hysteresis.inverse_volts` of one stack."""
     moved_m = 0.0
@@ -253,7 +255,7 @@ def inverse_volts(s: Any, w: Any, stack: int, wanted_m: float) -> float:
     return volts
 
 
-@jit
+@compilable()
 def mirror_to(s: Any, r: Any, w: Any, az_rad: float, el_rad: float) -> None:
     """``Mirror.volts_for``."""
     r.mirror_command_rad[0], r.mirror_command_rad[1] = az_rad, el_rad
@@ -266,7 +268,7 @@ def mirror_to(s: Any, r: Any, w: Any, az_rad: float, el_rad: float) -> None:
         r.stack_v[stack] = min(max(volts, 0.0), s.full_scale_v)
 
 
-@jit
+@compilable()
 def mirror_to_bias(s: Any, r: Any) -> None:
     """``MirrorStage.step_to_bias``."""
     for stack in range(3):
@@ -274,7 +276,7 @@ def mirror_to_bias(s: Any, r: Any) -> None:
     r.mirror_command_rad[0], r.mirror_command_rad[1] = r.mirror_rad[0], r.mirror_rad[1]
 
 
-@jit
+@compilable()
 def siderostat_to(s: Any, r: Any, axis: int, setpoint_rad: float) -> None:
     """``SiderostatStage.move_to``, one axis."""
     r.setpoint_rad[axis] = limited(setpoint_rad, s.travel_rad)
@@ -284,7 +286,7 @@ def siderostat_to(s: Any, r: Any, axis: int, setpoint_rad: float) -> None:
 # ---------------------------------------------------------------- controllers
 
 
-@jit
+@compilable()
 def prefilter_step(s: Any, r: Any) -> None:
     """``Prefilter.step`` towards the target."""
     for axis in range(2):
@@ -296,7 +298,7 @@ def prefilter_step(s: Any, r: Any) -> None:
         r.command_rate[axis] = s.prefilter[1, 0] * distance + s.prefilter[1, 1] * rate
 
 
-@jit
+@compilable()
 def angular_rate(s: Any, angle: float) -> float:
     """``Spiral._angular_rate``."""
     length_per_angle = s.spiral_growth_px * math.sqrt(1 + angle**2)
@@ -305,7 +307,7 @@ def angular_rate(s: Any, angle: float) -> float:
     return speed / length_per_angle
 
 
-@jit
+@compilable()
 def spiral_is_there(s: Any, r: Any) -> bool:
     """``Search.has_arrived``."""
     if not r.spiral_there:
@@ -317,7 +319,7 @@ def spiral_is_there(s: Any, r: Any) -> bool:
     return bool(r.spiral_there)
 
 
-@jit
+@compilable()
 def spiral_advance(s: Any, r: Any) -> None:
     """``Search.advance`` by one frame, and the siderostat with it."""
     if not spiral_is_there(s, r):
@@ -334,7 +336,7 @@ def spiral_advance(s: Any, r: Any) -> None:
     siderostat_to(s, r, 1, r.spiral_centre_rad[1] + el_rad)
 
 
-@jit
+@compilable()
 def pair_start(s: Any, r: Any) -> None:
     """``Pair.start`` from where the stages are, and ``Mirror.held_rad``."""
     ideal_rad_per_v = s.scale_m_per_v / (2 * s.stack_radius_m)
@@ -355,7 +357,7 @@ def pair_start(s: Any, r: Any) -> None:
         r.target_origin_px[axis] = r.command_px[axis]
 
 
-@jit
+@compilable()
 def pair_step(s: Any, r: Any, w: Any) -> Any:
     """``Pair.step``: from the error to the siderostat's set-point, and the mirror's angles."""
     columns = s.states + 5
