@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.messages.modes import Mode
-from fitctl.model.compiled import compiled
+from fitctl.model.compiled import compiled, numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import PlantState
 from fitctl.model.randomness import place_star, run_randomness
 from fitctl.simulation.batch.run_kernel import run
-from fitctl.simulation.batch.settings import DONE, RUN, WORK, batch_settings
+from fitctl.simulation.batch.settings import DONE, RUN, WORK, BatchRefusalError, batch_settings
 from fitctl.simulation.simulation import simulate
 from fitctl.simulation.statistics import SETTLE_S, SimulationResult, pair
 
@@ -41,13 +41,18 @@ class Batch:
 
     Raises
     ------
-    ImportError
-        Without numba.
-    TooLargeForBatchError
-        If the rig has more of something than a batch can hold.
+    BatchRefusalError
+        Without numba, or if the rig has more than one loop, more of something than the records hold, or
+        something that the batch does not model.
     """
 
     def __init__(self, rig: Rig) -> None:
+        if not numba_installed():
+            msg = "numba is not installed: pip install 'fitctl[fast]'"
+            raise BatchRefusalError(msg)
+        if len(rig.loops) > 1:
+            msg = f"it has {len(rig.loops)} loops, and the batch runs rigs of one"
+            raise BatchRefusalError(msg)
         (self._name,) = rig.loops
         self._rig = rig
         self._run = compiled(run)

@@ -130,8 +130,8 @@ WORK = np.dtype(
 )
 
 
-class TooLargeForBatchError(Exception):
-    """The rig has more of something than the records hold, or something that a batch does not know."""
+class BatchRefusalError(Exception):
+    """Why the batch cannot run a rig; :func:`fitctl.simulation.simulation.simulate` can."""
 
 
 def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArray[np.void]:
@@ -139,17 +139,17 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
 
     Raises
     ------
-    TooLargeForBatchError
+    BatchRefusalError
     """
     acting = acting_interlocks(rig, loop_name)
     if acting:
-        msg = f"interlock {acting[0]} may act, and a batch knows of no interlocks"
-        raise TooLargeForBatchError(msg)
+        msg = f"interlock {acting[0]} may act, and the batch has no interlocks"
+        raise BatchRefusalError(msg)
     loop, camera = rig.loops[loop_name], rig.true_camera
     truth, _ = rig.mock_parts()
     if truth.hot_pixels or camera.dark_file is not None:
-        msg = "pixels differ, and a batch takes all for alike"
-        raise TooLargeForBatchError(msg)
+        msg = "its pixels differ (hot pixels or a dark file), and the batch makes all pixels alike"
+        raise BatchRefusalError(msg)
     plant = truth.loops[loop_name]
     fsm, siderostat, acquisition = loop.fsm, loop.siderostat, loop.acquisition
     scale, plan = scales(rig, loop), plan_spiral(rig, loop_name)
@@ -168,8 +168,9 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     # What one frame needs lies between its exposure and two periods after its arrival.
     needed_s = camera.frame_delay_s + 3 * camera.period_s
     if needed_s / constants.step_s + 2 * block_steps > RING_STEPS:
-        msg = f"delay and step_s leave {needed_s / constants.step_s:.0f} steps to remember"
-        raise TooLargeForBatchError(msg)
+        steps = needed_s / constants.step_s + 2 * block_steps
+        msg = f"frame_delay_s and step_s give {steps:.0f} steps to remember; the batch holds {RING_STEPS}"
+        raise BatchRefusalError(msg)
     values = {
         "width_px": camera.width_px,
         "height_px": camera.height_px,
@@ -259,8 +260,11 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         "following_s": FOLLOWING_S,
     }
     if max(values["writes"], values["readings"]) > MOST_HISTORY:
-        msg = f"rates leave {values['readings']} readings to remember; a batch holds {MOST_HISTORY}"
-        raise TooLargeForBatchError(msg)
+        most = max(values["writes"], values["readings"])
+        msg = (
+            f"its rates give {most} readings or writes to remember; the batch holds {MOST_HISTORY}"
+        )
+        raise BatchRefusalError(msg)
     record = np.zeros(1, _dtype(values))
     for name, value in values.items():
         record[name] = value
@@ -276,6 +280,6 @@ def _padded(values: ArrayLike, *shape: int) -> Floats:
     """`values` in the corner of zeros of the given shape."""
     array = np.asarray(values, dtype=float)
     if any(size > most for size, most in zip(array.shape, shape, strict=True)):
-        msg = f"{array.shape} values where a batch holds {shape}"
-        raise TooLargeForBatchError(msg)
+        msg = f"it needs an array of shape {array.shape}; the batch holds {shape}"
+        raise BatchRefusalError(msg)
     return np.pad(array, [(0, most - size) for size, most in zip(array.shape, shape, strict=True)])
