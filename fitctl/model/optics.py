@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Loop, Rig
+from fitctl.config import ARCSEC_PER_RAD, Loop, Rig, Siderostat
 from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
@@ -58,6 +58,10 @@ class Scales:
     def motor_sky_arcsec_per_rad(self) -> float:
         """Beam angle on the sky of one radian of motor."""
         return self.motor_sky_rad_per_rad * ARCSEC_PER_RAD
+
+    def travel_rad(self, siderostat: Siderostat) -> float:
+        """Travel of a siderostat's motors, either way from the encoders' zero."""
+        return siderostat.travel_sky_arcsec / self.motor_sky_arcsec_per_rad
 
     # All of these take and give shape (..., 2).
 

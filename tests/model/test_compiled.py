@@ -86,7 +86,7 @@ def test_a_file_that_no_kernel_imports_leaves_the_machine_code_valid(package):
 
 def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():
     program = (
-        "import sys, fitctl.simulation.batch.run_kernel\n"
+        "import sys, fitctl.simulation.batch.run\n"
         "print(*(name for name in sys.modules if name.startswith('fitctl')))"
     )
     done = subprocess.run(
@@ -94,7 +94,7 @@ def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():
     )
     root = Path(fitctl.__file__).parents[1]
 
-    sources = sources_of("fitctl.simulation.batch.run_kernel")
+    sources = sources_of("fitctl.simulation.batch.run")
 
     read = {
         ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
