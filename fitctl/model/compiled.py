@@ -10,9 +10,12 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _PACKAGES = Path(__file__).parents[2]
@@ -74,6 +77,15 @@ def compiled(function: _Function) -> _Function:
         return njit(**options)(function)
     finally:
         config.CACHE_DIR = given
+
+
+def record(values: Mapping[str, Any]) -> NDArray[np.void]:
+    """Values by name as one record, shape (), which compiled code receives as one argument."""
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    made = np.zeros((), [(name, array.dtype, array.shape) for name, array in arrays.items()])
+    for name, array in arrays.items():
+        made[name] = array
+    return made
 
 
 def cache_folder(module: str) -> Path:

@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.model import air_path
-from fitctl.model.compiled import compiled, numba_installed
+from fitctl.model.compiled import compiled
 from fitctl.model.plant_constants import plant_constants
-from fitctl.model.plant_step import (
-    AdvanceKernel,
-    PlantState,
-    PlantTrace,
-    bind_compiled,
-    bind_plain,
-)
+from fitctl.model.plant_step import PlantState, PlantTrace, bound_step
 from fitctl.model.randomness import place_star, run_randomness
 
 Floats = NDArray[np.float64]
@@ -40,9 +34,6 @@ class Plant:
     loop_name : str
     seeds : sequence of int
         One for each run; everything random in a run follows from its seed.
-    kernel : callable, optional
-        :func:`~fitctl.model.plant_step.bind_plain` or, by default where numba is installed,
-        :func:`~fitctl.model.plant_step.bind_compiled`.
     star_offset_px : array, shape (runs, 2), optional
         Where the star is at the start, from the target; by default drawn from the seed.
     history_s : float, optional
@@ -55,7 +46,6 @@ class Plant:
         loop_name: str,
         seeds: Sequence[int],
         *,
-        kernel: AdvanceKernel | None = None,
         star_offset_px: Floats | None = None,
         history_s: float | None = None,
     ) -> None:
@@ -88,8 +78,7 @@ class Plant:
         kept = max(1, round(kept_s / truth.step_s))
         self._trace = PlantTrace(np.empty((kept, runs, spots, 2)), np.empty((kept, runs)))
         self._kept = kept
-        bind = kernel or (bind_compiled if numba_installed() else bind_plain)
-        self._step = bind(self.constants, self.state, self._air_px, self._trace)
+        self._step = bound_step(self.constants, self.state, self._air_px, self._trace)
 
     @property
     def inputs(self) -> PlantState:

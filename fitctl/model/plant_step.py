@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.model.compiled import compilable, compiled
+from fitctl.model.compiled import compilable, compiled, numba_installed
 from fitctl.model.hysteresis import play_output
 from fitctl.model.optics import turned
 from fitctl.model.plant_constants import PlantConstants
@@ -202,44 +202,28 @@ def advance(
                     )
 
 
-def bind_compiled(
-    constants: PlantConstants, state: PlantState, air_px: Floats, trace: PlantTrace
-) -> Advance:
-    """:func:`advance`, compiled, on a plant's own arrays."""
-    return _bind(compiled(advance), constants, constants.packed, state.rows, state, air_px, trace)
-
-
-def bind_plain(
-    constants: PlantConstants, state: PlantState, air_px: Floats, trace: PlantTrace
-) -> Advance:
-    """:func:`advance` as it is, on a plant's own arrays."""
-    names = state.rows.dtype.names or ()
-    runs = [SimpleNamespace(**{name: row[name] for name in names}) for row in state.rows]
-    return _bind(advance, constants, [constants], runs, state, air_px, trace)
-
-
-def _bind(
-    step: Callable[..., None],
+def bound_step(
     constants: PlantConstants,
-    constant_rows: Any,
-    state_rows: Any,
     state: PlantState,
     air_px: Floats,
     trace: PlantTrace,
-) -> Advance:
+    *,
+    machine_code: bool | None = None,
+) -> Callable[[int, int, int], None]:
+    """:func:`advance` on a plant's own arrays: from a row of air and of trace, by some steps.
+
+    Compiled where numba is installed, unless `machine_code` is False.
+    """
+    step: Callable[..., None] = advance
+    constant_rows: Any = [constants]
+    state_rows: Any = state.rows
+    if machine_code if machine_code is not None else numba_installed():
+        step, constant_rows = compiled(advance), constants.packed
+    else:
+        names = state.rows.dtype.names or ()
+        state_rows = [SimpleNamespace(**{name: row[name] for name in names}) for row in state.rows]
+    plays = constants.play_half_v, constants.play_gain_m_per_v
+    origin_px = constants.spot_origin_px
     return partial(
-        step,
-        constant_rows,
-        constants.play_half_v,
-        constants.play_gain_m_per_v,
-        state_rows,
-        state.plays_v,
-        constants.spot_origin_px,
-        air_px,
-        *trace,
+        step, constant_rows, *plays, state_rows, state.plays_v, origin_px, air_px, *trace
     )
-
-
-Advance = Callable[[int, int, int], None]
-"""Takes the row of air and of trace to begin at, and how many steps to go on."""
-AdvanceKernel = Callable[[PlantConstants, PlantState, Floats, PlantTrace], Advance]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +16,7 @@ from fitctl.controllers.position_servo import position_servo
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.loop.search import NEAR
+from fitctl.model.compiled import record
 from fitctl.model.light import light_table
 from fitctl.model.optics import scales
 from fitctl.model.pixel_noise import quantiles
@@ -82,7 +81,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
         entries = max(writes, readings)
         msg = f"its rates give {entries} readings to remember; the batch holds {MOST_HISTORY}"
         raise BatchRefusalError(msg)
-    return _record(
+    return record(
         {
             # camera and scene
             "width_px": camera.width_px,
@@ -182,16 +181,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
 
 def _fields(live: object, *names: str) -> NDArray[np.void]:
     """Some attributes of what the live loop uses, as a record."""
-    return _record({name: getattr(live, name) for name in names})
-
-
-def _record(values: Mapping[str, Any]) -> NDArray[np.void]:
-    """Values by name as one record, shape ()."""
-    arrays = {name: np.asarray(value) for name, value in values.items()}
-    record = np.zeros((), [(name, array.dtype, array.shape) for name, array in arrays.items()])
-    for name, array in arrays.items():
-        record[name] = array
-    return record
+    return record({name: getattr(live, name) for name in names})
 
 
 def _padded(values: ArrayLike, *shape: int) -> Floats:
