@@ -9,12 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from fitctl.config import Rig
 from fitctl.controllers.centroid import StarSensor
-from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.mirror import Mirror
-from fitctl.controllers.pair import Pair
 from fitctl.controllers.position_servo import position_servo
-from fitctl.controllers.prefilter import Prefilter
 from fitctl.controllers.spiral import plan_spiral
+from fitctl.loop.pointing import Pointing
 from fitctl.loop.search import NEAR
 from fitctl.model.compiled import record
 from fitctl.model.light import light_table
@@ -65,8 +63,8 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     target_px = np.array([loop.target_px.az, loop.target_px.el])
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
     servo = position_servo(loop.siderostat, camera.period_s)
-    prefilter = Prefilter(loop.prefilter.time_constant_s, camera.period_s, target_px)
-    pair = Pair(design_for(rig, loop_name), scale, fsm.range_rad)
+    pointing = Pointing(rig, loop_name, target_px)
+    pair = pointing.pair
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     block_steps = BLOCK_NODES * len(constants.air.weights)
     # What one frame needs lies between its exposure and two periods after its arrival.
@@ -134,10 +132,8 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
                 scale, "motor_px_per_rad", "mirror_px_per_rad", "siderostat_turn", "mirror_turn"
             ),
             # control laws
-            "prefilter": _fields(prefilter, "periods", "decay"),
-            "coarse_step_rad_per_px": loop.coarse.gain_rad_per_m
-            * scale.pixel_size_m
-            * camera.period_s,
+            "prefilter": _fields(pointing.prefilter, "periods", "decay"),
+            "coarse_step_rad_per_px": pointing.coarse_step_rad_per_px,
             "pair_states": len(pair.system) - 2,
             "pair_system": _padded(pair.system, MOST_STATES + 2, MOST_STATES + 5),
             "pair_at_rest": _padded(pair.at_rest, MOST_STATES),
