@@ -69,7 +69,7 @@ class StarSensor:
     ----------
     camera : Camera
     loop : Loop
-        Its flux range tells the pointing spot from fringe spots and hot pixels.
+        Its flux range separates the pointing spot from fringe spots and hot pixels.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:

@@ -19,7 +19,7 @@ def look_again(acquisition: Any, candidate: Any, star_visible: bool, exposed_s: 
     Parameters
     ----------
     acquisition : Acquisition
-    candidate : has since_s, when it was first seen, and frames, in a row, which is counted on
+    candidate : has since_s, when a frame first showed it, and frames, the count in a row
     star_visible : bool
     exposed_s : float
     """

@@ -67,7 +67,7 @@ class Design:
 
 
 class Measurement(NamedTuple):
-    """What one frame told, each shape (2,): in pixels from the frame, in radians from the stages."""
+    """Star and stages at one frame, each shape (2,): in pixels from the frame, in radians from the stages."""
 
     error_px: Floats
     target_px: Floats

@@ -37,7 +37,7 @@ class SpiralPlan:
         Where the search ends: half a turn's distance beyond the farthest star, or a star there could
         pass outside the last turn.
     field_radius_px : float
-        Circle in which a star is certain to be seen.
+        Circle in which every star is detected.
     """
 
     pitch_px: float

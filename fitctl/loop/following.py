@@ -48,7 +48,8 @@ class Following:
         if star is not None:
             error_px = star.position_px - target_px
             # The mirror's diamond lies along its own axes.
-            need = float(np.abs(error_px.dot(self._mirror_turn)).sum()) / self._range_px
+            az_px, el_px = error_px.dot(self._mirror_turn).tolist()
+            need = (abs(az_px) + abs(el_px)) / self._range_px
         count_frame(self, star is not None, need, self._reach_fraction)
         if self.lost >= self._lost_frames:
             return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")

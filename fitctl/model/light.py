@@ -55,7 +55,7 @@ def light_fractions(
 ) -> Any:
     """Part of a spot's light on pixels ``first + k``; returns the first and the end of those that get any.
 
-    What :func:`light_below` says of the edges.
+    :func:`light_below` at the edges, one after the other.
     """
     reach_px = REACH_SIGMAS * sigma_px
     low = max(0, math.ceil(centre_px - reach_px - 0.5) - first)

@@ -99,7 +99,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         play_half_v=half_v,
         play_gain_m_per_v=gains,
         bias_v=loop.fsm.bias_v,
-        # Where a stack rests that came up from zero to its bias: taken as the mirror's zero.
+        # Where a stack rests that came up from zero to its bias: the mirror's zero.
         mid_stroke_m=float(hysteresis.raised_displacement(loop.fsm.bias_v, half_v, gains)),
         stack_radius_m=loop.fsm.stack_radius_m,
         mode_shape=structure.mode_shapes(plant.structure),

@@ -1,4 +1,4 @@
-"""Many runs of one rig, on every core or on a Dask cluster, and what they say together.
+"""Many runs of one rig, on every core or on a Dask cluster, and their statistics.
 
 A run of a campaign with seed s is the run that `fitctl simulate --seed s` makes.
 """
@@ -59,7 +59,7 @@ class SeedRms:
 
 @dataclass(frozen=True)
 class LoopSummary:
-    """What the runs say of one loop.
+    """Statistics of one loop over all runs.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ def dask_executor(address: str, workers: int = 1) -> Iterator[tuple[Executor, in
 
 
 def summarize(results: Results) -> dict[str, LoopSummary]:
-    """What all runs say of each loop."""
+    """Statistics of each loop over all runs."""
     loops = next(iter(results.values()))
     return {
         name: _summarize({seed: loops[name] for seed, loops in results.items()}) for name in loops

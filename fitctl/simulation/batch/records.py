@@ -1,4 +1,4 @@
-"""Records of a batched run: its state, and what it works with; compiled code takes each as one argument.
+"""Records of a batched run: its state, and what it works with; compiled code receives each as one argument.
 
 Arrays in a record have a fixed size, so that one compilation serves every rig and every design.
 """
