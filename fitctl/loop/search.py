@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.estimator import StarEstimator
+from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, look_again
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Finding, Trigger
@@ -56,7 +57,7 @@ class Search:
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
         self._scale = scale
-        self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        self._travel_rad = scale.travel_rad(loop.siderostat)
         self._slew_limit_s = _SLEWS * 2 * self._travel_rad / loop.siderostat.velocity_limit_rad_s
         self._plan_spiral = partial(plan_spiral, rig, loop_name)
         self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
@@ -109,7 +110,7 @@ class Search:
 
     def evaluate(self, star: Star | None, now_s: float) -> Finding | None:
         """What a frame exposed at `now_s` showed, if it is anything to tell."""
-        settings, candidate = self._settings, self._candidate
+        candidate = self._candidate
         if not self._arrived:
             return self._wait_for_siderostat(now_s)
         if candidate is None:
@@ -122,11 +123,10 @@ class Search:
                     "check shutter and pointing, then acquire again",
                 )
             return None
-        settled = now_s >= candidate.since_s + settings.settle_s
-        candidate.frames = candidate.frames + 1 if star is not None and settled else 0
-        if candidate.frames >= settings.found_frames:
+        outcome = look_again(self._settings, candidate, star is not None, now_s)
+        if outcome == CONFIRMED:
             return Finding(Trigger.STAR_FOUND, f"star on {candidate.frames} frames in a row")
-        if now_s > candidate.since_s + settings.settle_s + settings.confirm_timeout_s:
+        if outcome == REJECTED:
             self._candidate = None
             return Finding(None, "a candidate was not confirmed; the search goes on")
         return None

@@ -94,7 +94,7 @@ class SimulatedMirror:
         self._plant = plant
         self._clock = clock
         self._stack_v = plant.inputs.stack_v[0]
-        self._step_v = fsm.dac.full_scale_v / (2**fsm.dac.bits - 1)
+        self._step_v = fsm.dac.step_v
         self._gain = fsm.piezo.gain
         self._limit_v = fsm.piezo.limit_v
         self._most_v = fsm.piezo.limit_v / fsm.piezo.gain

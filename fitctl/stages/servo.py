@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fitctl.clock import Clock
 from fitctl.config import Loop
-from fitctl.controllers.position_servo import PositionServo
+from fitctl.controllers.position_servo import position_servo
 from fitctl.drivers.interface import (
     AzEl,
     DeviceError,
@@ -105,14 +105,7 @@ class SiderostatServo:
         self._settings = siderostat.servo
         self._amplifiers = amplifiers
         self._clock = clock
-        self._servo = PositionServo(
-            siderostat.servo.gain_per_s,
-            siderostat.velocity_limit_rad_s,
-            siderostat.acceleration_limit_rad_s2,
-            self.period_s,
-            setpoint_period_s,
-            2 * math.pi / siderostat.encoder_counts_per_rev,
-        )
+        self._servo = position_servo(siderostat, setpoint_period_s)
         self._stopped = True
         self._position_rad: AzEl = (0.0, 0.0)
         self._wanted_rad: AzEl | None = None  # written by other threads, never by the servo's
