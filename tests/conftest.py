@@ -1,4 +1,5 @@
 import asyncio
+import gc
 import os
 import threading
 
@@ -17,6 +18,12 @@ hypothesis.settings.register_profile(
     "fitctl", hypothesis.settings.get_profile("default"), deadline=None, print_blob=True
 )
 hypothesis.settings.load_profile("fitctl")
+
+
+def pytest_collection_finish():
+    """Spare each garbage collection the several hundred thousand objects that collecting the tests leaves."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
