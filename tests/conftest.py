@@ -21,9 +21,10 @@ hypothesis.settings.load_profile("fitctl")
 
 
 def pytest_collection_finish():
-    """Spare each garbage collection the several hundred thousand objects that collecting the tests leaves."""
+    """Collect garbage less often: several hundred thousand objects of the tests themselves make it slow."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
 
 
 @pytest.fixture(scope="session")
