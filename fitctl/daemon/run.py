@@ -49,8 +49,8 @@ from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.stages.periodic import PeriodicThread
 from fitctl.stages.realtime import (
+    Collector,
     become_realtime,
-    collect_young,
     lock_memory,
     quiet_interpreter,
 )
@@ -180,11 +180,12 @@ def run_supervisor(
         def housekeep() -> None:
             queue.pump()
             record(buffer.losses(state, clock.now_s()))
-            collect_young()
+            collector.collect(pointing=supervisor.pointing)
 
         service = Service(supervisor, buffer, folder, state, clock)
         threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
         quiet_interpreter()
+        collector = Collector()
         service.start()
         for thread in threads:
             thread.start()

@@ -43,7 +43,7 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import Mode, Trigger, usable_commands
+from fitctl.messages.modes import TRACKING, Mode, Trigger, usable_commands
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.supervisor.camera_watch import CameraWatch
@@ -224,6 +224,11 @@ class Supervisor:
             loop.fire(Trigger.STOP, reason)
         now_s = self._clock.now_s()
         self._record(command_record(Stop(), Reply(accepted=True, text=reason), "fitctl", "", now_s))
+
+    @property
+    def pointing(self) -> bool:
+        """A loop has a star or looks for one."""
+        return any(loop.mode in TRACKING for loop in self.loops.values())
 
     def at_rest(self) -> bool:
         """Every stage that can still be commanded is where it may be left without power."""
