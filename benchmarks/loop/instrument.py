@@ -76,7 +76,7 @@ def measure(rate_hz: float, duration_s: float, seed: int) -> Segment:
             ticks = [tick for tick in course.ticks[LOOP] if tick.mode == "VERNIER"]
             residual_px = _true_residual_px(rig, running, ticks)
     return Segment(
-        _times_us(ticks), _figures(rig, course, ticks, residual_px, counts, duration_s), counts
+        tick_times_us(ticks), _figures(rig, course, ticks, residual_px, counts, duration_s), counts
     )
 
 
@@ -93,7 +93,7 @@ def _output(cyclictest: subprocess.Popen[str]) -> str:
     return cyclictest.communicate(timeout=30.0)[0]
 
 
-def _times_us(ticks: list[Tick]) -> dict[str, NDArray[np.float64]]:
+def tick_times_us(ticks: list[Tick]) -> dict[str, NDArray[np.float64]]:
     """What the steps of each tick lasted; `received` is when the driver had the last packet of the frame."""
     columns = [
         (
