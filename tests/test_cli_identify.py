@@ -60,7 +60,7 @@ def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp
     paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     for path, part in zip(paths, (records[:middle], records[middle:]), strict=True):
         with LogWriter(path, rig.logging) as log:
-            log.write(run_info(rig, "", 0.0), WALL_S)
+            log.write(run_info(rig, "", 0.0, designs={}), WALL_S)
             for record in part:
                 log.write(record, WALL_S + record.time_s)
 

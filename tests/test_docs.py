@@ -19,6 +19,7 @@ from documents import (
     blocks,
     commands,
 )
+from logged_simulation import designs_of
 
 from fitctl.cli import app, main
 from fitctl.config import default_rig_path, load_rig
@@ -129,7 +130,7 @@ def sample_log(tmp_path_factory):
     """What a recorder would have written of the first 30 s, but on the virtual clock."""
     rig = load_rig(default_rig_path())
     path = tmp_path_factory.mktemp("sample") / "sample.mcap"
-    info = run_info(rig, "simulated", now_s=0.0)
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
 
     def log_time_s():
         return simulation.clock.now_s() + info.wall_minus_monotonic_s

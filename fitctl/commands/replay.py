@@ -14,7 +14,7 @@ from fitctl.commands.choosing import of_controller
 from fitctl.commands.printing import progress_line, to_json
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_json
 from fitctl.controllers.design.choose import design_for
-from fitctl.controllers.design.files import design_json
+from fitctl.controllers.design.document import design_json
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo
 from fitctl.replay.files import dark_of_today, logged_files

@@ -89,7 +89,9 @@ def run(
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
     from fitctl.daemon.run import run_supervisor
     from fitctl.processes import end_with_parent, rig_arguments
+    from fitctl.stages.realtime import bound_memory
 
+    bound_memory()
     overrides = with_controller(rig, overrides, controller)
     settings = rig_of(rig, overrides)
     end_with_parent(parent_pid)

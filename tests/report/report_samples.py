@@ -1,6 +1,7 @@
 """Logs to report on, from the virtual clock, and ticks made by hand."""
 
 import numpy as np
+from logged_simulation import designs_of
 
 from fitctl.daemon.run import run_info
 from fitctl.logging.records import FrameRecord, RecorderStatus
@@ -16,7 +17,7 @@ PERIOD_S = 0.02
 
 def record(rig, path, course, seed=1):
     """What a recorder would have written of a simulated course, without the frames."""
-    info = run_info(rig, "simulated", now_s=0.0)
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
     with LogWriter(path, rig.logging) as log:
 
         def take(what):
