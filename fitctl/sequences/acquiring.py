@@ -91,8 +91,8 @@ def _found(view: View) -> Figures:
         return dict.fromkeys(_FOUND, math.nan)
     scale, target, look = scales(view.rig, view.settings), view.settings.target_px, seen[-1]
     beside_px = np.array([look.star_az_px - target.az, look.star_el_px - target.el])
-    mirror_px = scale.mirror_px(np.array([look.mirror_az_rad, look.mirror_el_rad]))
-    motor_px = scale.motor_px(np.array([look.motor_az_rad, look.motor_el_rad]))
+    mirror_px = scale.mirror_px(np.array([look.fsm_az_rad, look.fsm_el_rad]))
+    motor_px = scale.motor_px(np.array([look.siderostat_az_rad, look.siderostat_el_rad]))
     az, el = scale.sky_arcsec(beside_px - mirror_px - motor_px).tolist()
     return dict(zip(_FOUND, (az, el, look.star_flux_dn), strict=True))
 

@@ -51,12 +51,12 @@ class Contact:
         rig: Rig,
         name: str,
         steps: int,
-        on_status: Callable[[SequenceStatus], None],
+        on_status: Callable[[SequenceStatus], None] = lambda _status: None,
     ) -> None:
         self.stop_wanted = threading.Event()  # from another thread, such as a cancelled task's
         self.status = SequenceStatus(run=uuid.uuid4().hex, name=name, state="running", steps=steps)
-        self._link = link
-        self._rig = rig
+        self.link = link
+        self.rig = rig
         self._on_status = on_status
         self._wanted = "run"
         self._reported_s = 0.0
@@ -90,12 +90,12 @@ class Contact:
 
     def look(self, loop_name: str) -> View:
         """A view that begins with telemetry from now on: older may have queued up between two steps."""
-        since_s = self._link.now_s()
+        since_s = self.link.now_s()
         telemetry = self._receive()
         while telemetry.time_s < since_s:
             telemetry = self._receive()
         view = View(
-            self._link, self._rig, loop_name, telemetry, telemetry.time_s, self.status.attempt
+            self.link, self.rig, loop_name, telemetry, telemetry.time_s, self.status.attempt
         )
         self._obey(view)
         return view
@@ -112,19 +112,19 @@ class Contact:
         self._obey(view)
         if paused:
             self.show_pause(paused=True)
-        if self._link.now_s() - self._reported_s >= _REPORT_S:
+        if self.link.now_s() - self._reported_s >= _REPORT_S:
             self.report()
 
     def _receive(self) -> Telemetry:
-        begun_s = self._link.now_s()
+        begun_s = self.link.now_s()
         while True:
-            telemetry = self._link.receive(_RECEIVE_S)
+            telemetry = self.link.receive(_RECEIVE_S)
             if telemetry is not None:
                 return telemetry
             if self.stop_wanted.is_set():
                 msg = "stopped by its program"
                 raise Stopped(msg, hold=True)
-            if self._link.now_s() - begun_s > _SILENCE_S:
+            if self.link.now_s() - begun_s > _SILENCE_S:
                 msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then begin again"
                 raise ConnectionError(msg)
 
@@ -170,5 +170,5 @@ class Contact:
             self._on_status(self.status)
 
     def _send_report(self) -> Reply:
-        self._reported_s = self._link.now_s()
-        return self._link.send(SequenceReport(status=self.status))
+        self._reported_s = self.link.now_s()
+        return self.link.send(SequenceReport(status=self.status))

@@ -93,15 +93,13 @@ def read_table(path: Path, key: str, missing: str) -> list[tuple[str, Any]]:
 
 
 def _parse_csv(text: str, path: Path) -> list[tuple[str, Any]]:
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    reader = csv.reader([line for _, line in lines], skipinitialspace=True, strict=True)
     try:
-        rows = list(zip([number for number, _ in lines], reader, strict=True))
-    except (csv.Error, ValueError) as error:  # also a quoted text over several lines
+        rows = [
+            (number, next(csv.reader([line], skipinitialspace=True, strict=True)))
+            for number, line in enumerate(text.splitlines(), start=1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
+    except csv.Error as error:  # also a quoted text over several lines
         msg = f"{path}: not CSV: {error}"
         raise ConfigError(msg) from None
     if not rows:

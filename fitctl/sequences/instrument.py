@@ -23,6 +23,7 @@ from fitctl.messages.keys import RemoteKey, read_key_of
 from fitctl.messages.telemetry import Telemetry
 from fitctl.sequences import steps
 from fitctl.sequences.calibration import write_calibration
+from fitctl.sequences.contact import Contact
 from fitctl.sequences.files import find_sequence
 from fitctl.sequences.links import Link, SimulatedLink
 from fitctl.sequences.methods import StepMethods
@@ -126,7 +127,7 @@ class Instrument(StepMethods[Figures]):
         return load_sequence(find_sequence(Path(file)), self.rig)
 
     def _runner_of(self, name: str, todo: Sequence[steps.Step]) -> Runner:
-        return Runner(self._link, self.rig, name, len(todo))
+        return Runner(Contact(self._link, self.rig, name, len(todo)))
 
     def _run(self, runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
         """Run steps; the figures of each, NaN where a value could not be had."""

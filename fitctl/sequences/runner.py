@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
 import msgspec
 
-from fitctl.config import Rig
 from fitctl.logging.records import SequenceAttempt
-from fitctl.messages.commands import Hold, SequenceStatus
+from fitctl.messages.commands import Hold
 from fitctl.messages.modes import Mode
 from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
-from fitctl.sequences.links import Link
 from fitctl.sequences.stars import judge, star_results, steps_of
-from fitctl.sequences.steps import Sequence, Standby, Stars, Step
+from fitctl.sequences.steps import Standby, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 
 _RETRY_S = 1.0  # between attempts
@@ -32,32 +30,14 @@ class TimedOut(StepFailed):
 
 
 class Runner:
-    """Runs the steps of one sequence, one at a time, on one link.
+    """Runs the steps of one sequence, one at a time, by its contact with the supervisor."""
 
-    Parameters
-    ----------
-    link : Link
-    rig : Rig
-    name : str
-    steps : int
-        How many there will be.
-    on_status : callable
-        Hears of every change: a new attempt, a pause, an end.
-    """
-
-    def __init__(
-        self,
-        link: Link,
-        rig: Rig,
-        name: str,
-        steps: int,
-        on_status: Callable[[SequenceStatus], None] = lambda _status: None,
-    ) -> None:
+    def __init__(self, contact: Contact) -> None:
         self.attempts: list[SequenceAttempt] = []
         self.calibrations: list[Calibration] = []
-        self.contact = Contact(link, rig, name, steps, on_status)
-        self._link = link
-        self._rig = rig
+        self.contact = contact
+        self._link = contact.link
+        self._rig = contact.rig
         self._loops: set[str] = set()
         self._star = ""  # of a list, that the step is for
 
@@ -246,21 +226,7 @@ def _ending(runner: Runner) -> Iterator[None]:
 
 
 def run_steps(runner: Runner, steps: Iterable[Step]) -> list[SequenceAttempt]:
-    """Begin, run these steps, end; gives and raises what :func:`run_sequence` does."""
-    runner.contact.begin()
-    with _ending(runner):
-        for step in steps:
-            runner.run(step)
-    return runner.attempts
-
-
-def run_sequence(
-    link: Link,
-    rig: Rig,
-    sequence: Sequence,
-    on_status: Callable[[SequenceStatus], None] = lambda _status: None,
-) -> list[SequenceAttempt]:
-    """Run a whole sequence; the records of all attempts.
+    """Begin, run these steps, end; the records of all attempts.
 
     Raises
     ------
@@ -269,5 +235,8 @@ def run_sequence(
     ConnectionError
         If the supervisor does not answer or falls silent.
     """
-    runner = Runner(link, rig, sequence.name, len(sequence.steps), on_status)
-    return run_steps(runner, sequence.steps)
+    runner.contact.begin()
+    with _ending(runner):
+        for step in steps:
+            runner.run(step)
+    return runner.attempts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -61,18 +62,21 @@ class StepFailed(Exception):
 
 
 class Look(NamedTuple):
-    """What a frame's tick showed of the star; NaN where it was not seen."""
+    """What a frame's tick showed of the star, and where the stages were then; NaN where it was not seen."""
 
-    time_s: float
+    mid_exposure_s: float
     star_az_px: float
     star_el_px: float
     error_az_px: float
     error_el_px: float
-    motor_az_rad: float
-    motor_el_rad: float
-    mirror_az_rad: float
-    mirror_el_rad: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+    fsm_az_rad: float
+    fsm_el_rad: float
     star_flux_dn: float
+
+
+_look = attrgetter(*Look._fields)  # of a tick
 
 
 @dataclass
@@ -182,8 +186,7 @@ class View:
         if paused:
             self.paused_s += telemetry.time_s - self.telemetry.time_s
         else:
-            ticks = [tick for tick in telemetry.ticks if self._is_mine(tick)]
-            self.looks += [_look(tick) for tick in ticks]
+            self.looks += [Look(*_look(tick)) for tick in telemetry.ticks if self._is_mine(tick)]
         self.errors += [
             event.message
             for event in telemetry.events
@@ -200,21 +203,6 @@ class View:
     def tracking(self) -> bool:
         """The stages follow a star, or search for one."""
         return self.mode in TRACKING
-
-
-def _look(tick: Tick) -> Look:
-    return Look(
-        tick.mid_exposure_s,
-        tick.star_az_px,
-        tick.star_el_px,
-        tick.error_az_px,
-        tick.error_el_px,
-        tick.siderostat_az_rad,
-        tick.siderostat_el_rad,
-        tick.fsm_az_rad,
-        tick.fsm_el_rad,
-        tick.star_flux_dn,
-    )
 
 
 def columns(looks: list[Look]) -> Floats:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import Acquire, Hold, SequenceControl, Stop
@@ -11,7 +12,6 @@ from fitctl.sequences import pointing, view
 from fitctl.sequences.files import find_sequence, shipped_sequences
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import load_sequence
-from fitctl.sequences.runner import run_sequence
 
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
