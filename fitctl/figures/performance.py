@@ -19,7 +19,6 @@ from fitctl.figures.attenuation import (
     mean_spectra,
     rebuilt,
     spectra,
-    tick_columns,
 )
 from fitctl.figures.rigs import at_flight_rate, with_controller, with_rougher_stages
 from fitctl.figures.steps import (
@@ -33,6 +32,7 @@ from fitctl.figures.steps import (
     step_response,
     target_step,
 )
+from fitctl.identify.record import tick_columns
 from fitctl.model.optics import scales
 from fitctl.simulation.campaign import Results, run_seeds
 from fitctl.simulation.simulation import Simulation

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.signal import lti, step
 
 from fitctl.config import Rig
-from fitctl.figures.plate import BLACK, GREEN, ORANGE, Comparison, Plate, new_figure, save
+from fitctl.figures.plate import Comparison, Plate, save
+from fitctl.identify.drawing import BLACK, GREEN, ORANGE, new_figure
 from fitctl.identify.plays import ELEMENTS, model_from_ramp, trail
 from fitctl.model.hysteresis import (
     half_widths_v,
@@ -52,7 +53,7 @@ def figure_3(rig: Rig, loop_name: str, _seed: int, folder: Path) -> list[Plate]:
         return interferometer_m(hysteresis_output(plays_v, gains))
 
     ramp_v = np.linspace(0.0, full_scale_v, round(_RAMP_S * SAMPLE_HZ) + 1)
-    model = model_from_ramp(ramp_v, measured_m(ramp_v), "virgin")
+    model = model_from_ramp(ramp_v, measured_m(ramp_v))
     time_s = np.arange(round(_STEP_S * SAMPLE_HZ)) / SAMPLE_HZ
     volts = underdamped_step_v(time_s, full_scale_v)
     seen_m = measured_m(volts)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from fitctl.config import Rig
-from fitctl.identify.errors import IdentifyError
+from fitctl.identify.drawing import new_figure
+from fitctl.identify.errors import IdentifyError, insist_on_room, insist_on_star
 from fitctl.identify.record import ExperimentRecord
 from fitctl.identify.whitening import whitener
 from fitctl.model.drives import SIDEROSTAT, Drive
@@ -24,7 +25,6 @@ FREQUENCY_HZ, END_FREQUENCY_HZ = 0.6, 1.4  # two rates: a late frame looks like 
 SCAN_S = 25.0
 _LEAST_SWING_PX = 1.0
 _LEAST_FRAMES = 250
-_LEAST_SEEN = 0.9  # of the frames
 _FIRST_WIDTHS = np.linspace(0.0, 0.6, 13)  # of the swing, tried before the search
 
 
@@ -36,15 +36,8 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
     IdentifyError
         If the star would leave the frame.
     """
-    target = rig.loops[loop_name].target_px
     reach_px = AMPLITUDE_PX + 1.0
-    for sign in (-1, 1):
-        if not rig.camera.window_fits(target.az + sign * reach_px, target.el + sign * reach_px):
-            msg = (
-                f"the scan moves the star by {AMPLITUDE_PX:g} px, which must stay on the frame; move "
-                f"loops.{loop_name}.target_px nearer to the frame's middle"
-            )
-            raise IdentifyError(msg)
+    insist_on_room(rig, loop_name, "the scan", reach_px, reach_px)
     return [
         Drive(
             channel=channel,
@@ -143,9 +136,7 @@ class BacklashResult:
 
     def plot(self, path: Path) -> None:
         """The loop of each axis: what the camera saw, air path included, and the model."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10, 5), layout="constrained")
+        figure = new_figure(10, 5)
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
         for panel, (name, axis) in zip(panels, self.axes.items(), strict=True):
             panel.plot(axis.motor_px, axis.seen_px, ".", ms=3, color="0.6", label="seen")
@@ -251,13 +242,7 @@ def _usable_frames(axis: str, motor_px: Floats, star_px: Floats) -> NDArray[np.i
     far = [motor_px <= motor_px.min() + swing_px / 4, motor_px >= motor_px.max() - swing_px / 4]
     first = max(int(side.argmax()) for side in far)
     frames = first + np.flatnonzero(np.isfinite(star_px[first:]))
-    due = len(star_px) - first
-    if len(frames) < max(_LEAST_FRAMES, _LEAST_SEEN * due):
-        msg = (
-            f"the star is on {len(frames)} of {due} frames of {axis}, expected at least "
-            f"{_LEAST_FRAMES} and {100 * _LEAST_SEEN:g} %; look at the flux, then run it again"
-        )
-        raise IdentifyError(msg)
+    insist_on_star(len(frames), len(star_px) - first, f"frames of {axis}", _LEAST_FRAMES)
     return frames
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.identify.drawing import new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.plays import ELEMENTS, trail
 from fitctl.identify.record import ExperimentRecord
@@ -94,9 +95,7 @@ class DelayResult:
 
     def plot(self, path: Path) -> None:
         """How well each time shift explains the frames, and each tick's delay."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        figure = new_figure(10.0, 4.2)
         left, right = figure.subplots(1, 2)
         left.semilogy(1e3 * self.shift_s, self.misfit, linewidth=1.0)
         left.axvline(1e3 * self.stamp_error_s, color="k", linestyle="--", linewidth=0.8)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.identify.errors import IdentifyError
+from fitctl.identify.drawing import new_figure
+from fitctl.identify.errors import IdentifyError, insist_on_room, insist_on_star
 from fitctl.identify.plays import (
     ELEMENTS,
     Fit,
@@ -32,7 +33,6 @@ _WIPES = 2  # sweeps of all together; one would do if the machine never stood st
 FULL_S, MINOR_S = 12.0, 20.0
 _LEAST_SWING = 0.5  # of the D/A's full scale
 _LEAST_FRAMES = 500
-_LEAST_SEEN = 0.9  # of the frames
 _AT_END = 0.02  # of the swing
 _UNSURE_S = 0.001  # so near to a change of voltage, a frame may have seen either side
 _LATE_S = np.linspace(-0.010, 0.010, 81)  # tried
@@ -88,18 +88,12 @@ def _check_star_stays(rig: Rig, loop_name: str, amplitude_v: float) -> None:
     loop = rig.loops[loop_name]
     per_stack_rad = loop.fsm.stack_scale_m_per_v / (2 * loop.fsm.stack_radius_m)
     swing_rad = 1.2 * amplitude_v * per_stack_rad
-    scale, target = scales(rig, loop), loop.target_px
+    scale = scales(rig, loop)
     # The second stack moves both of the mirror's axes, and what that is on the frame, its rotation decides.
     az_px, el_px = (
         swing_rad * scale.mirror_px_per_rad * np.abs(scale.mirror_turn).sum(axis=1)
     ).tolist()
-    for sign in (-1, 1):
-        if not rig.camera.window_fits(target.az + sign * az_px, target.el + sign * el_px):
-            msg = (
-                f"a full swing of one stack moves the star by {max(az_px, el_px):.1f} px, which must stay on "
-                f"the frame; move loops.{loop_name}.target_px nearer to the frame's middle"
-            )
-            raise IdentifyError(msg)
+    insist_on_room(rig, loop_name, "a full swing of one stack", az_px, el_px)
 
 
 @dataclass(frozen=True)
@@ -163,9 +157,7 @@ class HysteresisResult:
 
     def plot(self, path: Path) -> None:
         """Each stack's loops: what the camera saw, air path included, and the model."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(12, 4.5), layout="constrained")
+        figure = new_figure(12, 4.5)
         for stack, axes in enumerate(figure.subplots(1, 3, sharex=True, sharey=True)):
             own = np.isfinite(self.measured_m[:, stack])
             volts, model_um = self.volts[own, stack], self.modelled_m[own, stack] * 1e6
@@ -229,12 +221,7 @@ def _usable_frames(
     after = exposed_s > wiped_s
     seen = np.isfinite(record.star_px).all(axis=1)
     frames = np.flatnonzero(after & seen)
-    if len(frames) < max(_LEAST_FRAMES, _LEAST_SEEN * np.count_nonzero(after)):
-        msg = (
-            f"the star is on {len(frames)} of {np.count_nonzero(after)} frames, expected at least "
-            f"{_LEAST_FRAMES} and {100 * _LEAST_SEEN:g} %; look at the flux, then run it again"
-        )
-        raise IdentifyError(msg)
+    insist_on_star(len(frames), int(np.count_nonzero(after)), "frames", _LEAST_FRAMES)
     changed_s = record.injected_s[1:][np.diff(volts, axis=0).any(axis=1)]
     return frames[_distance(changed_s, exposed_s[frames]) >= unsure_s]
 

@@ -24,6 +24,26 @@ _FLUSH_SLACK_S = 2.0
 Progress = Callable[[float], None]
 
 
+def hold_on_simulation(simulation: Simulation, loop_name: str, settle_s: float) -> None:
+    """Acquire on the virtual clock, and hold the star in VERNIER for `settle_s`.
+
+    Raises
+    ------
+    IdentifyError
+        If the star is not found in time.
+    """
+    loop = simulation.supervisor.loops[loop_name]
+    simulation.acquire()
+    while loop.mode is not Mode.VERNIER:
+        if simulation.clock.now_s() > _ACQUIRE_LIMIT_S:
+            msg = (
+                f"the star was not in vernier within {_ACQUIRE_LIMIT_S:g} s; mode {loop.mode.name}"
+            )
+            raise IdentifyError(msg)
+        simulation.run(0.5)
+    simulation.run(settle_s)
+
+
 def on_simulation(
     rig: Rig, loop_name: str, name: str, drives: list[Drive], seed: int, on_progress: Progress
 ) -> list[AnyRecord]:
@@ -36,16 +56,8 @@ def on_simulation(
     """
     records: list[AnyRecord] = []
     simulation = Simulation(rig, seed, record=records.append, history_s=1.0)
+    hold_on_simulation(simulation, loop_name, _SETTLE_S)
     loop = simulation.supervisor.loops[loop_name]
-    simulation.acquire()
-    while loop.mode is not Mode.VERNIER:
-        if simulation.clock.now_s() > _ACQUIRE_LIMIT_S:
-            msg = (
-                f"the star was not in vernier within {_ACQUIRE_LIMIT_S:g} s; mode {loop.mode.name}"
-            )
-            raise IdentifyError(msg)
-        simulation.run(0.5)
-    simulation.run(_SETTLE_S)
     records.clear()
     reply = simulation.command(Experiment(loop=loop_name, name=name, drives=drives))
     if not reply.accepted:

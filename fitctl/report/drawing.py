@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.figures.plate import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure
+from fitctl.identify.drawing import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

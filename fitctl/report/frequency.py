@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fitctl.figures.plate import GREEN
+from fitctl.identify.drawing import GREEN
 from fitctl.report.drawing import AZ, EL, FAINT, INK, SERIES, Plot, decimal, panels
 from fitctl.report.findings import AXES, LoopFindings
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.figures.plate import GREEN, ORANGE, PURPLE, SKY
+from fitctl.identify.drawing import GREEN, ORANGE, PURPLE, SKY
 from fitctl.messages.modes import Mode
 from fitctl.report.drawing import (
     AZ,
