@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -60,34 +58,6 @@ class Plate:
         """For JSON."""
         rows = [row._asdict() | {"ratio": row.ratio} for row in self.rows]
         return asdict(self) | {"rows": rows}
-
-    def markdown(self) -> list[str]:
-        """Picture, caption and table."""
-        head = ["quantity", "paper", "ours", "ratio", "remark"]
-        rows = [
-            [
-                row.quantity,
-                "not printed" if row.paper is None else f"{row.paper:.4g}",
-                "never" if math.isnan(row.ours) else f"{row.ours:.4g}",
-                "" if row.ratio is None else f"{row.ratio:.3f}",
-                row.note,
-            ]
-            for row in self.rows
-        ]
-        return [
-            f"## {self.title}",
-            "",
-            f"![{self.title}]({self.name}.svg)",
-            "",
-            self.caption,
-            "",
-            *table(head, rows),
-        ]
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,8 @@ _PAPER_STEADY_PX = 1 / 35
 _PAPER_REQUIREMENT_PX = 0.1
 
 
-class Response(NamedTuple):
+@dataclass(frozen=True)
+class Response:
     """What a loop did about a step.
 
     Attributes
