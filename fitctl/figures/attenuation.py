@@ -94,16 +94,22 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
     return np.where(np.isnan(exposed_s)[:, None], np.nan, mirror_px + motor_px)
 
 
+def stacks_m(ticks: Ticks, fsm: Fsm, half_widths_v: Floats, gains_m_per_v: Floats) -> Floats:
+    """Displacements of the stacks about where they rest at the bias, shape (ticks, 3)."""
+    volts = np.stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)], axis=-1, dtype=float)
+    moved_m = displacement_series(volts, half_widths_v, gains_m_per_v)
+    moved_m -= raised_displacement(fsm.bias_v, half_widths_v, gains_m_per_v)
+    return moved_m
+
+
 def _mirror_angles_rad(fsm: Fsm, ticks: Ticks) -> Floats:
     """After each tick's command, shape (ticks, 2)."""
-    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
     known = fsm.hysteresis
     if known is None:
+        volts = np.stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)], axis=-1, dtype=float)
         return mirror_angles(volts, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
-    half_width_v, gains = np.asarray(known.half_widths_v), np.asarray(known.gains_m_per_v)
-    moved_m = displacement_series(volts, half_width_v, gains)
-    moved_m -= raised_displacement(fsm.bias_v, half_width_v, gains)
-    return mirror_from_stacks(moved_m, fsm.stack_radius_m)
+    half_widths_v, gains = np.asarray(known.half_widths_v), np.asarray(known.gains_m_per_v)
+    return mirror_from_stacks(stacks_m(ticks, fsm, half_widths_v, gains), fsm.stack_radius_m)
 
 
 def _last_vernier(ticks: Ticks) -> NDArray[np.intp]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.messages.modes import Mode
 from fitctl.simulation.statistics import SETTLE_S
@@ -93,7 +94,7 @@ def _moves(
     ticks: Columns, rows: NDArray[np.intp], begins: NDArray[np.bool_], requirement_px: float
 ) -> NDArray[np.bool_]:
     """Whether the target is on its way, at each of some rows."""
-    target_px = np.column_stack([ticks[f"target_{axis}_px"][rows] for axis in ("az", "el")])
+    target_px = axis_pair(ticks, "target_{}_px")[rows]
     step_px = np.abs(np.diff(target_px, axis=0, prepend=target_px[:1])).max(axis=1)
     step_s = np.diff(ticks["time_s"][rows], prepend=ticks["time_s"][rows[0]] - 1.0)
     return (step_px > _TARGET_MOVES * requirement_px * np.maximum(step_s, 1e-6)) & ~begins

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections import defaultdict
 from collections.abc import Sequence
@@ -175,9 +176,8 @@ def as_figure(path: Path, series: Sequence[Series]) -> Any:
     with styled():
         figure, axes = panels(len(grouped), 1.2 + 2.0 * len(grouped))
         for panel, (unit, its) in zip(axes, grouped.items(), strict=True):
-            for number, one in enumerate(its):
-                color = SERIES[number % len(SERIES)]
-                trace(panel, time, (one.time_s, one.values), color, labels[one.label])
+            for one, color in zip(its, itertools.cycle(SERIES), strict=False):
+                trace(panel, time, one.time_s, one.values, color, labels[one.label])
             panel.set_ylabel(unit)
             panel.legend(loc="best")
         axes[-1].set_xlabel(time.label)

@@ -17,7 +17,16 @@ from fitctl.controllers.design.choose import DESIGNS, design_for
 from fitctl.controllers.design.files import design_of
 from fitctl.controllers.design.loopshape import sampled_response
 from fitctl.controllers.pair import Design
-from fitctl.figures.attenuation import SEGMENT_S, Rebuilt, Spectra, attenuation, spectra, stages_px
+from fitctl.figures.attenuation import (
+    SEGMENT_S,
+    Rebuilt,
+    Spectra,
+    attenuation,
+    mean_spectra,
+    spectra,
+    stages_px,
+)
+from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
 from fitctl.report.judged import Judged, regular
@@ -52,7 +61,7 @@ class Rejection(NamedTuple):
     judged_s : float
         In pieces long enough for a spectrum.
     spectra : Spectra
-        Of error and rebuilt disturbance, the mean of both axes.
+        Of error and rebuilt disturbance, the mean of both axes, above frequency zero.
     predicted : Predicted or None
         None where the design cannot be made again; then `why` says why.
     """
@@ -89,7 +98,7 @@ def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejec
     rig, ticks = gathered.run.rig, gathered.ticks[loop_name]
     if not judged.pieces:
         return []
-    error_px = np.column_stack([ticks[f"error_{axis}_px"] for axis in ("az", "el")]).astype(float)
+    error_px = axis_pair(ticks, "error_{}_px")
     disturbance_px = error_px - stages_px(rig, loop_name, ticks)
     period_s = rig.camera.period_s
     controllers = _controllers(gathered, loop_name)
@@ -108,11 +117,8 @@ def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejec
             seconds += len(both) * period_s
             segments.append(2 * len(both) * period_s / SEGMENT_S - 1)
         if its_spectra:
-            measured = Spectra(
-                its_spectra[0].frequency_hz,
-                np.average([one.error for one in its_spectra], axis=0, weights=segments),
-                np.average([one.disturbance for one in its_spectra], axis=0, weights=segments),
-            )
+            # Not at rest, where the siderostat integrates and a logarithm ends.
+            measured = Spectra(*(of[1:] for of in mean_spectra(its_spectra, segments)))
             predicted, why = _predicted(gathered, loop_name, name, measured.frequency_hz)
             found.append(Rejection(name, seconds, measured, predicted, why))
     return found
@@ -155,18 +161,9 @@ def _predicted(
         design = _design(gathered, loop_name, name, its_basis)
     except ConfigError as error:
         return None, str(error)
-    rejection = np.full(len(frequency_hz), math.inf)  # at rest: the siderostat integrates
-    above = frequency_hz > 0
-    loop = sampled_response(design, its_basis)(2 * math.pi * frequency_hz[above])
-    rejection[above] = np.abs(1 + loop)
-    return (
-        Predicted(
-            rejection,
-            linear_residual(design, its_basis),
-            bound(its_basis).residual_px,
-        ),
-        "",
-    )
+    rejection = np.abs(1 + sampled_response(design, its_basis)(2 * math.pi * frequency_hz))
+    least_px = bound(its_basis).residual_px
+    return Predicted(rejection, linear_residual(design, its_basis), least_px), ""
 
 
 def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> Design:

@@ -9,13 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.figures.attenuation import stacks_m
+from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
-from fitctl.model.hysteresis import (
-    displacement_series,
-    half_widths_v,
-    raised_displacement,
-    stack_gains,
-)
+from fitctl.model.hysteresis import half_widths_v, stack_gains
 from fitctl.model.optics import piston_m, scales
 from fitctl.report.judged import Judged
 
@@ -117,11 +114,9 @@ def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
         gains = np.tile(stack_gains(settings, fsm), (3, 1))
     else:
         return None
-    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
-    displacement_m = displacement_series(volts, half_v, gains)
-    displacement_m -= raised_displacement(fsm.bias_v, half_v, gains)
+    displacement_m = stacks_m(ticks, fsm, half_v, gains)
     # Piece by piece: its vectors would take ten times the room of what comes of them.
-    pieces = np.array_split(displacement_m, 1 + len(volts) // _PIECE)
+    pieces = np.array_split(displacement_m, 1 + len(displacement_m) // _PIECE)
     piston = np.concatenate([piston_m(piece, fsm.stack_radius_m) for piece in pieces])
     return Stacks(source, displacement_m, piston)
 
@@ -133,7 +128,7 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
     """
     scale = scales(rig, rig.loops[loop_name])
     mirror_rad, motor_rad, setpoint_rad = (
-        np.column_stack([ticks[name.format(axis)] for axis in ("az", "el")]).astype(float)
+        axis_pair(ticks, name)
         for name in ("fsm_{}_rad", "siderostat_{}_rad", "siderostat_setpoint_{}_rad")
     )
     known = motor_rad[~np.isnan(motor_rad).any(axis=1)]
@@ -152,10 +147,9 @@ def stages(
     mirror_px, _, setpoint_px = motion_px(rig, loop_name, ticks)
     rows, pieces = judged.rows, judged.pieces
     if len(rows) == 0:
-        nothing = np.full(2, math.nan)
-        return Stages(math.nan, math.nan, math.nan, math.nan, nothing, [])
+        return Stages(math.nan, math.nan, math.nan, math.nan, np.full(2, math.nan), [])
     told_px = mirror_px + setpoint_px
-    target_px = np.column_stack([ticks[f"target_{axis}_px"] for axis in ("az", "el")])
+    target_px = axis_pair(ticks, "target_{}_px")
     fraction = ticks["fsm_range_fraction"][rows]
     return Stages(
         range_mean=float(fraction.mean()),
