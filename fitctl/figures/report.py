@@ -6,13 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from fitctl.config import Rig
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.bound import bound
+from fitctl.figures.pages import write_json, write_page
 from fitctl.figures.performance import AT_HZ, ROUGH_BACKLASH_TIMES, ROUGH_HYSTERESIS, Row
 from fitctl.figures.plate import Plate
 from fitctl.figures.rigs import at_flight_rate
@@ -25,9 +23,11 @@ PAPER_RMS_PX = 1 / 35
 
 def write_figures(rig: Rig, seed: int, plates: Sequence[Plate], folder: Path) -> None:
     """``figures.md`` and ``figures.json``."""
-    _write(folder / "figures.md", rig=rig, seed=seed, plates=plates)
+    write_page(
+        folder / "figures.md", "fitctl.figures", "figures.md.j2", rig=rig, seed=seed, plates=plates
+    )
     figures = [plate.plain() for plate in plates]
-    _write_json(folder / "figures.json", {"rig": rig.name, "seed": seed, "figures": figures})
+    write_json(folder / "figures.json", {"rig": rig.name, "seed": seed, "figures": figures})
 
 
 def write_performance(
@@ -36,8 +36,10 @@ def write_performance(
     """``performance.md`` and ``performance.json``; `runs` says in words how many of what."""
     flight = at_flight_rate(rig)
     bound_px, flight_bound_px = (bound(basis(one, loop_name)).residual_px for one in (rig, flight))
-    _write(
+    write_page(
         folder / "performance.md",
+        "fitctl.figures",
+        "performance.md.j2",
         rig=rig,
         loop=loop_name,
         rows=rows,
@@ -61,7 +63,7 @@ def write_performance(
         "flight_bound_px": flight_bound_px,
         "controllers": [asdict(row) | {"design": _design(row)} for row in rows],
     }
-    _write_json(folder / "performance.json", numbers)
+    write_json(folder / "performance.json", numbers)
 
 
 def _design(row: Row) -> dict[str, float]:
@@ -70,26 +72,3 @@ def _design(row: Row) -> dict[str, float]:
         "residual_px": row.design.residual_px,
         "ratio_to_bound": row.design.ratio_to_bound,
     }
-
-
-def _write(path: Path, **values: Any) -> None:
-    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-
-    pages = Environment(
-        loader=PackageLoader("fitctl.figures"),
-        autoescape=select_autoescape(),  # of HTML: this is Markdown
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-    )
-    pages.filters["number"] = _number
-    path.write_text(pages.get_template(f"{path.name}.j2").render(values), encoding="utf-8")
-
-
-def _number(value: float | None, form: str, unknown: str = "") -> str:
-    return unknown if value is None or math.isnan(value) else f"{value:{form}}"
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    # What is not a number becomes null.
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")

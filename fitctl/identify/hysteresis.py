@@ -106,8 +106,8 @@ class HysteresisResult:
     full_scale_v : float
         Of the D/A.
     half_widths_v : array, shape (n,)
-    gains_m_per_v, gains_sd_m_per_v : arrays, shape (3, n)
-        The elements' gains, and one standard deviation of them.
+    gains_m_per_v : array, shape (3, n)
+        The elements' gains.
     output_sd : array, shape (3,)
         One standard deviation of the model's output, RMS over the record, as a part of the stroke.
     late_s : float
@@ -122,7 +122,6 @@ class HysteresisResult:
     full_scale_v: float
     half_widths_v: Floats
     gains_m_per_v: Floats
-    gains_sd_m_per_v: Floats
     output_sd: Floats
     late_s: float
     excess: float
@@ -310,7 +309,6 @@ def _result(
         full_scale_v=full_scale_v,
         half_widths_v=half_widths_v,
         gains_m_per_v=fit.gains,
-        gains_sd_m_per_v=np.sqrt(np.diag(fit.covariance)).reshape(3, n),
         output_sd=np.array(output_sd),
         late_s=late_s,
         excess=fit.excess,

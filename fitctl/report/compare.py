@@ -44,7 +44,7 @@ def make_comparison(nights: Sequence[Findings], folder: Path) -> Path:
     parts.insert(0, Section("Verdicts", [], [_nights(lettered)]))
     figures = {"nights": [{"letter": letter, **plain(night)} for letter, night in lettered]}
     facts = [f"{letter}: {night.run.name}" for letter, night in lettered]
-    return write(folder, "Nights side by side", facts, [], parts, figures)
+    return write(folder, "Nights side by side", facts, parts, figures)
 
 
 def _nights(lettered: Sequence[tuple[str, Findings]]) -> Table:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import re
-from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from fitctl.report import frequency, motion, tables, timeline
 from fitctl.report.drawing import Plot, time_axis
-from fitctl.report.findings import Findings, LoopFindings
+from fitctl.report.findings import Findings
 from fitctl.report.judged import TARGET_SETTLE_S
 from fitctl.report.residual import Word
 from fitctl.report.tables import Table
@@ -24,23 +22,6 @@ JUDGED = (
     "Met: all of both axes' intervals is within the requirement. Not met: all of one is above. Else, or where "
     "the record is too short: not known."
 )
-
-
-class Card(NamedTuple):
-    """The verdict on one loop.
-
-    Attributes
-    ----------
-    title : str
-    word : Word
-    why : str
-    tables : list of Table
-    """
-
-    title: str
-    word: Word
-    why: str
-    tables: list[Table]
 
 
 class Section(NamedTuple):
@@ -66,13 +47,6 @@ class Section(NamedTuple):
     def anchor(self) -> str:
         """For links."""
         return re.sub(r"\W+", "-", self.title.lower())
-
-
-def card(loop: LoopFindings) -> Card:
-    """Verdict, residual and key figures of a loop."""
-    title = f"Loop {loop.name}: {loop.requirement_px:g} px RMS on each axis"
-    its_tables = [tables.residual(loop), tables.key_figures(loop)]
-    return Card(title, loop.verdict.word, loop.verdict.why, its_tables)
 
 
 def sections(findings: Findings) -> list[Section]:
@@ -120,28 +94,3 @@ def sections(findings: Findings) -> list[Section]:
             json.dumps({"rig": rig.model_dump(mode="json"), "designs": designs}, indent=1),
         ),
     ]
-
-
-def render(
-    title: str,
-    facts: Sequence[str],
-    cards: list[Card],
-    parts: list[Section],
-    drawings: Mapping[str, str],
-) -> str:
-    """The page: one file, nothing from elsewhere; `drawings` are its plots as SVG by name."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    pages = Environment(
-        loader=PackageLoader("fitctl.report"), autoescape=True, undefined=StrictUndefined
-    )
-    return pages.get_template("page.html.j2").render(
-        title=title,
-        facts=facts,
-        cards=cards,
-        sections=parts,
-        drawings=drawings,
-        signs=SIGNS,
-        judged=JUDGED,
-        version=importlib.metadata.version("fitctl"),
-    )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.config import ConfigError, Rig, rig_from_document
+from fitctl.config import ConfigError, Rig, rig_from_json
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
@@ -44,11 +43,6 @@ class Run(NamedTuple):
     def metadata(self) -> dict[str, dict[str, str]]:
         """Of the last file."""
         return self.logs[-1].metadata
-
-    @property
-    def told(self) -> str:
-        """Its files, for errors."""
-        return ", ".join(str(log.path) for log in self.logs)
 
 
 def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
@@ -110,13 +104,9 @@ def _identity(log: LogInfo) -> tuple[str, ...]:
 
 def _rig_of(log: LogInfo) -> Rig:
     _identity(log)
+    text = log.metadata["rig"].get("json", "")
     try:
-        document = json.loads(log.metadata["rig"]["json"])
-    except (KeyError, ValueError) as error:
-        msg = f"{log.path}: the rig file in it cannot be read ({error}); give one with --rig"
-        raise LogError(msg) from None
-    try:
-        return rig_from_document(document, f"{log.path}: rig file in it")
+        return rig_from_json(text, f"{log.path}: rig file in it")
     except ConfigError as error:
         first, *more = str(error).splitlines()
         also = f" ({len(more)} more)" if more else ""

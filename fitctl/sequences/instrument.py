@@ -73,18 +73,16 @@ class Instrument(StepMethods[Figures]):
     ) -> None:
         self.rig = rig if isinstance(rig, Rig) else load_rig(Path(rig or default_rig_path()))
         self._runner: Runner | None = None
-        self._client: Client | None = None
         self._link: Link
         if simulate:
             self.rig.mock_parts()
             self._link = SimulatedLink(self.rig, seed)
         else:
-            self._client = Client(_where(self.rig, folder, remote))
-            self._link = self._client
+            self._link = Client(_where(self.rig, folder, remote))
             try:
-                self._client.send(Status())
+                self._link.send(Status())
             except ConnectionError:
-                self._client.close()
+                self._link.close()
                 raise
 
     def __enter__(self) -> Instrument:
@@ -95,8 +93,7 @@ class Instrument(StepMethods[Figures]):
 
     def close(self) -> None:
         """Let go of the connection; the instrument goes on."""
-        if self._client is not None:
-            self._client.close()
+        self._link.close()
 
     def run(self, step: steps.Step) -> Figures:
         """Run one step; its figures, NaN where a value could not be had.
