@@ -26,7 +26,7 @@ _PAPER_GAIN_PX, _PAPER_B1_S2, _PAPER_B2_S, _PAPER_NOISE_PX = 0.45, 0.517, 2.5, 0
 def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) -> list[Plate]:
     """A minute of frames in open loop, tracked, transformed and fitted.
 
-    `minutes` of the plant's air path, each of another seed, tell how often the intervals hold the truth.
+    `minutes` of the plant's air path, each of another seed, show how often the intervals hold the truth.
     """
     records = on_simulation(
         rig, loop_name, "airpath", plan(rig, loop_name), seed, lambda _part: None

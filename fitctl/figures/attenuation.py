@@ -55,7 +55,7 @@ def rebuilt(rig: Rig, loop_name: str, ticks: Ticks) -> Rebuilt:
 
     The last stretch of VERNIER counts, from `SETTLE_S` after its start. The mirror is where the rig
     file's hysteresis puts it for the logged stack voltages (Eq. 5 where it is not known), the siderostat
-    where its encoders were. What neither tells, backlash and unknown hysteresis, stays in both series.
+    where its encoders were. What neither shows, backlash and unknown hysteresis, stays in both series.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def attenuation(measured: Spectra, at_hz: float) -> float:
     """Disturbance over error about a frequency, as amplitudes.
 
     The centroid noise n needs no subtraction: the rebuilt disturbance is d + n, and the loop, which
-    cannot tell the two apart, makes S (d + n) of it, the measured error. To take a white floor off each
+    cannot distinguish the two, makes S (d + n) of it, the measured error. To take a white floor off each
     spectrum would be wrong, because in closed loop the star's true motion follows the noise.
     """
     near = np.abs(measured.frequency_hz - at_hz) <= BAND_HZ

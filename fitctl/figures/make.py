@@ -35,7 +35,7 @@ class Amount(NamedTuple):
     step_s : float
         After the step of Fig. 11.
     minutes : int
-        Of frames that judge the intervals of Fig. 7.
+        Of frames that check the intervals of Fig. 7.
     """
 
     runs: performance.Effort

@@ -121,8 +121,8 @@ class Held:
         ]
         tick = tick_columns(frames)
         exposed_s = tick["mid_exposure_s"]
-        seen_s = np.array([time_s for time_s, _, _ in self._stages])
-        row = np.clip(np.searchsorted(seen_s, exposed_s + 1e-6), 0, len(seen_s) - 1)
+        sampled_s = np.array([time_s for time_s, _, _ in self._stages])
+        row = np.clip(np.searchsorted(sampled_s, exposed_s + 1e-6), 0, len(sampled_s) - 1)
         displacement_m = np.array([moved for _, moved, _ in self._stages])[row]
         beam_rad = np.array([beam for _, _, beam in self._stages])[row]
         mirror_rad = mirror_from_stacks(displacement_m, loop.fsm.stack_radius_m)

@@ -23,7 +23,7 @@ class Comparison(NamedTuple):
         None where the paper prints no number.
     ours : float
     note : str
-        What the paper says in words, or what ours is judged by.
+        What the paper says in words, or what ours is compared with.
     """
 
     quantity: str

@@ -49,7 +49,7 @@ class Response:
     bias_s : float
         Until the mirror's command stays within a third of the most that it came to.
     bias_px : float
-        What the mirror is still told to give at the end.
+        What the mirror is still commanded to give at the end.
     modes : str
         That the loop went through.
     """
@@ -63,7 +63,7 @@ class Response:
 
 
 def step_response(motion: Motion, axis: int, stepped_s: float, within_px: float) -> Response:
-    """Judge one axis after a step."""
+    """Evaluate one axis after a step."""
     period_s = float(np.median(np.diff(motion.time_s)))
     distance_px = motion.star_px[:, axis] - motion.target_px[-1, axis]
     found = settling(motion.time_s, distance_px, stepped_s, within_px)

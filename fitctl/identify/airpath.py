@@ -50,7 +50,7 @@ class RelativeMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class AirPathResult:
-    """What the frames told.
+    """What the frames show.
 
     Attributes
     ----------
@@ -89,10 +89,10 @@ class AirPathResult:
         ]
         if self.tracks.duration_s < RECOMMENDED_S:
             lines.append(f"shorter than {RECOMMENDED_S:.0f} s: the intervals are wide")
-        lines.append(f"pointing spot, both axes: {_told(self.joint)}")
+        lines.append(f"pointing spot, both axes: {_fit_text(self.joint)}")
         for spot, pair in enumerate(self.fits):
             lines += [
-                f"spot {spot} ({self.tracks.flux_dn[spot]:.0f} DN) {axis}: {_told(fit)}"
+                f"spot {spot} ({self.tracks.flux_dn[spot]:.0f} DN) {axis}: {_fit_text(fit)}"
                 for axis, fit in zip(AXES, pair, strict=True)
             ]
         lines += [
@@ -209,7 +209,7 @@ def _relative(px: Floats, fits: list[tuple[AirFit, AirFit]], spot: int) -> Relat
     )
 
 
-def _told(fit: AirFit) -> str:
+def _fit_text(fit: AirFit) -> str:
     model: AirPathModel = fit.model
     return (
         f"gain {fit.gain_px} px, b1 {fit.b1_s2} s², b2 {fit.b2_s} s, noise {fit.noise_px} px, "

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from fitctl.config import Rig
 from fitctl.identify.drawing import new_figure
-from fitctl.identify.errors import IdentifyError, insist_on_room, insist_on_star
+from fitctl.identify.errors import IdentifyError, require_room, require_star
 from fitctl.identify.record import ExperimentRecord
 from fitctl.identify.whitening import whitener
 from fitctl.model.drives import SIDEROSTAT, Drive
@@ -37,7 +37,7 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
         If the star would leave the frame.
     """
     reach_px = AMPLITUDE_PX + 1.0
-    insist_on_room(rig, loop_name, "the scan", reach_px, reach_px)
+    require_room(rig, loop_name, "the scan", reach_px, reach_px)
     return [
         Drive(
             channel=channel,
@@ -67,7 +67,7 @@ class AxisBacklash:
         By how much the exposures were later than the encoders' times say.
     excess : float
         RMS of what is left, over what the rig file's air path and centroid noise explain.
-    motor_px, seen_px, modelled_px : arrays, shape (frames,)
+    motor_px, measured_px, modelled_px : arrays, shape (frames,)
         Motor by the plate scale, star, and model, each about its mean.
     """
 
@@ -79,7 +79,7 @@ class AxisBacklash:
     late_sd_s: float
     excess: float
     motor_px: Floats = field(repr=False)
-    seen_px: Floats = field(repr=False)
+    measured_px: Floats = field(repr=False)
     modelled_px: Floats = field(repr=False)
 
 
@@ -139,7 +139,7 @@ class BacklashResult:
         figure = new_figure(10, 5)
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
         for panel, (name, axis) in zip(panels, self.axes.items(), strict=True):
-            panel.plot(axis.motor_px, axis.seen_px, ".", ms=3, color="0.6", label="seen")
+            panel.plot(axis.motor_px, axis.measured_px, ".", ms=3, color="0.6", label="seen")
             panel.plot(axis.motor_px, axis.modelled_px, ".", ms=2, color="tab:blue", label="model")
             panel.set(
                 title=f"{self.loop} {name}: {axis.width_px:.3f} ± {axis.width_sd_px:.3f} px",
@@ -182,9 +182,9 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
     motor_px -= motor_px.mean()
     frames = _usable_frames(AXES[axis], motor_px, star_px)
     times_s = record.tick["mid_exposure_s"]
-    seen_px = star_px[frames]
+    measured_px = star_px[frames]
     whiten = whitener(rig, record.loop, times_s[frames])
-    seen = whiten(seen_px[:, None])[:, 0]
+    whitened = whiten(measured_px[:, None])[:, 0]
     # Not by interpolation: it would smooth the encoders' counts, and be preferred for that.
     rate_px_s = np.gradient(motor_px, times_s)
 
@@ -194,7 +194,7 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
         return ratio * behind_play(motor_px + late_s * rate_px_s, width_px / 2)[frames]
 
     def left_over(values: Floats) -> Floats:
-        return np.asarray(seen - whiten(modelled_px(values)[:, None])[:, 0])
+        return np.asarray(whitened - whiten(modelled_px(values)[:, None])[:, 0])
 
     swing_px = float(np.ptp(motor_px))
     starts = [np.array([1.0, width_px, 0.0]) for width_px in swing_px * _FIRST_WIDTHS]
@@ -225,7 +225,7 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
         late_sd_s=float(late_sd_s),
         excess=float(np.sqrt(variance)),
         motor_px=motor_px[frames],
-        seen_px=seen_px - seen_px.mean(),
+        measured_px=measured_px - measured_px.mean(),
         modelled_px=model_px - model_px.mean(),
     )
 
@@ -242,7 +242,7 @@ def _usable_frames(axis: str, motor_px: Floats, star_px: Floats) -> NDArray[np.i
     far = [motor_px <= motor_px.min() + swing_px / 4, motor_px >= motor_px.max() - swing_px / 4]
     first = max(int(side.argmax()) for side in far)
     frames = first + np.flatnonzero(np.isfinite(star_px[first:]))
-    insist_on_star(len(frames), len(star_px) - first, f"frames of {axis}", _LEAST_FRAMES)
+    require_star(len(frames), len(star_px) - first, f"frames of {axis}", _LEAST_FRAMES)
     return frames
 
 

@@ -11,7 +11,7 @@ class IdentifyError(ValueError):
     """A record, or a rig, from which nothing can be learned: one line with what, expected, next step."""
 
 
-def insist_on_room(rig: Rig, loop_name: str, what: str, az_px: float, el_px: float) -> None:
+def require_room(rig: Rig, loop_name: str, what: str, az_px: float, el_px: float) -> None:
     """Refuse motions that would take the star off the frame, az_px or el_px to either side of its target.
 
     Raises
@@ -28,7 +28,7 @@ def insist_on_room(rig: Rig, loop_name: str, what: str, az_px: float, el_px: flo
             raise IdentifyError(msg)
 
 
-def insist_on_star(with_star: int, due: int, frames: str, least: int) -> None:
+def require_star(with_star: int, due: int, frames: str, least: int) -> None:
     """Refuse a record with the star on too few of the `due` frames, which `frames` names.
 
     Raises

@@ -149,7 +149,7 @@ def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
 
 
 def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[TimedImage]:
-    """Frames from the longest stretch in which the loop's stages were told to stand still.
+    """Frames from the longest stretch in which the loop's stages were commanded to stand still.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.identify.drawing import new_figure
-from fitctl.identify.errors import IdentifyError, insist_on_room, insist_on_star
+from fitctl.identify.errors import IdentifyError, require_room, require_star
 from fitctl.identify.plays import (
     ELEMENTS,
     Fit,
@@ -93,7 +93,7 @@ def _check_star_stays(rig: Rig, loop_name: str, amplitude_v: float) -> None:
     az_px, el_px = (
         swing_rad * scale.mirror_px_per_rad * np.abs(scale.mirror_turn).sum(axis=1)
     ).tolist()
-    insist_on_room(rig, loop_name, "a full swing of one stack", az_px, el_px)
+    require_room(rig, loop_name, "a full swing of one stack", az_px, el_px)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class HysteresisResult:
     output_sd : array, shape (3,)
         One standard deviation of the model's output, RMS over the record, as a part of the stroke.
     late_s : float
-        By how much the exposures were later than the record says, beside the voltages; taken account of.
+        By how much the exposures were later than the record says, beside the voltages; corrected for.
     excess : float
         RMS of what the model leaves, over what the rig file's air path and centroid noise explain.
     volts, modelled_m, measured_m : arrays, shape (frames, 3)
@@ -185,7 +185,7 @@ def analyse(rig: Rig, record: ExperimentRecord) -> HysteresisResult:
 
     Notes
     -----
-    A star cannot tell where the mirror stood before its stacks were first swept: the model's output is
+    A star does not show where the mirror stood before its stacks were first swept: the model's output is
     known but for a constant, which depends on the widest elements, that a full swing moves last.
     """
     end_v = float(np.ptp(record.injected_v, axis=0).min()) / 2
@@ -218,9 +218,9 @@ def _usable_frames(
     at_ends = np.stack([volts <= low_v + margin_v, volts >= high_v - margin_v])
     wiped_s = record.injected_s[at_ends.argmax(axis=1).max()]
     after = exposed_s > wiped_s
-    seen = np.isfinite(record.star_px).all(axis=1)
-    frames = np.flatnonzero(after & seen)
-    insist_on_star(len(frames), int(np.count_nonzero(after)), "frames", _LEAST_FRAMES)
+    with_star = np.isfinite(record.star_px).all(axis=1)
+    frames = np.flatnonzero(after & with_star)
+    require_star(len(frames), int(np.count_nonzero(after)), "frames", _LEAST_FRAMES)
     changed_s = record.injected_s[1:][np.diff(volts, axis=0).any(axis=1)]
     return frames[_distance(changed_s, exposed_s[frames]) >= unsure_s]
 
@@ -258,19 +258,21 @@ class _Evidence:
     def fit(self, half_widths_v: Floats, prior: Floats) -> Fit:
         """Gains from all frames and both axes at once."""
         plays_v = self.plays_v(half_widths_v)
-        seen = self.px_per_m.T[:, None, :, None] * plays_v
-        plays = self._whitened(seen.reshape(2, len(plays_v), -1)).reshape(-1, *plays_v.shape[1:])
+        moved_px = self.px_per_m.T[:, None, :, None] * plays_v
+        plays = self._whitened(moved_px.reshape(2, len(plays_v), -1)).reshape(
+            -1, *plays_v.shape[1:]
+        )
         return fit_gains(plays, self._white_star[:, 0], prior)
 
     def late_s(self, half_widths_v: Floats, gains: Floats) -> float:
         """By how much exposures are later than their times: as what a model explains most.
 
-        Voltages go in steps, so a frame that is told the wrong time was often told a wrong voltage.
+        Voltages go in steps, so a frame with a wrong time often has a wrong voltage too.
         """
         moved_m = hysteresis_output(trail(self.record.injected_v, half_widths_v), gains)
         rows = self._rows(self.exposed_s[:, None] + _LATE_S)
-        seen_px = np.einsum("fls,sa->afl", moved_m[rows], self.px_per_m)
-        left_over = self._white_star - self._whitened(seen_px)
+        modelled_px = np.einsum("fls,sa->afl", moved_m[rows], self.px_per_m)
+        left_over = self._white_star - self._whitened(modelled_px)
         return float(_LATE_S[np.argmin((left_over**2).sum(axis=0))])
 
     def _rows(self, times_s: Floats) -> NDArray[np.intp]:

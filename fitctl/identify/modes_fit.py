@@ -145,8 +145,8 @@ def fit_modes(frequency_hz: Floats, response: Complexes, driven: tuple[int, ...]
     )
 
     def misfit(values: Floats) -> Floats:
-        seen = _response(values, frequency_hz, driven)
-        difference = ((seen - response) / size[:, None, None]).ravel()
+        modelled = _response(values, frequency_hz, driven)
+        difference = ((modelled - response) / size[:, None, None]).ravel()
         return np.concatenate([difference.real, difference.imag])
 
     found = least_squares(misfit, begin, x_scale=scale)

@@ -73,7 +73,7 @@ def place_breakpoints(at_v: Floats, bend: Floats, end_v: float, count: int = ELE
         By how much the slope changes at each of some evenly spread voltages; the first, zero, where
         the curve begins, is not a bend.
     end_v : float
-        The largest that could be seen.
+        The largest that could show.
 
     Notes
     -----
@@ -117,7 +117,7 @@ class Fit(NamedTuple):
 def smoothness(half_widths_v: Floats, end_v: float, bend_m_per_v2: float) -> Floats:
     """Rows that ask neighbouring elements of one stack to bend alike, shape (n - 2, n).
 
-    Elements so wide that a full swing hardly moves them are told by little else. A row is the change of
+    Elements so wide that a full swing hardly moves them are determined by little else. A row is the change of
     curvature over what is expected of it, so that it may stand below whitened measurements.
 
     Parameters

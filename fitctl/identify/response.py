@@ -289,7 +289,7 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
             f"response: sampled at {record.rate_hz:g} Hz; expected {2.5 * HIGHEST_HZ:g} Hz or more"
         )
         raise IdentifyError(msg)
-    drive_rad, seen_rad = record.drive_rad, mirror_angles_seen(record.detector_v).T
+    drive_rad, mirror_rad = record.drive_rad, mirror_angles_seen(record.detector_v).T
     parts = []
     for low_hz, high_hz, segment_s in _BANDS:
         welch_of: dict[str, Any] = {
@@ -297,8 +297,8 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
             "nperseg": round(segment_s * record.rate_hz),
         }
         frequency_hz, driven = welch(drive_rad, **welch_of)
-        _, cross = csd(drive_rad, seen_rad, **welch_of)
-        _, coherent = coherence(drive_rad, seen_rad, **welch_of)
+        _, cross = csd(drive_rad, mirror_rad, **welch_of)
+        _, coherent = coherence(drive_rad, mirror_rad, **welch_of)
         # A stretch has its lower end and leaves its upper end to the next.
         inside = (frequency_hz > low_hz - 1e-9) & (frequency_hz < high_hz - 1e-9)
         parts.append((frequency_hz[inside], (cross / driven)[:, inside].T, coherent[:, inside].T))

@@ -81,9 +81,9 @@ def _figures(nights: list[Night]) -> Table:
             ", ".join(one.controller for one in loop.rejections) or tables.UNKNOWN
         ),
         "rejection at 1 Hz": _at_1_hz,
-        "time in VERNIER": lambda loop: seconds(loop.judged.vernier_s),
-        "of it judged": lambda loop: seconds(loop.judged.judged_s),
-        "star seen": lambda loop: number(loop.judged.star_fraction, ".2f", "%", 100),
+        "time in VERNIER": lambda loop: seconds(loop.selection.vernier_s),
+        "of it judged": lambda loop: seconds(loop.selection.evaluated_s),
+        "star seen": lambda loop: number(loop.selection.star_fraction, ".2f", "%", 100),
         "mirror's range, mean": lambda loop: number(loop.stages.range_mean, ".1f", "%", 100),
         "mirror's range, worst": lambda loop: number(loop.stages.range_worst, ".1f", "%", 100),
         "piston, RMS": lambda loop: number(loop.stages.piston_rms_m, ".1f", "nm", 1e9),
@@ -93,13 +93,13 @@ def _figures(nights: list[Night]) -> Table:
         "frame's age, median": lambda loop: number(loop.timing["age_median_s"], ".2f", "ms", 1e3),
         "tick, worst": lambda loop: number(loop.timing["compute_worst_s"], ".2f", "ms", 1e3),
     }
-    rows = [[what, *(tell(loop) for _, loop in nights)] for what, tell in kinds.items()]
+    rows = [[what, *(text(loop) for _, loop in nights)] for what, text in kinds.items()]
     return Table("Measured", ["what", *(letter for letter, _ in nights)], rows)
 
 
 def _rms(found: Estimate) -> str:
-    told = number(found.rms_px, ".4f")
-    return told if math.isnan(found.rms_px) else f"{told} ({tables.interval(found)})"
+    text = number(found.rms_px, ".4f")
+    return text if math.isnan(found.rms_px) else f"{text} ({tables.interval(found)})"
 
 
 def _at_1_hz(loop: LoopFindings) -> str:

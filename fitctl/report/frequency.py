@@ -101,7 +101,7 @@ def hysteresis(loop: LoopFindings) -> Plot:
             xlabel="target (px)",
             ylabel="stages told, from their mean (px)",
         )
-    rows = loop.judged.rows
+    rows = loop.selection.rows
     if loop.stacks is not None and len(rows):
         some = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(int)]
         for number, color in enumerate((AZ, EL, GREEN)):
@@ -121,7 +121,7 @@ def hysteresis(loop: LoopFindings) -> Plot:
 
 
 def _gap_text(loop: LoopFindings) -> str:
-    told = [
+    gaps = [
         f"{axis} {gap.px:+.3f} px"
         + ("" if math.isnan(gap.error_px) else f" (standard error {gap.error_px:.3f})")
         for axis, gap in zip(AXES, loop.stages.gaps, strict=False)
@@ -129,8 +129,8 @@ def _gap_text(loop: LoopFindings) -> str:
     ]
     found = (
         "Difference of the commands at one place of the target, come from below less come from above: "
-        f"{', '.join(told)}."
-        if told
+        f"{', '.join(gaps)}."
+        if gaps
         else "The target did not come to one place from both sides, so the commands cannot show hysteresis."
     )
     return (

@@ -12,7 +12,7 @@ from fitctl.figures.pages import write_json, write_page
 from fitctl.report import tables
 from fitctl.report.drawing import draw, styled
 from fitctl.report.findings import Findings, LoopFindings
-from fitctl.report.page import JUDGED, SIGNS, Section, sections
+from fitctl.report.page import EVALUATION, SIGNS, Section, sections
 
 PAGE = "report.html"
 
@@ -66,7 +66,7 @@ def write(
         sections=parts,
         drawings=drawings,
         signs=SIGNS,
-        judged=JUDGED,
+        evaluation=EVALUATION,
         version=importlib.metadata.version("fitctl"),
     )
     write_json(folder / "report.json", figures)
@@ -95,9 +95,9 @@ def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
         "requirement_px": loop.requirement_px,
         "sky_arcsec_per_px": loop.sky_arcsec_per_px,
         "residual": {axis: found._asdict() for axis, found in loop.residual.items()},
-        "vernier_s": loop.judged.vernier_s,
-        "judged_s": loop.judged.judged_s,
-        "star_fraction": loop.judged.star_fraction,
+        "vernier_s": loop.selection.vernier_s,
+        "judged_s": loop.selection.evaluated_s,
+        "star_fraction": loop.selection.star_fraction,
         "mode_s": loop.mode_s,
         "counts": loop.counts,
         "timing": loop.timing,
@@ -110,7 +110,7 @@ def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
         "controllers": [
             {
                 "name": found.controller,
-                "judged_s": found.judged_s,
+                "judged_s": found.evaluated_s,
                 "design_residual_px": math.nan
                 if found.predicted is None
                 else found.predicted.residual_px,

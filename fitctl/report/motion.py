@@ -25,7 +25,7 @@ from fitctl.report.drawing import (
     trace,
 )
 from fitctl.report.findings import AXES, Findings, LoopFindings
-from fitctl.report.judged import last_marked
+from fitctl.report.selection import last_marked
 from fitctl.report.stages import motion_px
 
 if TYPE_CHECKING:

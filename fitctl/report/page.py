@@ -9,13 +9,13 @@ from typing import NamedTuple
 from fitctl.report import frequency, motion, tables, timeline
 from fitctl.report.drawing import Plot, time_axis
 from fitctl.report.findings import Findings
-from fitctl.report.judged import TARGET_SETTLE_S
 from fitctl.report.residual import Word
+from fitctl.report.selection import TARGET_SETTLE_S
 from fitctl.report.tables import Table
 from fitctl.simulation.statistics import SETTLE_S
 
 SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
-JUDGED = (
+EVALUATION = (
     f"Judged is VERNIER, from {SETTLE_S:g} s after it began and {TARGET_SETTLE_S:g} s after the target last "
     "moved, on frames with a star. The error is the measured one: the camera's noise is in it. The interval "
     "knows that neighbouring frames are alike: so many independent values would leave the RMS as uncertain. "
@@ -75,7 +75,7 @@ def sections(findings: Findings) -> list[Section]:
             Section(f"Loop {loop.name}", plots, [tables.rejected(loop), tables.timings(loop)], text)
         )
     recorded = [tables.losses(findings), tables.files(run)]
-    told = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
+    happened = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
     rig = run.rig
     designs = {
         loop: json.loads(text).get("parameters")
@@ -83,7 +83,7 @@ def sections(findings: Findings) -> list[Section]:
     }
     return [
         *found,
-        Section("Events", [], told),
+        Section("Events", [], happened),
         Section("Losses and files", [], recorded),
         Section("Devices", [], [tables.devices(findings)]),
         Section(

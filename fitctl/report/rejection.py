@@ -29,7 +29,7 @@ from fitctl.figures.attenuation import (
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
-from fitctl.report.judged import Judged, regular
+from fitctl.report.selection import Selection, regular
 
 Floats = NDArray[np.float64]
 AT_HZ = (0.25, 0.5, 1.0, 2.0, 5.0)
@@ -58,7 +58,7 @@ class Rejection(NamedTuple):
     Attributes
     ----------
     controller : str
-    judged_s : float
+    evaluated_s : float
         In pieces long enough for a spectrum.
     spectra : Spectra
         Of error and rebuilt disturbance, the mean of both axes, above frequency zero.
@@ -67,7 +67,7 @@ class Rejection(NamedTuple):
     """
 
     controller: str
-    judged_s: float
+    evaluated_s: float
     spectra: Spectra
     predicted: Predicted | None
     why: str
@@ -78,7 +78,7 @@ class Rejection(NamedTuple):
         return np.sqrt(self.spectra.disturbance / self.spectra.error)
 
     def table(self) -> list[tuple[float, float, float]]:
-        """Frequency, measured, design's (nan if unknown), where the camera can tell."""
+        """Frequency, measured, design's (nan if unknown), up to what the camera resolves."""
         frequency_hz = self.spectra.frequency_hz
         return [
             (
@@ -93,10 +93,10 @@ class Rejection(NamedTuple):
         ]
 
 
-def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejection]:
+def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list[Rejection]:
     """One for each controller that was in force long enough, in the order of their first use."""
     rig, ticks = gathered.run.rig, gathered.ticks[loop_name]
-    if not judged.pieces:
+    if not selection.pieces:
         return []
     error_px = axis_pair(ticks, "error_{}_px")
     disturbance_px = error_px - stages_px(rig, loop_name, ticks)
@@ -106,7 +106,7 @@ def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejec
     for name in dict.fromkeys(name for _, _, name in controllers):
         spans = [(begin_s, end_s) for begin_s, end_s, its in controllers if its == name]
         its_spectra, segments, seconds = [], [], 0.0
-        for piece in _within(judged, ticks, spans):
+        for piece in _within(selection, ticks, spans):
             time_s = ticks["mid_exposure_s"][piece]
             if time_s[-1] - time_s[0] < SEGMENT_S:
                 continue
@@ -141,10 +141,10 @@ def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float,
 
 
 def _within(
-    judged: Judged, ticks: Columns, spans: list[tuple[float, float]]
+    selection: Selection, ticks: Columns, spans: list[tuple[float, float]]
 ) -> list[NDArray[np.intp]]:
     pieces = []
-    for piece in judged.pieces:
+    for piece in selection.pieces:
         time_s = ticks["time_s"][piece]
         for begin_s, end_s in spans:
             inside = piece[(time_s >= begin_s) & (time_s < end_s)]

@@ -14,7 +14,7 @@ from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.model.hysteresis import half_widths_v, stack_gains
 from fitctl.model.optics import piston_m, scales
-from fitctl.report.judged import Judged
+from fitctl.report.selection import Selection
 
 Floats = NDArray[np.float64]
 _SAME_PLACE_PX = 0.02  # of the target
@@ -45,7 +45,7 @@ class Dwell(NamedTuple):
     Attributes
     ----------
     target_px, command_px : float
-        Where it stood, and the mean of what both stages were told, as star motion.
+        Where it stood, and the mean of what both stages were commanded, as star motion.
     direction : int
         From where the target had come: 1 from below, -1 from above, 0 if this axis did not move.
     """
@@ -100,7 +100,7 @@ class Stages(NamedTuple):
 def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
     """Displacements and piston by the rig's identified hysteresis, or a mock's own; None without either.
 
-    Ideal stacks under Eq. 1 have no piston, so that without a model nothing can be said.
+    Ideal stacks under Eq. 1 have no piston, so that without a model nothing is known.
     """
     fsm = rig.loops[loop_name].fsm
     if fsm.hysteresis is not None:
@@ -141,14 +141,14 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
 
 
 def stages(
-    rig: Rig, loop_name: str, ticks: Columns, judged: Judged, found: Stacks | None
+    rig: Rig, loop_name: str, ticks: Columns, selection: Selection, found: Stacks | None
 ) -> Stages:
-    """The figures of what is judged; nan without any."""
+    """The figures of the frames that are evaluated; nan without any."""
     mirror_px, _, setpoint_px = motion_px(rig, loop_name, ticks)
-    rows, pieces = judged.rows, judged.pieces
+    rows, pieces = selection.rows, selection.pieces
     if len(rows) == 0:
         return Stages(math.nan, math.nan, math.nan, math.nan, np.full(2, math.nan), [])
-    told_px = mirror_px + setpoint_px
+    command_px = mirror_px + setpoint_px
     target_px = axis_pair(ticks, "target_{}_px")
     fraction = ticks["fsm_range_fraction"][rows]
     return Stages(
@@ -157,18 +157,18 @@ def stages(
         saturated_fraction=float(ticks["fsm_saturated"][rows].mean()),
         piston_rms_m=math.nan if found is None else float(found.piston_m[rows].std()),
         motor_moved_px=setpoint_px[rows[-1]] - setpoint_px[rows[0]],
-        gaps=[_gap(_dwells(target_px[:, axis], told_px[:, axis], pieces)) for axis in range(2)],
+        gaps=[_gap(_dwells(target_px[:, axis], command_px[:, axis], pieces)) for axis in range(2)],
     )
 
 
-def _dwells(target_px: Floats, told_px: Floats, pieces: list[NDArray[np.intp]]) -> list[Dwell]:
-    """Pieces end where the target moves (see :func:`fitctl.report.judged.judge_by`)."""
+def _dwells(target_px: Floats, command_px: Floats, pieces: list[NDArray[np.intp]]) -> list[Dwell]:
+    """Pieces end where the target moves (see :func:`fitctl.report.selection.select_frames`)."""
     found: list[Dwell] = []
     for piece in pieces:
         at_px = float(target_px[piece[-1]])
         came_px = at_px - found[-1].target_px if found else 0.0
         direction = 0 if abs(came_px) < _SAME_PLACE_PX else int(math.copysign(1, came_px))
-        found.append(Dwell(at_px, float(told_px[piece].mean()), direction))
+        found.append(Dwell(at_px, float(command_px[piece].mean()), direction))
     return found
 
 

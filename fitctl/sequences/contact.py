@@ -1,4 +1,4 @@
-"""A sequence's contact with the supervisor: what it hears, what it tells, and who wants it to end."""
+"""A sequence's contact with the supervisor: telemetry in, reports out, and who wants it to end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _REPORT_S = 1.0
 
 
 class Stopped(Exception):
-    """Somebody wants the whole sequence to end; `hold` tells whether its loops are to be held then."""
+    """Somebody wants the whole sequence to end; `hold` says whether its loops are to be held then."""
 
     def __init__(self, message: str, *, hold: bool) -> None:
         super().__init__(message)
@@ -42,7 +42,7 @@ class Contact:
     steps : int
         How many there will be.
     on_status : callable
-        Hears of every change: a new attempt, a pause, an end.
+        Called at every change: a new attempt, a pause, an end.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Contact:
         self._reported_s = 0.0
 
     def begin(self) -> None:
-        """Tell the supervisor that a sequence begins.
+        """Report to the supervisor that a sequence begins.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class Contact:
         self._on_status(self.status)
 
     def end(self, state: Literal["done", "failed", "stopped"], message: str = "") -> None:
-        """Tell the supervisor how it ended; one that is gone is not told."""
+        """Report to the supervisor how it ended, if it still answers."""
         with suppress(ConnectionError):
             self.report(state=state, message=message[:MESSAGE_CHARS])
 
@@ -88,7 +88,7 @@ class Contact:
 
     # ------------------------------------------------------------ telemetry
 
-    def look(self, loop_name: str) -> View:
+    def view_of(self, loop_name: str) -> View:
         """A view that begins with telemetry from now on: older may have queued up between two steps."""
         since_s = self.link.now_s()
         telemetry = self._receive()
@@ -101,14 +101,14 @@ class Contact:
         return view
 
     def next(self, view: View, *, paused: bool = False) -> None:
-        """Take the next message.
+        """Wait for the next message.
 
         Raises
         ------
         Stopped
             If the loop is made SAFE, or somebody stops the sequence.
         """
-        view.take(self._receive(), paused=paused)
+        view.update(self._receive(), paused=paused)
         self._obey(view)
         if paused:
             self.show_pause(paused=True)
@@ -136,17 +136,17 @@ class Contact:
         if self.stop_wanted.is_set():
             msg = "stopped by its program"
             raise Stopped(msg, hold=True)
-        told = view.telemetry.running_sequence
-        if told is not None and told.run == self.status.run:
-            self._wanted = told.wanted
+        running = view.telemetry.running_sequence
+        if running is not None and running.run == self.status.run:
+            self._wanted = running.wanted
         if self._wanted == "stop":
             msg = "stopped by the operator"
             raise Stopped(msg, hold=True)
 
-    # ------------------------------------------------------------ what is told
+    # ------------------------------------------------------------ reports
 
     def show_pause(self, *, paused: bool) -> bool:
-        """Tell when a pause begins or ends; True if one has just ended."""
+        """Report when a pause begins or ends; True if one has just ended."""
         state: Literal["paused", "running"] = "paused" if paused else "running"
         if self.status.state == state:
             return False
@@ -154,7 +154,7 @@ class Contact:
         return not paused
 
     def report(self, **changes: object) -> None:
-        """Tell the supervisor where the sequence is, with what has changed of it.
+        """Report to the supervisor where the sequence is, with what has changed of it.
 
         Raises
         ------

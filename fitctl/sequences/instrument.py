@@ -198,7 +198,7 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
 
     Steps and files run one after the other, in a thread of their own. One that waits for another one's end
     has not begun: cancelled, it never does, and the other goes on. Commands, STOP above all, wait for none.
-    Takes what :class:`Instrument` takes, and is made by ``async with``.
+    Is given what :class:`Instrument` is given, and made by ``async with``.
     """
 
     def __init__(

@@ -57,7 +57,7 @@ class SimulatedLink:
         """Go on until telemetry is due, or by `timeout_s`."""
         with self._stepping:
             self._simulation.run(min(timeout_s, self._period_s))
-            self._simulation.ticks.clear()  # for judging a run; nobody does here
+            self._simulation.ticks.clear()  # which a run is evaluated by; nothing is here
             if timeout_s < self._period_s:
                 return None
             self._state.sequence += 1

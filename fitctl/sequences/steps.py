@@ -29,7 +29,7 @@ LargestOffset = Annotated[
     Positive | None,
     Field(description="no search goes farther; without it, the radius does not grow"),
 ]
-SettleS = Annotated[NonNegative, Field(le=600, description="before, not judged")]
+SettleS = Annotated[NonNegative, Field(le=600, description="before, does not count")]
 DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
 OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
 RmsLimitPx = Annotated[
@@ -94,10 +94,10 @@ class Acquire(Step):
 
 
 class Hold(Step):
-    """Hold the star for a time and judge each axis against the requirement."""
+    """Hold the star for a time and compare the RMS of each axis with the requirement."""
 
     step: Literal["hold"] = "hold"
-    duration_s: Annotated[DurationS, Field(description="how long is judged")]
+    duration_s: Annotated[DurationS, Field(description="for how long the RMS counts")]
     settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     timeout_s: TimeoutS = 60.0
@@ -114,7 +114,7 @@ class Star(Settings):
 
 
 class Stars(Step):
-    """A list of stars, one after the other: acquire each where it is expected, hold it and judge it."""
+    """A list of stars, one after the other: acquire each where it is expected, and hold it as `hold` does."""
 
     step: Literal["stars"] = "stars"
     stars: Annotated[
@@ -129,7 +129,9 @@ class Stars(Step):
     file: Annotated[
         str, Field(description="TOML, YAML or CSV with the stars, beside the sequence's own file")
     ] = ""
-    duration_s: Annotated[DurationS, Field(description="how long each is judged")] = 30.0
+    duration_s: Annotated[DurationS, Field(description="for how long the RMS of each counts")] = (
+        30.0
+    )
     settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     search_radius_sky_arcsec: SearchRadius = None

@@ -183,9 +183,9 @@ def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
 def test_a_long_hold_remembers_no_more_frames_than_a_message_brings(tried, monkeypatch):
     remembered = []
 
-    def columns(looks):
-        remembered.append(len(looks))
-        return view.columns(looks)
+    def columns(measurements):
+        remembered.append(len(measurements))
+        return view.columns(measurements)
 
     monkeypatch.setattr(pointing, "columns", columns)
     run = tried()
