@@ -53,12 +53,12 @@ def figure_3(rig: Rig, loop_name: str, _seed: int, folder: Path) -> list[Plate]:
         return interferometer_m(hysteresis_output(plays_v, gains))
 
     ramp_v = np.linspace(0.0, full_scale_v, round(_RAMP_S * SAMPLE_HZ) + 1)
-    model = model_from_ramp(ramp_v, read_m(ramp_v))
+    model_half_v, model_gains = model_from_ramp(ramp_v, read_m(ramp_v))
     time_s = np.arange(round(_STEP_S * SAMPLE_HZ)) / SAMPLE_HZ
     volts = underdamped_step_v(time_s, full_scale_v)
     measured_m = read_m(volts)
-    plays_v = trail(volts[:, None], model.half_widths_v)[:, 0]
-    modelled_m = hysteresis_output(plays_v, model.gains_m_per_v)
+    plays_v = trail(volts[:, None], model_half_v)[:, 0]
+    modelled_m = hysteresis_output(plays_v, model_gains)
     stroke_m = swept_stroke(half_v, gains, full_scale_v)
     width_m = swept_loop_width(half_v, gains, full_scale_v)
     error = float(np.sqrt(np.mean((modelled_m - measured_m) ** 2))) / stroke_m

@@ -181,7 +181,7 @@ class _Motion:
     """
 
     def __init__(self, record: ExperimentRecord, rig: Rig, exposure_s: float = 0.0) -> None:
-        self._injected_s = record.injected_s
+        self._record = record
         self._exposure_s = exposure_s
         self._plays_v = _plays(record.injected_v)
         # Integrals, so that an exposure's mean is a difference.
@@ -227,18 +227,15 @@ class _Motion:
 
     def _plays_at(self, time_s: Floats) -> Floats:
         if self._exposure_s == 0.0:
-            return self._plays_v[self._row(time_s)]
+            return self._plays_v[self._record.row_at(time_s)]
         half_s = self._exposure_s / 2
         moved_vs = self._integral_at(time_s + half_s) - self._integral_at(time_s - half_s)
         return moved_vs / self._exposure_s
 
     def _integral_at(self, time_s: Floats) -> Floats:
-        row = self._row(time_s)
-        since_s = (time_s - self._injected_s[row])[:, None]
+        row = self._record.row_at(time_s)
+        since_s = (time_s - self._record.injected_s[row])[:, None]
         return self._integral_vs[row] + self._plays_v[row] * since_s
-
-    def _row(self, time_s: Floats) -> NDArray[np.intp]:
-        return np.maximum(np.searchsorted(self._injected_s, time_s, side="right") - 1, 0)
 
 
 def _plays(volts: Floats) -> Floats:

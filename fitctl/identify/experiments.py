@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 from fitctl.config import Rig
 from fitctl.identify import airpath, backlash, delay, hysteresis, response
@@ -14,18 +14,14 @@ from fitctl.logging.records import AnyRecord
 from fitctl.mocks.detector import DetectorBench
 from fitctl.model.drives import Drive
 
-
-class Finding(Protocol):
-    """What an identification found."""
-
-    def fragment(self) -> dict[str, Any]:
-        """What to lay over the rig file."""
-
-    def lines(self) -> list[str]:
-        """For an operator."""
-
-    def plot(self, path: Path) -> None:
-        """PNG or SVG, by the path's suffix."""
+Finding = (
+    hysteresis.HysteresisResult
+    | backlash.BacklashResult
+    | delay.DelayResult
+    | airpath.AirPathResult
+    | response.ResponseResult
+)
+"""Each has `fragment`, to lay over the rig file, `lines`, for an operator, and `plot`, a PNG or SVG."""
 
 
 class Identification(NamedTuple):

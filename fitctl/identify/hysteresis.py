@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,38 +50,22 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
     fsm = rig.loops[loop_name].fsm
     amplitude_v = min(fsm.bias_v, fsm.dac.full_scale_v - fsm.bias_v)
     _check_star_stays(rig, loop_name, amplitude_v)
-    drives = [
-        Drive(
-            channel=stack,
-            shape="triangle",
-            amplitude=amplitude_v,
-            frequency_hz=SLOW_HZ,
-            duration_s=_WIPES / SLOW_HZ,
-        )
-        for stack in STACKS
-    ]
-    start_s = _WIPES / SLOW_HZ
-    for stack in STACKS:
+    sweep = partial(Drive, shape="triangle", amplitude=amplitude_v)
+    wipe_s = _WIPES / SLOW_HZ
+    drives = [sweep(channel=stack, frequency_hz=SLOW_HZ, duration_s=wipe_s) for stack in STACKS]
+    for number, stack in enumerate(STACKS):
+        start_s = wipe_s + number * (FULL_S + MINOR_S)
+        minor_s = start_s + FULL_S
         drives += [
-            Drive(
+            sweep(channel=stack, frequency_hz=SLOW_HZ, start_s=start_s, duration_s=FULL_S),
+            sweep(
                 channel=stack,
-                shape="triangle",
-                amplitude=amplitude_v,
-                frequency_hz=SLOW_HZ,
-                start_s=start_s,
-                duration_s=FULL_S,
-            ),
-            Drive(
-                channel=stack,
-                shape="triangle",
-                amplitude=amplitude_v,
                 end_amplitude=0.0,
                 frequency_hz=FAST_HZ,
-                start_s=start_s + FULL_S,
+                start_s=minor_s,
                 duration_s=MINOR_S,
             ),
         ]
-        start_s += FULL_S + MINOR_S
     return drives
 
 
@@ -253,7 +238,7 @@ class _Evidence:
 
     def plays_v(self, half_widths_v: Floats) -> Floats:
         """Plays at the frames, shape (frames, stacks, n)."""
-        return trail(self.record.injected_v, half_widths_v)[self._rows(self.exposed_s)]
+        return trail(self.record.injected_v, half_widths_v)[self.record.row_at(self.exposed_s)]
 
     def fit(self, half_widths_v: Floats, prior: Floats) -> Fit:
         """Gains from all frames and both axes at once."""
@@ -270,14 +255,10 @@ class _Evidence:
         Voltages go in steps, so a frame with a wrong time often has a wrong voltage too.
         """
         moved_m = hysteresis_output(trail(self.record.injected_v, half_widths_v), gains)
-        rows = self._rows(self.exposed_s[:, None] + _LATE_S)
+        rows = self.record.row_at(self.exposed_s[:, None] + _LATE_S)
         modelled_px = np.einsum("fls,sa->afl", moved_m[rows], self.px_per_m)
         left_over = self._white_star - self._whitened(modelled_px)
         return float(_LATE_S[np.argmin((left_over**2).sum(axis=0))])
-
-    def _rows(self, times_s: Floats) -> NDArray[np.intp]:
-        row = np.searchsorted(self.record.injected_s, times_s, side="right") - 1
-        return np.maximum(row, 0)
 
     def _whitened(self, columns: Floats) -> Floats:
         """From (axes, frames, m) to (axes * frames, m)."""
@@ -292,7 +273,7 @@ def _result(
     modelled_m = hysteresis_output(plays_v, fit.gains)
     left_over_px = evidence.star_px - modelled_m @ evidence.px_per_m
     left_over_px -= left_over_px.mean(axis=0)
-    volts = evidence.record.stack_v_at(evidence.exposed_s)
+    volts = evidence.record.injected_v[evidence.record.row_at(evidence.exposed_s)]
     stacks = range(modelled_m.shape[1])
     output_sd = []
     for stack in stacks:

@@ -17,20 +17,7 @@ _BEND_CHANGE = 0.3  # of the mean curvature, from one element to the next, one s
 _LEAST_SLOPE = 0.05  # of the mean: a slope that is zero has no inverse
 
 
-class Ramp(NamedTuple):
-    """Eq. 6: a model from a full-scale ramp.
-
-    Attributes
-    ----------
-    half_widths_v : array, shape (n,)
-    gains_m_per_v : array, shape (..., n)
-    """
-
-    half_widths_v: Floats
-    gains_m_per_v: Floats
-
-
-def model_from_ramp(volts: Floats, displacement_m: Floats) -> Ramp:
+def model_from_ramp(volts: Floats, displacement_m: Floats) -> tuple[Floats, Floats]:
     """Eq. 6: half widths and gains from one rising full-scale ramp of each stack, relaxed before.
 
     Parameters
@@ -39,6 +26,11 @@ def model_from_ramp(volts: Floats, displacement_m: Floats) -> Ramp:
         Ascending; the ramp of all stacks.
     displacement_m : array, shape (..., m)
         Of one stack or of many.
+
+    Returns
+    -------
+    half_widths_v : array, shape (n,)
+    gains_m_per_v : array, shape (..., n)
 
     Notes
     -----
@@ -49,9 +41,8 @@ def model_from_ramp(volts: Floats, displacement_m: Floats) -> Ramp:
     gains = gains_from_slopes(_ramp_slopes(risen_v, displacement_m, look_v))
     bend = np.abs(gains).reshape(-1, len(look_v)).mean(axis=0)
     half_widths_v = place_breakpoints(look_v, bend, float(risen_v[-1]))
-    return Ramp(
-        half_widths_v, gains_from_slopes(_ramp_slopes(risen_v, displacement_m, half_widths_v))
-    )
+    slopes = _ramp_slopes(risen_v, displacement_m, half_widths_v)
+    return half_widths_v, gains_from_slopes(slopes)
 
 
 def _ramp_slopes(risen_v: Floats, displacement_m: Floats, breakpoints_v: Floats) -> Floats:

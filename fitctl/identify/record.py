@@ -45,10 +45,9 @@ class ExperimentRecord:
     injected_s: Floats
     injected_v: Floats
 
-    def stack_v_at(self, time_s: Floats) -> Floats:
-        """Voltages in force at given times, shape (..., 3)."""
-        row = np.searchsorted(self.injected_s, time_s, side="right") - 1
-        return self.injected_v[np.maximum(row, 0)]
+    def row_at(self, time_s: Floats) -> NDArray[np.intp]:
+        """The row of the injected voltages that was in force at each time, shape as `time_s`."""
+        return np.maximum(np.searchsorted(self.injected_s, time_s, side="right") - 1, 0)
 
     @property
     def star_px(self) -> Floats:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 from zipfile import BadZipFile
 
 import numpy as np
@@ -21,6 +21,7 @@ from fitctl.config import ARCSEC_PER_RAD, Fsm
 from fitctl.identify.drawing import BLACK, BLUE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.modes_fit import ModesFit, fit_modes, modes_response
+from fitctl.mocks.detector import DetectorBench
 from fitctl.model.detector import DETECTOR_RANGE_V, SAMPLE_RATE_HZ, mirror_angles_seen
 
 Floats = NDArray[np.float64]
@@ -42,13 +43,6 @@ _BANDS = ((LOWEST_HZ, 10.0, 20.0), (10.0, HIGHEST_HZ, 1.25))
 _COLUMNS = ("time_s", "drive_v", "detector_az_v", "detector_el_v")
 _CLIPPED = 0.999
 _FLAT_HZ = 100.0  # the paper: no resonance appears below
-
-
-class Bench(Protocol):
-    """A signal generator on the stacks and a detector: the mock's, or a real one's."""
-
-    def measure(self, axis: Axis, drive_rad: Floats) -> Floats:
-        """Inject wanted mirror angles, shape (n,) at 12.8 kHz; detector volts, shape (n, 2)."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +168,7 @@ def drive() -> Floats:
 
 
 def measure(
-    bench: Bench, on_axis: Callable[[Axis], None] = lambda _axis: None
+    bench: DetectorBench, on_axis: Callable[[Axis], None] = lambda _axis: None
 ) -> list[BenchRecord]:
     """Drive each axis of a bench; `on_axis` hears which one comes next.
 

@@ -31,6 +31,8 @@ LargestOffset = Annotated[
 ]
 SettleS = Annotated[NonNegative, Field(le=600, description="before, does not count")]
 DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
+DwellS = Annotated[DurationS, Field(description="at each place")]
+SteadyAfterS = Annotated[NonNegative, Field(description="of a dwell: from then on its RMS counts")]
 OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
 RmsLimitPx = Annotated[
     Positive | None,
@@ -160,10 +162,8 @@ class Moving(Step):
 class Visiting(Moving):
     """The common part of steps that lead the star to one place after another."""
 
-    dwell_s: Annotated[DurationS, Field(description="at each place")] = 20.0
-    steady_after_s: Annotated[
-        NonNegative, Field(description="of a dwell: from then on its RMS counts")
-    ] = 10.0
+    dwell_s: DwellS = 20.0
+    steady_after_s: SteadyAfterS = 10.0
     rms_limit_px: RmsLimitPx = None
 
 
@@ -189,10 +189,8 @@ class Raster(Visiting):
     columns: Annotated[Count, Field(le=21, description="in azimuth")] = 3
     rows: Annotated[Count, Field(le=21, description="in elevation")] = 3
     spacing_px: Annotated[Positive, Field(description="between neighbours")] = 1.0
-    dwell_s: Annotated[DurationS, Field(description="at each place")] = 12.0
-    steady_after_s: Annotated[
-        NonNegative, Field(description="of a dwell: from then on its RMS counts")
-    ] = 8.0
+    dwell_s: DwellS = 12.0
+    steady_after_s: SteadyAfterS = 8.0
 
 
 class Controller(Step):

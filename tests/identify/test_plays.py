@@ -33,12 +33,12 @@ def rms(values):
 def test_eq_6_makes_models_of_many_stacks_from_one_ramp(stacks):
     ramp_m = output(RISING, *stacks)
 
-    found = model_from_ramp(RISING, ramp_m)
+    half_widths_v, gains_m_per_v = model_from_ramp(RISING, ramp_m)
 
-    assert found.half_widths_v.size == 13
+    assert half_widths_v.size == 13
     # What only wide elements tell is the same constant throughout.
     minor = np.concatenate([SWEPT, 5 - 5 * np.cos(RISING) * np.linspace(1, 0, RISING.size)])
-    error_m = output(minor, found.half_widths_v, found.gains_m_per_v) - output(minor, *stacks)
+    error_m = output(minor, half_widths_v, gains_m_per_v) - output(minor, *stacks)
     error_m = error_m[:, SWEPT.size :]
     error_m -= error_m.mean(axis=1, keepdims=True)
     assert np.all(rms(error_m) < 0.002 * np.ptp(ramp_m, axis=1))
