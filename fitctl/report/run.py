@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.config import ConfigError, Rig, rig_from_json
+from fitctl.config import ConfigError, Rig, rig_from_document
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
@@ -104,9 +105,13 @@ def _identity(log: LogInfo) -> tuple[str, ...]:
 
 def _rig_of(log: LogInfo) -> Rig:
     _identity(log)
-    text = log.metadata["rig"].get("json", "")
     try:
-        return rig_from_json(text, f"{log.path}: rig file in it")
+        document = json.loads(log.metadata["rig"]["json"])
+    except (KeyError, ValueError) as error:
+        msg = f"{log.path}: the rig file in it cannot be read ({error}); give one with --rig"
+        raise LogError(msg) from None
+    try:
+        return rig_from_document(document, f"{log.path}: rig file in it")
     except ConfigError as error:
         first, *more = str(error).splitlines()
         also = f" ({len(more)} more)" if more else ""
