@@ -22,8 +22,8 @@ def require_room(rig: Rig, loop_name: str, what: str, az_px: float, el_px: float
     for sign in (-1, 1):
         if not rig.camera.window_fits(target.az + sign * az_px, target.el + sign * el_px):
             msg = (
-                f"{what} needs {max(az_px, el_px):.1f} px to either side of the star, which must stay on the frame; "
-                f"move loops.{loop_name}.target_px nearer to the frame's middle"
+                f"{what} needs {max(az_px, el_px):.1f} px to either side of the star, which must stay on the "
+                f"frame; move loops.{loop_name}.target_px nearer to the frame's middle"
             )
             raise IdentifyError(msg)
 
