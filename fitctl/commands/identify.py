@@ -26,7 +26,7 @@ from fitctl.identify.experiments import (
     response_on_mock_bench,
 )
 from fitctl.identify.fragments import fragment_text
-from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
+from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
 from fitctl.messages.modes import Mode
@@ -138,7 +138,7 @@ def _found(
             return _from_logs(experiment, rig, loop_name, paths)
     client = client_of(rig)
     try:
-        insist_on_vernier(client, loop_name)
+        require_vernier(client, loop_name)
         paths = on_rig(client, rig, loop_name, what, drives, progress)
     finally:
         client.close()

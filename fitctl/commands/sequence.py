@@ -174,12 +174,13 @@ def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json:
     """Run, show progress, print what every attempt gave, write calibrations; returns the exit status."""
     from fitctl.commands.sequence_text import as_json_text, attempts_text, where
     from fitctl.processes import ended_by_signals, interrupt
-    from fitctl.sequences.calibration import CALIBRATING, insist_on_folder, write_calibration
+    from fitctl.sequences.calibration import CALIBRATING, require_folder, write_calibration
+    from fitctl.sequences.contact import Contact
     from fitctl.sequences.runner import Runner, run_steps
     from fitctl.sequences.view import SequenceError
 
     if out is not None and any(step.step in CALIBRATING for step in sequence.steps):
-        insist_on_folder(out)
+        require_folder(out)
     attempts: list[SequenceAttempt] = []
     failure = "interrupted"
     with ended_by_signals(interrupt), progress_line() as progress:
@@ -196,7 +197,7 @@ def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json:
                 description=where(status),
             )
 
-        runner = Runner(link, rig, sequence.name, len(sequence.steps), show)
+        runner = Runner(Contact(link, rig, sequence.name, len(sequence.steps), show))
         try:
             run_steps(runner, sequence.steps)
             failure = ""

@@ -12,10 +12,10 @@ from fitctl.figures.attenuation import (
     mean_spectra,
     rebuilt,
     spectra,
-    tick_columns,
 )
 from fitctl.figures.rigs import with_controller
 from fitctl.identify.errors import IdentifyError
+from fitctl.identify.record import tick_columns
 from fitctl.logging.reading import tick_arrays
 from fitctl.logging.writer import LogWriter
 from fitctl.model.plant import Plant

@@ -64,7 +64,7 @@ def test_a_log_that_was_cut_off_is_judged_as_far_as_it_goes(held, tmp_path):
     found = find(find_run([path]))
 
     assert not found.run.logs[0].finished
-    assert 5 < found.loops["right"].judged.judged_s < 40
+    assert 5 < found.loops["right"].selection.evaluated_s < 40
 
 
 def test_a_log_without_ticks_is_not_known(rig, tmp_path):

@@ -1,4 +1,4 @@
-"""Which frames of a loop a residual is judged by, and the pieces that are whole."""
+"""The frames of a loop from which its residual is computed, and the pieces that are whole."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.messages.modes import Mode
 from fitctl.simulation.statistics import SETTLE_S
@@ -17,8 +18,8 @@ LONGEST_GAP_S = 0.5
 _TARGET_MOVES = 0.5  # requirements a second: slower is no motion
 
 
-class Judged(NamedTuple):
-    """The part of a run by which a loop is judged.
+class Selection(NamedTuple):
+    """The part of a run that is evaluated for a loop.
 
     Attributes
     ----------
@@ -27,7 +28,7 @@ class Judged(NamedTuple):
         missing within one.
     vernier_s : float
         All time in VERNIER.
-    judged_s : float
+    evaluated_s : float
         Of it, what counts.
     star_fraction : float
         Part of the frames that count in which the star was measured; nan without any.
@@ -35,7 +36,7 @@ class Judged(NamedTuple):
 
     pieces: list[NDArray[np.intp]]
     vernier_s: float
-    judged_s: float
+    evaluated_s: float
     star_fraction: float
 
     @property
@@ -44,7 +45,7 @@ class Judged(NamedTuple):
         return np.concatenate([np.empty(0, np.intp), *self.pieces])
 
 
-def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
+def select_frames(ticks: Columns, period_s: float, requirement_px: float) -> Selection:
     """Choose the frames: VERNIER, from `SETTLE_S` after it began and `TARGET_SETTLE_S` after the target moved.
 
     Parameters
@@ -58,7 +59,7 @@ def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
     """
     rows = np.flatnonzero((ticks["mode_number"] == Mode.VERNIER) & (ticks["number"] >= 0))
     if len(rows) == 0:
-        return Judged([], 0.0, 0.0, float("nan"))
+        return Selection([], 0.0, 0.0, float("nan"))
     time_s = ticks["time_s"][rows]
     # A stretch ends where another mode came between, or nothing for long.
     begins = np.ones(len(rows), bool)
@@ -67,17 +68,17 @@ def judge_by(ticks: Columns, period_s: float, requirement_px: float) -> Judged:
     since_s = time_s - last_marked(time_s, begins)
     still_s = time_s - last_marked(time_s, _moves(ticks, rows, begins, requirement_px) | begins)
     counts = (since_s >= SETTLE_S) & (still_s >= TARGET_SETTLE_S)
-    seen = rows[counts & ticks["star_visible"][rows]]
-    seen_s = ticks["mid_exposure_s"][seen]
-    apart = (np.diff(seen_s) > LONGEST_GAP_S) | (
-        np.diff(np.cumsum(begins)[np.searchsorted(rows, seen)]) > 0
+    with_star = rows[counts & ticks["star_visible"][rows]]
+    exposed_s = ticks["mid_exposure_s"][with_star]
+    apart = (np.diff(exposed_s) > LONGEST_GAP_S) | (
+        np.diff(np.cumsum(begins)[np.searchsorted(rows, with_star)]) > 0
     )
-    pieces = np.split(seen, np.flatnonzero(apart) + 1) if len(seen) else []
-    return Judged(
+    pieces = np.split(with_star, np.flatnonzero(apart) + 1) if len(with_star) else []
+    return Selection(
         pieces=[piece for piece in pieces if len(piece) > 1],
         vernier_s=len(rows) * period_s,
-        judged_s=int(np.count_nonzero(counts)) * period_s,
-        star_fraction=len(seen) / max(1, int(np.count_nonzero(counts)))
+        evaluated_s=int(np.count_nonzero(counts)) * period_s,
+        star_fraction=len(with_star) / max(1, int(np.count_nonzero(counts)))
         if counts.any()
         else float("nan"),
     )
@@ -93,7 +94,7 @@ def _moves(
     ticks: Columns, rows: NDArray[np.intp], begins: NDArray[np.bool_], requirement_px: float
 ) -> NDArray[np.bool_]:
     """Whether the target is on its way, at each of some rows."""
-    target_px = np.column_stack([ticks[f"target_{axis}_px"][rows] for axis in ("az", "el")])
+    target_px = axis_pair(ticks, "target_{}_px")[rows]
     step_px = np.abs(np.diff(target_px, axis=0, prepend=target_px[:1])).max(axis=1)
     step_s = np.diff(ticks["time_s"][rows], prepend=ticks["time_s"][rows[0]] - 1.0)
     return (step_px > _TARGET_MOVES * requirement_px * np.maximum(step_s, 1e-6)) & ~begins
