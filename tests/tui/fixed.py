@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.widgets.spectrum import Spectrum
-from tests.tui.fake import START_S, FakeSupervisor
+from tests.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 
 MESSAGES = 420

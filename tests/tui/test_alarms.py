@@ -8,7 +8,7 @@ from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
 from fitctl.tui.dialogs import alarms_text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
-from tests.tui.fake import START_S, FakeSupervisor
+from tests.fake_supervisor import START_S, FakeSupervisor
 
 FAULT = (
     "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error; "

@@ -27,7 +27,7 @@ from fitctl.tui.state import WINDOWS
 from fitctl.tui.views.listing import ListingView
 from fitctl.tui.views.operate import OperateView
 from fitctl.tui.widgets.focalplane import FocalPlane
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs
 
 SCREENS = [ConsoleApp.MODES[view.name] for view in VIEWS]

@@ -27,8 +27,8 @@ from fitctl.tui.widgets.spectrum import Spectrum
 from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces
+from tests.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.drawn import plain, shown
-from tests.tui.fake import START_S, FakeSupervisor
 
 
 def header(state):

@@ -16,8 +16,8 @@ from fitctl.tui.widgets.spectrum import spectra_of
 from fitctl.tui.widgets.stages import Stages, working_point
 from fitctl.tui.widgets.timing import Breakdown
 from fitctl.tui.widgets.traces import Traces, axis_limit_px, trace_lines
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.drawn import changed_tick, plain, shown
-from tests.tui.fake import FakeSupervisor
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,9 @@ import csv
 import json
 import re
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "logging"))
 from log_samples import (
     RUN_INFO,
     SETTINGS,

@@ -13,7 +13,7 @@ from fitctl.commands.status import duration, status_document, status_lines, utc
 from fitctl.logging.records import Event
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 
 TRIPPED = TrippedInterlock(
     name="flux_low", since_s=999.0, action="warn", reset="itself", reason="0.7; check the shutter"
