@@ -20,7 +20,7 @@ from documents import (
     commands,
 )
 
-from fitctl.cli import app, main
+from fitctl.cli import COMMANDS, app, load_command, main
 from fitctl.config import default_rig_path, load_rig
 from fitctl.daemon.run import run_info
 from fitctl.logging.records import QuantityReading, RecorderStatus
@@ -118,7 +118,7 @@ def to_run():
 
 def parsed(name, arguments):
     """The options of a subcommand; raises if it does not know one or its value is wrong."""
-    return CLI.commands[name].make_context(name, list(arguments)).params
+    return load_command(name).make_context(name, list(arguments)).params
 
 
 # ---------------------------------------------------------------- a folder to run things in
@@ -187,7 +187,7 @@ def test_every_command_exists_with_its_options(found):
             known = {option for parameter in CLI.params for option in parameter.opts}
             assert set(arguments) <= known | {"--help"}
             return
-        assert arguments[0] in CLI.commands, f"fitctl has no command {arguments[0]}"
+        assert arguments[0] in COMMANDS, f"fitctl has no command {arguments[0]}"
         if arguments[0] == "send" and "--help" not in arguments:
             sent_command(arguments[1:])
         with contextlib.suppress(typer.Exit):  # --help
@@ -312,7 +312,7 @@ def test_the_session_in_operating_is_what_the_supervisor_answers():
     pytest.fail("operating.md shows no session that ends in a shutdown")
 
 
-@pytest.mark.parametrize("name", [name for name, c in CLI.commands.items() if not c.hidden])
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.summary])
 def test_every_command_is_documented_and_has_help(name, capsys):
     assert any(found.words[1:2] == (name,) for found in ours()), f"no document shows fitctl {name}"
     with pytest.raises(typer.Exit):

@@ -5,7 +5,7 @@ import tomllib
 
 from documents import ROOT, between, blocks, table
 
-from fitctl.commands.fault import kinds as fault_kinds
+from fitctl.commands.shared.fault_kinds import kinds as fault_kinds
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.command_table import COMMANDS as COMMAND_ROWS

@@ -8,7 +8,7 @@ import pytest
 from log_samples import RUN_INFO, SETTINGS, WALL_S, filled, tick
 
 from benchmarks.soak import growth, logs, strikes
-from fitctl.commands.fault import kinds
+from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.logging.records import Event, RecorderStatus
 from fitctl.logging.writer import LogWriter
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from fitctl import __version__
-from fitctl.cli import app, main
+from fitctl.cli import COMMANDS, main
 
 
 def fitctl(*arguments, timeout_s=60):
@@ -21,11 +21,7 @@ def fitctl(*arguments, timeout_s=60):
     )
 
 
-def commands():
-    return [command.name or command.callback.__name__ for command in app.registered_commands]
-
-
-@pytest.mark.parametrize("command", commands())
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_a_help_text(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
@@ -43,14 +39,36 @@ def test_the_version_is_said():
     assert said.stdout == f"fitctl {__version__}\n"
 
 
-def test_help_does_not_import_what_is_slow():
-    slow = ("numpy", "scipy", "control", "textual", "zmq", "can")
-    probe = f"import sys, fitctl.cli; print([m for m in {slow} if m in sys.modules])"
+def test_help_and_completion_of_commands_do_not_import_what_is_slow():
+    slow = ("numpy", "scipy", "control", "textual", "zmq", "can", "pydantic")
+    probe = (
+        "import sys, fitctl.cli\n"
+        "try: fitctl.cli.main(['--help'])\n"
+        f"finally: print([m for m in {slow} if m in sys.modules])"
+    )
     result = subprocess.run(
         [sys.executable, "-c", probe], capture_output=True, text=True, check=True
     )
 
-    assert result.stdout.strip() == "[]"
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_help_lists_every_command_with_its_whole_summary():
+    lines = fitctl("--help").stdout.split("\nCommands:\n")[1].splitlines()
+
+    listed = {name: command.summary for name, command in COMMANDS.items() if command.summary}
+    assert dict(line.split(maxsplit=1) for line in lines) == listed
+    assert max(map(len, listed.values())) <= 45
+
+
+def test_a_console_without_a_terminal_says_what_to_use_instead():
+    result = fitctl("console", timeout_s=20)
+
+    assert result.returncode == 2
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    for instead in ("needs a terminal", "fitctl watch", "fitctl status", "--web"):
+        assert instead in line
 
 
 BAD_INPUT = {

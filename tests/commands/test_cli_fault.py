@@ -8,7 +8,7 @@ import time
 import pytest
 
 from fitctl.cli import main
-from fitctl.commands.fault import kinds
+from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.mocks.faults import WIRE_FAULTS
 
 SCRIPT = """

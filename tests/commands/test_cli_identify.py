@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from fitctl.cli import main
-from fitctl.commands import identify as commands
+from fitctl.commands.design import identify as commands
 from fitctl.daemon.run import run_info
 from fitctl.identify import run as runs
 from fitctl.identify.experiments import EXPERIMENTS

@@ -10,7 +10,7 @@ import tomllib
 import pytest
 
 from fitctl.cli import main
-from fitctl.commands.welcome import rig_files
+from fitctl.commands.shared.welcome import rig_files
 from fitctl.config import default_rig_path, load_rig
 from fitctl.config.new_rig import DEVICES, MOCK, chosen, forms, new_rig_text
 

@@ -112,6 +112,7 @@ def console(monkeypatch, capsys):
     monkeypatch.setattr(ConsoleApp, "run", show)
     monkeypatch.setattr(os, "nice", lambda _by: 0)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr("fitctl.commands.operate.console.has_terminal", lambda: True)
 
     def run(*arguments):
         status = fitctl("console", *arguments)
@@ -165,7 +166,8 @@ def test_each_page_of_a_browser_is_the_console_that_was_asked_for(
     console, key_file, monkeypatch, rig, remote
 ):
     pages = []
-    monkeypatch.setattr("fitctl.commands.web.serve_console", lambda *page: pages.append(page))
+    served = "fitctl.commands.operate.console.serve_console"
+    monkeypatch.setattr(served, lambda *page: pages.append(page))
     options = [*rig, *(["--remote", key_file] if remote else [])]
 
     assert fitctl("console", "--web", *options) == 0

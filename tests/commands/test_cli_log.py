@@ -20,7 +20,7 @@ from log_samples import (
 )
 
 from fitctl.cli import main
-from fitctl.commands.log import app
+from fitctl.commands.analyse.log import app
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import AnyRecord
 from fitctl.logging.writer import LogWriter

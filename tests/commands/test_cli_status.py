@@ -7,9 +7,9 @@ import math
 import msgspec
 import pytest
 
-from fitctl.commands import watch
-from fitctl.commands.printing import to_json
-from fitctl.commands.status import duration, status_document, status_lines, utc
+from fitctl.commands.operate import watch
+from fitctl.commands.operate.status import duration, status_document, status_lines
+from fitctl.commands.shared.printing import to_json, utc
 from fitctl.logging.records import Event
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.messages.troubles import RECORDER_SILENT_S, troubles

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from fitctl.commands.fault import kinds
+from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.config import CONTROLLERS, default_rig_path
 from fitctl.sequences.files import shipped_sequences
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_np
 
-from fitctl.commands.attending import console
+from fitctl.commands.operate.console import console
 from fitctl.tui.draw.frame import place
 from fitctl.tui.draw.overlays import OVERLAY_INKS, SHAPES, Overlay, cell_marks, paint
 from fitctl.tui.draw.pictures import KITTY_AWAY, SIXEL_INKS, kitty, sixel
