@@ -136,8 +136,9 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         # Not at the top: `fitctl --help` and Tab need no rig file, and take half the time without.
         from fitctl.config import ConfigError
+        from fitctl.logging.errors import LogError
 
-        if not isinstance(error, ConfigError):
+        if not isinstance(error, ConfigError | LogError):
             raise
         typer.echo(str(error), err=True)
         status = UNUSABLE

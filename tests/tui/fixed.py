@@ -52,7 +52,7 @@ class FakeJob:
 
     def __init__(self, arguments, *, outlives=False):
         self.arguments = list(arguments)
-        self.told = " ".join(["fitctl", *arguments])
+        self.command_line = " ".join(["fitctl", *arguments])
         self.outlives = outlives
         self.status = 0
         self.ended = False

@@ -220,7 +220,7 @@ class KeyApp(FixedApp):
             "dialog": type(self.screen).__name__ if self.screen.is_modal else "",
             "loop": self.state.shown,
             "window_s": self.state.window.rms_s,
-            "unseen": self.alarms.unseen,
+            "unseen": self.alarms.unacknowledged,
             "loud": self.alarms.loud,
             "kept": len(list(self.log_folder.glob("*.keep"))),
             "started": [

@@ -36,17 +36,17 @@ def header(state):
 
 
 def keys(state):
-    return Keys(state, "operate", judged(state))
+    return Keys(state, "operate", updated_book(state))
 
 
-def judged(state):
+def updated_book(state):
     book = AlarmBook()
-    book.judge(state)
+    book.update(state)
     return book
 
 
 def alarm_bar(state):
-    return AlarmBar(state, judged(state))
+    return AlarmBar(state, updated_book(state))
 
 
 def hand(state):
@@ -219,7 +219,7 @@ def test_at_80_columns_an_alarms_keys_follow_stop_and_the_commands(mode):
     supervisor = FakeSupervisor(mode)
     supervisor.records_lost = 3
     state = shown(supervisor)
-    book = judged(state)
+    book = updated_book(state)
     footer = Keys(state, "operate", book)
     line = plain(footer.draw(80, 1))[0]
     commands = [row.label for row in OPERATOR_COMMANDS if row.name in state.usable_commands]

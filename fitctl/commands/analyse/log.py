@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.logs import one_line, time_ns
+from fitctl.commands.shared.log_time import time_ns
 from fitctl.commands.shared.printing import to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
@@ -52,8 +52,7 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="All of it, also the rig file.")] = False,
 ) -> None:
     """Say what a log holds."""
-    with one_line():
-        found, kept, recording = log_info(log), folder.is_kept(log), folder.in_use(log)
+    found, kept, recording = log_info(log), folder.is_kept(log), folder.in_use(log)
     if as_json:
         typer.echo(to_json(_info_document(found, kept=kept, recording=recording)))
         return
@@ -89,8 +88,7 @@ def verify(logs: LogsArgument) -> None:
     """Read logs from end to end: checksums, index, order, every message. Exit status 1 if one is not whole."""
     problems = 0
     for log in logs:
-        with one_line():
-            verdict = verifying.verify(log)
+        verdict = verifying.verify(log)
         problems += len(verdict.problems)
         typer.echo(
             f"{log}: {'not whole' if verdict.problems else 'whole'}; {verdict.records} records, "
@@ -104,15 +102,14 @@ def verify(logs: LogsArgument) -> None:
 @app.command()
 def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
     """Make a whole log from one that was cut off or damaged. LOG itself stays as it is."""
-    with one_line():
-        if folder.in_use(log):
-            msg = f"{log}: is being recorded just now; there is nothing to mend"
-            raise ConfigError(msg)
-        if not verifying.verify(log).problems:
-            typer.echo(f"{log}: is whole; there is nothing to mend")
-            return
-        target = out or log.with_name(f"{log.stem}_recovered.mcap")
-        saved = copying.recover(log, target, overwrite=overwrite)
+    if folder.in_use(log):
+        msg = f"{log}: is being recorded just now; there is nothing to mend"
+        raise ConfigError(msg)
+    if not verifying.verify(log).problems:
+        typer.echo(f"{log}: is whole; there is nothing to mend")
+        return
+    target = out or log.with_name(f"{log.stem}_recovered.mcap")
+    saved = copying.recover(log, target, overwrite=overwrite)
     lost = f"{saved.damaged_chunks} damaged chunks passed over, " if saved.damaged_chunks else ""
     typer.echo(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
@@ -134,18 +131,19 @@ def cut(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Copy a span of time, some topics, or both. UTC times look like 2026-11-21T09:18:30.5."""
-    with one_line():
-        found = log_info(log)
-        from_ns = time_ns("--from", from_, found)
-        to_ns = 2**63 if to is None else time_ns("--to", to, found)
-        if to_ns <= from_ns:
-            msg = f"cut: --to {to} is not after --from {from_}; choose a later --to, or an earlier --from"
-            raise ConfigError(msg)
-        target = out or log.with_name(f"{log.stem}_cut.mcap")
-        topics = _topics(found, topic)
-        records = copying.cut(
-            log, target, from_ns=from_ns, to_ns=to_ns, topics=topics, overwrite=overwrite
+    found = log_info(log)
+    from_ns = time_ns("--from", from_, found)
+    to_ns = 2**63 if to is None else time_ns("--to", to, found)
+    if to_ns <= from_ns:
+        msg = (
+            f"cut: --to {to} is not after --from {from_}; choose a later --to, or an earlier --from"
         )
+        raise ConfigError(msg)
+    target = out or log.with_name(f"{log.stem}_cut.mcap")
+    topics = _topics(found, topic)
+    records = copying.cut(
+        log, target, from_ns=from_ns, to_ns=to_ns, topics=topics, overwrite=overwrite
+    )
     typer.echo(f"{target}: {records} of {sum(found.counts.values())} records")
 
 
@@ -156,8 +154,7 @@ def merge(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Join logs by time, such as those of one night, or what a crash tore in two."""
-    with one_line():
-        records, doubles = copying.merge(logs, out, overwrite=overwrite)
+    records, doubles = copying.merge(logs, out, overwrite=overwrite)
     also = f"; {doubles} were in two logs" if doubles else ""
     typer.echo(f"{out}: {records} records of {len(logs)} logs{also}")
 
@@ -174,8 +171,7 @@ def export(
 ) -> None:
     """Write each topic as a table, with units in the names of the columns."""
     target = out or log.with_name(f"{log.stem}_{format_}")
-    with one_line():
-        files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
+    files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
     for file, rows in sorted(files.items()):
         typer.echo(f"{file}: {rows} rows")
     if not files:
@@ -189,10 +185,9 @@ def keep(
     undo: Annotated[bool, typer.Option("--undo", help="No longer keep them.")] = False,
 ) -> None:
     """Mark logs, so that the recorder never deletes them; the mark is an empty file LOG.keep beside each."""
-    with one_line():
-        for log in logs:
-            folder.keep(log, kept=not undo)
-            typer.echo(f"{log}: {'no longer kept' if undo else 'kept'}")
+    for log in logs:
+        folder.keep(log, kept=not undo)
+        typer.echo(f"{log}: {'no longer kept' if undo else 'kept'}")
 
 
 def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.logs import one_line, time_ns
+from fitctl.commands.shared.log_time import time_ns
 from fitctl.config import ConfigError
 from fitctl.logging.reading import log_info
 from fitctl.report.quick import Series, as_figure, as_text, read_series
@@ -42,11 +42,10 @@ def plot(
     if out is not None and out.suffix.lower() not in _PICTURES:
         msg = f"plot: --out {out}: expected a name that ends in {', '.join(sorted(_PICTURES))}"
         raise ConfigError(msg)
-    with one_line():
-        found = log_info(log)
-        from_ns = time_ns("--from", from_, found) if found.counts else 0
-        to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
-        series = read_series(log, what, from_ns, to_ns)
+    found = log_info(log)
+    from_ns = time_ns("--from", from_, found) if found.counts else 0
+    to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
+    series = read_series(log, what, from_ns, to_ns)
     if not any(len(one.time_s) for one in series):
         msg = f"plot: {log} has nothing of that between --from {from_} and --to {to or 'its end'}"
         raise ConfigError(msg)

@@ -17,7 +17,6 @@ from fitctl.commands.shared.rig import controller_overrides
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_json
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import design_json
-from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo
 from fitctl.replay.files import dark_of_today, logged_files
 from fitctl.replay.log import read_steps, whole_run
@@ -56,16 +55,13 @@ def replay(
     Exit status 0 if every mode and every command is the same to the last bit, 1 if not, 2 if the log
     cannot be replayed. A changed command changes no frames.
     """
-    try:
-        with whole_run(logs) as info, logged_files(info) as files:
-            settings = _rig(info, files, rig, overrides or [], controller)
-            dark_file = dark_of_today(info, settings)
-            if dark_file is not None and not Path(dark_file).exists():
-                msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
-                raise ConfigError(msg)
-            result = _replayed(info, settings)
-    except LogError as error:
-        raise ConfigError(str(error)) from None
+    with whole_run(logs) as info, logged_files(info) as files:
+        settings = _rig(info, files, rig, overrides or [], controller)
+        dark_file = dark_of_today(info, settings)
+        if dark_file is not None and not Path(dark_file).exists():
+            msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
+            raise ConfigError(msg)
+        result = _replayed(info, settings)
     named = ", ".join(map(str, logs))
     if dark_file is not None:
         today = f"{dark_file} was read as it is today; if it was measured anew since, {_NAME_IT}"
@@ -129,16 +125,8 @@ def _document(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> dict
     loops = {}
     for name, loop in result.loops.items():
         loops[name] = document = asdict(loop)
-        differences = loop.differences.items()
-        document["differences"] = {
-            what: {
-                "ticks": difference.ticks,
-                "first_s": _from_start_s(info, difference.first_s),
-                "worst": difference.worst,
-                "rms": difference.rms,
-            }
-            for what, difference in differences
-        }
+        for difference in document["differences"].values():
+            difference["first_s"] = _from_start_s(info, difference["first_s"])
         document["mode"]["first_s"] = _from_start_s(info, loop.mode.first_s)
     span_s = result.end_s - result.start_s
     return {

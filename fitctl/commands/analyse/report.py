@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.logs import one_line
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError
 from fitctl.report.compare import make_comparison
@@ -52,11 +51,8 @@ def report(
     if compare and not 2 <= len(logs) <= MOST_NIGHTS:
         msg = f"report: --compare takes 2 to {MOST_NIGHTS} logs or folders, got {len(logs)}"
         raise ConfigError(msg)
-    with one_line():
-        runs = (
-            [find_run([log], settings) for log in logs] if compare else [find_run(logs, settings)]
-        )
-        nights = [find(run) for run in runs]
+    runs = [find_run([log], settings) for log in logs] if compare else [find_run(logs, settings)]
+    nights = [find(run) for run in runs]
     name = "comparison" if compare else f"{runs[0].name}_report"
     first = runs[0].logs[0].path
     folder = out or first.with_name(name)

@@ -29,7 +29,6 @@ from fitctl.identify.experiments import (
 from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, insist_on_vernier, on_rig, on_simulation
 from fitctl.logging.copying import merge
-from fitctl.logging.errors import LogError
 from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -89,15 +88,15 @@ def identify(
     source = Source(log, simulated, mock, seed)
     stem = f"{settings.name}-{loop}-{what}"
     fragment_path = out or Path(f"{stem}.toml")
-    _insist_on_output(fragment_path)
+    _require_output(fragment_path)
     plot_path = plot or fragment_path.with_suffix(".png")
     if plot_path.suffix not in _PLOT_SUFFIXES:
         msg = f"identify: {plot_path}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
         raise ConfigError(msg)
-    _insist_on_output(plot_path)
+    _require_output(plot_path)
     try:
         with ended_by_signals(interrupt), progress_line(f"identify {what}") as progress:
-            finding = _found(
+            finding = _finding(
                 settings, rig or default_rig_path(), overrides or [], what, loop, source, progress
             )
         # The plot first: it shows why, where there is nothing to write for the rig.
@@ -105,8 +104,6 @@ def identify(
         text = fragment_text(
             f"fitctl identify {what}", settings, finding.lines(), finding.fragment()
         )
-    except LogError as error:
-        raise ConfigError(str(error)) from None
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
         typer.echo(f"identify {what}: {error}", err=True)
         raise typer.Exit(FAILED) from None
@@ -116,7 +113,7 @@ def identify(
     typer.echo(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
 
 
-def _insist_on_output(path: Path) -> None:
+def _require_output(path: Path) -> None:
     """Refuse, before minutes of an experiment, what could not be written after them."""
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         msg = f"identify: {path}: nothing can be written there; name another with --out or --plot"
@@ -131,7 +128,7 @@ def _write(path: Path, write: Callable[[], object]) -> None:
         raise ConfigError(msg) from None
 
 
-def _found(
+def _finding(
     rig: Rig,
     rig_path: Path,
     overrides: Sequence[str],

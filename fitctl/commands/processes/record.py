@@ -7,8 +7,6 @@ from pathlib import Path
 
 from fitctl.commands.shared.options import ParentOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
-from fitctl.config import ConfigError
-from fitctl.logging.errors import LogError
 from fitctl.logging.recorder import record as record_messages
 from fitctl.logging.records import RecorderStatus
 from fitctl.messages.client import Client
@@ -45,7 +43,5 @@ def record(
                 on_status=report,
                 parent_pid=parent_pid,
             )
-        except LogError as error:
-            raise ConfigError(str(error)) from None
         finally:
             client.close()

@@ -24,7 +24,6 @@ from fitctl.commands.shared.options import (
 from fitctl.commands.shared.printing import to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError, Fault, LoopMocks, Rig
-from fitctl.logging.errors import LogError
 from fitctl.logging.pictures import LoggedPictures
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.faults import UnknownFault
@@ -98,17 +97,14 @@ def _with_script(rig: Rig, path: Path) -> Rig:
 
 def _pictures(rig: Rig, log: Path) -> Picture:
     camera = rig.true_camera
-    try:
-        return LoggedPictures(
-            log,
-            camera.width_px,
-            camera.height_px,
-            camera.period_s,
-            camera.bias_dn,
-            lambda why: typer.echo(f"mocks: {why}; it is dark from here on", err=True),
-        )
-    except LogError as error:
-        raise ConfigError(str(error)) from None
+    return LoggedPictures(
+        log,
+        camera.width_px,
+        camera.height_px,
+        camera.period_s,
+        camera.bias_dn,
+        lambda why: typer.echo(f"mocks: {why}; it is dark from here on", err=True),
+    )
 
 
 def _with_free_ports(rig: Rig) -> Rig:

@@ -49,11 +49,11 @@ class DevicesView(ListingView):
         if row is None or not self.query_one(Readings).active:
             self.notify("choose an interlock first: tab, then up and down", timeout=3)
         else:
-            self.console.give(Reset(name=row.name))
+            self.console.send(Reset(name=row.name))
 
 
 def _table(lines: list[tuple[str, str]]) -> Table:
     table = Table.grid(padding=(0, 2))
-    for name, told in lines:
-        table.add_row(Text(name, DIM), Text(told, INK))
+    for name, content in lines:
+        table.add_row(Text(name, DIM), Text(content, INK))
     return table

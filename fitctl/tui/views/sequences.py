@@ -68,14 +68,14 @@ class SequencesView(ListingView):
         self._folder.cleanup()
 
     def before_drawing(self) -> None:
-        """Take the list of sequences once it has come."""
+        """Show the list of sequences once it has come."""
         job = self._list
         if job is None or job.status is None:
             return
         self._list = None
         printed = self.query_one(Printed)
         if job.status == 0:
-            self._take(json.loads(job.text()))
+            self._add(json.loads(job.text()))
             job.end()
         elif printed.moving is None:
             printed.show(job)  # it says why
@@ -83,7 +83,7 @@ class SequencesView(ListingView):
             self.notify(job.text(), severity="error", timeout=8, markup=False)
             job.end()
 
-    def _take(self, documents: list[dict[str, Any]]) -> None:
+    def _add(self, documents: list[dict[str, Any]]) -> None:
         sequences = self.query_one(SequenceList)
         known = [d for d in sequences.documents if d["file"] not in {n["file"] for n in documents}]
         sequences.documents = [*known, *documents]
@@ -103,16 +103,16 @@ class SequencesView(ListingView):
             return
         step = document["steps"][parameter.step]
 
-        def take(value: str | None) -> None:
+        def accept(value: str | None) -> None:
             if value is not None:
                 step[parameter.key] = parsed(value)
                 sequences.edited.add(document["file"])
                 self._start("check")
 
-        told = (
+        prompt = (
             f"step {parameter.step + 1}, {step['step']}: {parameter.key} (is {parameter.value!r})"
         )
-        self.app.push_screen(Ask(document["name"], told, str(parameter.value)), take)
+        self.app.push_screen(Ask(document["name"], prompt, str(parameter.value)), accept)
 
     def action_dry_run(self) -> None:
         """Rehearse the chosen sequence on the virtual clock."""
@@ -133,28 +133,28 @@ class SequencesView(ListingView):
         """Pause what is under way, or let it go on."""
         status = self.state.newest.running_sequence if self.state.newest else None
         paused = status is not None and "pause" in {status.wanted, status.state.removesuffix("d")}
-        self.console.give(SequenceControl(action="resume" if paused else "pause"))
+        self.console.send(SequenceControl(action="resume" if paused else "pause"))
 
     def action_end(self) -> None:
         """End what is under way; its stages are held."""
-        self.console.give(SequenceControl(action="stop"))
+        self.console.send(SequenceControl(action="stop"))
 
     def action_file(self) -> None:
         """Read a file of the operator's own."""
 
-        def take(name: str | None) -> None:
+        def accept(name: str | None) -> None:
             if name and self._list is None:
                 self._list = self.console.start_job(["sequence", "list", "--json", name])
 
         def refused(name: str) -> str:
             return "" if Path(name).is_file() else f"{name}: no such file"
 
-        self.app.push_screen(Ask("Open", "a sequence file (TOML or YAML)", "", refused), take)
+        self.app.push_screen(Ask("Open", "a sequence file (TOML or YAML)", "", refused), accept)
 
     # ------------------------------------------------------------ children
 
     def _chosen(self) -> dict[str, Any] | None:
-        """The chosen sequence; if nothing can be done with one, the operator is told why."""
+        """The chosen sequence; if nothing can be done with one, a notice shows why."""
         document = self.query_one(SequenceList).document
         if self.console.rig_arguments is None:
             self.notify(NEEDS_RIG, severity="warning", timeout=8, markup=False)

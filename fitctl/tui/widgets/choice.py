@@ -60,11 +60,11 @@ class Choice(Panel):
         self.chosen = max(0, min(self.chosen, len(lines) - 1))
         lowest = max(0, len(lines) - room)
         self._top = min(max(self._top, self.chosen - room + 1, 0), self.chosen, lowest)
-        seen = [
+        shown = [
             [text(BAR if number == self.chosen and self.active else " ", SKY, bold=True), *line]
             for number, line in enumerate(lines[self._top : self._top + room], start=self._top)
         ]
-        return [*([text(" "), *line] for line in heads), *seen]
+        return [*([text(" "), *line] for line in heads), *shown]
 
     def move(self, by: int) -> None:
         """Choose another row, as far as there is one."""

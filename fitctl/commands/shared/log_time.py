@@ -1,25 +1,13 @@
-"""What the commands about logs share: one-line errors, and spans of time."""
+"""Times in a log, as options give them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 
 from fitctl.config import ConfigError
-from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo
 
 _NS_PER_S = 1_000_000_000
-
-
-@contextmanager
-def one_line() -> Iterator[None]:
-    """Report what is wrong with a log to the operator, in one line."""
-    try:
-        yield
-    except LogError as error:
-        raise ConfigError(str(error)) from None
 
 
 def time_ns(option: str, text: str, found: LogInfo) -> int:
