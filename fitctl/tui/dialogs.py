@@ -45,6 +45,7 @@ class Alarms(Reader):
 
     HINT = "k acknowledges · u silences · esc closes · s stops"
     BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,q,v,enter", "dismiss", "Close", show=False),
         Binding("k", "acknowledge", "Acknowledge", show=False),
         Binding("u", "silence", "Silence", show=False),
     ]
