@@ -121,7 +121,7 @@ KEYS = (
     Key("n", "n", "Reset", "screen.reset", "let the chosen interlock go", "devices"),
     Key("w", "w", "Window", "app.window", "over 10, 60 or 1 s", "loop"),
     Key("up,down", "↑↓", "Choose", "", "choose a sequence or a parameter", "sequences"),
-    Key("tab", "tab", "Other list", "screen.other", "sequences or parameters", "sequences"),
+    Key("tab", "tab", "Other list", "app.focus_next", "sequences or parameters", "sequences"),
     Key("enter", "enter", "Edit", "screen.edit", "change the chosen parameter", "sequences"),
     Key("d", "d", "Dry run", "screen.dry_run", "the whole of it on the virtual clock", "sequences"),
     Key("g", "g", "Go", "screen.go", "run it on the instrument", "sequences"),

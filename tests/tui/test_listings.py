@@ -45,7 +45,7 @@ def test_a_click_chooses_a_row_and_its_list():
         await pilot.click(Readings, offset=(5, 4))
         await settle(app, pilot)
         readings = app.view.query_one(Readings)
-        assert readings.active
+        assert readings.has_focus
         assert readings.now().name == "following_error"
 
     run(scenario)

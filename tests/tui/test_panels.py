@@ -291,6 +291,7 @@ def test_readings_are_told_in_the_units_of_their_names(quantity, value, told):
 
 def test_a_list_scrolls_to_what_is_chosen():
     readings = Readings(shown(FakeSupervisor()))
+    readings.set_reactive(Readings.has_focus, True)
     readings.draw(80, 4)
     for wanted in (6, 0, 7):
         readings.chosen = wanted

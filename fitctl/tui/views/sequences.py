@@ -16,7 +16,7 @@ from fitctl.messages.commands import SequenceControl
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Ask
 from fitctl.tui.jobs import Job
-from fitctl.tui.views.listing import ListingView
+from fitctl.tui.views.view import View
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
 
@@ -30,7 +30,7 @@ NEEDS_RIG = (
 )
 
 
-class SequencesView(ListingView):
+class SequencesView(View):
     """Sequences at the left, parameters at the right, progress and what was printed below.
 
     Everything that is run is `fitctl sequence` as a process of its own, which goes on when the console
@@ -98,7 +98,7 @@ class SequencesView(ListingView):
         document = self._chosen()
         if document is None:
             return
-        if parameter is None or not self.query_one(Parameters).active:
+        if parameter is None or not self.query_one(Parameters).has_focus:
             self.notify("choose a parameter first: tab, then up and down", timeout=3)
             return
         step = document["steps"][parameter.step]

@@ -85,5 +85,9 @@ class View(Screen[None]):
             if panel.display and (beat is None or beat % panel.every == 0):
                 panel.redraw()
 
+    def on_choice_changed(self) -> None:
+        """Draw what depends on a list's choice."""
+        self.call_after_refresh(self.console.draw_all)
+
     def before_drawing(self) -> None:
         """What must be done at each beat."""
