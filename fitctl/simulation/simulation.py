@@ -85,22 +85,22 @@ class Simulation:
             )
         self.ticks: list[Tick] = []
         self.mode_changes: list[ModeChange] = []
-        self._also = record
+        self._on_record = record
         self.devices = Devices(self.camera, loops)
         self.supervisor = Supervisor(
-            rig, self.devices, self.clock, InlineExecutor(), self._take, design_for
+            rig, self.devices, self.clock, InlineExecutor(), self._receive, design_for
         )
         self.camera.on_servo_period = [
             (work.period_s, work.period) for work in self.supervisor.periodic
         ]
 
-    def _take(self, record: AnyRecord) -> None:
+    def _receive(self, record: AnyRecord) -> None:
         if isinstance(record, Tick):
             self.ticks.append(record)
         elif isinstance(record, ModeChange):
             self.mode_changes.append(record)
-        if self._also is not None:
-            self._also(record)
+        if self._on_record is not None:
+            self._on_record(record)
 
     def command(self, command: AnyCommand) -> Reply:
         """Give a command and step once, so that it is obeyed."""

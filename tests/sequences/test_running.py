@@ -265,7 +265,7 @@ def test_motions_that_the_operator_stops_end_at_once(tried):
 def test_attempts_of_a_run_are_recorded_once_each(rig):
     records = []
     link = SimulatedLink(rig, 0)
-    link._simulation._also = records.append
+    link._simulation._on_record = records.append
     sequence = load_sequence(find_sequence(Path("acquire")), rig)
 
     attempts = run_sequence(link, rig, sequence)
