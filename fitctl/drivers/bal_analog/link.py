@@ -82,6 +82,8 @@ class ModbusLink:
             except ValueError as error:
                 raise self.nonsense("a Modbus header", str(error)) from None
             if message is not None:
+                if message.protocol != 0:
+                    raise self.nonsense("a Modbus header", f"protocol {message.protocol}")
                 return message
             try:
                 left_s = max(0.0, deadline_s - time.monotonic())

@@ -38,11 +38,12 @@ EXCEPTIONS = {
 
 
 class Message(NamedTuple):
-    """One answer, taken out of its frame."""
+    """One message without its frame; `protocol` is 0 for Modbus."""
 
     transaction: int
     unit: int
     pdu: bytes
+    protocol: int = 0
 
 
 def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
@@ -51,17 +52,17 @@ def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
 
 
 def take_message(pending: bytearray) -> Message | None:
-    """Take the first whole message off `pending`; None while there is none.
+    """Remove the first whole message from `pending`; None while there is none.
 
     Raises
     ------
     ValueError
-        If what is there is no Modbus header.
+        If no message can be that long, so that nobody knows where the next one begins.
     """
     if len(pending) < _HEADER.size:
         return None
     transaction, protocol, length, unit = _HEADER.unpack_from(pending)
-    if protocol != 0 or not 2 <= length <= 1 + _PDU_BYTES_MAX:
+    if not 2 <= length <= 1 + _PDU_BYTES_MAX:
         msg = f"protocol {protocol}, length {length}"
         raise ValueError(msg)
     end = _HEADER.size - 1 + length
@@ -69,7 +70,7 @@ def take_message(pending: bytearray) -> Message | None:
         return None
     pdu = bytes(pending[_HEADER.size : end])
     del pending[:end]
-    return Message(transaction, unit, pdu)
+    return Message(transaction, unit, pdu, protocol)
 
 
 def encode_exchange(first_input: int, first_output: int, outputs: Sequence[int]) -> bytes:

@@ -13,7 +13,7 @@ from fitctl.drivers.bal_analog.protocol import (
     word_of,
 )
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
-from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel
+from fitctl.mocks.modbus.pdu import DataModel
 from fitctl.mocks.modbus.tcp import ModbusTcpServer
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.timers import Periodic, Watchdog
@@ -89,15 +89,9 @@ class BalAnalogMockStation:
             for first in (device.first_output_register, device.first_input_register)
         )
         self._first_output, self._first_input = outputs.start, inputs.start
-        model = DataModel(
-            {HOLDING_REGISTERS: {*outputs, *inputs}}, self._read, self._write, _IDENTITY
-        )
+        model = DataModel({*outputs, *inputs}, self._read, self._write, _IDENTITY)
         self._server = ModbusTcpServer(
-            model,
-            self.faults,
-            unit=device.device_id,
-            unknown_unit="refuse",
-            port=settings.modbus_port,
+            model, self.faults, unit=device.device_id, unknown_unit="refuse"
         )
         self.faults.on_change(self._take_fault)
 
@@ -109,7 +103,7 @@ class BalAnalogMockStation:
         OSError
             If the port is taken.
         """
-        port = await self._server.start()
+        port = await self._server.start(self._settings.modbus_port)
         self._hold.set_period(_HOLD_S)
         return port
 
@@ -123,12 +117,12 @@ class BalAnalogMockStation:
         await self._server.stop()
 
     # ------------------------------------------------------------ the station
-    def _read(self, table: str, address: int, count: int) -> list[int]:
+    def _read(self, address: int, count: int) -> list[int]:
         registers = dict(enumerate(self._inputs(), self._first_input))
         registers |= dict(enumerate(self._outputs, self._first_output))
         return [registers[place] for place in range(address, address + count)]
 
-    def _write(self, table: str, address: int, values: Sequence[int]) -> None:
+    def _write(self, address: int, values: Sequence[int]) -> None:
         for place, value in enumerate(values, address - self._first_output):
             if 0 <= place < REGISTERS:  # what is written to an input is lost
                 self._outputs[place] = value

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import cast
 
 from fitctl.config import EnsembleDevice, EnsembleMock, Siderostat
 from fitctl.drivers.ensemble.protocol import EOS, AxisFault, Parameter
 from fitctl.mocks.ensemble.axis import Axis
 from fitctl.mocks.ensemble.commands import Interpreter
 from fitctl.mocks.ensemble.line import Client
-from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
+from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.pty import Endpoints, Pty
+from fitctl.mocks.tcp import Link, TcpServer
 from fitctl.mocks.timers import Periodic, Watchdog
 
 FAULTS = (
@@ -76,8 +76,9 @@ class EnsembleControllerMock:
         self._motors = FaultyMotors(motors, self.faults, siderostat.encoder_counts_per_rev)
         self._units_per_rad = self._motors.counts_per_rad / settings.counts_per_unit
         self._power_up()
-        self._listener: asyncio.Server | None = None
-        self.links: set[_Link] = set()
+        self._server = TcpServer(
+            self.faults, lambda: _Link(self._server, self._new_client, settings.idle_timeout_s)
+        )
         self._pty: Pty | None = None
         self._pty_client: Client | None = None
         self._cycle = Periodic(self._run_cycle)
@@ -92,17 +93,14 @@ class EnsembleControllerMock:
         OSError
             If the port is taken.
         """
-        loop = asyncio.get_running_loop()
-        self._listener = await loop.create_server(
-            lambda: _Link(self), "127.0.0.1", self._settings.tcp_port
-        )
+        port = await self._server.start(self._settings.tcp_port)
         self._pty = Pty()
-        self._pty_client = self.new_client(self._pty.write)
+        self._pty_client = self._new_client(Wire(self.faults, self._pty.write))
         self._pty.read_into(self._pty_client.receive)
-        self._stepped_s = loop.time()
+        self._stepped_s = asyncio.get_running_loop().time()
         self._run_cycle()
         self._cycle.set_period(CYCLE_S)
-        return Endpoints(self._listener.sockets[0].getsockname()[1], self._pty.path)
+        return Endpoints(port, self._pty.path)
 
     async def stop(self) -> None:
         """Take all power, disconnect everyone; safe to call twice."""
@@ -114,20 +112,10 @@ class EnsembleControllerMock:
         if self._pty is not None:
             self._pty.close()
             self._pty = None
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-        self._abort_links()
-        await asyncio.sleep(0)  # transports close their sockets on the loop's next turn
+        await self._server.stop()
 
-    def new_client(self, write: Callable[[bytes], None]) -> Client:
-        """What serves a connection."""
-        return Client(self.faults, self._answer, self._settings.reply_s, write)
-
-    @property
-    def idle_timeout_s(self) -> float:
-        """A connection is closed after so long without a byte."""
-        return self._settings.idle_timeout_s
+    def _new_client(self, wire: Wire) -> Client:
+        return Client(wire, self._answer, self._settings.reply_s)
 
     def _power_up(self) -> None:
         parameters = [self._parameters() for _ in AXES]
@@ -190,48 +178,31 @@ class EnsembleControllerMock:
             for name, cause in _CAUSES.items():
                 if self.faults.value(name, part) is not None:
                     axis.causes |= cause
-        if self.faults.away:
-            self._abort_links()
-
-    def _abort_links(self) -> None:
-        for link in list(self.links):
-            link.transport.abort()
 
 
-class _Link(asyncio.Protocol):
-    """One client over TCP."""
+class _Link(Link):
+    """One client over TCP; closed after `idle_timeout_s` without a byte."""
 
-    transport: asyncio.Transport
-
-    def __init__(self, controller: EnsembleControllerMock) -> None:
-        self._controller = controller
+    def __init__(
+        self, server: TcpServer, new_client: Callable[[Wire], Client], idle_timeout_s: float
+    ) -> None:
+        super().__init__(server)
+        self._new_client = new_client
+        self._idle = Watchdog(self._expired, idle_timeout_s)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast(asyncio.Transport, transport)
-        self._client = self._controller.new_client(self.write)
-        self._controller.links.add(self)
-        self._idle = Watchdog(self.transport.close, self._controller.idle_timeout_s)
+        super().connection_made(transport)
+        self._client = self._new_client(self.wire)
         self._idle.feed()
-        if self._controller.faults.away:
-            self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         self._idle.feed()
         self._client.receive(data)
 
-    def write(self, data: bytes) -> None:
-        """Send."""
-        if not self.transport.is_closing():
-            self.transport.write(data)
-
-    # Who sends and never reads is not read from either, so that nothing piles up.
-    def pause_writing(self) -> None:
-        self.transport.pause_reading()
-
-    def resume_writing(self) -> None:
-        self.transport.resume_reading()
-
-    def connection_lost(self, error: Exception | None) -> None:
+    def connection_lost(self, exc: Exception | None) -> None:
         self._idle.stop()
         self._client.close()
-        self._controller.links.discard(self)
+        super().connection_lost(exc)
+
+    def _expired(self) -> None:
+        self.transport.close()

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, Reply
-from fitctl.mocks.faults import Faults, Wire
+from fitctl.mocks.faults import Wire
 
 _WAITING_MAX = 1000
 
@@ -45,24 +45,16 @@ class Client:
 
     Parameters
     ----------
-    faults : Faults
+    wire : Wire
     answer : callable
         Does a line and gives the bytes of its answer.
     reply_s : float
         From when a command's turn comes until its answer.
-    write : callable
-        Sends bytes; never waits.
     """
 
-    def __init__(
-        self,
-        faults: Faults,
-        answer: Callable[[str], bytes],
-        reply_s: float,
-        write: Callable[[bytes], None],
-    ) -> None:
+    def __init__(self, wire: Wire, answer: Callable[[str], bytes], reply_s: float) -> None:
         self._splitter = LineSplitter()
-        self._wire = Wire(faults, write)
+        self._wire = wire
         self._answer = answer
         self._reply_s = reply_s
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)

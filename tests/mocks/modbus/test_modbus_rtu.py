@@ -11,7 +11,7 @@ from mock_bench import in_a_loop
 from fitctl.config import Fault
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu
-from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel
+from fitctl.mocks.modbus.pdu import DataModel
 
 READ = bytes.fromhex("01 03 00 00 00 01 84 0a")
 WRITE = bytes.fromhex("01 06 00 00 12 34 84 bd")
@@ -24,7 +24,7 @@ class Line:
         self.register = 7
         self.written = asyncio.Event()
         self.faults = Faults(WIRE_FAULTS)
-        model = DataModel({HOLDING_REGISTERS: {0}}, lambda *_: [self.register], self._write, ())
+        model = DataModel({0}, lambda *_: [self.register], self._write, ())
         self.server = rtu.ModbusRtuServer(model, self.faults, unit=1, baud_rate=baud_rate)
         self._came = asyncio.Queue()
 
@@ -50,7 +50,7 @@ class Line:
         await asyncio.sleep(0.1)
         return self._came.empty()
 
-    def _write(self, table, address, values):
+    def _write(self, address, values):
         self.register = values[0]
         self.written.set()
 
