@@ -20,6 +20,7 @@ from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.cia402.link import BulkSlcanBus, CanLink
 from fitctl.drivers.cia402.node import Node
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceError
 from fitctl.mocks.cia402.dictionary import SdoServer
 from fitctl.mocks.cia402.drive import Cia402DriveMock
@@ -59,6 +60,9 @@ class _Transport:
 
     def get_write_buffer_size(self) -> int:
         return 0
+
+    def is_closing(self) -> bool:
+        return False
 
     def write(self, data: bytes) -> None:
         self.sent += data
@@ -141,7 +145,7 @@ def serve_sdo(data: bytes) -> None:
 class _Scripted:
     """A link whose far end says these frames, whatever it is told."""
 
-    endpoint = "nowhere"
+    endpoint = Endpoint("drive", "nowhere")
 
     def __init__(self, data: bytes) -> None:
         self._frames = _frames(data, _FROM_DRIVE)
@@ -179,7 +183,7 @@ def exchange(data: bytes) -> None:
     node = Node(_Scripted(data), _DEVICE)
     node.nmt_state = protocol.NmtState.OPERATIONAL
     node.handlers |= {0x181: amplifiers._on_positions, 0x281: amplifiers._on_statuswords}
-    amplifiers._node = node
+    amplifiers._link = node
     amplifiers._status_s = node._heard_s
     for _ in range(1 + len(data) // 8):
         try:
@@ -204,7 +208,7 @@ def hear_line(data: bytes) -> None:
         bus._can_protocol = CanProtocol.CAN_20
         bus._descriptor = ours.fileno()
         link = object.__new__(CanLink)
-        link.endpoint = "nowhere"
+        link.endpoint = Endpoint("drive", "nowhere")
         link._bus = bus
         for _ in range(len(data) + 2):
             try:

@@ -12,7 +12,7 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 
 from fitctl.config import ConfigError, Fault, Rig
-from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_faults
+from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 from fitctl.mocks.faults import FaultKind
 
 _MOCKS = {
@@ -69,7 +69,7 @@ def change_faults(rig: Rig, question: SetFault | ClearFaults | ListFaults) -> No
         msg = "fault: mocks.bench_port is 0; give the port that the mocks printed: --set mocks.bench_port=PORT"
         raise ConfigError(msg)
     try:
-        now = ask_faults(mocks.bench_port, question)
+        now = ask_bench(mocks.bench_port, question, FaultsNow)
     except ConnectionError as error:
         msg = f"fault: {error}; start fitctl mocks, or give its port: --set mocks.bench_port=PORT"
         raise ConfigError(msg) from None

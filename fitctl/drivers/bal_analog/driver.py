@@ -10,21 +10,23 @@ away when we are gone.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections import deque
+from contextlib import closing
 
 from fitctl.config import BalAnalogDevice, Siderostat
-from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, held, reach_rad
+from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, LinkedAmplifiers
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
     EXCEPTION_FLAG,
     EXCEPTIONS,
+    READ_HOLDING_REGISTERS,
     Message,
     decode_registers,
     encode_exchange,
+    encode_read,
     lines,
     signed,
     unwrap,
@@ -33,20 +35,19 @@ from fitctl.drivers.bal_analog.protocol import (
 )
 from fitctl.drivers.interface import (
     AzEl,
-    DeviceError,
     DeviceFault,
     DeviceIdentity,
     DeviceRefused,
     DeviceTimeout,
-    DeviceUnreachable,
     ServoReading,
 )
+from fitctl.drivers.probe import Probe, round_trip_s
 
 _STILL = (0.0, 0.0)
 _MOST_OUTSTANDING = 100
 
 
-class BalAnalogAmplifiers:
+class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
     """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
 
     An axis has no line that says that it is enabled: it counts as enabled while it is told to be and
@@ -59,13 +60,11 @@ class BalAnalogAmplifiers:
     """
 
     def __init__(self, siderostat: Siderostat[BalAnalogDevice]) -> None:
-        self._device = siderostat.device
+        super().__init__(siderostat, siderostat.device.endpoint)
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
-        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         most_rad_s = SLACK * siderostat.velocity_limit_rad_s
         self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / most_rad_s
-        self._link: ModbusLink | None = None
         self._enable = False
         self._counts: tuple[int, int] | None = None
         self._asked_s = -math.inf
@@ -86,13 +85,9 @@ class BalAnalogAmplifiers:
         self._enable = False
         self._asked.clear()
         self._asked_s = -math.inf
-        self._link = ModbusLink(self._device)
-        try:
-            identity = self._link.identify()
+        with self._connected(ModbusLink(self._device)) as link:
+            identity = link.identify()
             self._settle()
-        except BaseException:
-            self._drop()
-            raise
         return identity
 
     def enable(self) -> None:
@@ -104,15 +99,11 @@ class BalAnalogAmplifiers:
             An axis is in fault; then neither has power.
         """
         self._enable = True
-        try:
+        with self._disabled_on_failure():
             self._settle()
             reading = self._settle()  # the first answers were on their way when the lines changed
             if reading.fault:
                 raise self._fault("both axes enabled", reading.fault)
-        except DeviceError:
-            with contextlib.suppress(DeviceError):
-                self.disable()
-            raise
 
     def disable(self) -> None:
         """Command zero velocity and take the enable lines away; a latched fault stays."""
@@ -167,23 +158,10 @@ class BalAnalogAmplifiers:
             raise self._silent()
         return newest
 
-    def close(self) -> None:
-        """Disable if possible and disconnect; safe to call twice and after a failure."""
-        if self._link is None:
-            return
-        with contextlib.suppress(DeviceError):
-            self.disable()
-        self._drop()
-
-    def _drop(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
-
     # ------------------------------------------------------------ requests
     def _request(self, link: ModbusLink, velocity_rad_s: AzEl) -> float:
         """Send one transaction, velocities within the motors' limit; returns when."""
-        wanted_rad_s = held(velocity_rad_s, self._velocity_limit_rad_s)
+        wanted_rad_s = self._limited(velocity_rad_s)
         device = self._device
         scale = device.velocity_rad_s_per_v
         az, el = (
@@ -246,9 +224,8 @@ class BalAnalogAmplifiers:
             raise self._opened().nonsense(f"unit {self._device.device_id}", got)
         if len(message.pdu) == 2 and message.pdu[0] & EXCEPTION_FLAG:
             code = message.pdu[1]
-            raise DeviceRefused(
-                DEVICE,
-                self._device.endpoint,
+            raise self._endpoint.error(
+                DeviceRefused,
                 "function 23 to be carried out",
                 f"exception {code:02X}, {EXCEPTIONS.get(code, 'see the station manual')}",
                 "check device_id, first_output_register and first_input_register",
@@ -268,30 +245,13 @@ class BalAnalogAmplifiers:
                 f"a reading within {self._blind_s:.2f} s, for the counters not to wrap unseen"
             )
             raise self._timeout(expected, f"one after {since_s:.2f} s")
-        most_counts = reach_rad(self._velocity_limit_rad_s, since_s) / self._rad_per_count
-        for name, before, now in zip(AXES, near, (az, el), strict=True):
-            if abs(now - before) > most_counts:
-                raise DeviceFault(
-                    DEVICE,
-                    self._device.endpoint,
-                    f"{name} to turn at most {most_counts:.0f} counts in {since_s:.3f} s",
-                    f"{now - before}",
-                    "check the encoder, its cable and its counter, then recover",
-                )
+        self._check_turned(near, (az, el), since_s, self._rad_per_count)
         return az, el
 
     # ------------------------------------------------------------ errors
-    def _opened(self) -> ModbusLink:
-        if self._link is None:
-            expected = "an open connection"
-            raise DeviceUnreachable(
-                DEVICE, self._device.endpoint, expected, "none", "open it again"
-            )
-        return self._link
-
     def _fault(self, expected: str, got: str) -> DeviceFault:
         hint = "look at the amplifier's lamps, remove the cause, then recover"
-        return DeviceFault(DEVICE, self._device.endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceFault, expected, got, hint)
 
     def _silent(self) -> DeviceTimeout:
         return self._timeout(f"an answer within {self._device.response_timeout_s:g} s", "none")
@@ -300,4 +260,37 @@ class BalAnalogAmplifiers:
         hint = (
             "check the I/O station's power and load, and siderostat.device.device_id; then recover"
         )
-        return DeviceTimeout(DEVICE, self._device.endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceTimeout, expected, got, hint)
+
+
+def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
+    """Who a station is, and whether an amplifier behind it is in fault.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or has no such registers.
+    """
+    device = siderostat.device
+    with closing(ModbusLink(device)) as link:
+        identity = link.identify()
+        read = encode_read(device.first_input_register)
+        answer = link.ask(read)
+        if not answer:
+            expected = f"an answer within {device.response_timeout_s:g} s"
+            hint = "check siderostat.device.device_id"
+            raise DeviceTimeout(DEVICE, device.endpoint, expected, "none", hint)
+        try:
+            _, _, faults = decode_registers(answer, READ_HOLDING_REGISTERS)
+        except ValueError as error:
+            hint = "check siderostat.device.first_input_register"
+            raise DeviceRefused(
+                DEVICE, device.endpoint, "three registers", str(error), hint
+            ) from None
+        question_s = round_trip_s(lambda: link.ask(read))
+    disagreements = tuple(
+        f"{name}'s fault line is up: look at the amplifier's lamps and remove the cause"
+        for name, is_up in zip(AXES, lines(faults, device.fault_level), strict=True)
+        if is_up
+    )
+    return Probe(identity, question_s, disagreements)

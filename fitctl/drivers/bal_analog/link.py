@@ -19,6 +19,7 @@ from fitctl.drivers.bal_analog.protocol import (
     frame,
     take_message,
 )
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
 
 _MESSAGE_BYTES_MAX = 260
@@ -39,6 +40,7 @@ class ModbusLink:
 
     def __init__(self, device: BalAnalogDevice) -> None:
         self._device = device
+        self._endpoint = Endpoint(DEVICE, device.endpoint)
         self._pending = bytearray()
         self._transaction = 0
         try:
@@ -46,9 +48,8 @@ class ModbusLink:
                 (device.host, device.port), device.response_timeout_s
             )
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all
-            raise DeviceUnreachable(
-                DEVICE,
-                device.endpoint,
+            raise self._endpoint.error(
+                DeviceUnreachable,
                 "a Modbus I/O station",
                 str(error),
                 "check its power and cable, and siderostat.device.host and .port",
@@ -128,13 +129,12 @@ class ModbusLink:
         """The error for an answer that cannot be; the link is closed."""
         self.close()
         hint = "check that siderostat.device.host and .port lead to the I/O station, then recover"
-        return DeviceProtocolError(DEVICE, self._device.endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceProtocolError, expected, got, hint)
 
     def _broken(self, got: str) -> DeviceUnreachable:
         self.close()
-        return DeviceUnreachable(
-            DEVICE,
-            self._device.endpoint,
+        return self._endpoint.error(
+            DeviceUnreachable,
             "a connection",
             f"a broken one ({got})",
             "check the I/O station's power and cable, then recover",

@@ -18,7 +18,8 @@ import can
 from can.interfaces.slcan import slcanBus
 
 from fitctl.config import Cia402Device
-from fitctl.drivers.cia402.protocol import DEVICE
+from fitctl.drivers.amplifiers import DEVICE
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 
 _SEND_TIMEOUT_S = 0.1
@@ -142,7 +143,8 @@ class CanLink:
     """
 
     def __init__(self, device: Cia402Device) -> None:
-        self.endpoint = f"{device.interface} {device.channel}, node {device.node_id}"
+        address = f"{device.interface} {device.channel}, node {device.node_id}"
+        self.endpoint = Endpoint(DEVICE, address)
         try:
             self._bus: can.BusABC = (
                 BulkSlcanBus(device.channel, device.bitrate)
@@ -155,9 +157,8 @@ class CanLink:
                 )
             )
         except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
-            raise DeviceUnreachable(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceUnreachable,
                 "an open CAN bus",
                 str(error) or type(error).__name__,
                 "check that the adapter is on, and siderostat.device in the rig file",
@@ -187,8 +188,8 @@ class CanLink:
             except (can.CanError, OSError) as error:
                 self._broken("frames", error)
             except (ValueError, IndexError) as error:
-                raise DeviceProtocolError(
-                    DEVICE, self.endpoint, "CAN frames", str(error), "check the adapter"
+                raise self.endpoint.error(
+                    DeviceProtocolError, "CAN frames", str(error), "check the adapter"
                 ) from error
             if message is None:
                 return None
@@ -208,4 +209,4 @@ class CanLink:
     def _broken(self, expected: str, error: Exception) -> NoReturn:
         hint = "check the adapter and its cable, then recover"
         got = str(error) or type(error).__name__
-        raise DeviceUnreachable(DEVICE, self.endpoint, expected, got, hint) from error
+        raise self.endpoint.error(DeviceUnreachable, expected, got, hint) from error

@@ -11,7 +11,8 @@ import time
 from collections import deque
 from typing import NamedTuple
 
-from fitctl.drivers.cia402.protocol import AXES, wrap_int32
+from fitctl.drivers.amplifiers import AXES
+from fitctl.drivers.cia402.protocol import wrap_int32
 
 _SPEED_MARGIN = 1.25  # over the motor's velocity limit
 _MARGIN_COUNTS = 2  # two roundings

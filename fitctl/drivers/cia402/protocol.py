@@ -16,9 +16,6 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-DEVICE = "siderostat amplifiers"
-"""What errors call the device."""
-
 # ---------------------------------------------------------------- CAN identifiers (CiA 301)
 NMT_ID = 0x000
 SYNC_ID = 0x080
@@ -97,7 +94,6 @@ RPDO_MAPPING = 0x1600
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
 
-AXES = ("azimuth", "elevation")
 AXIS_OFFSET = 0x800
 """The second axis' objects stand this much higher."""
 

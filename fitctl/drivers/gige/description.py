@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import zipfile
 
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
+from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.gige.protocol import MalformedPacketError, Register
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
 
@@ -36,16 +37,15 @@ def download_xml(channel: ControlChannel) -> str:
             continue
         data = channel.read_memory(location.address, location.length)
         return unpacked(data, channel.endpoint)
-    raise DeviceMismatch(
-        DEVICE,
-        channel.endpoint,
+    raise channel.endpoint.error(
+        DeviceMismatch,
         "a GenICam description of 1 byte to 16 MiB in the camera's memory, Local:NAME;ADDRESS;LENGTH",
         " and ".join(repr(url) for url in urls),
         "fitctl cannot read a description kept elsewhere; update the camera's firmware",
     )
 
 
-def unpacked(data: bytes, endpoint: str) -> str:
+def unpacked(data: bytes, endpoint: Endpoint) -> str:
     """The text of a description: most real cameras send a zip archive that holds the one file.
 
     Raises
@@ -63,9 +63,8 @@ def unpacked(data: bytes, endpoint: str) -> str:
                 data = archive.read(first)
         return data.rstrip(b"\0").decode("utf-8-sig")
     except Exception as error:  # a damaged archive can raise any of a dozen kinds
-        raise DeviceProtocolError(
-            DEVICE,
-            endpoint,
+        raise endpoint.error(
+            DeviceProtocolError,
             "a readable GenICam description",
             f"{type(error).__name__}: {error}",
             "update its firmware",

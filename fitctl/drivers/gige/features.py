@@ -9,9 +9,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from fitctl.config import Camera
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.description import download_xml
-from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
+from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.interface import DeviceMismatch, DeviceRefused
 
 RATE_TOLERANCE = 1e-3  # cameras round the frame rate to their own clock
@@ -245,14 +246,14 @@ class Features:
             raise self._mismatch(f"command {name}", str(error)) from error
 
 
-def expect(endpoint: str, name: str, wanted: float, actual: float, tolerance: float) -> None:
+def expect(endpoint: Endpoint, name: str, wanted: float, actual: float, tolerance: float) -> None:
     """See that a camera has taken a number. Raises DeviceMismatch."""
     if abs(actual - wanted) > tolerance * abs(wanted):
         raise mismatch(endpoint, f"{name} = {wanted:g}", f"{actual:g}")
 
 
-def mismatch(endpoint: str, expected: str, got: str) -> DeviceMismatch:
+def mismatch(endpoint: Endpoint, expected: str, got: str) -> DeviceMismatch:
     """The error for a camera that is not what the rig file says."""
-    return DeviceMismatch(
-        DEVICE, endpoint, expected, got, "correct [camera] in the rig file to this camera"
+    return endpoint.error(
+        DeviceMismatch, expected, got, "correct [camera] in the rig file to this camera"
     )

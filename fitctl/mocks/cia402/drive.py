@@ -90,7 +90,7 @@ class Cia402DriveMock:
         self.nmt_state = NmtState.STOPPED
         self.axes = tuple(
             Axis(partial(self._motors.set_enabled, number), self._axis_changed)
-            for number in range(len(protocol.AXES))
+            for number in range(len(AXES))
         )
         self.heartbeat_ms = 0
         self.consumer = 0

@@ -13,6 +13,7 @@ from fitctl.drivers.gige.protocol import Register, Status
 from fitctl.mocks.gige.acquisition import Acquisition, AcquisitionSettings
 from fitctl.mocks.gige.memory import (
     DOUBLES,
+    LOCKED_WHILE_RUNNING,
     SINGLE_FRAME,
     TICKS_PER_S,
     Feature,
@@ -32,23 +33,6 @@ SIZE_MIN_PX = 8
 _ROUNDING = 1 + 1e-9  # a period of 1 / rate and back is not exact
 
 _FORMAT_OF_CODE = {one.code: one for one in protocol.PIXEL_FORMATS.values()}
-_LOCKED_WHILE_RUNNING = frozenset(
-    {
-        Register.STREAM_PACKET_SIZE,
-        Register.STREAM_PACKET_DELAY,
-        Register.STREAM_DESTINATION,
-        Feature.ACQUISITION_MODE,
-        Feature.TRIGGER_MODE,
-        Feature.GAIN_DB,
-        Feature.WIDTH,
-        Feature.HEIGHT,
-        Feature.OFFSET_X,
-        Feature.OFFSET_Y,
-        Feature.PIXEL_FORMAT,
-        Feature.EXPOSURE_TIME_US,
-        Feature.FRAME_RATE_HZ,
-    }
-)
 
 
 class CameraClock:
@@ -148,7 +132,7 @@ class Registers:
         """Raise RegisterError if no client may ever write there, or not now."""
         self._memory.check_writable(address, length)
         written = range(address, address + length, 4)
-        if self._acquisition.running and not _LOCKED_WHILE_RUNNING.isdisjoint(written):
+        if self._acquisition.running and not LOCKED_WHILE_RUNNING.isdisjoint(written):
             raise RegisterError(Status.ACCESS_DENIED)
 
     def write(self, address: int, data: bytes) -> None:

@@ -8,8 +8,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from scripted_server import scripted_server
 
 from fitctl import config
-from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
-from fitctl.drivers.bal_analog.probe import probe_bal_analog
+from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers, probe_bal_analog
 from fitctl.drivers.bal_analog.protocol import frame, take_message
 from fitctl.drivers.interface import (
     DeviceFault,
