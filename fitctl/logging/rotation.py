@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 
 from fitctl.config import Logging
 from fitctl.logging.folder import new_log_path, prune
@@ -97,12 +96,7 @@ class RotatingLog:
     def __enter__(self) -> RotatingLog:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _begin(self) -> None:

@@ -151,7 +151,7 @@ class GigeCameraMock:
         return self._commands[command](payload, sender)
 
     def _discovery(self, _payload: bytes, _sender: Address) -> bytes:
-        return self._parts()[2].discovery()
+        return self._parts()[2].head(protocol.DISCOVERY_BYTES)
 
     def _force_ip(self, payload: bytes, _sender: Address) -> bytes | None:
         """Whom it is not for stays silent; the address cannot be changed."""

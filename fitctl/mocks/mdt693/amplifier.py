@@ -113,12 +113,16 @@ class Amplifier:
         self._scan_v = volts or 0.0
         self._update()
 
-    def low_v(self, channel: int) -> float:
-        """The lowest voltage that a channel may have."""
+    def low_v(self, channel: int | None) -> float:
+        """The lowest voltage that a channel may have; with None, the system's limit."""
+        if channel is None:
+            return self.system_low_v
         return max(self._low_v[channel], self.system_low_v)
 
-    def high_v(self, channel: int) -> float:
-        """The highest voltage that a channel may have."""
+    def high_v(self, channel: int | None) -> float:
+        """The highest voltage that a channel may have; with None, the system's limit."""
+        if channel is None:
+            return self.system_high_v
         return min(self._high_v[channel], self.system_high_v, self.switch_v + LIMIT_MARGIN_V)
 
     def set_low_v(self, channel: int | None, volts: float) -> None:
