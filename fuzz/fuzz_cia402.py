@@ -24,8 +24,7 @@ from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceError
 from fitctl.mocks.cia402.dictionary import SdoServer
 from fitctl.mocks.cia402.drive import Cia402DriveMock
-from fitctl.mocks.cia402.slcan import _Client
-from fitctl.mocks.cia402.slcan_frames import CanFrame, decode_frame, encode_frame
+from fitctl.mocks.cia402.slcan import CanFrame, _Client, decode_frame, encode_frame
 
 _RIG_SIDEROSTAT = load_rig(default_rig_path()).loops["right"].siderostat
 _DEVICE = _RIG_SIDEROSTAT.device.model_copy(update={"response_timeout_s": 0.001})

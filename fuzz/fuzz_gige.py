@@ -16,8 +16,8 @@ import numpy as np
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol as p
-from fitctl.drivers.gige.description import unpacked
 from fitctl.drivers.gige.discovery import decode_found
+from fitctl.drivers.gige.features import unpacked
 from fitctl.drivers.gige.stream import FrameAssembler
 from fitctl.drivers.interface import DeviceError
 from fitctl.mocks.gige.camera import GigeCameraMock

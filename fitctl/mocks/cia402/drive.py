@@ -19,15 +19,13 @@ from functools import partial
 
 from fitctl.config import Siderostat
 from fitctl.drivers.cia402 import protocol
-from fitctl.drivers.cia402.protocol import NmtCommand, NmtState
+from fitctl.drivers.cia402.protocol import NmtCommand, NmtState, wrap_int32
 from fitctl.mocks.cia402.axis import Axis, Command
 from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoServer, constant
 from fitctl.mocks.cia402.emergency import Emergencies
-from fitctl.mocks.cia402.encoders import Encoders
 from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
-from fitctl.mocks.cia402.slcan import SlcanAdapter
-from fitctl.mocks.cia402.slcan_frames import CanFrame
+from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.timers import Periodic, Watchdog
@@ -50,6 +48,42 @@ BOTH_VELOCITY_MODES = 1 << (protocol.PROFILE_VELOCITY - 1) | 1 << (
 )
 PDOS_EACH_WAY = 4
 _CONTROL_S = 0.002  # how often the axes' ramps go on also without SYNC
+
+
+class Encoders:
+    """What the drive has last read of its motors.
+
+    Parameters
+    ----------
+    motors : FaultyMotors
+
+    Attributes
+    ----------
+    counts : pair of int
+        Both counters as last sampled.
+    """
+
+    def __init__(self, motors: FaultyMotors) -> None:
+        self.counts = (0, 0)
+        self._motors = motors
+        self._earlier = self._later = (0.0, self.counts)
+
+    def sample(self) -> None:
+        """Read both."""
+        az_counts, el_counts = self._motors.position_counts()
+        self.counts = (wrap_int32(az_counts), wrap_int32(el_counts))
+
+    def latch(self, now_s: float) -> None:
+        """Keep the sample, and its time, for the velocity."""
+        self._earlier, self._later = self._later, (now_s, self.counts)
+
+    def velocity_rad_s(self, axis: int) -> float:
+        """Mean velocity between the last two samples that were latched."""
+        (earlier_s, earlier), (later_s, later) = self._earlier, self._later
+        if later_s <= earlier_s:
+            return 0.0
+        moved = wrap_int32(later[axis] - earlier[axis])
+        return moved / (later_s - earlier_s) / self._motors.counts_per_rad
 
 
 class Cia402DriveMock:

@@ -8,8 +8,7 @@ import zipfile
 import pytest
 
 from fitctl.drivers.gige import protocol as p
-from fitctl.drivers.gige.description import unpacked
-from fitctl.drivers.gige.features import Features
+from fitctl.drivers.gige.features import Features, unpacked
 from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fitctl.config import Fault
-from fitctl.mocks.cia402.slcan import SlcanAdapter
-from fitctl.mocks.cia402.slcan_frames import CanFrame, decode_frame, encode_frame
+from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter, decode_frame, encode_frame
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 
 frames = st.builds(
