@@ -202,7 +202,7 @@ def hear_line(data: bytes) -> None:
         bus = object.__new__(BulkSlcanBus)
         bus._buffer = bytearray()
         bus._queue = queue.SimpleQueue()
-        bus._held = None
+        bus._batch = None
         bus._is_shutdown = True
         bus._can_protocol = CanProtocol.CAN_20
         bus._descriptor = ours.fileno()

@@ -10,7 +10,7 @@ import socket
 import numpy as np
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.drivers.bal_analog.protocol import take_message
+from fitctl.drivers.bal_analog.protocol import pop_message
 from fitctl.drivers.interface import DeviceError
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
@@ -47,8 +47,8 @@ def read_tcp(data: bytes) -> None:
     server = tcp.ModbusTcpServer(_MODEL, Faults(WIRE_FAULTS), unit=1, unknown_unit="refuse")
     pending = bytearray(data)
     try:
-        while (message := take_message(pending)) is not None:
-            back = take_message(bytearray(server.respond(message)))
+        while (message := pop_message(pending)) is not None:
+            back = pop_message(bytearray(server.respond(message)))
             if message.protocol == 0:
                 assert back is not None
                 assert (back.transaction, back.unit) == (message.transaction, message.unit)

@@ -84,7 +84,7 @@ class RotatingLog:
         if self._run_info is not None:
             self._writer.write(self._run_info, time.time())
 
-    def take_notes(self) -> list[tuple[Severity, str]]:
+    def pop_notes(self) -> list[tuple[Severity, str]]:
         """What somebody should read of files deleted, once."""
         notes, self._notes = self._notes, []
         return notes

@@ -63,13 +63,13 @@ class Watchdog:
         loop = asyncio.get_running_loop()
         self._fed_s = loop.time()
         if self._timer is None and self.timeout_s > 0:
-            self._timer = loop.call_later(self.timeout_s, self._look)
+            self._timer = loop.call_later(self.timeout_s, self._check)
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         loop = asyncio.get_running_loop()
         left_s = self._fed_s + self.timeout_s - loop.time()
         if left_s > 0:
-            self._timer = loop.call_later(left_s, self._look)
+            self._timer = loop.call_later(left_s, self._check)
         else:
             self._timer = None
             self._expired()

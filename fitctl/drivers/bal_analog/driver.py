@@ -2,7 +2,7 @@
 
 One transaction of function 23 a servo period writes both commands and the enable lines, and reads both
 encoder counters and the fault lines. The counters have 16 bits: the driver counts on across their wrap,
-and says so where it has been blind for longer than they are unambiguous.
+and fails where it has not read them for longer than they are unambiguous.
 
 The amplifiers themselves watch nobody: the station's output watchdog must take commands and enable lines
 away when we are gone.
@@ -50,7 +50,7 @@ _MOST_OUTSTANDING = 100
 class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
     """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
 
-    An axis has no line that says that it is enabled: it counts as enabled while it is told to be and
+    No line reports that an axis is enabled: it counts as enabled while its enable line is up and it
     reports no fault.
 
     Parameters
@@ -67,9 +67,9 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / most_rad_s
         self._enable = False
         self._counts: tuple[int, int] | None = None
-        self._asked_s = -math.inf
+        self._counted_s = -math.inf
         self._answered_s = 0.0
-        self._asked: deque[tuple[int, float]] = deque(maxlen=_MOST_OUTSTANDING)
+        self._outstanding: deque[tuple[int, float]] = deque(maxlen=_MOST_OUTSTANDING)
 
     def open(self) -> DeviceIdentity:
         """Connect, disable both amplifiers and read their encoders.
@@ -83,8 +83,8 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         """
         self.close()
         self._enable = False
-        self._asked.clear()
-        self._asked_s = -math.inf
+        self._outstanding.clear()
+        self._counted_s = -math.inf
         with self._connected(ModbusLink(self._device)) as link:
             identity = link.identify()
             self._settle()
@@ -142,18 +142,18 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         DeviceRefused, DeviceProtocolError
             The station refuses, or what comes is no answer.
         DeviceFault
-            A counter says what no motor can do.
+            A counter reports a motion that no motor can make.
         ValueError
             A velocity is not finite.
         """
         link = self._opened()
         sent_s = self._request(link, velocity_rad_s)
         newest: ServoReading | None = None
-        while self._asked:
+        while self._outstanding:
             message = link.receive(sent_s + self._period_s)
             if message is None:
                 break
-            newest = self._take(message) or newest
+            newest = self._reading_of(message) or newest
         if newest is None and sent_s - self._answered_s > self._device.response_timeout_s:
             raise self._silent()
         return newest
@@ -173,29 +173,31 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
             device.first_input_register, device.first_output_register, [az, el, enable]
         )
         sent_s = time.monotonic()
-        if not self._asked:
+        if not self._outstanding:
             self._answered_s = sent_s
-        self._asked.append((link.send(pdu), sent_s))
+        self._outstanding.append((link.send(pdu), sent_s))
         return sent_s
 
     def _settle(self) -> ServoReading:
-        """Stand still until the station has answered a request that says so."""
+        """Command zero velocity and wait for the answer to that very request."""
         link = self._opened()
         sent_s = self._request(link, _STILL)
-        number = self._asked[-1][0]
+        number = self._outstanding[-1][0]
         while (message := link.receive(sent_s + self._device.response_timeout_s)) is not None:
-            reading = self._take(message)
+            reading = self._reading_of(message)
             if reading is not None and message.transaction == number:
                 return reading
         raise self._silent()
 
     # ------------------------------------------------------------ answers
-    def _take(self, message: Message) -> ServoReading | None:
-        """What an answer says; None where it answers nothing that was asked."""
-        sent_s = next((sent for number, sent in self._asked if number == message.transaction), None)
+    def _reading_of(self, message: Message) -> ServoReading | None:
+        """The reading in an answer; None if it answers no outstanding request."""
+        sent_s = next(
+            (sent for number, sent in self._outstanding if number == message.transaction), None
+        )
         if sent_s is None:
             return None
-        while self._asked.popleft()[0] != message.transaction:
+        while self._outstanding.popleft()[0] != message.transaction:
             pass
         now_s = self._answered_s = time.monotonic()
         self._check_unit_and_exception(message)
@@ -204,7 +206,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         except ValueError as error:
             raise self._opened().nonsense("three registers", str(error)) from None
         self._counts = self._count((az, el), now_s)
-        self._asked_s = sent_s
+        self._counted_s = sent_s
         az_counts, el_counts = self._counts
         fault = "; ".join(
             f"{name}: fault line"
@@ -233,7 +235,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
 
     def _count(self, counters: tuple[int, int], now_s: float) -> tuple[int, int]:
         """Both counters, counted on across their wrap."""
-        since_s = now_s - self._asked_s
+        since_s = now_s - self._counted_s
         near = self._counts
         if near is None:
             return signed(counters[0]), signed(counters[1])

@@ -1,4 +1,4 @@
-"""The Modbus/TCP connection to the I/O station: requests out, answers in, told apart by their number.
+"""The Modbus/TCP connection to the I/O station: requests out, answers in, matched by their number.
 
 Own code and not pymodbus, whose client waits for each answer as long as its time limit: a servo goes on
 after one period, and takes a late answer when it comes.
@@ -17,7 +17,7 @@ from fitctl.drivers.bal_analog.protocol import (
     decode_identity,
     encode_identify,
     frame,
-    take_message,
+    pop_message,
 )
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
@@ -79,7 +79,7 @@ class ModbusLink:
         """
         while True:
             try:
-                message = take_message(self._pending)
+                message = pop_message(self._pending)
             except ValueError as error:
                 raise self.nonsense("a Modbus header", str(error)) from None
             if message is not None:

@@ -51,7 +51,7 @@ def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
     return _HEADER.pack(transaction, 0, 1 + len(pdu), unit) + pdu
 
 
-def take_message(pending: bytearray) -> Message | None:
+def pop_message(pending: bytearray) -> Message | None:
     """Remove the first whole message from `pending`; None while there is none.
 
     Raises

@@ -287,7 +287,7 @@ class Cia402Amplifiers(_Base):
         return sync_s
 
     def _find_lost(self) -> None:
-        """Once behind for long, tell a TPDO that was lost from a slow link.
+        """Once behind for long, distinguish a lost TPDO from a slow link.
 
         On both the oldest SYNC stays unanswered. By the time that the drive answers a request it has
         long sent its TPDOs of earlier SYNCs: those that have not come before the answer never will. It
@@ -300,7 +300,7 @@ class Cia402Amplifiers(_Base):
             self._encoders.give_up()
 
     def _on_positions(self, data: bytes) -> None:
-        self._encoders.take(_PAIR.unpack(self._sized(data, _PAIR.size, "both positions")))
+        self._encoders.add(_PAIR.unpack(self._sized(data, _PAIR.size, "both positions")))
 
     def _on_statuswords(self, data: bytes) -> None:
         sized = self._sized(data, _STATUS_PAIR.size, "both statuswords")

@@ -38,7 +38,7 @@ class BulkSlcanBus(slcanBus):
     _BITRATES = {**slcanBus._BITRATES, 800000: "S7"}  # noqa: RUF012 (overrides python-can's)
 
     def __init__(self, channel: str, bitrate: int) -> None:
-        self._held: bytearray | None = None
+        self._batch: bytearray | None = None
         super().__init__(channel, bitrate=bitrate, sleep_after_open=0)
         self._descriptor = self.fileno()
         if channel.startswith("socket://"):
@@ -48,20 +48,20 @@ class BulkSlcanBus(slcanBus):
 
     def send_together(self, messages: Sequence[can.Message]) -> None:
         """Send frames that belong together by one write: a write costs more than all the rest."""
-        self._held = bytearray()
+        self._batch = bytearray()
         try:
             for message in messages:
                 self.send(message, _SEND_TIMEOUT_S)
         finally:
-            held, self._held = self._held, None
+            batch, self._batch = self._batch, None
         with can.exceptions.error_check("Could not write to the adapter"):
-            self.serialPortOrig.write(held)
+            self.serialPortOrig.write(batch)
 
     def _write(self, string: str) -> None:
-        if self._held is None:
+        if self._batch is None:
             super()._write(string)
         else:
-            self._held += string.encode("ascii") + self.LINE_TERMINATOR
+            self._batch += string.encode("ascii") + self.LINE_TERMINATOR
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame; python-can's own waits by the wall clock, which may be set back."""
@@ -70,8 +70,8 @@ class BulkSlcanBus(slcanBus):
     def _read(self, timeout: float | None) -> str | None:
         """The next line that is a frame, or None when none came in time.
 
-        Bytes that are waiting are looked at once even if `timeout` is 0. What else an adapter says is
-        passed over: a frame that it refuses (BEL) shows as an answer of the drive that does not come.
+        Waiting bytes are read once even if `timeout` is 0. Everything else that an adapter sends is
+        ignored: a frame that it refuses (BEL) shows as an answer of the drive that does not come.
 
         Raises
         ------

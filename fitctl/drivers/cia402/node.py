@@ -40,9 +40,9 @@ class Node:
     Attributes
     ----------
     handlers : dict
-        Who takes the data of which identifier; PDOs are added by their owner.
+        The handler of each identifier's data; the owner of a PDO adds its own.
     error_code : int
-        Of the newest emergency message; 0 once the node says that the error is gone.
+        Of the newest emergency message; 0 once the node reports that the error is gone.
     """
 
     def __init__(self, link: CanLink, device: Cia402Device) -> None:
@@ -68,7 +68,7 @@ class Node:
 
     # ------------------------------------------------------------ frames
     def pump(self, timeout_s: float) -> bool:
-        """Take one frame from the bus and hand it to its handler; False when none came in time."""
+        """Receive one frame and pass it to its handler; False when none came in time."""
         frame = self.link.receive(timeout_s)
         if frame is None:
             return False
@@ -78,13 +78,13 @@ class Node:
         return True
 
     def drain(self) -> None:
-        """Take what has come in, without waiting: at most 100 frames, so that a flood does not hold us."""
+        """Receive what is waiting, at most 100 frames, so that a flood cannot block the caller."""
         for _ in range(_DRAIN_FRAMES):
             if not self.pump(0.0):
                 return
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        """Take frames, and keep our heartbeat going, until `done` or the time limit."""
+        """Receive frames and send our heartbeat until `done` or the time limit."""
         deadline_s = time.monotonic() + timeout_s
         while not done():
             left_s = deadline_s - time.monotonic()
@@ -114,7 +114,7 @@ class Node:
             self.link.send((protocol.HEARTBEAT_BASE + self._master_id, state))
 
     def check_alive(self) -> None:
-        """See that the drive's heartbeat goes on and says OPERATIONAL.
+        """Check that the drive's heartbeat continues and reports OPERATIONAL.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class Node:
         self.link.send((protocol.NMT_ID, bytes([command, self._device.node_id])))
 
     def start(self) -> None:
-        """Start the node, and wait for a heartbeat that says so.
+        """Start the node, and wait for a heartbeat that reports it.
 
         Raises
         ------

@@ -52,7 +52,7 @@ STATUS_EVERY_MS = 100
 
 
 class NmtCommand(IntEnum):
-    """What the NMT master tells a node."""
+    """Commands of the NMT master to a node."""
 
     START = 0x01
     STOP = 0x02
@@ -62,7 +62,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """What a heartbeat says; BOOT_UP is sent once."""
+    """The state in a heartbeat; BOOT_UP is sent once."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04

@@ -136,7 +136,7 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         DeviceUnreachable, DeviceTimeout, DeviceProtocolError
             The link broke, or is out of step. A fault of an axis does not raise: the reading has it.
         DeviceFault
-            An encoder says what no motor can do.
+            An encoder reports a motion that no motor can make.
         ValueError
             A velocity is not finite.
         """
@@ -144,14 +144,14 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         self._opened()
         for axis in range(2):
             self._free_run(axis, velocity_rad_s[axis])
-        asked_s = time.monotonic()
+        requested_s = time.monotonic()
         az_rad, el_rad = self._position_rad(0), self._position_rad(1)
         read_s = time.monotonic()
-        self._look_after(*divmod(self._turn, 2))
+        self._poll_axis(*divmod(self._turn, 2))
         self._turn = (self._turn + 1) % 4
-        self._check_plausible(asked_s, read_s, (az_rad, el_rad))
+        self._check_plausible(requested_s, read_s, (az_rad, el_rad))
         return ServoReading(
-            time_s=(asked_s + read_s) / 2,
+            time_s=(requested_s + read_s) / 2,
             position_rad=(az_rad, el_rad),
             enabled=all(status & AxisStatus.ENABLED for status in self._status),
             fault="; ".join(
@@ -186,7 +186,7 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         self._read_faults(axis)
 
     def _free_run(self, axis: int, velocity_rad_s: float) -> None:
-        """Say a velocity, unless it was the last one said too."""
+        """Command a velocity, unless it is the last one commanded."""
         units_s = f"{velocity_rad_s / self._rad_per_unit[axis]:.{self._digits[axis]}f}"
         if units_s == self._sent[axis] or not self._status[axis] & AxisStatus.ENABLED:
             return
@@ -198,7 +198,7 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
             if not self._read_faults(axis) and self._is_enabled(axis):
                 raise link.refused(command, reply)
 
-    def _look_after(self, axis: int, what: int) -> None:
+    def _poll_axis(self, axis: int, what: int) -> None:
         """Read the status or the faults of an axis; both where it has just lost its power."""
         was_enabled = self._status[axis] & AxisStatus.ENABLED
         if what or (was_enabled and not self._is_enabled(axis)):
@@ -209,9 +209,9 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
     def _position_rad(self, axis: int) -> float:
         return self._number(f"PFBKPROG({self._at(axis)})") * self._rad_per_unit[axis]
 
-    def _check_plausible(self, asked_s: float, read_s: float, position_rad: AzEl) -> None:
+    def _check_plausible(self, requested_s: float, read_s: float, position_rad: AzEl) -> None:
         """An ASCII answer has neither checksum nor number: check that the motors can be there."""
-        last, self._last = self._last, (asked_s, position_rad)
+        last, self._last = self._last, (requested_s, position_rad)
         if last is not None:
             self._check_turned(last[1], position_rad, read_s - last[0])
 

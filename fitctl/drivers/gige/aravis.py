@@ -235,7 +235,7 @@ class AravisCamera:
         return Frame(self._number, middle_s, received_s, image)
 
     def _answers(self) -> bool:
-        """Whether it is worth while to tell it anything: Aravis would try for seconds."""
+        """Whether the camera still answers; if not, Aravis would retry for seconds."""
         lost = self._heartbeat is not None and self._heartbeat.error is not None
         return self._device is not None and not lost
 

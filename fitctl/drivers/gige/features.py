@@ -99,7 +99,7 @@ class Features:
             raise self._mismatch("a GenICam description", str(error)) from error
 
     def configure(self, camera: Camera) -> float:
-        """Set what the rig file says and check that the camera took it.
+        """Apply the settings of the rig file and check that the camera has accepted them.
 
         Returns
         -------
@@ -315,7 +315,7 @@ def expect(endpoint: Endpoint, name: str, wanted: float, actual: float, toleranc
 
 
 def mismatch(endpoint: Endpoint, expected: str, got: str) -> DeviceMismatch:
-    """The error for a camera that is not what the rig file says."""
+    """The error for a camera that does not match the rig file."""
     return endpoint.error(
         DeviceMismatch, expected, got, "correct [camera] in the rig file to this camera"
     )

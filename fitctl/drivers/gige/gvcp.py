@@ -106,7 +106,7 @@ class ControlChannel:
         return text_of(self.read_memory(*register))
 
     def read_identity(self) -> DeviceIdentity:
-        """Read who the camera says it is."""
+        """Read the camera's maker, model, serial number and version."""
         return DeviceIdentity(
             maker=self.read_text(protocol.MAKER),
             model=self.read_text(protocol.MODEL),
@@ -235,7 +235,7 @@ class ControlChannel:
 
 
 def text_of(data: bytes) -> str:
-    """What a string register says."""
+    """The text in a string register."""
     return data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
 
 

@@ -22,7 +22,7 @@ _LOAD = ("Width", "Height", "PayloadSize")
 
 
 def probe_camera(camera: Camera) -> Probe:
-    """Who a camera is, and whether it can be what the rig file says.
+    """Read the identity of a camera, and check whether it can be set as in the rig file.
 
     Raises
     ------
@@ -35,12 +35,12 @@ def probe_camera(camera: Camera) -> Probe:
         identity = channel.read_identity()
         question_s = round_trip_s(lambda: channel.read_register(Register.VERSION))
         controlled = channel.read_register(Register.CONTROL_PRIVILEGE)
-        told = [_CONTROLLED] if controlled & _ANY_CONTROL else []
+        problems = [_CONTROLLED] if controlled & _ANY_CONTROL else []
         try:
-            told += _disagreements(Features(channel), camera)
+            problems += _disagreements(Features(channel), camera)
         except DeviceError as error:
-            told.append(str(error))
-    return Probe(identity, question_s, tuple(told))
+            problems.append(str(error))
+    return Probe(identity, question_s, tuple(problems))
 
 
 class _Wanted(NamedTuple):
@@ -70,7 +70,7 @@ def _disagreements(features: Features, camera: Camera) -> Iterator[str]:
 
     Some limits hang on other settings: a long exposure allows few frames a second, a large frame fewer
     still. Where the last program has left the camera with more of these than the rig file asks, the limit
-    may rise once it is opened, and says nothing.
+    may rise once it is opened, and is not reported.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def _disagreements(features: Features, camera: Camera) -> Iterator[str]:
 
 
 def _outside(features: Features, name: str, wanted: _Wanted, *, limited: bool) -> Iterator[str]:
-    """What is to be said of a number and its feature; `limited` where its maximum stays as it is."""
+    """The disagreement of a number with its feature, if any; `limited` where its maximum stays as it is."""
     limits = features.limits(name)
     if limits is None:
         return

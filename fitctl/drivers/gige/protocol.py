@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 
 class MalformedPacketError(ValueError):
-    """Bytes that are not a packet of the protocol; ``str()`` says what is wrong with them."""
+    """Bytes that are not a packet of the protocol; ``str()`` describes the error."""
 
 
 # ---------------------------------------------------------------- GVCP
@@ -331,7 +331,7 @@ class StreamHeader(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """What a frame's first packet says of it; the timestamp is the start of exposure."""
+    """Contents of a frame's first packet; the timestamp is the start of exposure."""
 
     timestamp_ticks: int
     pixel_format: int

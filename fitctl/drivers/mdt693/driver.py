@@ -140,7 +140,7 @@ class Mdt693:
         return volts
 
     def ask_once(self) -> None:
-        """One question and its answer, unjudged: what a round trip takes.
+        """Send one query and read its answer without checking it, to time a round trip.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class Mdt693:
             ("low", self._commands.system_low, 0.0),
             ("high", self._commands.system_high, self._piezo.limit_v),
         ):
-            if command and not self._ask(command).refused:  # not every firmware tells
+            if command and not self._ask(command).refused:  # not every firmware has them
                 (volts,) = self._volts(command, _one)
                 volts = min(volts, self._piezo.limit_v)  # beyond the switch it limits nothing
                 self._check_limit(f"the system's {bound} limit", volts, expected_v)
@@ -234,7 +234,7 @@ class Mdt693:
         self._in_step = False
         self._send(command)
         data = self._collect(command)
-        # Without echo nothing in an answer tells to which question; so nothing may follow it.
+        # Without echo an answer does not name its question, so nothing may follow it.
         more = b"" if self._echoes else self._read(command)
         if not is_frame_only(command, more):
             self._nonsense(f"one answer to {command}", f"{(data + more)[:80]!r}")

@@ -143,7 +143,7 @@ class Cia402DriveMock:
         )
         self._events = tuple(Periodic(partial(self._send_pdo, tpdo)) for tpdo in self._tpdos)
         self._handlers: dict[int, Callable[[bytes], None]] = {}
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     async def start(self) -> int:
         """Power up: listen, boot, wait in PRE-OPERATIONAL. Returns the TCP port."""
@@ -260,7 +260,7 @@ class Cia402DriveMock:
             case NmtCommand.RESET_NODE:
                 self._power_off()
                 self._reset_communication()
-                self._look_for_causes()
+                self._update_causes()
             case NmtCommand.RESET_COMMUNICATION:
                 self._reset_communication()
 
@@ -282,7 +282,7 @@ class Cia402DriveMock:
 
     def _apply(self, rpdo: Pdo, data: bytes) -> None:
         if not rpdo.apply(data):
-            self._emergencies.tell(protocol.EMCY_PDO_TOO_SHORT, 0)
+            self._emergencies.report(protocol.EMCY_PDO_TOO_SHORT, 0)
 
     def _on_sync(self, _data: bytes) -> None:
         self._encoders.sample()
@@ -301,7 +301,7 @@ class Cia402DriveMock:
         self._adapter.send(tpdo.can_id, tpdo.message())
 
     def _send_events(self) -> None:
-        """The TPDOs that are sent on change, as far as they would tell something new."""
+        """The TPDOs that are sent on change, if their contents have changed."""
         if self.nmt_state is NmtState.OPERATIONAL:
             for tpdo in self._tpdos:
                 if tpdo.in_service and tpdo.on_event and tpdo.changed:
@@ -335,10 +335,10 @@ class Cia402DriveMock:
     # ------------------------------------------------------------ what happens
     def _axis_changed(self) -> None:
         self._command_motors()
-        self._emergencies.look()
+        self._emergencies.update()
         self._send_events()
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         self._adapter.severed = self.faults.value("link_loss") is not None
         without_power = self.faults.value("reboot") is not None
         if kind == "reboot":
@@ -346,16 +346,16 @@ class Cia402DriveMock:
             if not without_power:
                 self._reset_communication()
         if not without_power:
-            self._look_for_causes()
+            self._update_causes()
             self._command_motors()
 
-    def _look_for_causes(self) -> None:
+    def _update_causes(self) -> None:
         """A cause puts its axis in fault, and no reset helps before it is gone."""
         for number, (axis, part) in enumerate(zip(self.axes, AXES, strict=True)):
             cause = self._cause(part)
             axis.fault_persists = cause is not None
             if cause is not None and axis.fault(cause):
-                self._emergencies.tell(cause, number + 1)
+                self._emergencies.report(cause, number + 1)
 
     def _cause(self, part: str) -> int | None:
         """Error code of what is wrong with an axis now."""
@@ -366,7 +366,7 @@ class Cia402DriveMock:
         return protocol.ERROR_FOLLOWING if fails else None
 
     def _master_lost(self) -> None:
-        """The master's heartbeat is missing: each axis does what its object 6007 says."""
+        """The master's heartbeat is missing: each axis reacts as its object 6007 says."""
         for axis in self.axes:
             if axis.abort_option == protocol.ABORT_IS_FAULT:
                 axis.fault(protocol.EMCY_HEARTBEAT_LOST)
@@ -374,7 +374,7 @@ class Cia402DriveMock:
                 axis.command(Command.DISABLE_VOLTAGE)
             elif axis.abort_option == protocol.ABORT_IS_QUICK_STOP:
                 axis.command(Command.QUICK_STOP)
-        self._emergencies.tell(protocol.EMCY_HEARTBEAT_LOST, 0)
+        self._emergencies.report(protocol.EMCY_HEARTBEAT_LOST, 0)
 
     def _enter(self, state: NmtState) -> None:
         """Change the NMT state; leaving OPERATIONAL stops the motors, entering it sends event TPDOs."""

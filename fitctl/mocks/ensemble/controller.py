@@ -83,7 +83,7 @@ class EnsembleControllerMock:
         self._pty_client: Client | None = None
         self._cycle = Periodic(self._run_cycle)
         self._stepped_s = 0.0
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     async def start(self) -> Endpoints:
         """Listen, and begin to control.
@@ -170,7 +170,7 @@ class EnsembleControllerMock:
             az, el = (axis.motor_velocity / self._units_per_rad for axis in self.axes)
             self._motors.command_velocity_rad_s(az, el)
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         if kind == "reboot":
             self._power_up()
         for axis, part in zip(self.axes, AXES, strict=True):

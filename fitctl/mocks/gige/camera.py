@@ -94,7 +94,9 @@ class GigeCameraMock:
     async def start(self) -> int:
         """Listen; returns the GVCP port."""
         stream = Stream(self.faults, resends=self._settings.resends)
-        acquisition = Acquisition(self._seen, self._clock.ticks, self._camera.frame_delay_s, stream)
+        acquisition = Acquisition(
+            self._expose, self._clock.ticks, self._camera.frame_delay_s, stream
+        )
         self._started = stream, acquisition, self._registers(stream, acquisition)
         try:
             self._control = await listen(self.answer, self.faults, self._port)
@@ -246,8 +248,8 @@ class GigeCameraMock:
             self._heartbeat.set_timeout(heartbeat_s)
         self._heartbeat.feed()
 
-    def _seen(self, mid_exposure_s: float) -> NDArray[np.uint16]:
-        return self._sensor.seen(self._render(mid_exposure_s), mid_exposure_s)
+    def _expose(self, mid_exposure_s: float) -> NDArray[np.uint16]:
+        return self._sensor.expose(self._render(mid_exposure_s), mid_exposure_s)
 
     def _registers(self, stream: Stream, acquisition: Acquisition) -> Registers:
         return Registers(self._camera, self._settings, self._clock, acquisition, stream)

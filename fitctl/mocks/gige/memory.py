@@ -17,7 +17,7 @@ _SPACE_BYTES = 0xB000
 
 
 class Feature(IntEnum):
-    """The camera's own registers, as its GenICam description tells clients."""
+    """The camera's own registers, as in its GenICam description."""
 
     WIDTH = 0xA000
     HEIGHT = 0xA004
@@ -114,7 +114,7 @@ _WRITABLE = LOCKED_WHILE_RUNNING | {
 
 
 class RegisterError(Exception):
-    """A command that the camera answers with an error status; `payload` says how far it got."""
+    """A command that the camera answers with an error status; `payload` gives how far it got."""
 
     def __init__(self, status: Status, payload: bytes = b"") -> None:
         super().__init__(status.name)

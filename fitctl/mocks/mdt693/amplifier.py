@@ -73,7 +73,7 @@ class Amplifier:
         self._update()
 
     def set_saturated(self, channels: Collection[str]) -> None:
-        """These outputs stay at their highest voltage, whatever they are told."""
+        """These outputs stay at their highest voltage, whatever is commanded."""
         self._saturated = channels
         self._update()
 

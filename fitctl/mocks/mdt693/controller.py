@@ -68,7 +68,7 @@ class Controller:
         self._set_defaults()
 
     def answer(self, command: str) -> str:
-        """Do what a command says, and everything that the device sends back, its echo included."""
+        """Execute a command; returns everything that the device sends back, its echo included."""
         text = command.replace("\n", "")
         echo = f"{command.lower() if self._is_a else command}\r" if self.echo else ""
         try:

@@ -68,7 +68,7 @@ class ModbusRtuServer:
     async def start(self) -> str:
         """Open the pty; returns the path of the clients' end."""
         self._pty = Pty(self._baud_rate)
-        self._pty.read_into(self._take)
+        self._pty.read_into(self._receive)
         return self._pty.path
 
     async def stop(self) -> None:
@@ -91,7 +91,7 @@ class ModbusRtuServer:
             return b""
         return frame(unit, answer(request, self._model)) if unit == self._unit else b""
 
-    def _take(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         if self._wire.dead or self._pty is None or not self._pty.is_at_our_baud_rate():
             self._pending.clear()
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fitctl.drivers.bal_analog.protocol import Message, frame, take_message
+from fitctl.drivers.bal_analog.protocol import Message, frame, pop_message
 from fitctl.drivers.modbus_dac.protocol import NO_SUCH_DEVICE
 from fitctl.mocks.faults import Faults
 from fitctl.mocks.modbus.pdu import DataModel, answer, exception
@@ -64,7 +64,7 @@ class _Link(Link):
             return
         self._pending += data
         try:
-            while (request := take_message(self._pending)) is not None:
+            while (request := pop_message(self._pending)) is not None:
                 if framed := self._respond(request):
                     self.wire.send(framed)
         except ValueError:

@@ -86,7 +86,7 @@ class ModbusDacMock:
             model, self.faults, unit=dac.device_id, unknown_unit=settings.unknown_unit
         )
         self._rtu = ModbusRtuServer(model, self.faults, unit=dac.device_id, baud_rate=dac.baud_rate)
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     @property
     def outputs_v(self) -> list[float]:
@@ -145,7 +145,7 @@ class ModbusDacMock:
         self._latched = self._settings.watchdog_latches
         self._set(list(self._safe))
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         if kind == "watchdog_trip" and self.faults.value(kind) is not None:
             self._trip()
         if kind == "reboot":  # both its ends: power gone, power back

@@ -21,7 +21,7 @@ def heard(data):
     with ours, theirs:
         theirs.sendall(data)
         bus = object.__new__(BulkSlcanBus)
-        bus._buffer, bus._held, bus._queue = bytearray(), None, queue.SimpleQueue()
+        bus._buffer, bus._batch, bus._queue = bytearray(), None, queue.SimpleQueue()
         bus._is_shutdown, bus._can_protocol = True, CanProtocol.CAN_20
         bus._descriptor = ours.fileno()
         link = object.__new__(CanLink)

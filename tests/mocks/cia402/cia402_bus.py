@@ -46,9 +46,7 @@ class Bus:
         self._writer.close()
 
     def send(self, can_id, data=""):
-        self._writer.write(
-            slcan.encode_frame(slcan.CanFrame(can_id, bytes.fromhex(data)))
-        )
+        self._writer.write(slcan.encode_frame(slcan.CanFrame(can_id, bytes.fromhex(data))))
 
     def ask_for(self, can_id):
         """A remote frame."""

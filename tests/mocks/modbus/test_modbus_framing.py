@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.framer.rtu import FramerRTU
 
-from fitctl.drivers.bal_analog.protocol import Message, frame, take_message
+from fitctl.drivers.bal_analog.protocol import Message, frame, pop_message
 from fitctl.drivers.modbus_dac.protocol import rtu_silence_s
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu
@@ -27,7 +27,7 @@ SERVER = ModbusTcpServer(
 
 def taken_from(pending):
     messages = []
-    while (message := take_message(pending)) is not None:
+    while (message := pop_message(pending)) is not None:
         messages.append(message)
     return messages
 
@@ -56,7 +56,7 @@ def test_a_message_of_another_protocol_is_thrown_away_and_the_next_is_served():
 def test_a_length_that_cannot_be_is_out_of_step(length):
     header = b"\0\1\0\0" + length.to_bytes(2, "big") + b"\1"
     with pytest.raises(ValueError, match="length"):
-        take_message(bytearray(header))
+        pop_message(bytearray(header))
 
 
 @given(st.binary(max_size=600))
