@@ -108,11 +108,19 @@ class LinkedAmplifiers(Generic[_Link, _Settings]):
         )
 
     def _check_turned(
-        self, before: Sequence[float], now: Sequence[float], since_s: float, rad_per_unit: float = 1
+        self,
+        before: Sequence[float],
+        now: Sequence[float],
+        since_s: float,
+        *,
+        rad_per_count: float | None = None,
     ) -> None:
-        """Raise DeviceFault if a motor cannot have turned so far in that time."""
-        most = (_MARGIN_RAD + SLACK * self._velocity_limit_rad_s * since_s) / rad_per_unit
-        unit, digits = ("rad", 2) if rad_per_unit == 1 else ("counts", 0)
+        """Raise DeviceFault if a motor cannot have turned so far in that time.
+
+        Angles are in rad, or in encoder counts if `rad_per_count` is given.
+        """
+        unit, digits = ("rad", 2) if rad_per_count is None else ("counts", 0)
+        most = (_MARGIN_RAD + SLACK * self._velocity_limit_rad_s * since_s) / (rad_per_count or 1.0)
         for name, earlier, later in zip(AXES, before, now, strict=True):
             if abs(later - earlier) > most:
                 raise self._endpoint.error(

@@ -247,7 +247,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
                 f"a reading within {self._blind_s:.2f} s, for the counters not to wrap unseen"
             )
             raise self._timeout(expected, f"one after {since_s:.2f} s")
-        self._check_turned(near, (az, el), since_s, self._rad_per_count)
+        self._check_turned(near, (az, el), since_s, rad_per_count=self._rad_per_count)
         return az, el
 
     # ------------------------------------------------------------ errors
