@@ -7,13 +7,18 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PEERS := $(VENV)/.peers
 FUZZ_S ?= 120
+SEED ?= 1
+COUNT ?= 200
 SOAK_S ?= 3600
 FAULT_RESULTS ?= .fault-results.json
 # Two instruments side by side: one takes less than half a core.
 FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
 
+# Compiled anew by every process, the code costs each worker and each fitctl that a test starts seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-slow test-console test-faults reliability test-peers bench-console bench-devices bench-recorder bench-report bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -31,7 +36,12 @@ $(READY): requirements/dev.lock pyproject.toml
 demo: $(READY)  ## Run the whole instrument on mock devices
 	@$(BIN)/fitctl demo $(ARGS)
 
-test: lint types contract pytest  ## Lint, types, import contract, tests
+# A core's worth of the tests is waiting: type checks and the instrument in real time run beside the others.
+BESIDE := $(MAKE) --no-print-directory --jobs 3 --output-sync=target
+
+test: lint contract  ## Lint, import contract, types, tests
+	@echo "Types and tests, about four minutes ..."
+	@$(BESIDE) types test-instrument test-parts
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -46,16 +56,21 @@ contract: $(READY)
 pytest: $(READY)
 ifdef ARGS
 	$(BIN)/pytest $(ARGS)
-else  # those of the whole instrument run in real time: two of them beside each other, and nothing else
-	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system
-	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system
+else
+	@$(BESIDE) test-instrument test-parts
 endif
+
+test-instrument: $(READY)
+	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system
+
+test-parts: $(READY)
+	$(BIN)/pytest --numprocesses 3 --dist loadfile --ignore tests/system
 
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
 test-console: $(READY)  ## What people do: the tutorial, the console by keys (tmux) and in a browser (Chromium)
-	@tests/install-packages tmux chromium
+	-@tests/install-packages tmux chromium
 	$(BIN)/pytest -m terminal tests/system --numprocesses 2 $(ARGS)
 
 test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
@@ -68,15 +83,18 @@ reliability: $(READY)  ## The fault catalogue, and its results into docs/reliabi
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
 	$(BIN)/pytest -m peer tests/peers $(ARGS)
 
-$(PEERS): $(READY) requirements/peers.lock tests/install-packages tests/peers/install tests/peers/canopen/package-lock.json
+$(PEERS): $(READY) requirements/peers.lock tests/install-packages tests/peers/install tests/peers/canopen/package-lock.json tests/peers/mcap/package-lock.json
 	@echo "Getting the peers ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/peers.lock
-	@tests/peers/install
-	@touch $(PEERS)
+	@if tests/peers/install; then touch $(PEERS); fi  # what is missing is tried again the next time
 
 fuzz: $(READY)  ## Coverage-guided fuzzing of every parser, FUZZ_S seconds each (needs atheris)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/fuzz.lock
 	@for target in fuzz/fuzz_*.py; do $(BIN)/python $$target -max_total_time=$(FUZZ_S) || exit 1; done
+
+mutants: $(READY)  ## Mutation testing: COUNT changes to the code drawn by SEED, and which of them the tests find
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/mutants.lock
+	$(BIN)/python -m benchmarks.mutants --seed $(SEED) --count $(COUNT) $(ARGS)
 
 soak: $(READY)  ## SOAK_S seconds on mocks with random faults: what grows, is late, is lost
 	$(BIN)/python -m benchmarks.soak --duration $(SOAK_S) $(ARGS)
@@ -123,6 +141,7 @@ lock: $(READY)  ## Resolve the requirements anew (needs uv and npm)
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
 	uv pip compile --group docs $(LOCK) --constraint requirements/dev.lock -o requirements/docs.lock
 	uv pip compile --group bench $(LOCK) --constraint requirements/dev.lock -o requirements/bench.lock
+	uv pip compile --group mutants $(LOCK) --constraint requirements/dev.lock -o requirements/mutants.lock
 	npm --prefix requirements/site install --package-lock-only --omit-lockfile-registry-resolved --silent
 
 clean:  ## Remove .venv and caches

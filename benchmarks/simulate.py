@@ -15,9 +15,8 @@ import numpy as np
 
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.model.air_path import NODE_S
-from fitctl.model.compiled import jit
-from fitctl.model.kernels import mix
-from fitctl.model.pixel_noise import quantiles
+from fitctl.model.compiled import compilable
+from fitctl.model.pixel_noise import mix, quantiles
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.simulation import Simulation
 
@@ -45,7 +44,7 @@ def line(title: str, rows: np.ndarray) -> str:
     return f"{title:34}" + "".join(f"{cell:10.0f}" for cell in cells)
 
 
-@jit
+@compilable()
 def draw_normals(random: object, air: int, key: int, pixels: int, table: np.ndarray) -> float:
     """As many normal deviates for the air and for pixels as given, compiled as the batch is."""
     total = 0.0

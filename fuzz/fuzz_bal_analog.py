@@ -6,14 +6,11 @@ The mock's side is the Modbus server of all mocks: see fuzz_modbus_dac.py.
 from __future__ import annotations
 
 from fitctl.drivers.bal_analog.protocol import (
-    READ_HOLDING_REGISTERS,
     READ_WRITE_MULTIPLE_REGISTERS,
-    decode_identity,
     decode_registers,
-    frame,
-    pop_message,
     unwrap,
 )
+from fitctl.drivers.modbus import READ_HOLDING_REGISTERS, decode_identity, frame, pop_message
 
 
 def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name

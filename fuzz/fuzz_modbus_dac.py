@@ -10,9 +10,10 @@ import socket
 import numpy as np
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.drivers.bal_analog.protocol import pop_message
 from fitctl.drivers.interface import DeviceError
+from fitctl.drivers.modbus import pop_message
 from fitctl.drivers.modbus_dac.driver import ModbusDac
+from fitctl.drivers.modbus_dac.link import RtuLink, TcpLink, limit_receiving
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu, tcp
 from fitctl.mocks.modbus.pdu import DataModel, answer
@@ -67,9 +68,14 @@ def read_rtu(data: bytes) -> None:
         assert not framed or rtu.parse_frame(framed) is not None
 
 
+def _write(dac: ModbusDac) -> None:
+    dac.send_v(np.zeros(3))
+    dac.confirm()
+
+
 def _use(dac: ModbusDac) -> None:
     """Nothing but device errors come out, and no voltage that the D/A does not have."""
-    for request in (dac._identify, dac.read_v, lambda: dac.write_v(np.zeros(3))):
+    for request in (dac._identify, dac.read_v, lambda: _write(dac)):
         try:
             got = request()
         except DeviceError:
@@ -85,9 +91,12 @@ def drive_tcp(data: bytes) -> None:
     with ours, theirs:
         theirs.sendall(data[:4096])
         theirs.shutdown(socket.SHUT_WR)
+        link = TcpLink.__new__(TcpLink)
+        link._unit, link._timeout_s, link._transaction = _DAC.device_id, _DAC.response_timeout_s, 0
+        link._pending, link._socket = bytearray(), ours
+        limit_receiving(ours, _DAC.response_timeout_s)
         dac = ModbusDac(_DAC)
-        dac._client = dac._make_client()
-        dac._client.socket = ours
+        dac._link = link
         _use(dac)
         dac.close()
 
@@ -120,13 +129,12 @@ class _Port:
 def drive_rtu(data: bytes) -> None:
     """The driver on a serial port; once as the bytes are, once with a right check at their end."""
     for said in (data, data + rtu.crc16(data)):
-        rtu_dac = _DAC.model_copy(update={"transport": "rtu", "serial_port": "none"})
-        dac = ModbusDac(rtu_dac)
-        dac._client = dac._make_client()
-        dac._client.socket = _Port(said)
-        # Polling sleeps a millisecond at a time, which would be all that the fuzzer does.
-        dac._client._recv_interval = 0.0
-        dac._silence_s = dac._late_s = 0.0
+        link = RtuLink.__new__(RtuLink)
+        link._unit, link._timeout_s = _DAC.device_id, _DAC.response_timeout_s
+        link._silence_s = link._free_s = 0.0
+        link._port = _Port(said)
+        dac = ModbusDac(_DAC)
+        dac._link = link
         _use(dac)
         dac.close()
 

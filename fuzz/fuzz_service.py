@@ -34,7 +34,7 @@ from fitctl.model.drives import Drive
 from fitctl.service.admission import Sender
 from fitctl.service.doors import Door
 from fitctl.service.envelope import Passed, Report, decode_envelope
-from fitctl.service.gateway import judge
+from fitctl.service.gateway import admit
 from fitctl.service.intake import Intake
 from fitctl.service.service import Service, Waiting
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
@@ -157,11 +157,11 @@ def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
 
 
 def _through_the_gateway(key: AllowedKey | None, payload: bytes, door: _Door) -> None:
-    judged = judge(key, "10.0.0.1", payload, _INTAKE, _SIMULATION.clock.now_s())
-    if isinstance(judged, Passed):
-        _SERVICE._open(b"gateway", b"route", msgspec.msgpack.encode(judged))
+    admitted = admit(key, "10.0.0.1", payload, _INTAKE, _SIMULATION.clock.now_s())
+    if isinstance(admitted, Passed):
+        _SERVICE._open(b"gateway", b"route", msgspec.msgpack.encode(admitted))
     else:
-        door.answer(b"identity", b"tag", msgspec.msgpack.encode(judged))
+        door.answer(b"identity", b"tag", msgspec.msgpack.encode(admitted))
 
 
 def _payload(data: bytes, whole: list[bytes]) -> bytes:

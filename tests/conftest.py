@@ -1,4 +1,5 @@
 import asyncio
+import gc
 import os
 import threading
 
@@ -9,11 +10,21 @@ import pytest
 
 from fitctl.config import Rig, default_rig_path, load_rig
 
-pytest_plugins = ["virtual_instrument"]
+pytest_plugins = ["pytester", "skips", "virtual_instrument"]
 
-# The machine itself may stand still for 100 ms: an example's time says nothing about the code.
-hypothesis.settings.register_profile("fitctl", deadline=None)
+# The machine itself may stand still for 100 ms: an example's time says nothing about the code. The examples
+# differ from run to run, also with CI set, where Hypothesis by itself repeats the same ones.
+hypothesis.settings.register_profile(
+    "fitctl", hypothesis.settings.get_profile("default"), deadline=None, print_blob=True
+)
 hypothesis.settings.load_profile("fitctl")
+
+
+def pytest_collection_finish():
+    """Collect garbage less often: several hundred thousand objects of the tests themselves make it slow."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
 
 
 @pytest.fixture(scope="session")

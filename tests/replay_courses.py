@@ -13,6 +13,7 @@ from fitctl.messages.commands import (
     Off,
     Recover,
     Reset,
+    SetBiasOffset,
     SetController,
     SetTarget,
     Standby,
@@ -40,7 +41,12 @@ def replayed(*paths, change=()):
 
 
 def hold_a_star(simulation):
-    simulation.acquire()
+    simulation.command(Standby())
+    hold_a_star_from_standby(simulation)
+
+
+def hold_a_star_from_standby(simulation):
+    assert simulation.command(Acquire()).accepted
     until(simulation, Mode.VERNIER, limit_s=20.0)
     simulation.run(2.0)
 
@@ -97,6 +103,26 @@ def nothing_that_opens(simulation):
     hold_a_star(simulation)
 
 
+def a_stall(simulation):
+    """The machine stands still twice; then only the newest frame is acted on."""
+    hold_a_star(simulation)
+    for periods in (3, 8):
+        simulation.clock.sleep_until(
+            simulation.clock.now_s() + periods * simulation.rig.camera.period_s
+        )
+        simulation.run(1.0)
+    assert simulation.ticks[-1].frames_skipped == 9
+
+
+def an_off_that_waits_for_the_mirror(simulation):
+    """A refused Off takes the mirror to its bias, and with it what the next search starts from."""
+    simulation.command(Standby())
+    assert simulation.command(SetBiasOffset(az_urad=150.0, el_urad=0.0)).accepted
+    simulation.run(1.0)
+    assert not simulation.command(Off()).accepted
+    hold_a_star_from_standby(simulation)
+
+
 def _fails(part, method, error=TIMEOUT):
     """While a star is held a device fails; it recovers, and the star is held again."""
 
@@ -137,11 +163,11 @@ def interlocks(simulation):
         ("recorder_backlog_fraction", 0.9),
         ("recorder_backlog_fraction", 0.0),
     ):
-        supervisor.measured(quantity, value)
+        supervisor.report_quantity(quantity, value)
         simulation.run(0.5)
     assert simulation.command(Reset(name="recorder_behind")).accepted
     simulation.run(0.5)
-    supervisor.measured("clock_step_s", 9.0)
+    supervisor.report_quantity("clock_step_s", 9.0)
     simulation.run(0.5)
 
 
@@ -175,7 +201,10 @@ COURSES = {
     "nothing opens": (nothing_that_opens, [], {"STANDBY", "IN_REACH"}),
     "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
-    "the D/A fails": (_fails("dac", "write_v"), [], FAULT),
+    "a stall": (a_stall, [], {"IN_REACH"}),
+    "a refused Off": (an_off_that_waits_for_the_mirror, [SOON], {"IN_REACH"}),
+    "the D/A takes nothing": (_fails("dac", "send_v"), [], FAULT),
+    "the D/A confirms nothing": (_fails("dac", "confirm"), [], FAULT),
     "the amplifiers fail": (_fails("amplifiers", "exchange"), [], FAULT),
     "the camera fails": (_fails("camera", "next_frame"), [], FAULT),
     "the piezo amplifier is silent": (_fails("piezo", "stack_volts"), [], FAULT),

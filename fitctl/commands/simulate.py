@@ -61,6 +61,17 @@ def run_many(
 ) -> int:
     """Simulate every seed, here or on a Dask cluster, and print what they say together."""
     started = time.perf_counter()
+    refusal: str | None = None
+
+    def on_refusal(reason: str) -> None:
+        nonlocal refusal
+        refusal = reason
+        progress.console.print(
+            f"The batch simulator cannot run this rig: {reason}.\n"
+            "Each run is simulated tick by tick, about a hundred times slower.",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+
     try:
         with (
             ended_by_signals(interrupt),  # its workers would outlive it
@@ -75,6 +86,7 @@ def run_many(
                 executor,
                 workers,
                 on_progress=lambda done: progress.update(task, completed=done),
+                on_refusal=on_refusal,
             )
     except CampaignError as error:
         typer.echo(str(error), err=True)
@@ -83,7 +95,13 @@ def run_many(
     summaries = summarize(results)
     speed_x = len(seeds) * duration_s / wall_s
     if as_json:
-        head = {"duration_s": duration_s, "workers": workers, "wall_s": wall_s, "speed_x": speed_x}
+        head = {
+            "duration_s": duration_s,
+            "workers": workers,
+            "wall_s": wall_s,
+            "speed_x": speed_x,
+            "batch_refusal": refusal,
+        }
         typer.echo(to_json(head | {"loops": summaries}))
     else:
         for name, summary in summaries.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Annotated, Generic, Literal, TypeVar
 
 from pydantic import Field, model_validator
@@ -198,6 +199,11 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
     device: AmplifierDevice
     backlash_sky_arcsec: NonNegative | None = None
 
+    @property
+    def encoder_count_rad(self) -> float:
+        """Motor angle of one encoder count."""
+        return 2 * math.pi / self.encoder_counts_per_rev
+
 
 AnySiderostat = Siderostat[SiderostatDevice]
 
@@ -227,6 +233,11 @@ class ModbusDacDevice(Settings):
             msg = "device_id must be from 1 to 247 where transport is rtu: to 0, nobody answers"
             raise ValueError(msg)
         return self
+
+    @property
+    def step_v(self) -> float:
+        """Voltage of one step of the converter."""
+        return self.full_scale_v / (2**self.bits - 1)
 
     @property
     def endpoint(self) -> str:

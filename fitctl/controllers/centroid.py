@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 from fitctl.controllers.dark import Dark
+from fitctl.model.compiled import compilable
 
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 # Eq. 7's three sums over a window, row by row: light, and its moments along azimuth and elevation.
@@ -55,6 +56,12 @@ class Star(NamedTuple):
         return max(abs(self.az_px - self.window_az_px), abs(self.el_px - self.window_el_px))
 
 
+@compilable()
+def window_centre(px: float, largest_px: int) -> int:
+    """The pixel nearest to `px`, along one axis, about which the window fits on the frame."""
+    return min(max(round(px), HALF_WINDOW_PX), largest_px)
+
+
 class StarSensor:
     """Finds one loop's pointing spot.
 
@@ -62,20 +69,20 @@ class StarSensor:
     ----------
     camera : Camera
     loop : Loop
-        Its flux range tells the pointing spot from fringe spots and hot pixels.
+        Its flux range separates the pointing spot from fringe spots and hot pixels.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
         self._dark = Dark(camera)
-        self._threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
+        self.threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_range = loop.flux_range
-        self._largest_az_px, self._largest_el_px = camera.largest_window_px
+        self.largest_az_px, self.largest_el_px = camera.largest_window_px
         self.expect(loop.star_flux_dn)
 
     def expect(self, star_flux_dn: float) -> None:
         """From now on the loop's star is the one with this flux, within the loop's range about it."""
-        self._flux_low_dn = self._flux_range.low * star_flux_dn
-        self._flux_high_dn = self._flux_range.high * star_flux_dn
+        self.flux_low_dn = self._flux_range.low * star_flux_dn
+        self.flux_high_dn = self._flux_range.high * star_flux_dn
 
     def measure(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
@@ -100,7 +107,7 @@ class StarSensor:
         search = self._dark.light(image, 0, 0, *image.shape)
         for _ in range(MAX_CANDIDATES):
             el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
-            if search[el_px, az_px] < self._threshold_dn:
+            if search[el_px, az_px] < self.threshold_dn:
                 return None
             star = self.find_at(image, az_px, el_px)
             if star is not None:
@@ -125,8 +132,8 @@ class StarSensor:
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
     ) -> Star | None:
         """Eq. 7; None where there is no light, or one pixel has most of it."""
-        az = min(max(round(window_az_px), HALF_WINDOW_PX), self._largest_az_px)
-        el = min(max(round(window_el_px), HALF_WINDOW_PX), self._largest_el_px)
+        az = window_centre(window_az_px, self.largest_az_px)
+        el = window_centre(window_el_px, self.largest_el_px)
         side = _LEVER_PX.size
         light_dn = self._dark.light(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
         flux_dn, az_moment, el_moment = _SUMS.dot(light_dn.ravel()).tolist()
@@ -136,6 +143,6 @@ class StarSensor:
         return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
 
     def _accepted(self, star: Star | None) -> Star | None:
-        if star is None or not self._flux_low_dn <= star.flux_dn <= self._flux_high_dn:
+        if star is None or not self.flux_low_dn <= star.flux_dn <= self.flux_high_dn:
             return None
         return star

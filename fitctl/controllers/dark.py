@@ -61,7 +61,7 @@ def read_dark(path: Path, shape: tuple[int, int]) -> Floats:
     Raises
     ------
     ConfigError
-        If it cannot be read, has another shape, or does not say of enough pixels what they read.
+        If it cannot be read, has another shape, or lacks too many pixels.
     """
     try:
         dark_dn = np.load(io.BytesIO(dark_bytes(path)), allow_pickle=False)

@@ -20,7 +20,7 @@ class StarEstimator:
     ----------
     scale : Scales
     target_px : array, shape (2,)
-        Where an unknown star is taken to be at the start: on the target.
+        Where an unknown star is assumed at the start: on the target.
     """
 
     def __init__(self, scale: Scales, target_px: Floats) -> None:
@@ -37,7 +37,7 @@ class StarEstimator:
             self.place(star_px, motor_rad, mirror_rad)
 
     def place(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
-        """Take the star to be at `star_px` with the stages as given; all shapes (2,)."""
+        """Assume the star at `star_px` with the stages as given; all shapes (2,)."""
         self.observe(star_px, self.stages_px(motor_rad, mirror_rad))
 
     def observe(self, star_px: Floats, stages_px: Floats) -> None:

@@ -25,39 +25,44 @@ class Mirror:
 
     def __init__(self, fsm: Fsm) -> None:
         self._fsm = fsm
-        self._stack_matrix = stack_matrix(fsm.stack_radius_m)
+        self.stack_matrix = stack_matrix(fsm.stack_radius_m)
         # Eq. 1 and 5, whose matrices are the same at every tick.
-        self._stack_v_per_rad = self._stack_matrix / fsm.stack_scale_m_per_v
-        self._rad_per_stack_v = np.linalg.pinv(self._stack_v_per_rad)
+        self._stack_v_per_rad = self.stack_matrix / fsm.stack_scale_m_per_v
+        self.rad_per_stack_v = np.linalg.pinv(self._stack_v_per_rad)
         known = fsm.hysteresis
         self.hysteresis_known = known is not None
+        # Without a model, one play that does nothing.
+        self.half_width_v, self.gains_m_per_v, self.zero_m = (
+            np.zeros(1),
+            np.zeros((3, 1)),
+            np.zeros(3),
+        )
         if known is not None:
-            self._half_width_v = np.asarray(known.half_widths_v)
-            self._gains = np.asarray(known.gains_m_per_v)
+            self.half_width_v = np.asarray(known.half_widths_v)
+            self.gains_m_per_v = np.asarray(known.gains_m_per_v)
             # Where stacks rest that came up from zero to their bias: the mirror's zero.
-            self._zero_m = raised_displacement(fsm.bias_v, self._half_width_v, self._gains)
-            self._zero_rad = mirror_from_stacks(self._zero_m, fsm.stack_radius_m)
+            self.zero_m = raised_displacement(fsm.bias_v, self.half_width_v, self.gains_m_per_v)
+            self._zero_rad = mirror_from_stacks(self.zero_m, fsm.stack_radius_m)
             per_m = mirror_from_stacks(np.eye(3), fsm.stack_radius_m).T
-            self._rad_per_play_v = (per_m[..., None] * self._gains).reshape(2, -1)
+            self._rad_per_play_v = (per_m[..., None] * self.gains_m_per_v).reshape(2, -1)
         self.assume(np.full(3, fsm.bias_v))
 
     def assume(self, stack_v: Floats) -> None:
         """Take the stacks, shape (3,), to have come up to these voltages from zero."""
-        if self.hysteresis_known:
-            self._plays_v = np.zeros_like(self._gains)
+        self._plays_v = np.zeros_like(self.gains_m_per_v)
         self.written(stack_v)
 
     def written(self, stack_v: Floats) -> None:
         """These voltages, shape (3,), are on the D/A now."""
         self.stack_v = np.array(stack_v, dtype=float)
         if self.hysteresis_known:
-            self._plays_v = play(self._plays_v, self.stack_v[:, None], self._half_width_v)
+            self._plays_v = play(self._plays_v, self.stack_v[:, None], self.half_width_v)
 
     @property
     def angles_rad(self) -> Floats:
         """Where the mirror is, shape (2,)."""
         if not self.hysteresis_known:
-            return self._rad_per_stack_v @ (self.stack_v - self._fsm.bias_v)
+            return self.rad_per_stack_v @ (self.stack_v - self._fsm.bias_v)
         return self._rad_per_play_v.dot(self._plays_v.ravel()) - self._zero_rad
 
     def held_rad(self, *, hysteresis_inverse: bool) -> Floats:
@@ -77,8 +82,8 @@ class Mirror:
         By Eq. 1, or by the exact inverse of the identified hysteresis where asked for and known.
         """
         if hysteresis_inverse and self.hysteresis_known:
-            wanted_m = self._zero_m + self._stack_matrix @ mirror_rad
-            volts = inverse_volts(self._plays_v, self._half_width_v, self._gains, wanted_m)
+            wanted_m = self.zero_m + self.stack_matrix @ mirror_rad
+            volts = inverse_volts(self._plays_v, self.half_width_v, self.gains_m_per_v, wanted_m)
         else:
             volts = self._stack_v_per_rad.dot(mirror_rad) + self._fsm.bias_v  # `@` takes longer
         return np.minimum(np.maximum(volts, 0.0), self._fsm.dac.full_scale_v)

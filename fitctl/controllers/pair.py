@@ -67,7 +67,7 @@ class Design:
 
 
 class Measurement(NamedTuple):
-    """What one frame told, each shape (2,): in pixels from the frame, in radians from the stages."""
+    """Star and stages at one frame, each shape (2,): in pixels from the frame, in radians from the stages."""
 
     error_px: Floats
     target_px: Floats
@@ -97,10 +97,10 @@ class Pair:
         self.design = design
         self._scale = scale
         self._range_rad = range_rad
-        self._at_rest = rest_state(design)
-        self._left_at_rest = left_at_rest(design, self._at_rest)
-        self._system = self._in_rad()
-        self._given = np.zeros((len(self._system) + 3, 2))
+        self.at_rest = rest_state(design)
+        self.left_at_rest = left_at_rest(design, self.at_rest)
+        self.system = self._in_rad()
+        self._given = np.zeros((len(self.system) + 3, 2))
         self.start(np.zeros(2), np.zeros(2), np.zeros(2))
 
     def start(self, mirror_rad: Floats, motor_rad: Floats, target_px: Floats) -> None:
@@ -110,8 +110,8 @@ class Pair:
         command, and handed over to the siderostat little by little.
         """
         mirror_px = self._scale.mirror_px(mirror_rad)
-        self._given[len(INPUTS) : -1] = np.outer(self._at_rest, mirror_px)
-        self._given[-1] = mirror_px * self._left_at_rest
+        self._given[len(INPUTS) : -1] = np.outer(self.at_rest, mirror_px)
+        self._given[-1] = mirror_px * self.left_at_rest
         self.excess_px = np.zeros(2)
         self.motor_origin_rad = np.array(motor_rad, dtype=float)
         self.target_origin_px = np.array(target_px, dtype=float)
@@ -132,7 +132,7 @@ class Pair:
         given[2] = mirror_turn.dot(measured.mirror_rad)
         given[3] = siderostat_turn.dot(measured.motor_rad - self.motor_origin_rad)
         given[4] = measured.target_px - self.target_origin_px
-        made = self._system.dot(given)  # `@` takes twice as long
+        made = self.system.dot(given)  # `@` takes twice as long
         given[len(INPUTS) :] = made[len(OUTPUTS) :]
         wanted_rad = made[0].dot(mirror_turn)
         mirror_rad = saturate_diamond(wanted_rad, self._range_rad)

@@ -7,7 +7,24 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.model.compiled import compilable
+
 Floats = NDArray[np.float64]
+
+
+@compilable()
+def filtered(
+    command: float, value: float, rate: float, periods: float, decay: float
+) -> tuple[float, float]:
+    """Value and rate (in units of the time constant) of one axis a period later.
+
+    `periods` is the period over the time constant, `decay` what that leaves of an exponential.
+    """
+    distance = value - command
+    return (
+        command + decay * ((1 + periods) * distance + periods * rate),
+        decay * ((1 - periods) * rate - periods * distance),
+    )
 
 
 class Prefilter:
@@ -20,20 +37,21 @@ class Prefilter:
     """
 
     def __init__(self, time_constant_s: float, period_s: float, initial_px: Floats) -> None:
-        x = period_s / time_constant_s
-        decay = math.exp(-x)
-        # Of a critically damped approach: distance to the command and its rate (in units of tau).
-        self._transition = decay * np.array([[1 + x, x], [-x, 1 - x]])
+        self.periods = period_s / time_constant_s
+        self.decay = math.exp(-self.periods)
         self.reset(initial_px)
 
     def reset(self, value_px: Floats) -> None:
         """Rest at `value_px`, shape (2,)."""
         self.value_px = np.array(value_px, dtype=float)
-        self._approach = np.zeros((2, 2))
+        self._rates = (0.0, 0.0)
 
     def step(self, command_px: Floats) -> Floats:
         """Go on by one period; returns the filtered command, shape (2,)."""
-        self._approach[0] = self.value_px - command_px
-        self._approach = self._transition.dot(self._approach)  # `@` takes twice as long
-        self.value_px = command_px + self._approach[0]
+        (az_px, el_px), (az_rate, el_rate) = self.value_px.tolist(), self._rates
+        to_az_px, to_el_px = command_px.tolist()
+        periods, decay = self.periods, self.decay
+        az_px, az_rate = filtered(to_az_px, az_px, az_rate, periods, decay)
+        el_px, el_rate = filtered(to_el_px, el_px, el_rate, periods, decay)
+        self.value_px, self._rates = np.array([az_px, el_px]), (az_rate, el_rate)
         return self.value_px

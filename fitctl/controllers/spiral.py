@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.model.compiled import compilable
 from fitctl.model.optics import scales
 
 _LOOKS_BEYOND_FOUND = 2  # frames in the chord beyond those that count a star as found
@@ -35,7 +37,7 @@ class SpiralPlan:
         Where the search ends: half a turn's distance beyond the farthest star, or a star there could
         pass outside the last turn.
     field_radius_px : float
-        Circle in which a star is certain to be seen.
+        Circle in which every star is detected.
     """
 
     pitch_px: float
@@ -43,6 +45,11 @@ class SpiralPlan:
     acceleration_px_s2: float
     radius_px: float
     field_radius_px: float
+
+    @property
+    def growth_px(self) -> float:
+        """Radius gained in a radian."""
+        return self.pitch_px / (2 * math.pi)
 
     @property
     def duration_s(self) -> float:
@@ -89,6 +96,23 @@ def plan_spiral(
     )
 
 
+@compilable()
+def angular_rate(plan: Any, angle: float) -> float:
+    """How fast a spiral turns at an angle from its middle, rad/s."""
+    length_px_per_rad = plan.growth_px * math.sqrt(1 + angle**2)
+    curvature_radius_px = plan.growth_px * (1 + angle**2) ** 1.5 / (2 + angle**2)
+    acceleration_limit = math.sqrt(plan.acceleration_px_s2 * curvature_radius_px)
+    return min(plan.speed_px_s, acceleration_limit) / length_px_per_rad
+
+
+@compilable()
+def spiral_angle_after(plan: Any, angle: float, duration_s: float) -> float:
+    """The angle from the spiral's middle `duration_s` later."""
+    # The speed is that at the step's end, where the path is longest for the angle.
+    ahead = angle + angular_rate(plan, angle) * duration_s
+    return angle + angular_rate(plan, ahead) * duration_s
+
+
 class Spiral:
     """A walk along the spiral; it can wait, but not go back.
 
@@ -99,13 +123,12 @@ class Spiral:
 
     def __init__(self, plan: SpiralPlan) -> None:
         self._plan = plan
-        self._growth_px = plan.pitch_px / (2 * math.pi)
         self._angle = 0.0
 
     @property
     def radius_px(self) -> float:
         """Distance from the middle."""
-        return self._growth_px * self._angle
+        return self._plan.growth_px * self._angle
 
     @property
     def exhausted(self) -> bool:
@@ -123,15 +146,5 @@ class Spiral:
 
     def advance(self, duration_s: float) -> NDArray[np.float64]:
         """Go on for `duration_s` and return the new position, shape (2,)."""
-        # The speed is judged where the step ends, where the path is longest for the angle.
-        angle = self._angle + self._angular_rate(self._angle) * duration_s
-        self._angle += self._angular_rate(angle) * duration_s
+        self._angle = spiral_angle_after(self._plan, self._angle, duration_s)
         return self.position_px()
-
-    def _angular_rate(self, angle: float) -> float:
-        length_per_angle = self._growth_px * math.sqrt(1 + angle**2)
-        curvature_radius = self._growth_px * (1 + angle**2) ** 1.5 / (2 + angle**2)
-        speed = min(
-            self._plan.speed_px_s, math.sqrt(self._plan.acceleration_px_s2 * curvature_radius)
-        )
-        return speed / length_per_angle

@@ -67,7 +67,6 @@ _VERSIONED = (
     "pyzmq",
     "mcap",
     "python-can",
-    "pymodbus",
     "genicam",
 )
 
@@ -150,14 +149,14 @@ def run_supervisor(
 
         executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
         supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
-        children = _children(rig, rig_arguments, folder, supervisor.note)
+        children = _children(rig, rig_arguments, folder, supervisor.report_event)
         for child in children:
             stack.callback(child.end)
         machine = Machine(
             log_folder,
             lambda: queue.waiting / rig.logging.queue_records,
-            supervisor.measured,
-            supervisor.note,
+            supervisor.report_quantity,
+            supervisor.report_event,
         )
         scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
         info = run_info(rig, scheduling, clock.now_s())

@@ -74,8 +74,7 @@ class DeviceIdentity:
     firmware: str
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """One camera frame.
 
     Attributes
@@ -95,8 +94,7 @@ class Frame:
     image: NDArray[np.uint16]
 
 
-@dataclass(frozen=True, slots=True)
-class CameraCounts:
+class CameraCounts(NamedTuple):
     """Since the stream was started."""
 
     frames: int
@@ -197,8 +195,19 @@ class MirrorDac(Protocol):
         """Connect; outputs stay as they are."""
         ...
 
-    def write_v(self, volts: NDArray[np.float64]) -> None:
-        """Set all three channels at once; shape (3,), stack 1 first."""
+    def send_v(self, volts: NDArray[np.float64]) -> None:
+        """Send the command that sets all three channels at once; shape (3,), stack 1 first.
+
+        Returns as soon as it is on its way. One that was not confirmed yet is confirmed first.
+        """
+        ...
+
+    def confirm(self) -> None:
+        """Wait, within the device's time limit, until it confirms the last :meth:`send_v`.
+
+        Returns at once where nothing is to be confirmed. Raises DeviceError when no confirmation comes,
+        or a refusal.
+        """
         ...
 
     def read_v(self) -> NDArray[np.float64]:
@@ -232,11 +241,11 @@ class PiezoAmplifier(Protocol):
 
 @dataclass(frozen=True)
 class LoopDevices:
-    """What one stellar loop acts through."""
+    """What one loop acts through; a loop without a mirror has neither D/A nor piezo amplifier."""
 
     amplifiers: ServoAmplifiers
-    dac: MirrorDac
-    piezo: PiezoAmplifier
+    dac: MirrorDac | None = None
+    piezo: PiezoAmplifier | None = None
 
 
 @dataclass(frozen=True)

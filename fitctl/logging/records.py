@@ -36,7 +36,7 @@ class RunInfo(Record, frozen=True, kw_only=True):
     dark_npy: bytes | None = None  # the file that camera.dark_file names, as it was read
 
 
-class Tick(Record, frozen=True, kw_only=True):
+class Tick(Record, frozen=True, kw_only=True, gc=False):
     """One tick of one loop: a frame came (or did not), and a command was made from it."""
 
     loop: str
@@ -72,8 +72,8 @@ class Tick(Record, frozen=True, kw_only=True):
     siderostat_az_sky_arcsec: float
     siderostat_el_sky_arcsec: float
     search_progress: float
-    # What the tick took from outside besides the frame, so that it can be replayed: when the D/A took the
-    # voltages, how long it and the amplifiers took, the least following error since the last tick, and the
+    # What the tick took from outside besides the frame, so that it can be replayed: when the D/A confirmed
+    # its voltages, how long it and the amplifiers took, the least following error since the last tick, and the
     # encoders as last read.
     fsm_written_s: float = math.nan
     dac_round_trip_s: float = math.nan
@@ -82,12 +82,15 @@ class Tick(Record, frozen=True, kw_only=True):
     encoder_read_s: float = math.nan
     encoder_az_rad: float = math.nan
     encoder_el_rad: float = math.nan
-    # Of `compute_s`: measuring the star, and deciding; what is left is writing to the D/A.
+    # Of `compute_s`: measuring the star, and deciding; what is left is the D/A: sending, and waiting for its
+    # confirmation, which comes at `fsm_written_s`.
     sense_s: float = math.nan
     decide_s: float = math.nan
+    dac_sent_s: float = math.nan
+    frames_skipped: int = 0  # since the camera was opened: a newer frame was there already
 
 
-class FrameRecord(Record, frozen=True, kw_only=True):
+class FrameRecord(Record, frozen=True, kw_only=True, gc=False):
     """One whole camera frame; ``data`` is little-endian 16 bit, row by row. ``time_s`` is mid-exposure."""
 
     camera: str

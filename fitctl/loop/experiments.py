@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.logging.records import AnyRecord, ExperimentStart, InjectionRecord
+from fitctl.logging.records import ExperimentStart, InjectionRecord
 from fitctl.model.drives import SIDEROSTAT, Drive, channel_values, experiment_s
-from fitctl.stages.stages import Stages
+from fitctl.stages.journal import Journal
+from fitctl.stages.mirror import MirrorStage
+from fitctl.stages.siderostat import SiderostatStage
 
 Floats = NDArray[np.float64]
 
@@ -33,28 +34,32 @@ class Experiments:
     ----------
     loop_name : str
     motor_px_per_rad : float
-    report : callable
-        Takes records; must not block.
+    journal : Journal
     """
 
-    def __init__(
-        self, loop_name: str, motor_px_per_rad: float, report: Callable[[AnyRecord], None]
-    ) -> None:
+    def __init__(self, loop_name: str, motor_px_per_rad: float, journal: Journal) -> None:
         self._loop_name = loop_name
         self._motor_px_per_rad = motor_px_per_rad
-        self._report = report
+        self._journal = journal
         self._motions: _Motions | None = None
 
-    def begin(self, name: str, drives: list[Drive], stages: Stages, now_s: float) -> None:
-        """Move the stages as told, from now on."""
-        held_rad = stages.setpoint_rad.copy()
+    def begin(
+        self,
+        name: str,
+        drives: list[Drive],
+        siderostat: SiderostatStage,
+        mirror: MirrorStage,
+        now_s: float,
+    ) -> None:
+        """Make these motions, from now on."""
+        held_rad = siderostat.setpoint_rad.copy()
         self._motions = _Motions(drives, now_s, now_s + experiment_s(drives), held_rad)
         text = msgspec.json.encode(drives).decode()
-        self._report(
+        self._journal.record(
             ExperimentStart(time_s=now_s, loop=self._loop_name, name=name, drives_json=text)
         )
-        self._report_injection(now_s, stages.stack_v)
-        stages.injector.start(drives, now_s)
+        self._report_injection(now_s, mirror.stack_v)
+        mirror.injector.start(drives, now_s)
 
     def setpoint_rad(self, now_s: float) -> Floats | None:
         """Where the siderostat shall be, shape (2,); None once all motions are done."""
@@ -64,21 +69,21 @@ class Experiments:
         offset_px = channel_values(motions.drives, SIDEROSTAT, now_s - motions.start_s)
         return motions.held_rad + offset_px / self._motor_px_per_rad
 
-    def note_injections(self, stages: Stages) -> None:
+    def record_injections(self, mirror: MirrorStage) -> None:
         """Log what was written to the D/A since last asked."""
-        for time_s, stack_v in stages.take_injections():
+        for time_s, stack_v in mirror.drain_injections():
             self._report_injection(time_s, stack_v)
 
-    def end(self, stages: Stages) -> Floats | None:
+    def end(self, mirror: MirrorStage) -> Floats | None:
         """Write no more; where the siderostat was held before, shape (2,), if an experiment was under way."""
-        stages.injector.end()
-        self.note_injections(stages)
+        mirror.injector.end()
+        self.record_injections(mirror)
         motions, self._motions = self._motions, None
         return None if motions is None else motions.held_rad
 
     def _report_injection(self, time_s: float, stack_v: Floats) -> None:
         v1, v2, v3 = stack_v.tolist()
-        self._report(
+        self._journal.record(
             InjectionRecord(
                 time_s=time_s, loop=self._loop_name, stack1_v=v1, stack2_v=v2, stack3_v=v3
             )

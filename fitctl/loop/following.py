@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Loop
 from fitctl.controllers.centroid import Star
+from fitctl.controllers.frame_counts import count_frame
 from fitctl.messages.modes import Finding, Mode, Trigger
 from fitctl.model.optics import Scales
 
@@ -37,22 +40,19 @@ class Following:
         """Count anew."""
         self.lost = self.in_reach = self.out_of_reach = 0
 
-    def judge(
+    def evaluate(
         self, mode: Mode, star: Star | None, target_px: NDArray[np.float64]
     ) -> Finding | None:
         """What a frame showed, if it leads to another mode; `target_px` has shape (2,)."""
-        if star is None:
-            self.lost += 1
-            self.in_reach = self.out_of_reach = 0
-            if self.lost >= self._lost_frames:
-                return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")
-            return None
-        self.lost = 0
-        error_px = star.position_px - target_px
-        # The mirror's diamond lies along its own axes.
-        need = float(np.abs(error_px.dot(self._mirror_turn)).sum()) / self._range_px
-        self.in_reach = self.in_reach + 1 if need <= self._reach_fraction else 0
-        self.out_of_reach = self.out_of_reach + 1 if need > 1.0 else 0
+        need = math.nan
+        if star is not None:
+            error_px = star.position_px - target_px
+            # The mirror's diamond lies along its own axes.
+            az_px, el_px = error_px.dot(self._mirror_turn).tolist()
+            need = (abs(az_px) + abs(el_px)) / self._range_px
+        count_frame(self, star is not None, need, self._reach_fraction)
+        if self.lost >= self._lost_frames:
+            return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")
         if mode is Mode.COARSE and self.in_reach >= self._reach_frames:
             return Finding(Trigger.IN_REACH, f"error needs {need:.0%} of the mirror's range")
         if mode is Mode.VERNIER and self.out_of_reach >= self._reach_frames:

@@ -36,7 +36,7 @@ class _Rule:
     high: float
     stale_s: float
     for_s: float
-    judged_since_s: float = 0.0
+    active_since_s: float = 0.0
     turned_s: float | None = (
         None  # out of range since then; once tripped, in range again since then
     )
@@ -44,13 +44,13 @@ class _Rule:
 
     def in_range(self, reading: Reading | None, now_s: float) -> bool:
         """Whether there is nothing against it; what was measured before it is judged says nothing."""
-        if reading is None or reading[1] < self.judged_since_s:
-            return now_s - self.judged_since_s <= self.stale_s
+        if reading is None or reading[1] < self.active_since_s:
+            return now_s - self.active_since_s <= self.stale_s
         return self.low <= reading[0] <= self.high and now_s - reading[1] <= self.stale_s
 
     def begin(self, now_s: float) -> None:
         """Judge it from now on, as if for the first time."""
-        self.judged_since_s, self.turned_s, self.trip = now_s, None, None
+        self.active_since_s, self.turned_s, self.trip = now_s, None, None
 
     def lasted(self, now_s: float) -> bool:
         """Whether it is, for `for_s` now, not what it was before."""
@@ -63,7 +63,7 @@ class _Rule:
         value, time_s, note = reading or (math.nan, -math.inf, "")
         if note:
             return note  # an error of a device says all of this itself
-        age_s = now_s - max(time_s, self.judged_since_s)
+        age_s = now_s - max(time_s, self.active_since_s)
         if age_s > self.stale_s:
             what = f"no {self.quantity} for {age_s:.3g} s"
         else:
@@ -108,25 +108,25 @@ class Interlocks:
             for name, row in rows.items()
         }
         self._mode = ""
-        self._judged: list[_Rule] = []
+        self._active: list[_Rule] = []
 
-    def judge(self, mode: str, now_s: float, readings: Mapping[str, Reading]) -> list[Change]:
+    def evaluate(self, mode: str, now_s: float, readings: Mapping[str, Reading]) -> list[Change]:
         """What trips and what is over, now, by the newest reading of each quantity.
 
-        A row is judged in its own modes. One that has tripped and resets itself is watched in all modes,
+        A row is active in its own modes. One that has tripped and resets itself is watched in all modes,
         and only what is measured counts for it.
         """
         if mode != self._mode:
             self._enter(mode, now_s)
         changes = []
-        for rule in self._judged:
+        for rule in self._active:
             reading = readings.get(rule.quantity)
             if (  # in line, because it is so for every row at nearly every tick
                 reading is not None
                 and rule.turned_s is None
                 and rule.trip is None
                 and rule.low <= reading[0] <= rule.high
-                and rule.judged_since_s <= reading[1] >= now_s - rule.stale_s
+                and rule.active_since_s <= reading[1] >= now_s - rule.stale_s
             ):
                 continue
             if rule.trip is not None:
@@ -157,7 +157,7 @@ class Interlocks:
         if rule.trip is None:
             return f"interlock {name} is not tripped"
         reading = readings.get(rule.quantity)
-        if rule in self._judged and not rule.in_range(reading, now_s):
+        if rule in self._active and not rule.in_range(reading, now_s):
             return f"it would trip again: {rule.reason(reading, now_s)}"
         rule.begin(now_s)
         self._sum_up()
@@ -171,7 +171,7 @@ class Interlocks:
 
     def watched(self, now_s: float, readings: Mapping[str, Reading]) -> list[Watched]:
         """Every row beside its quantity as last measured; may be asked from any thread."""
-        judged = set(map(id, self._judged))
+        active = set(map(id, self._active))
         rows = []
         for rule in self._rules.values():
             value, time_s, _ = readings.get(rule.quantity, (math.nan, math.nan, ""))
@@ -185,7 +185,7 @@ class Interlocks:
                     high=rule.row.high,
                     stale_s=rule.row.stale_s,
                     action=rule.row.action,
-                    judged=id(rule) in judged,
+                    judged=id(rule) in active,
                 )
             )
         return rows
@@ -196,7 +196,7 @@ class Interlocks:
             if newly and rule.trip is None:
                 rule.begin(now_s)
         self._mode = mode
-        self._judged = [rule for rule in self._rules.values() if mode in rule.row.modes]
+        self._active = [rule for rule in self._rules.values() if mode in rule.row.modes]
 
     def _sum_up(self) -> None:
         trips = [rule.trip for rule in self._rules.values() if rule.trip is not None]

@@ -1,53 +1,28 @@
-"""One stellar loop's tick, from a frame to a command.
+"""What every loop has: a mode, interlocks, a siderostat, a tick in phases and its record.
 
-frame -> centroid (or star finder) -> interlocks -> mode's control law -> saturate on the mirror's
-diamond -> D/A write and siderostat set-point -> record.
+A loop's tick is :meth:`Loop.sense`, :meth:`Loop.decide` and :meth:`Loop.send`, for each loop of the rig in
+turn, and when all have sent, :meth:`Loop.confirm` and :meth:`Loop.tick_record`. So no loop waits for another's
+device or record, and a loop may use what those before it in the rig file have observed in the same step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.clock import Clock
+from fitctl.config import Loop as LoopSettings
 from fitctl.config import Rig
-from fitctl.controllers.centroid import Star
-from fitctl.controllers.pair import Design
-from fitctl.drivers.interface import DeviceError, Frame, MirrorDac
-from fitctl.logging.records import (
-    AnyRecord,
-    ControllerChange,
-    Event,
-    FailingDevice,
-    ModeChange,
-    Severity,
-    Tick,
-)
-from fitctl.loop.experiments import Experiments
-from fitctl.loop.following import Following
+from fitctl.drivers.interface import Frame
+from fitctl.logging.records import FailingDevice, ModeChange, Severity, Tick
 from fitctl.loop.interlocks import Interlocks
-from fitctl.loop.observation import Seen
-from fitctl.loop.pointing import Pointing
 from fitctl.loop.quantities import Quantities, places
-from fitctl.loop.search import Search
-from fitctl.loop.star_finder import Sighting
-from fitctl.loop.tick_record import TickRecords, TickTimes
-from fitctl.messages.commands import Acquire
-from fitctl.messages.modes import (
-    FOLLOWING,
-    TRACKING,
-    Finding,
-    Mode,
-    Trigger,
-    transition,
-)
-from fitctl.model.drives import Drive
-from fitctl.model.optics import scales
-from fitctl.stages.failures import failure_record
-from fitctl.stages.servo import ServoState, SiderostatServo
-from fitctl.stages.stages import Stages
+from fitctl.messages.modes import Mode, Trigger, transition
+from fitctl.messages.telemetry import LoopState
+from fitctl.stages.journal import Journal
+from fitctl.stages.periodic import Periodic
+from fitctl.stages.siderostat import SiderostatStage
 
 Floats = NDArray[np.float64]
 _SEVERITY: dict[Trigger, Severity] = {
@@ -57,148 +32,114 @@ _SEVERITY: dict[Trigger, Severity] = {
 }
 
 
-class StellarLoop:
-    """One stellar loop: its mode, its controllers and its stages.
+class Loop(ABC):
+    """One loop; a kind of loop adds its sensor, its other stages and its control laws.
 
     Parameters
     ----------
     name : str
     rig : Rig
-    servo : SiderostatServo
-    dac : MirrorDac
-    clock : Clock
-    report : callable
-        Takes every record that the loop makes; must not block.
+    siderostat : SiderostatStage
+    journal : Journal
+
+    Attributes
+    ----------
+    mode : Mode
+    mode_since_s : float
+    last_change : ModeChange or None
+    quantities : Quantities
+        What interlocks evaluate, as last measured.
+    interlocks : Interlocks
     """
 
-    def __init__(
-        self,
-        name: str,
-        rig: Rig,
-        servo: SiderostatServo,
-        dac: MirrorDac,
-        clock: Clock,
-        report: Callable[[AnyRecord], None],
-    ) -> None:
-        loop = rig.loops[name]
+    def __init__(self, name: str, rig: Rig, siderostat: SiderostatStage, journal: Journal) -> None:
         self.name = name
-        self.settings = loop
-        self.servo = servo
+        self.settings: LoopSettings = rig.loops[name]
+        self.siderostat = siderostat
+        self.servo = siderostat.servo
         self.mode = Mode.OFF
-        self.mode_since_s = clock.now_s()
+        self.mode_since_s = journal.clock.now_s()
         self.last_change: ModeChange | None = None
-        self._last_failure = ""
-        self.target_px = np.array([loop.target_px.az, loop.target_px.el])
-        self._clock = clock
-        self._report = report
-        scale = scales(rig, loop)
-        self._period_s = rig.camera.period_s
-        self.sighting = Sighting(rig, name, self.target_px, self._event)
-        self.search = Search(rig, name, self.sighting.estimator)
-        self.following = Following(loop, scale)
-        self.pointing = Pointing(rig, name, self.target_px)
-        self.stages = Stages(rig, name, servo, dac, clock)
-        self._experiments = Experiments(name, scale.motor_px_per_rad, report)
-        self._tick_records = TickRecords(rig, name)
-        self._flattened = False
-        self.measured = Quantities(rig, name)
+        self.quantities = Quantities(rig, name)
         self.interlocks = Interlocks(rig.interlocks, places(rig, name))
-        self._laws: dict[Mode, Callable[[Seen], None]] = {
-            Mode.OFF: self._rest,
-            Mode.STANDBY: self._stand_by,
-            Mode.ACQUISITION: self._search,
-            Mode.COARSE: self._pull_in,
-            Mode.VERNIER: self._hold_star,
-            Mode.EXPERIMENT: self._move_as_told,
-            Mode.SAFE: self._rest,
-        }
+        self._journal = journal
+        self._clock = journal.clock
+        self._last_failures: dict[str, str] = {}  # by what failed
 
     # ------------------------------------------------------------ the tick
 
-    def tick(self, frame: Frame | None, frames_lost: int) -> Tick:
-        """One tick, with the newest frame or without one."""
-        servo = self.servo.look()
-        started_s = self._clock.now_s()
-        self._experiments.note_injections(self.stages)
-        seen = self._sense(frame, servo, started_s)
-        sensed_s = self._clock.now_s()
-        self._judge(frame, seen)
-        self._judge_interlocks(frame, seen)
-        self._move(frame, seen)
-        decided_s = self._clock.now_s()
-        self._write()
-        times = TickTimes(sensed_s, decided_s, self._clock.now_s())
-        tick = self._tick_records.make(
-            self.mode, frame, frames_lost, seen, self.stages, self.pointing, self.search, times
-        )
-        self.measured.of_tick(tick.compute_s, tick.time_s)
-        return tick
+    @abstractmethod
+    def sense(self, frame: Frame | None, frames_lost: int, frames_skipped: int) -> None:
+        """Observe star and stages: with the camera's newest frame, or without one.
 
-    def _move(self, frame: Frame | None, seen: Seen) -> None:
-        """By the mode's law, unless an interlock holds or flattens."""
-        action = self.interlocks.action if self.mode in TRACKING else None
-        if action == "flatten":
-            self.stages.mirror_to_bias()
-        elif self._flattened and self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.stages, seen.motor_rad)
-        self._flattened = action == "flatten"
-        # Without a frame to track by, the stages wait where they are.
-        waits = frame is None and self.mode in TRACKING
-        if action not in {"hold", "flatten"} and not waits:
-            self._laws[self.mode](seen)
+        `frames_lost` and `frames_skipped` count since the camera was opened.
+        """
 
-    def _sense(self, frame: Frame | None, servo: ServoState, now_s: float) -> Seen:
-        """What a frame shows belongs to where the stages were when it was exposed."""
-        if frame is None:
-            return Seen(None, self.stages.mirror_now_rad, servo.position_rad, servo, now_s)
-        motor_rad = self.servo.position_at(frame.mid_exposure_s)
-        mirror_rad = self.stages.mirror_at(frame.mid_exposure_s)
-        star = self._find(frame, mirror_rad, motor_rad)
-        return Seen(star, mirror_rad, motor_rad, servo, now_s)
+    @abstractmethod
+    def decide(self) -> None:
+        """Evaluate what was observed, and choose what the stages are to do."""
 
-    def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
-        if self.mode is Mode.ACQUISITION and not self.search.is_there(motor_rad):
-            return None  # what is seen on the way is another star
-        follows = self.mode in FOLLOWING and self.following.lost == 0
-        return self.sighting.find(frame.image, self.mode, motor_rad, mirror_rad, follows=follows)
+    @abstractmethod
+    def send(self) -> None:
+        """Send the stages what was decided, and wait for nothing."""
 
-    def _judge(self, frame: Frame | None, seen: Seen) -> None:
-        """Errors of devices and findings: what leads to another mode."""
-        if seen.servo.fault is not None:
-            self.device_failed("siderostat", seen.servo.fault)
-        elif self.mode is Mode.EXPERIMENT and self.stages.injector.fault is not None:
-            self.stages.ready = False
-            self.device_failed("injector", self.stages.injector.fault)
-        elif frame is not None and (found := self._found(frame, seen.star)) is not None:
-            if found.trigger is None:
-                self._event("warning", found.reason)
-            else:
-                self.fire(found.trigger, found.reason)
+    @abstractmethod
+    def confirm(self) -> None:
+        """Wait for the confirmation of what was sent."""
 
-    def _found(self, frame: Frame, star: Star | None) -> Finding | None:
-        if self.mode is Mode.ACQUISITION:
-            return self.search.judge(star, frame.mid_exposure_s)
-        if self.mode in FOLLOWING:
-            return self.following.judge(self.mode, star, self.pointing.command_px)
-        return None
+    @abstractmethod
+    def tick_record(self) -> Tick:
+        """The record of the tick that :meth:`confirm` ended."""
 
-    def _judge_interlocks(self, frame: Frame | None, seen: Seen) -> None:
-        """Measure, judge by the rig file's table, and tell; what holds or flattens, :meth:`_move` asks for."""
-        now_s, measured, interlocks = seen.now_s, self.measured, self.interlocks
-        if frame is not None:
-            measured.of_frame(frame, seen.star, now_s)
-        measured.of_stages(seen.servo, self.stages, now_s)
-        for trip, over in interlocks.judge(self.mode.name, now_s, measured.readings):
+    # ------------------------------------------------------------ for the supervisor
+
+    @property
+    def periodic(self) -> list[Periodic]:
+        """What runs at a pace of its own, beside the frames."""
+        return [self.servo]
+
+    @abstractmethod
+    def state(self, now_s: float) -> LoopState:
+        """The newest of everything, for consoles; may be asked from any thread."""
+
+    def begin(self, stack_v: Floats | None) -> None:
+        """Begin anew with devices just opened and checked: every interlock is evaluated anew.
+
+        `stack_v`, shape (3,), is what the D/A was found set to, where the loop has one.
+        """
+        self._last_failures.clear()
+        self.quantities.begin()
+        self.interlocks.reset_all(self._clock.now_s())
+
+    def release(self) -> None:  # noqa: B027 - the siderostat's servo has no need of it
+        """Send nothing more to devices, which are opened anew or closed, until :meth:`begin`."""
+
+    def rest(self) -> None:  # noqa: B027 - a siderostat rests where it is
+        """From now on rest where stages may be left without power."""
+
+    def at_rest(self) -> bool:
+        """Whether every stage that can still be commanded is where it may be left without power."""
+        return True
+
+    # ------------------------------------------------------------ interlocks
+
+    def _evaluate_interlocks(self, now_s: float) -> None:
+        """Evaluate the rig file's table, report what changed, and enforce what is tripped.
+
+        What holds or flattens is for the control laws of each kind of loop.
+        """
+        interlocks = self.interlocks
+        for trip, over in interlocks.evaluate(self.mode.name, now_s, self.quantities.readings):
             if over:
-                self._event("info", f"interlock {trip.name} is over")
+                self._report_event("info", f"interlock {trip.name} is over")
             elif trip.action == "safe":
-                self.fail(trip.reason)
+                self.fail(f"interlock {trip.name}", trip.reason)
             else:
-                self._event("warning", f"{trip.reason} ({trip.action})")
+                self._report_event("warning", f"{trip.reason} ({trip.action})")
         if interlocks.tripped:
-            self._obey_interlocks()
+            self._enforce_interlocks()
 
-    def _obey_interlocks(self) -> None:
+    def _enforce_interlocks(self) -> None:
         """What is tripped stays in force, whatever mode the loop is put in."""
         action = self.interlocks.action
         reason = next(trip.reason for trip in self.interlocks.tripped if trip.action == action)
@@ -208,17 +149,17 @@ class StellarLoop:
             self.fire(Trigger.EXPERIMENT_DONE, reason)
 
     def reset_interlock(self, name: str) -> str:
-        """Let one go by hand; why not, if it cannot be."""
+        """Reset a tripped interlock by hand; why not, if it cannot be."""
         now_s = self._clock.now_s()
-        why_not = self.interlocks.reset(name, now_s, self.measured.readings)
+        why_not = self.interlocks.reset(name, now_s, self.quantities.readings)
         if not why_not:
-            self._event("info", f"interlock {name} is reset by hand")
+            self._report_event("info", f"interlock {name} is reset by hand")
         return why_not
 
     # ------------------------------------------------------------ modes
 
     def fire(self, trigger: Trigger, reason: str) -> bool:
-        """Go where the table says; False where the trigger means nothing in this mode."""
+        """Change the mode as the table has it; False where the trigger is not in this mode's rows."""
         row = transition(self.mode, trigger)
         if row is None:
             return False
@@ -226,7 +167,6 @@ class StellarLoop:
         source, self.mode = self.mode, row.target
         if source is not self.mode:
             self.mode_since_s = now_s
-        self.following.begin()
         self._enter(source, motor_rad)
         motor_az_rad, motor_el_rad = motor_rad.tolist()
         self.last_change = ModeChange(
@@ -240,160 +180,30 @@ class StellarLoop:
             siderostat_az_rad=motor_az_rad,
             siderostat_el_rad=motor_el_rad,
         )
-        self._report(self.last_change)
-        self._event(_SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}")
+        self._journal.record(self.last_change)
+        self._report_event(
+            _SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}"
+        )
         return True
 
-    def fail(self, reason: str) -> None:
-        """Something is wrong: SAFE, or, where that changes nothing, an event; the same is told once."""
-        if not self.fire(Trigger.FAULT, reason) and reason != self._last_failure:
-            self._event("error", reason)
-        self._last_failure = reason
-
-    def device_failed(self, device: FailingDevice, error: Exception) -> None:
-        """A device failed while it was used."""
-        if str(error) != self._last_failure:
-            now_s = self._clock.now_s()
-            self._report(failure_record(now_s, self.name, device, error))
-        self.fail(str(error))
-
     def _enter(self, source: Mode, motor_rad: Floats) -> None:
-        if source is Mode.EXPERIMENT:
-            self._end_experiment()
+        """Do what a change from `source` to the mode needs, with the motors at `motor_rad`, shape (2,)."""
         if self.mode is Mode.SAFE:
             self.servo.stop()
         elif self.mode is Mode.STANDBY:
-            self.servo.hold(motor_rad)
-            self.stages.siderostat_held()
-        elif self.mode is Mode.ACQUISITION:
-            self._start_search(motor_rad)
-        elif self.mode is Mode.COARSE:
-            self.pointing.start_coarse(self.target_px)
-        elif self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.stages, motor_rad)
+            self.siderostat.hold(motor_rad)
 
-    def look_for(self, asked: Acquire) -> None:
-        """What the next search is to find, and how, as a command asks that was not refused."""
-        flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
-        self.sighting.expect_flux(flux_dn)
-        self.measured.star_flux_dn = flux_dn
-        self.search.ask(asked)
+    def fail(self, source: str, reason: str) -> None:
+        """Go to SAFE because `source` failed; where that changes nothing, report a reason that is new."""
+        if not self.fire(Trigger.FAULT, reason) and reason not in self._last_failures.values():
+            self._report_event("error", reason)
+        self._last_failures[source] = reason
 
-    def _start_search(self, motor_rad: Floats) -> None:
-        """As asked; else about where the star is expected: on the target, or where it was last seen."""
-        self.sighting.estimator.expect(self.target_px, motor_rad, np.zeros(2))
-        self.search.begin()
+    def device_failed(self, device: FailingDevice, error: Exception) -> None:
+        """Record that a device failed while it was used, and :meth:`fail`."""
+        if str(error) != self._last_failures.get(device):
+            self._journal.failure(self.name, device, error)
+        self.fail(device, str(error))
 
-    # ------------------------------------------------------------ control laws
-
-    def _rest(self, _seen: Seen) -> None:
-        """Mirror back to its bias; the siderostat is held or stopped by its servo."""
-        self.stages.mirror_to_bias()
-
-    def _stand_by(self, _seen: Seen) -> None:
-        """Both stages rest where the operator has put them."""
-        self.stages.mirror_to_rest()
-
-    def _search(self, seen: Seen) -> None:
-        self.stages.mirror_to_rest()
-        self.stages.siderostat_to(self.search.advance(self._period_s, seen.motor_rad))
-
-    def _pull_in(self, seen: Seen) -> None:
-        self.stages.mirror_to_rest()
-        step_rad = self.pointing.step_coarse(seen, self.target_px)
-        if step_rad is not None:
-            self._siderostat_by(step_rad)
-
-    def _hold_star(self, seen: Seen) -> None:
-        command = self.pointing.step_pair(seen, self.target_px)
-        if command is not None:
-            self._siderostat_by(command.motor_step_rad)
-            self.stages.mirror_to(
-                command.mirror_rad, hysteresis_inverse=self.pointing.design.hysteresis_inverse
-            )
-
-    def _move_as_told(self, seen: Seen) -> None:
-        setpoint_rad = self._experiments.setpoint_rad(seen.now_s)
-        if setpoint_rad is None:
-            self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
-        else:
-            self.stages.siderostat_to(setpoint_rad)
-
-    def _siderostat_by(self, step_rad: Floats) -> None:
-        self.stages.siderostat_to(self.stages.setpoint_rad + step_rad)
-
-    # ------------------------------------------------------------ designs and experiments
-
-    @property
-    def controller(self) -> str:
-        """The design at work in VERNIER."""
-        return self.pointing.design.name
-
-    def use(self, design: Design) -> None:
-        """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
-        before, motor_rad = self.controller, self.servo.position_rad
-        self.pointing.use(design)
-        if self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.stages, motor_rad)
-        az_rad, el_rad = motor_rad.tolist()
-        self._report(
-            ControllerChange(
-                time_s=self._clock.now_s(),
-                loop=self.name,
-                source=before,
-                target=design.name,
-                siderostat_az_rad=az_rad,
-                siderostat_el_rad=el_rad,
-            )
-        )
-        self._event("info", f"controller {before} -> {design.name}")
-
-    def start_experiment(self, name: str, drives: list[Drive]) -> bool:
-        """Move the stages as told, from the next tick on; False where this mode has no star to watch."""
-        now_s = self._clock.now_s()
-        if not self.fire(Trigger.EXPERIMENT, name):
-            return False
-        self._experiments.begin(name, drives, self.stages, now_s)
-        return True
-
-    def _end_experiment(self) -> None:
-        held_rad = self._experiments.end(self.stages)
-        if held_rad is not None and self.mode is not Mode.SAFE:
-            self.stages.siderostat_to(held_rad)
-
-    # ------------------------------------------------------------ stages
-
-    def start_from(self, stack_v: Floats) -> None:
-        """Begin anew with devices just opened and checked.
-
-        The D/A's outputs, shape (3,), are taken as found: the mirror goes to its bias from there. Every
-        interlock is judged anew.
-        """
-        self.stages.start_from(stack_v)
-        self._last_failure = ""
-        self.measured.begin()
-        self.interlocks.reset_all(self._clock.now_s())
-        if self.servo.encoders_jumped:
-            self.sighting.estimator.forget()
-            self._event(
-                "warning", "encoders read elsewhere than before; the star's place is forgotten"
-            )
-
-    def _write(self) -> None:
-        """Every tick, so that the D/A's watchdog sees that we live."""
-        if not self.stages.ready or self.mode in {Mode.OFF, Mode.EXPERIMENT}:
-            return
-        try:
-            self.stages.write()
-        except DeviceError as error:
-            self.device_failed("D/A", error)
-
-    def _event(self, severity: Severity, message: str) -> None:
-        self._report(
-            Event(
-                time_s=self._clock.now_s(),
-                severity=severity,
-                source=self.name,
-                message=message,
-            )
-        )
+    def _report_event(self, severity: Severity, message: str) -> None:
+        self._journal.event(severity, self.name, message)

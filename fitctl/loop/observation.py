@@ -1,4 +1,4 @@
-"""What a tick goes by."""
+"""What a tick is decided by."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.controllers.centroid import Star
+from fitctl.drivers.interface import Frame
 from fitctl.stages.servo import ServoState
 
 
-class Seen(NamedTuple):
+class Observation(NamedTuple):
     """One tick's view of star and stages.
 
     Attributes
     ----------
+    frame : Frame or None
+        The newest; None if none came in time.
+    frames_lost, frames_skipped : int
+        Since the camera was opened: frames that it lost, and frames that came while a newer one was there
+        already, on which no tick acted.
     star : Star or None
         On the frame, if there is one and it shows the star.
     mirror_rad, motor_rad : arrays, shape (2,)
@@ -26,6 +32,9 @@ class Seen(NamedTuple):
         When that is: the tick's beginning.
     """
 
+    frame: Frame | None
+    frames_lost: int
+    frames_skipped: int
     star: Star | None
     mirror_rad: NDArray[np.float64]
     motor_rad: NDArray[np.float64]

@@ -9,9 +9,9 @@ from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design, Measurement, Pair, PairCommand
 from fitctl.controllers.prefilter import Prefilter
-from fitctl.loop.observation import Seen
+from fitctl.loop.observation import Observation
 from fitctl.model.optics import scales
-from fitctl.stages.stages import Stages
+from fitctl.stages.mirror import MirrorStage
 
 Floats = NDArray[np.float64]
 
@@ -25,14 +25,22 @@ class Pointing:
     loop_name : str
     target_px : array, shape (2,)
         Where the star is held at first.
+
+    Attributes
+    ----------
+    prefilter : Prefilter
+    pair : Pair
+        At work in VERNIER.
+    coarse_step_rad_per_px : float
+        Of the motors' set-point, in a frame.
     """
 
     def __init__(self, rig: Rig, loop_name: str, target_px: Floats) -> None:
         loop, period_s = rig.loops[loop_name], rig.camera.period_s
         self._scale = scales(rig, loop)
         self._range_rad = loop.fsm.range_rad
-        self._prefilter = Prefilter(loop.prefilter.time_constant_s, period_s, target_px)
-        self._coarse_step_rad_per_px = (
+        self.prefilter = Prefilter(loop.prefilter.time_constant_s, period_s, target_px)
+        self.coarse_step_rad_per_px = (
             loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * period_s
         )
         self.use(design_for(rig, loop_name))
@@ -40,43 +48,45 @@ class Pointing:
     @property
     def design(self) -> Design:
         """At work in VERNIER."""
-        return self._pair.design
+        return self.pair.design
 
     @property
     def command_px(self) -> Floats:
         """The target as the prefilter has it now, shape (2,)."""
-        return self._prefilter.value_px
+        return self.prefilter.value_px
 
     @property
     def saturated(self) -> bool:
         """The pair last wanted more than the mirror's range."""
-        return self._pair.saturated
+        return self.pair.saturated
 
     def use(self, design: Design) -> None:
         """Work with another design; where the star is held, :meth:`start_pair` is next."""
-        self._pair = Pair(design, self._scale, self._range_rad)
+        self.pair = Pair(design, self._scale, self._range_rad)
 
     def start_coarse(self, target_px: Floats) -> None:
         """Rest on the target, shape (2,)."""
-        self._prefilter.reset(target_px)
+        self.prefilter.reset(target_px)
 
-    def start_pair(self, stages: Stages, motor_rad: Floats) -> None:
+    def start_pair(self, mirror: MirrorStage, motor_rad: Floats) -> None:
         """Go on from where the mirror is held, with the motors at `motor_rad`, shape (2,)."""
-        held_rad = stages.mirror_held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
-        self._pair.start(held_rad, motor_rad, self.command_px)
+        held_rad = mirror.held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
+        self.pair.start(held_rad, motor_rad, self.command_px)
 
-    def step_coarse(self, seen: Seen, target_px: Floats) -> Floats | None:
-        """One frame: the step of the motors' set-point, shape (2,); None where no star is seen."""
-        command_px = self._prefilter.step(target_px)
-        if seen.star is None:
+    def step_coarse(self, observation: Observation, target_px: Floats) -> Floats | None:
+        """One frame: the step of the motors' set-point, shape (2,); None where no star is visible."""
+        command_px = self.prefilter.step(target_px)
+        if observation.star is None:
             return None
-        error_px = seen.star.position_px - command_px
-        return -self._coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_turn)
+        error_px = observation.star.position_px - command_px
+        return -self.coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_turn)
 
-    def step_pair(self, seen: Seen, target_px: Floats) -> PairCommand | None:
-        """One frame: what both stages shall do; None where no star is seen."""
-        command_px = self._prefilter.step(target_px)
-        if seen.star is None:
+    def step_pair(self, observation: Observation, target_px: Floats) -> PairCommand | None:
+        """One frame: what both stages shall do; None where no star is visible."""
+        command_px = self.prefilter.step(target_px)
+        if observation.star is None:
             return None
-        error_px = seen.star.position_px - command_px
-        return self._pair.step(Measurement(error_px, command_px, seen.mirror_rad, seen.motor_rad))
+        error_px = observation.star.position_px - command_px
+        return self.pair.step(
+            Measurement(error_px, command_px, observation.mirror_rad, observation.motor_rad)
+        )

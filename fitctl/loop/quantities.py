@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 from fitctl.config import Rig
-from fitctl.controllers.centroid import Star
-from fitctl.drivers.interface import Frame, ServoReading
+from fitctl.drivers.interface import ServoReading
 from fitctl.logging.records import LoopTiming, PiezoReading
 from fitctl.loop.interlocks import Reading
+from fitctl.loop.observation import Observation
+from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import ServoState
-from fitctl.stages.stages import Stages
+from fitctl.stages.siderostat import SiderostatStage
 
 
 class Quantities:
@@ -35,6 +36,7 @@ class Quantities:
         self._velocity_limit_rad_s = loop.siderostat.velocity_limit_rad_s
         self._limit_v = loop.fsm.piezo.limit_v
         self._exposed_s: float | None = None
+        self._skipped = 0
         self._read: ServoReading | None = None
 
     def put(self, name: str, value: float, time_s: float) -> None:
@@ -45,27 +47,43 @@ class Quantities:
         """Devices were opened anew: what was measured before says nothing about what comes now."""
         self._exposed_s = self._read = None
 
-    def of_frame(self, frame: Frame, star: Star | None, now_s: float) -> None:
-        """What a frame tells."""
+    def record_observation(self, observation: Observation) -> None:
+        """What a frame says about camera and star."""
+        frame, star, now_s = observation.frame, observation.star, observation.now_s
+        if frame is None:
+            return
         readings, exposed_s = self.readings, frame.mid_exposure_s
         late_s = frame.received_s - exposed_s - self._delay_s
         readings["frame_late_s"] = (late_s, now_s, "")
         if self._exposed_s is not None:
-            periods = (exposed_s - self._exposed_s) / self._period_s
+            # Frames that were skipped did come.
+            frames = 1 + observation.frames_skipped - self._skipped
+            periods = (exposed_s - self._exposed_s) / self._period_s / frames
             readings["frame_interval_periods"] = (periods, now_s, "")
-        self._exposed_s = exposed_s
+        self._exposed_s, self._skipped = exposed_s, observation.frames_skipped
         if star is not None:
             readings["star_flux_fraction"] = (star.flux_dn / self.star_flux_dn, now_s, "")
 
-    def of_stages(self, servo: ServoState, stages: Stages, now_s: float) -> None:
+    def record_stages(
+        self, observation: Observation, siderostat: SiderostatStage, mirror: MirrorStage
+    ) -> None:
         """Where mirror and siderostat are, and how their devices are."""
+        self._record_mirror(mirror, observation.now_s)
+        self._record_siderostat(observation.servo, siderostat, observation.now_s)
+
+    def _record_mirror(self, mirror: MirrorStage, now_s: float) -> None:
         readings = self.readings
-        az_rad, el_rad = stages.mirror_rad.tolist()
+        az_rad, el_rad = mirror.command_rad.tolist()
         fraction = (abs(az_rad) + abs(el_rad)) / self._range_rad
         readings["fsm_range_fraction"] = (fraction, now_s, "")
-        readings["siderostat_asked_fraction"] = (stages.asked_fraction, now_s, "")
-        readings["dac_unwritten_s"] = (now_s - stages.written_s, now_s, "")
-        readings["dac_round_trip_s"] = (stages.round_trip_s, now_s, "")
+        readings["dac_unwritten_s"] = (now_s - mirror.written_s, now_s, "")
+        readings["dac_round_trip_s"] = (mirror.round_trip_s, now_s, "")
+
+    def _record_siderostat(
+        self, servo: ServoState, siderostat: SiderostatStage, now_s: float
+    ) -> None:
+        readings = self.readings
+        readings["siderostat_asked_fraction"] = (siderostat.wanted_fraction, now_s, "")
         fault = servo.fault
         # Made a text only when there is something to say.
         readings["amplifier_fault"] = (
@@ -80,7 +98,7 @@ class Quantities:
             return
         self._read = reading
         az_rad, el_rad = reading.position_rad
-        travelled = max(abs(az_rad), abs(el_rad)) / stages.travel_rad
+        travelled = max(abs(az_rad), abs(el_rad)) / siderostat.travel_rad
         readings["siderostat_travel_fraction"] = (travelled, reading.time_s, "")
         if before is not None and reading.time_s > before.time_s:
             before_az_rad, before_el_rad = before.position_rad
@@ -92,19 +110,19 @@ class Quantities:
                 "",
             )
 
-    def of_tick(self, compute_s: float, now_s: float) -> None:
+    def record_tick(self, compute_s: float, now_s: float) -> None:
         """How long the tick took; judged at the next."""
         self.readings["tick_period_fraction"] = (compute_s / self._period_s, now_s, "")
 
-    def of_piezo_error(self, told: str, now_s: float) -> None:
+    def record_piezo_error(self, error: str, now_s: float) -> None:
         """Whether the piezo amplifier has an error, and what it says."""
-        self.readings["piezo_fault"] = (1.0 if told else 0.0, now_s, told)
+        self.readings["piezo_fault"] = (1.0 if error else 0.0, now_s, error)
 
-    def of_piezo(self, record: PiezoReading) -> None:
+    def record_piezo(self, record: PiezoReading) -> None:
         """What the piezo amplifier said."""
         self.put("piezo_limit_error_v", record.limit_v - self._limit_v, record.time_s)
 
-    def of_timing(self, record: LoopTiming) -> None:
+    def record_timing(self, record: LoopTiming) -> None:
         """Whether the servo kept its pace, where it has a pace of its own."""
         periods = record.servo_periods + record.servo_skipped
         if periods:

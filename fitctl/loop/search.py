@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.estimator import StarEstimator
+from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, look_again
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Finding, Trigger
@@ -23,7 +24,7 @@ NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must b
 
 
 @dataclass
-class _Sighting:
+class Candidate:
     """A star seen during the search: the siderostat goes back to where it saw it, and looks again."""
 
     motor_rad: Floats
@@ -56,23 +57,23 @@ class Search:
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
         self._scale = scale
-        self._travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+        self._travel_rad = scale.travel_rad(loop.siderostat)
         self._slew_limit_s = _SLEWS * 2 * self._travel_rad / loop.siderostat.velocity_limit_rad_s
         self._plan_spiral = partial(plan_spiral, rig, loop_name)
         self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
         self._plan = self._plan_spiral()
         self._spiral = Spiral(self._plan)
-        self._there = False
+        self._arrived = False
         self._since_s = math.nan
         self._asked = Acquire()
-        self._sighting: _Sighting | None = None
+        self._candidate: Candidate | None = None
 
     @property
     def progress(self) -> float:
         """Part of the searched area, 0 to 1."""
         return self._spiral.progress
 
-    def ask(self, asked: Acquire) -> None:
+    def configure(self, asked: Acquire) -> None:
         """Make the next search, and no other, as a command asks that was not refused."""
         self._asked = asked
 
@@ -91,30 +92,30 @@ class Search:
         )
         self.centre_rad = self._star_in_the_middle_rad()
         self._spiral = Spiral(self._plan)
-        self._there = False
+        self._arrived = False
         self._since_s = math.nan
-        self._sighting = None
+        self._candidate = None
 
-    def is_there(self, motor_rad: Floats) -> bool:
+    def has_arrived(self, motor_rad: Floats) -> bool:
         """Whether the siderostat, which was at `motor_rad`, has come near the spiral's middle.
 
         On its way from another star it would see that one, and a spiral that had begun would have passed
         the middle by.
         """
-        if not self._there:
+        if not self._arrived:
             middle_rad = np.clip(self.centre_rad, -self._travel_rad, self._travel_rad)
             away_px = float(np.abs(motor_rad - middle_rad).max()) * self._scale.motor_px_per_rad
-            self._there = away_px <= NEAR * self._plan.field_radius_px
-        return self._there
+            self._arrived = away_px <= NEAR * self._plan.field_radius_px
+        return self._arrived
 
-    def judge(self, star: Star | None, now_s: float) -> Finding | None:
+    def evaluate(self, star: Star | None, now_s: float) -> Finding | None:
         """What a frame exposed at `now_s` showed, if it is anything to tell."""
-        settings, sighting = self._settings, self._sighting
-        if not self._there:
+        candidate = self._candidate
+        if not self._arrived:
             return self._wait_for_siderostat(now_s)
-        if sighting is None:
+        if candidate is None:
             if star is not None:
-                self._sighting = _Sighting(self._star_in_the_middle_rad(), now_s)
+                self._candidate = Candidate(self._star_in_the_middle_rad(), now_s)
             elif self._spiral.exhausted:
                 return Finding(
                     Trigger.SEARCH_EXHAUSTED,
@@ -122,13 +123,12 @@ class Search:
                     "check shutter and pointing, then acquire again",
                 )
             return None
-        settled = now_s >= sighting.since_s + settings.settle_s
-        sighting.frames = sighting.frames + 1 if star is not None and settled else 0
-        if sighting.frames >= settings.found_frames:
-            return Finding(Trigger.STAR_FOUND, f"star on {sighting.frames} frames in a row")
-        if now_s > sighting.since_s + settings.settle_s + settings.confirm_timeout_s:
-            self._sighting = None
-            return Finding(None, "a sighting was not confirmed; the search goes on")
+        outcome = look_again(self._settings, candidate, star is not None, now_s)
+        if outcome == CONFIRMED:
+            return Finding(Trigger.STAR_FOUND, f"star on {candidate.frames} frames in a row")
+        if outcome == REJECTED:
+            self._candidate = None
+            return Finding(None, "a candidate was not confirmed; the search goes on")
         return None
 
     def _wait_for_siderostat(self, now_s: float) -> Finding | None:
@@ -144,9 +144,9 @@ class Search:
 
     def advance(self, duration_s: float, motor_rad: Floats) -> Floats:
         """Go on for `duration_s`, or wait where something was seen; motor set-point, shape (2,)."""
-        if self._sighting is not None:
-            return self._sighting.motor_rad
-        if not self.is_there(motor_rad):
+        if self._candidate is not None:
+            return self._candidate.motor_rad
+        if not self.has_arrived(motor_rad):
             return self.centre_rad
         return self.centre_rad + self._scale.motor_rad(self._spiral.advance(duration_s))
 

@@ -17,7 +17,7 @@ from fitctl.model.optics import scales
 Floats = NDArray[np.float64]
 
 
-class Sighting:
+class StarFinder:
     """One loop's.
 
     Parameters
@@ -26,7 +26,7 @@ class Sighting:
     loop_name : str
     target_px : array, shape (2,)
         Where a star of which nothing is known is taken to be.
-    tell : callable
+    report_event : callable
         Takes the severity and the text of an event.
 
     Attributes
@@ -37,13 +37,17 @@ class Sighting:
     """
 
     def __init__(
-        self, rig: Rig, loop_name: str, target_px: Floats, tell: Callable[[Severity, str], None]
+        self,
+        rig: Rig,
+        loop_name: str,
+        target_px: Floats,
+        report_event: Callable[[Severity, str], None],
     ) -> None:
         loop = rig.loops[loop_name]
         self.estimator = StarEstimator(scales(rig, loop), target_px)
         self.look_at_px: tuple[float, float] | None = None
         self._sensor = StarSensor(rig.camera, loop)
-        self._tell = tell
+        self._report_event = report_event
 
     def expect_flux(self, flux_dn: float) -> None:
         """What the star's light is to be from now on."""
@@ -81,7 +85,7 @@ class Sighting:
         star = self._sensor.find_at(image, *look_px)
         place = f"az {look_px[0]:g}, el {look_px[1]:g} px"
         if star is None:
-            self._tell("warning", f"no star in the window at {place}; nothing changes")
+            self._report_event("warning", f"no star in the window at {place}; nothing changes")
         else:
-            self._tell("info", f"the star at {place} is followed from now on")
+            self._report_event("info", f"the star at {place} is followed from now on")
         return star

@@ -6,20 +6,21 @@ import math
 from typing import NamedTuple
 
 from fitctl.config import Rig
-from fitctl.drivers.interface import Frame, ServoReading
+from fitctl.drivers.interface import ServoReading
 from fitctl.logging.records import Tick
-from fitctl.loop.observation import Seen
+from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.search import Search
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
-from fitctl.stages.stages import Stages
+from fitctl.stages.mirror import MirrorStage
+from fitctl.stages.siderostat import SiderostatStage
 
 _NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 
 
 class TickTimes(NamedTuple):
-    """When the star was measured, when it was decided what to do, and when that was done, in s."""
+    """When the star was measured, when it was decided what to do, and when that was confirmed, in s."""
 
     sensed_s: float
     decided_s: float
@@ -45,25 +46,25 @@ class TickRecords:
     def make(
         self,
         mode: Mode,
-        frame: Frame | None,
-        frames_lost: int,
-        seen: Seen,
-        stages: Stages,
+        observation: Observation,
+        siderostat: SiderostatStage,
+        mirror: MirrorStage,
         pointing: Pointing,
         search: Search,
         times: TickTimes,
     ) -> Tick:
-        """What a tick went by, and what it did."""
+        """What a tick was decided by, and what it did."""
         sensed_s, decided_s, done_s = times
-        star, servo, sky_arcsec_per_rad = seen.star, seen.servo, self._sky_arcsec_per_rad
+        frame, star, servo = observation.frame, observation.star, observation.servo
+        begun_s, sky_arcsec_per_rad = observation.now_s, self._sky_arcsec_per_rad
         read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or _NO_READING
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
         star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
         target_az_px, target_el_px = pointing.command_px.tolist()
-        fsm_az_rad, fsm_el_rad = stages.mirror_rad.tolist()
-        stack1_v, stack2_v, stack3_v = stages.stack_v.tolist()
-        motor_az_rad, motor_el_rad = seen.motor_rad.tolist()
-        setpoint_az_rad, setpoint_el_rad = stages.setpoint_rad.tolist()
+        fsm_az_rad, fsm_el_rad = mirror.command_rad.tolist()
+        stack1_v, stack2_v, stack3_v = mirror.stack_v.tolist()
+        motor_az_rad, motor_el_rad = observation.motor_rad.tolist()
+        setpoint_az_rad, setpoint_el_rad = siderostat.setpoint_rad.tolist()
         return Tick(
             time_s=done_s,
             loop=self._loop_name,
@@ -72,9 +73,9 @@ class TickRecords:
             mode_number=int(mode),
             mid_exposure_s=exposed_s,
             frame_age_s=math.nan if frame is None else frame.received_s - exposed_s,
-            compute_s=done_s - seen.now_s,
+            compute_s=done_s - begun_s,
             late=frame is not None and done_s - exposed_s > self._due_after_s,
-            frames_lost=frames_lost,
+            frames_lost=observation.frames_lost,
             star_visible=star is not None,
             star_az_px=star_az_px,
             star_el_px=star_el_px,
@@ -99,13 +100,15 @@ class TickRecords:
             siderostat_az_sky_arcsec=motor_az_rad * sky_arcsec_per_rad,
             siderostat_el_sky_arcsec=motor_el_rad * sky_arcsec_per_rad,
             search_progress=search.progress if mode is Mode.ACQUISITION else math.nan,
-            fsm_written_s=stages.written_s,
-            dac_round_trip_s=stages.round_trip_s,
+            fsm_written_s=mirror.written_s,
+            dac_round_trip_s=mirror.round_trip_s,
             amplifier_round_trip_s=servo.round_trip_s,
             following_error_rad=servo.following_rad,
             encoder_read_s=read_s,
             encoder_az_rad=encoder_az_rad,
             encoder_el_rad=encoder_el_rad,
-            sense_s=sensed_s - seen.now_s,
+            sense_s=sensed_s - begun_s,
             decide_s=decided_s - sensed_s,
+            dac_sent_s=mirror.sent_s,
+            frames_skipped=observation.frames_skipped,
         )

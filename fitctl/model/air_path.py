@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from fitctl.config import AirPathModel
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
 NODE_S = 0.005  # choice
@@ -99,10 +100,16 @@ def bridge_rms_px(air: AirPathModel, node_s: float = NODE_S) -> float:
     return float(air.gain_px / air.b1_s2 * np.sqrt(node_s**3 / 192))
 
 
+@compilable(inline=True, fused=True)
 def air_motion(
-    state: Floats, normals: Floats, transition: Floats, noise_gain: Floats, weights: Floats
-) -> Floats:
-    """Motion on the grid over some nodes, shape (nodes * steps, 2), px; `state` goes on with it.
+    state: Floats,
+    normals: Floats,
+    transition: Floats,
+    noise_gain: Floats,
+    weights: Floats,
+    motion_px: Floats,
+) -> None:
+    """Motion on the grid over some nodes; `state` goes on with it.
 
     Parameters
     ----------
@@ -113,11 +120,24 @@ def air_motion(
         From node to node, :func:`step_matrices`.
     weights : array, shape (steps, 4)
         :func:`bridge_weights`.
+    motion_px : array, shape (nodes * steps, 2)
+        Receives the motion.
     """
-    nodes = [state.copy()]
-    for normal in normals:
-        nodes.append(nodes[-1] @ transition.T + normal @ noise_gain.T)
-    state[:] = nodes[-1]
-    at = np.array(nodes)
-    ends = np.concatenate([at[:-1], at[1:]], axis=-1)
-    return np.einsum("sk,nak->nsa", weights, ends).reshape(-1, 2)
+    nodes, steps = normals.shape[0], weights.shape[0]
+    for axis in range(2):
+        x0, v0 = state[axis, 0], state[axis, 1]
+        for node in range(nodes):
+            n0, n1 = normals[node, axis, 0], normals[node, axis, 1]
+            x1 = transition[0, 0] * x0 + transition[0, 1] * v0
+            x1 += noise_gain[0, 0] * n0 + noise_gain[0, 1] * n1
+            v1 = transition[1, 0] * x0 + transition[1, 1] * v0
+            v1 += noise_gain[1, 0] * n0 + noise_gain[1, 1] * n1
+            for step in range(steps):
+                motion_px[node * steps + step, axis] = (
+                    weights[step, 0] * x0
+                    + weights[step, 1] * v0
+                    + weights[step, 2] * x1
+                    + weights[step, 3] * v1
+                )
+            x0, v0 = x1, v1
+        state[axis, 0], state[axis, 1] = x0, v0

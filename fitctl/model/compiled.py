@@ -1,74 +1,118 @@
-"""Compiling by numba, where it is installed (extra ``fast``); without it everything runs on NumPy."""
+"""Compiling plain functions with numba, where it is installed (extra ``fast``).
+
+Physics and control laws that simulations call most are plain scalar functions, marked with
+:func:`compilable`. The live loop, and everything without numba, calls them as they are; :func:`compiled`
+gives the machine code of one of them, into which the marked functions that it calls are compiled too.
+"""
 
 from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
-_COMPILED_FROM = (
-    "config/*.py",
-    "model/*.py",
-    "controllers/*.py",
-    "simulation/batch/*.py",
-    "messages/modes.py",
-)
+import numpy as np
+from numpy.typing import NDArray
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_PACKAGES = Path(__file__).parents[2]
+_IMPORT = re.compile(rb"^(?:from|import) (fitctl[\w.]*)(?: import (\([^)]*\)|.*))?", re.M)
+_options: dict[Callable[..., Any], dict[str, Any]] = {}  # of all marked functions
+_registered: set[Callable[..., Any]] = set()  # with numba
+
+
+def compilable(*, inline: bool = False, fused: bool = False) -> Callable[[_Function], _Function]:
+    """Mark a plain function that compiled code may call.
+
+    Parameters
+    ----------
+    inline : bool
+        Put its code into every compiled function that calls it: for what a run calls most.
+    fused : bool
+        Products may go into sums without rounding in between: not for times.
+    """
+
+    def mark(function: _Function) -> _Function:
+        options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": inline}
+        _options[function] = options | ({"fastmath": {"contract"}} if fused else {})
+        return function
+
+    return mark
 
 
 @functools.cache
-def kernels() -> ModuleType | None:
-    """The compiled kernels of the model, or None without numba; each compiles at its first call."""
+def numba_installed() -> bool:
+    """Whether :func:`compiled` compiles."""
     try:
         import numba  # noqa: F401
     except ImportError:
-        return None
-    from fitctl.model import kernels as compiled
-
-    return compiled
+        return False
+    return True
 
 
 @functools.cache
-def _cache_folder() -> str:
-    """Where compiled code is kept: named by what all files say that kernels take code or constants from.
+def compiled(function: _Function) -> _Function:
+    """A marked function, compiled at its first call; the function itself without numba.
 
-    Numba takes kept code for good as long as the outermost function's own file is unchanged, but
-    kernels here call kernels of other files, and have the constants of others compiled in.
+    The machine code is kept for other processes where the package's folder can be written.
     """
-    package = Path(__file__).parent.parent
-    files = sorted(path for part in _COMPILED_FROM for path in package.glob(part))
-    sources = b"".join(path.read_bytes() for path in files)
-    return str(package / "__pycache__" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}")
-
-
-def jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a kernel at its first call, and keep the result for other processes where that can be."""
-    return _compiled(function)
-
-
-def jit_inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As :func:`jit`, and put into every kernel that calls it: for what a run calls most."""
-    return _compiled(function, forceinline=True)
-
-
-def jit_fused(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As :func:`jit_inlined`, but products may go into sums without rounding in between: not for times."""
-    return _compiled(function, forceinline=True, fastmath={"contract"})
-
-
-def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    if not numba_installed():
+        return function
     from numba import njit
     from numba.core import config as module
+    from numba.extending import register_jitable
 
     config: Any = module  # its options are made when it is imported
-
-    options |= {"nogil": True, "error_model": "numpy"}
-    given, config.CACHE_DIR = config.CACHE_DIR, _cache_folder()
+    for marked in _options.keys() - _registered:
+        register_jitable(**_options[marked])(marked)
+    _registered.update(_options)
+    options = _options[function]
+    given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder(function.__module__))
     try:
         return njit(cache=True, **options)(function)
-    except RuntimeError:  # nowhere to write: it compiles anew in each process
+    except RuntimeError:  # the folder cannot be written: each process compiles anew
         return njit(**options)(function)
     finally:
         config.CACHE_DIR = given
+
+
+def record(values: Mapping[str, Any]) -> NDArray[np.void]:
+    """Values by name as one record, shape (), which compiled code receives as one argument."""
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    made = np.zeros((), [(name, array.dtype, array.shape) for name, array in arrays.items()])
+    for name, array in arrays.items():
+        made[name] = array
+    return made
+
+
+def cache_folder(module: str) -> Path:
+    """Folder of machine code from a module, named by a hash of all source that may be compiled into it.
+
+    Numba itself compiles anew only when the file of the outermost function changes, but functions of
+    other files, and their constants, are compiled in: those of every module imported, directly or not.
+    """
+    sources = sources_of(module)
+    digest = hashlib.sha256(b"".join(sources[path] for path in sorted(sources))).hexdigest()
+    return _PACKAGES / "fitctl" / "__pycache__" / f"compiled-{digest[:12]}"
+
+
+def sources_of(module: str) -> dict[Path, bytes]:
+    """Source of a module of the package, of its parents and of all that they import, by file."""
+    sources: dict[Path, bytes] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        path = _PACKAGES.joinpath(*name.split("."))
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        if path in sources or not path.is_file():  # no file: a name imported from a module
+            continue
+        sources[path] = path.read_bytes()
+        waiting.append(name.rpartition(".")[0] or name)
+        for imported, names in _IMPORT.findall(sources[path]):
+            origin = imported.decode()
+            waiting.append(origin)
+            waiting += [f"{origin}.{part}" for part in re.findall(r"\w+", names.decode())]
+    return sources

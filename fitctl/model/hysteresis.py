@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Fsm, Hysteresis
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +46,18 @@ def half_widths_v(settings: Hysteresis) -> Floats:
 def play(state: Floats, value: Floats, half_width: Floats) -> Floats:
     """One evaluation of the play (backlash) operator: the new output, shapes broadcast."""
     return np.maximum(value - half_width, np.minimum(value + half_width, state))
+
+
+@compilable(inline=True)
+def play_output(plays: Floats, value: float, half_width: Floats, gain: Floats) -> float:
+    """Output of parallel plays, shape (n,) each, after they met `value`; they are moved on."""
+    total = 0.0
+    for element in range(plays.shape[0]):
+        half = half_width[element]
+        output = max(value - half, min(value + half, plays[element]))
+        plays[element] = output
+        total += output * gain[element]
+    return total
 
 
 def displacement_series(volts: Floats, half_width_v: Floats, gains: Floats) -> Floats:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import functools
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
+
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
 REACH_SIGMAS = 8.5  # beyond lies a part of the light in 1e17
@@ -43,3 +47,30 @@ def light_below(distance_sigmas: Floats) -> Floats:
     x = place - interval
     c3, c2, c1, c0 = np.moveaxis(table[interval], -1, 0)
     return np.asarray(((c3 * x + c2) * x + c1) * x + c0)
+
+
+@compilable(inline=True)
+def light_fractions(
+    first: int, centre_px: float, sigma_px: float, table: Floats, fraction: Floats
+) -> Any:
+    """Part of a spot's light on pixels ``first + k``; returns the first and the end of those that get any.
+
+    :func:`light_below` at the edges, one after the other.
+    """
+    reach_px = REACH_SIGMAS * sigma_px
+    low = max(0, math.ceil(centre_px - reach_px - 0.5) - first)
+    high = min(len(fraction), math.floor(centre_px + reach_px + 0.5) - first + 1)
+    below = 0.0
+    for edge in range(low, high + 1):
+        distance = (first + edge - 0.5 - centre_px) / sigma_px
+        place = (min(max(distance, -REACH_SIGMAS), REACH_SIGMAS) + REACH_SIGMAS) * PER_SIGMA
+        interval = min(int(place), len(table) - 1)
+        x = place - interval
+        c3, c2, c1, c0 = (
+            table[interval, 0], table[interval, 1], table[interval, 2], table[interval, 3],
+        )  # fmt: skip
+        above = ((c3 * x + c2) * x + c1) * x + c0
+        if edge > low:
+            fraction[edge - 1] = above - below
+        below = above
+    return low, max(low, high)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Loop, Rig
+from fitctl.config import ARCSEC_PER_RAD, Loop, Rig, Siderostat
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +58,10 @@ class Scales:
     def motor_sky_arcsec_per_rad(self) -> float:
         """Beam angle on the sky of one radian of motor."""
         return self.motor_sky_rad_per_rad * ARCSEC_PER_RAD
+
+    def travel_rad(self, siderostat: Siderostat) -> float:
+        """Travel of a siderostat's motors, either way from the encoders' zero."""
+        return siderostat.travel_sky_arcsec / self.motor_sky_arcsec_per_rad
 
     # All of these take and give shape (..., 2).
 
@@ -105,6 +110,18 @@ def rotation(angle_deg: float) -> Floats:
     """The matrix, shape (2, 2), that turns from azimuth towards elevation."""
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.array([[cos, -sin], [sin, cos]])
+
+
+@compilable(inline=True)
+def turned(turn: Floats, az: float, el: float) -> tuple[float, float]:
+    """A pair, by a matrix of shape (2, 2)."""
+    return turn[0, 0] * az + turn[0, 1] * el, turn[1, 0] * az + turn[1, 1] * el
+
+
+@compilable(inline=True)
+def turned_back(turn: Floats, az: float, el: float) -> tuple[float, float]:
+    """A pair, by the transpose of a matrix of shape (2, 2)."""
+    return turn[0, 0] * az + turn[1, 0] * el, turn[0, 1] * az + turn[1, 1] * el
 
 
 def stack_matrix(stack_radius_m: float) -> Floats:

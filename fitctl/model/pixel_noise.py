@@ -7,15 +7,20 @@ simulation makes whole frames with it, the batch only the windows that it looks 
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from fitctl.model.compiled import compilable
+
 Floats = NDArray[np.float64]
 _TABLE_BITS = 16
-_GOLDEN = 0x9E3779B97F4A7C15
-_WORD = 2**64 - 1
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+QUANTILE_SHIFT = np.uint64(64 - _TABLE_BITS)  # from a hash to the index of its quantile
+_FACTOR1, _FACTOR2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_SHIFT1, _SHIFT2, _SHIFT3 = np.uint64(30), np.uint64(27), np.uint64(31)
 
 
 @functools.cache
@@ -42,13 +47,15 @@ def pixel_normals(key: int, number: int, pixels: int) -> Floats:
     The hash is SplitMix64's (Steele, Lea and Flood, OOPSLA 2014): of the frame's number with the run's
     key, then of the pixel's index with the result.
     """
-    frame = _mix(np.array([(key + number * _GOLDEN) & _WORD], np.uint64))
+    # Arrays, because they wrap at 64 bits without a warning.
+    frame = mix(np.array([key], np.uint64) + np.array([number], np.uint64) * GOLDEN)
     index = np.arange(1, pixels + 1, dtype=np.uint64)
-    bits = _mix(frame + index * np.uint64(_GOLDEN))
-    return quantiles()[bits >> np.uint64(64 - _TABLE_BITS)]
+    return quantiles()[mix(frame + index * GOLDEN) >> QUANTILE_SHIFT]
 
 
-def _mix(word: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return word ^ (word >> np.uint64(31))
+@compilable(inline=True)
+def mix(word: Any) -> Any:
+    """SplitMix64's finalizer, of one 64-bit word or an array of them."""
+    word = (word ^ (word >> _SHIFT1)) * _FACTOR1
+    word = (word ^ (word >> _SHIFT2)) * _FACTOR2
+    return word ^ (word >> _SHIFT3)

@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.model import air_path
-from fitctl.model.compiled import kernels
+from fitctl.model.compiled import compiled
 from fitctl.model.plant_constants import plant_constants
-from fitctl.model.plant_step import (
-    AdvanceKernel,
-    PlantState,
-    PlantTrace,
-    bind_reference,
-    compiled_advance,
-)
+from fitctl.model.plant_step import PlantState, PlantTrace, bound_step
 from fitctl.model.randomness import place_star, run_randomness
 
 Floats = NDArray[np.float64]
@@ -40,9 +34,6 @@ class Plant:
     loop_name : str
     seeds : sequence of int
         One for each run; everything random in a run follows from its seed.
-    kernel : callable, optional
-        :func:`~fitctl.model.plant_step.bind_reference` or a compiled one; by default compiled where
-        numba is installed.
     star_offset_px : array, shape (runs, 2), optional
         Where the star is at the start, from the target; by default drawn from the seed.
     history_s : float, optional
@@ -55,7 +46,6 @@ class Plant:
         loop_name: str,
         seeds: Sequence[int],
         *,
-        kernel: AdvanceKernel | None = None,
         star_offset_px: Floats | None = None,
         history_s: float | None = None,
     ) -> None:
@@ -88,8 +78,7 @@ class Plant:
         kept = max(1, round(kept_s / truth.step_s))
         self._trace = PlantTrace(np.empty((kept, runs, spots, 2)), np.empty((kept, runs)))
         self._kept = kept
-        bind = kernel or compiled_advance() or bind_reference
-        self._step = bind(self.constants, self.state, self._air_px, self._trace)
+        self._step = bound_step(self.constants, self.state, self._air_px, self._trace)
 
     @property
     def inputs(self) -> PlantState:
@@ -164,20 +153,16 @@ class Plant:
 
     def _draw_air(self) -> None:
         # One draw for each run and spot, so that a run is the same whichever others are beside it.
-        air, compiled = self.constants.air, kernels()
+        air, air_motion = self.constants.air, compiled(air_path.air_motion)
         shape = (BLOCK_NODES, 2, 2)
         for run, randoms in enumerate(self._air_random):
             for spot, random in enumerate(randoms):
-                arguments = (
+                air_motion(
                     self._air[run, spot],
                     random.standard_normal(shape),
                     air.transition,
                     air.noise_gain,
                     air.weights,
+                    self._air_px[:, run, spot],
                 )
-                motion_px = self._air_px[:, run, spot]
-                if compiled is None:
-                    motion_px[:] = air_path.air_motion(*arguments)
-                else:
-                    compiled.air_motion(*arguments, motion_px)
         self._air_px[:, :, 1:] *= air.relative

@@ -11,27 +11,11 @@ from numpy.typing import NDArray
 
 from fitctl.config import ARCSEC_PER_RAD, AirPath, ConfigError, Rig
 from fitctl.model import air_path, hysteresis, structure
+from fitctl.model.compiled import record
 from fitctl.model.optics import scales
 
 Floats = NDArray[np.float64]
-_PACKED = np.dtype(
-    [
-        ("step_s", "f8"),
-        ("amplifier_decay", "f8"),
-        ("amplifier_lag_s", "f8"),
-        ("backlash_half_rad", "f8"),
-        ("mid_stroke_m", "f8"),
-        ("stack_radius_m", "f8"),
-        ("mode_shape", "f8", (2, 2)),
-        ("mode_transition", "f8", (2, 2, 2)),
-        ("mode_gain", "f8", (2, 2)),
-        ("participation", "f8"),
-        ("motor_px_per_rad", "f8"),
-        ("mirror_px_per_rad", "f8"),
-        ("siderostat_turn", "f8", (2, 2)),
-        ("mirror_turn", "f8", (2, 2)),
-    ]
-)
+_SIZED_BY_RIG = {"play_half_v", "play_gain_m_per_v", "air", "spot_origin_px"}
 
 
 class AirConstants(NamedTuple):
@@ -80,11 +64,9 @@ class PlantConstants:
 
     @functools.cached_property
     def packed(self) -> NDArray[np.void]:
-        """What a compiled step needs of it, but for the arrays whose size depends on the rig; (1,)."""
-        row = np.zeros(1, _PACKED)
-        for name in _PACKED.names or ():
-            row[name] = getattr(self, name)
-        return row
+        """All of it but the arrays whose size depends on the rig, for compiled code; shape (1,)."""
+        values = vars(self).items()
+        return record({name: value for name, value in values if name not in _SIZED_BY_RIG})[None]
 
 
 def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantConstants:
@@ -117,7 +99,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         play_half_v=half_v,
         play_gain_m_per_v=gains,
         bias_v=loop.fsm.bias_v,
-        # Where a stack rests that came up from zero to its bias: taken as the mirror's zero.
+        # Where a stack rests that came up from zero to its bias: the mirror's zero.
         mid_stroke_m=float(hysteresis.raised_displacement(loop.fsm.bias_v, half_v, gains)),
         stack_radius_m=loop.fsm.stack_radius_m,
         mode_shape=structure.mode_shapes(plant.structure),

@@ -1,17 +1,18 @@
-"""One loop's hardware, step by step: its state, and the step in NumPy and compiled."""
+"""One loop's hardware, step by step: its state, and the step."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.model import hysteresis
-from fitctl.model.compiled import kernels
-from fitctl.model.optics import mirror_from_stacks, piston_m
+from fitctl.model.compiled import compilable, compiled, numba_installed
+from fitctl.model.hysteresis import play_output
+from fitctl.model.optics import turned
 from fitctl.model.plant_constants import PlantConstants
 
 Floats = NDArray[np.float64]
@@ -73,97 +74,156 @@ class PlantTrace(NamedTuple):
     piston_m: Floats
 
 
-def advance_reference(
-    constants: PlantConstants,
-    state: PlantState,
+@compilable(inline=True)
+def move_stacks(c: Any, s: Any, plays_v: Floats, half_v: Floats, gain_m_per_v: Floats) -> None:
+    """Take the stacks of one run to their volts. They are static: without a change nothing moves."""
+    for stack in range(3):
+        volts = s.stack_v[stack]
+        if volts != s.stacks_at_v[stack]:
+            s.stacks_at_v[stack] = volts
+            output_m = play_output(plays_v[stack], volts, half_v, gain_m_per_v)
+            s.displacement_m[stack] = output_m - c.mid_stroke_m
+
+
+@compilable(inline=True, fused=True)
+def step_run(c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats) -> None:
+    """A step for each row, of one run and its first spot; stacks stand still. Shapes (2,), twice (rows, 2).
+
+    Both axes and modes go side by side: each is a chain of dependent sums, and four run in the time of
+    one.
+    """
+    mirror_az = (s.displacement_m[1] - s.displacement_m[2]) / (2 * c.stack_radius_m)
+    mirror_el = (s.displacement_m[0] - s.displacement_m[1]) / (2 * c.stack_radius_m)
+    # On the focal plane: what of the mirror does not go through the modes, and each mode's part.
+    turned_az, turned_el = turned(c.mirror_turn, mirror_az, mirror_el)
+    still_az_px = origin_px[0] + c.mirror_px_per_rad * (1 - c.participation) * turned_az
+    still_el_px = origin_px[1] + c.mirror_px_per_rad * (1 - c.participation) * turned_el
+    mode_px = c.mirror_px_per_rad * c.participation
+    shape_az1, shape_el1 = turned(c.mirror_turn, c.mode_shape[0, 0], c.mode_shape[0, 1])
+    shape_az2, shape_el2 = turned(c.mirror_turn, c.mode_shape[1, 0], c.mode_shape[1, 1])
+    az_px1, el_px1 = mode_px * shape_az1, mode_px * shape_el1
+    az_px2, el_px2 = mode_px * shape_az2, mode_px * shape_el2
+    drive1 = mirror_az * c.mode_shape[0, 0] + mirror_el * c.mode_shape[0, 1]
+    drive2 = mirror_az * c.mode_shape[1, 0] + mirror_el * c.mode_shape[1, 1]
+    a1, b1, c1, d1 = (
+        c.mode_transition[0, 0, 0], c.mode_transition[0, 0, 1],
+        c.mode_transition[0, 1, 0], c.mode_transition[0, 1, 1],
+    )  # fmt: skip
+    a2, b2, c2, d2 = (
+        c.mode_transition[1, 0, 0], c.mode_transition[1, 0, 1],
+        c.mode_transition[1, 1, 0], c.mode_transition[1, 1, 1],
+    )  # fmt: skip
+    to_place1, to_rate1 = c.mode_gain[0, 0] * drive1, c.mode_gain[0, 1] * drive1
+    to_place2, to_rate2 = c.mode_gain[1, 0] * drive2, c.mode_gain[1, 1] * drive2
+    place1, rate1 = s.modes[0, 0], s.modes[0, 1]
+    place2, rate2 = s.modes[1, 0], s.modes[1, 1]
+    decay, half, motor_px = c.amplifier_decay, c.backlash_half_rad, c.motor_px_per_rad
+    catch_up_s = c.amplifier_lag_s * (1 - decay)
+    command_az, command_el = s.velocity_rad_s[0], s.velocity_rad_s[1]
+    moved_az, moved_el = command_az * c.step_s, command_el * c.step_s
+    motor_az, lead_az, beam_az = s.motor_rad[0], s.motor_rad_s[0] - command_az, s.beam_motor_rad[0]
+    motor_el, lead_el, beam_el = s.motor_rad[1], s.motor_rad_s[1] - command_el, s.beam_motor_rad[1]
+    for row in range(spot_px.shape[0]):
+        place1, rate1 = to_place1 + b1 * rate1 + a1 * place1, to_rate1 + d1 * rate1 + c1 * place1
+        place2, rate2 = to_place2 + b2 * rate2 + a2 * place2, to_rate2 + d2 * rate2 + c2 * place2
+        motor_az += moved_az + lead_az * catch_up_s
+        motor_el += moved_el + lead_el * catch_up_s
+        lead_az *= decay
+        lead_el *= decay
+        beam_az = max(motor_az - half, min(motor_az + half, beam_az))
+        beam_el = max(motor_el - half, min(motor_el + half, beam_el))
+        turned_az, turned_el = turned(c.siderostat_turn, beam_az, beam_el)
+        spot_px[row, 0] = (
+            still_az_px + az_px1 * place1 + az_px2 * place2 + motor_px * turned_az
+            + air_px[row, 0]
+        )  # fmt: skip
+        spot_px[row, 1] = (
+            still_el_px + el_px1 * place1 + el_px2 * place2 + motor_px * turned_el
+            + air_px[row, 1]
+        )  # fmt: skip
+    s.modes[0, 0], s.modes[0, 1], s.modes[1, 0], s.modes[1, 1] = place1, rate1, place2, rate2
+    s.motor_rad[0], s.motor_rad_s[0], s.beam_motor_rad[0] = motor_az, command_az + lead_az, beam_az
+    s.motor_rad[1], s.motor_rad_s[1], s.beam_motor_rad[1] = motor_el, command_el + lead_el, beam_el
+
+
+@compilable()
+def stack_piston_m(s: Any) -> float:
+    """Eq. 4: the origin lies midway between stacks 1 and 3, so that it is their mean."""
+    return (s.displacement_m[0] + s.displacement_m[2]) / 2
+
+
+@compilable()
+def advance(
+    constants: Any,
+    play_half_v: Floats,
+    play_gain_m_per_v: Floats,
+    state: Any,
+    plays_v: Floats,
+    origin_px: Floats,
     air_px: Floats,
-    trace: PlantTrace,
+    trace_px: Floats,
+    trace_piston_m: Floats,
     air_from: int,
     trace_from: int,
     steps: int,
 ) -> None:
-    """Advance in NumPy; the compiled kernel is held to this.
+    """Advance all runs by some steps; stacks go to their volts first, and stand still.
 
     Parameters
     ----------
+    constants, state : one or more rows of PlantConstants.packed and PlantState.rows
+        Or, not compiled, what has their fields as attributes.
+    play_half_v, play_gain_m_per_v : arrays, shape (elements,)
+    plays_v : array, shape (runs, 3, elements)
+    origin_px : array, shape (runs, spots, 2)
     air_px : array, shape (rows, runs, spots, 2)
         Motion that all spots share, then what each further spot has besides, from row `air_from` on.
-    trace : PlantTrace
-        Receives what the steps lead to, from row `trace_from` on.
+    trace_px, trace_piston_m : arrays, shape (rows, runs, spots, 2) and (rows, runs)
+        Receive what the steps lead to, from row `trace_from` on.
     steps : int
     """
-    c = constants
-    state.plays_v[:] = hysteresis.play(state.plays_v, state.stack_v[..., None], c.play_half_v)
-    state.displacement_m[:] = (
-        hysteresis.hysteresis_output(state.plays_v, c.play_gain_m_per_v) - c.mid_stroke_m
-    )
-    mirror_rad = mirror_from_stacks(state.displacement_m, c.stack_radius_m)
-    mode_input = mirror_rad @ c.mode_shape.T
-    static_rad = (1 - c.participation) * mirror_rad
-    trace.piston_m[trace_from : trace_from + steps] = piston_m(
-        state.displacement_m, c.stack_radius_m
-    )
-    for step in range(steps):
-        lead_rad_s = state.motor_rad_s - state.velocity_rad_s
-        state.motor_rad += state.velocity_rad_s * c.step_s + lead_rad_s * c.amplifier_lag_s * (
-            1 - c.amplifier_decay
-        )
-        state.motor_rad_s[:] = state.velocity_rad_s + lead_rad_s * c.amplifier_decay
-        state.beam_motor_rad[:] = hysteresis.play(
-            state.beam_motor_rad, state.motor_rad, np.asarray(c.backlash_half_rad)
-        )
-        state.modes[:] = (
-            np.einsum("mij,rmj->rmi", c.mode_transition, state.modes)
-            + c.mode_gain * mode_input[..., None]
-        )
-        moving_rad = static_rad + c.participation * state.modes[..., 0] @ c.mode_shape
-        air_now_px = air_px[air_from + step]
-        own_px = air_now_px.copy()
-        own_px[:, 0] = 0.0
-        trace.spots_px[trace_from + step] = (
-            c.spot_origin_px
-            + own_px
-            + (
-                air_now_px[:, 0]
-                + c.motor_px_per_rad * state.beam_motor_rad @ c.siderostat_turn.T
-                + c.mirror_px_per_rad * moving_rad @ c.mirror_turn.T
-            )[:, None, :]
-        )
+    c = constants[0]
+    for run in range(trace_px.shape[1]):
+        s = state[run]
+        move_stacks(c, s, plays_v[run], play_half_v, play_gain_m_per_v)
+        step_run(
+            c, s, origin_px[run, 0], air_px[air_from : air_from + steps, run, 0],
+            trace_px[trace_from : trace_from + steps, run, 0],
+        )  # fmt: skip
+        trace_piston_m[trace_from : trace_from + steps, run] = stack_piston_m(s)
+        for spot in range(1, trace_px.shape[2]):
+            for axis in range(2):
+                apart_px = origin_px[run, spot, axis] - origin_px[run, 0, axis]
+                for row in range(steps):
+                    trace_px[trace_from + row, run, spot, axis] = (
+                        trace_px[trace_from + row, run, 0, axis]
+                        + apart_px
+                        + air_px[air_from + row, run, spot, axis]
+                    )
 
 
-def compiled_advance() -> AdvanceKernel | None:
-    """The compiled step, or None without numba."""
-    compiled = kernels()
-    return None if compiled is None else partial(_bind_compiled, compiled.advance)
-
-
-def bind_reference(
-    constants: PlantConstants, state: PlantState, air_px: Floats, trace: PlantTrace
-) -> Advance:
-    """The step in NumPy, on a plant's own arrays."""
-    return partial(advance_reference, constants, state, air_px, trace)
-
-
-def _bind_compiled(
-    kernel: Callable[..., None],
+def bound_step(
     constants: PlantConstants,
     state: PlantState,
     air_px: Floats,
     trace: PlantTrace,
-) -> Advance:
+    *,
+    machine_code: bool | None = None,
+) -> Callable[[int, int, int], None]:
+    """:func:`advance` on a plant's own arrays: from a row of air and of trace, by some steps.
+
+    Compiled where numba is installed, unless `machine_code` is False.
+    """
+    step: Callable[..., None] = advance
+    constant_rows: Any = [constants]
+    state_rows: Any = state.rows
+    if machine_code if machine_code is not None else numba_installed():
+        step, constant_rows = compiled(advance), constants.packed
+    else:
+        names = state.rows.dtype.names or ()
+        state_rows = [SimpleNamespace(**{name: row[name] for name in names}) for row in state.rows]
+    plays = constants.play_half_v, constants.play_gain_m_per_v
+    origin_px = constants.spot_origin_px
     return partial(
-        kernel,
-        constants.packed,
-        constants.play_half_v,
-        constants.play_gain_m_per_v,
-        state.rows,
-        state.plays_v,
-        constants.spot_origin_px,
-        air_px,
-        *trace,
+        step, constant_rows, *plays, state_rows, state.plays_v, origin_px, air_px, *trace
     )
-
-
-Advance = Callable[[int, int, int], None]
-"""Takes the row of air and of trace to begin at, and how many steps to go on."""
-AdvanceKernel = Callable[[PlantConstants, PlantState, Floats, PlantTrace], Advance]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Camera, HotPixel, Spot
-from fitctl.model.compiled import kernels
-from fitctl.model.light import light_below, light_table
-from fitctl.model.pixel_noise import pixel_normals, quantiles
+from fitctl.model.compiled import compilable, compiled, numba_installed
+from fitctl.model.light import light_below, light_fractions, light_table
+from fitctl.model.pixel_noise import GOLDEN, QUANTILE_SHIFT, mix, pixel_normals, quantiles
 
 Floats = NDArray[np.float64]
 FULL_WELL_DN = 65535
@@ -56,10 +57,9 @@ class Scene:
         The noise is that of frame `number` of the run whose key is given
         (:mod:`fitctl.model.pixel_noise`).
         """
-        compiled = kernels()
-        if compiled is None:
+        if not numba_installed():
             return self.frame_reference(positions_px, key, number)
-        compiled.render(
+        compiled(render)(
             self._light_dn,
             0,
             0,
@@ -95,6 +95,55 @@ class Scene:
         """Part of a spot's light that falls on each column (or row), shape (..., spots, pixels)."""
         below = light_below((edges - centre_px[..., None]) / self._sigma_px[:, None])
         return np.asarray(below[..., 1:] - below[..., :-1])
+
+
+@compilable(inline=True)
+def render(
+    light_dn: Floats,
+    first_row: int,
+    first_column: int,
+    width_px: int,
+    positions_px: Floats,
+    flux_dn: Floats,
+    sigma_px: Floats,
+    spots: int,
+    bias_dn: float,
+    noise_dn: float,
+    full_dn: float,
+    key: Any,
+    number: int,
+    table: Floats,
+    light: Floats,
+    down: Floats,
+    across: Floats,
+) -> None:
+    """:meth:`Scene.frame`, or a part of it, whole numbers into `light_dn`.
+
+    A spot at NaN is left out. `down` and `across` are room for a column and a row.
+    """
+    rows, columns = light_dn.shape
+    for row in range(rows):
+        for column in range(columns):
+            light_dn[row, column] = bias_dn
+    for spot in range(spots):
+        az_px, el_px = positions_px[spot, 0], positions_px[spot, 1]
+        if math.isnan(az_px):
+            continue
+        left, right = light_fractions(first_column, az_px, sigma_px[spot], light, across)
+        if left >= right:
+            continue
+        top, bottom = light_fractions(first_row, el_px, sigma_px[spot], light, down)
+        for row in range(top, bottom):
+            row_dn = flux_dn[spot] * down[row]
+            for column in range(left, right):
+                light_dn[row, column] += row_dn * across[column]
+    frame = mix(key + np.uint64(number) * GOLDEN)
+    for row in range(rows):
+        pixel = (first_row + row) * width_px + first_column + 1
+        for column in range(columns):
+            bits = mix(frame + np.uint64(pixel + column) * GOLDEN)
+            noisy = light_dn[row, column] + noise_dn * table[bits >> QUANTILE_SHIFT]
+            light_dn[row, column] = min(max(np.rint(noisy), 0.0), full_dn)
 
 
 def centroid_noise_px(camera: Camera, flux_dn: float, window_px: int) -> float:

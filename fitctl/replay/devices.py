@@ -34,8 +34,8 @@ from fitctl.logging.records import (
 )
 from fitctl.replay.log import LoggedStep
 from fitctl.stages.injector import Injection, Injector
+from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import ServoState, ServoTiming, SiderostatServo
-from fitctl.stages.stages import Stages
 from fitctl.supervisor.power import Opened, close_devices, open_devices
 
 Floats = NDArray[np.float64]
@@ -43,18 +43,18 @@ _NOBODY = DeviceIdentity("fitctl", "log", "", "")
 
 
 class LoggedClock:
-    """A clock that is told the time; nobody waits by it."""
+    """A clock that stands at the time last set; nobody waits by it."""
 
     def __init__(self) -> None:
         self._now_s = 0.0
 
-    def tell(self, now_s: float) -> None:
+    def set(self, now_s: float) -> None:
         """It is this late; what is not a number changes nothing."""
         if not math.isnan(now_s):
             self._now_s = now_s
 
     def now_s(self) -> float:
-        """What it was told."""
+        """As last set."""
         return self._now_s
 
     def sleep_until(self, deadline_s: float) -> None:
@@ -70,7 +70,8 @@ def logged_error(kind: str, text: str) -> DeviceError:
 def failures(step: LoggedStep, loop: str) -> dict[str, DeviceError]:
     """By device, what failed in a step."""
     return {
-        told.device: logged_error(told.kind, told.error) for told in step.of(DeviceFailure, loop)
+        message.device: logged_error(message.kind, message.error)
+        for message in step.of(DeviceFailure, loop)
     }
 
 
@@ -82,15 +83,15 @@ class NoDevice:
         return _NOBODY
 
     def close(self) -> None:
-        """Nothing to disconnect; the same for whatever else a device can be told."""
+        """Nothing to disconnect; the same for every other command."""
 
-    start = stop = enable = disable = reset_fault = close
+    start = stop = enable = disable = reset_fault = confirm = close
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """Silence."""
         return None
 
-    def write_v(self, volts: Floats) -> None:
+    def send_v(self, volts: Floats) -> None:
         """Nothing to write to."""
 
     def read_v(self) -> Floats:
@@ -105,36 +106,40 @@ class NoDevice:
 
 
 class LoggedCamera(NoDevice):
-    """Gives each step the frame that it had, or none, or the camera's error."""
+    """Gives each step the frames that came in it, or none, or the camera's error."""
 
     def __init__(self) -> None:
-        self._frame: Frame | None = None
+        self._frames: deque[Frame] = deque()
         self._error: DeviceError | None = None
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What :meth:`next_frame` gives next."""
         self._error = next(
             (errors[CAMERA] for loop in step.ticks if CAMERA in (errors := failures(step, loop))),
             None,
         )
-        self._frame = None
+        self._frames.clear()
         if step.frame is not None:
             tick = next(iter(step.ticks.values()))
-            shape = step.frame.height, step.frame.width
-            image = np.frombuffer(step.frame.data, "<u2").reshape(shape)
             exposed_s = tick.mid_exposure_s
             # To the last bit: the age was had by subtracting times that lie close together.
-            self._frame = Frame(tick.number, exposed_s, exposed_s + tick.frame_age_s, image)
+            received_s = exposed_s + tick.frame_age_s
+            self._frames.extend(Frame(-1, math.nan, math.nan, _image(old)) for old in step.older)
+            self._frames.append(Frame(tick.number, exposed_s, received_s, _image(step.frame)))
 
     def next_frame(self, timeout_s: float) -> Frame | None:
-        """The step's."""
+        """The step's next, oldest first."""
         if self._error is not None:
             raise self._error
-        return self._frame
+        return self._frames.popleft() if self._frames else None
 
     def counts(self) -> CameraCounts:
         """Nobody decides by them."""
         return CameraCounts(0, 0, 0)
+
+
+def _image(message: Any) -> NDArray[np.uint16]:
+    return np.frombuffer(message.data, "<u2").reshape(message.height, message.width)
 
 
 class LoggedServo(SiderostatServo):
@@ -145,26 +150,26 @@ class LoggedServo(SiderostatServo):
     name : str
     rig : Rig
     clock : LoggedClock
-        Told when a tick begins.
+        Set when a tick begins.
     """
 
     def __init__(self, name: str, rig: Rig, clock: LoggedClock) -> None:
         super().__init__(name, rig.loops[name], NoDevice(), clock, rig.camera.period_s)
-        self._told = clock
+        self._logged_clock = clock
         self._tick: Any = None
         self._ticked = False
         self._moments: deque[Floats] = deque()
         self._timing = ServoTiming([], 0, 0)
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What is known of it in a step."""
-        if self._ticked:  # else what was told may still be to come
+        if self._ticked:  # else what was logged may still be to come
             self._moments.clear()
         self._ticked = self.name in step.ticks
         self._tick = step.ticks.get(self.name, self._tick)
         changes = (ModeChange, ControllerChange)
         self._moments.extend(
-            _az_el(record.message, "siderostat")
+            az_el(record.message, "siderostat")
             for record in step.before_tick.get(self.name, ())
             if record.kind in changes
         )
@@ -187,24 +192,24 @@ class LoggedServo(SiderostatServo):
         """As it was taken at the step's next change of mode or controller; else the tick's, shape (2,)."""
         if self._moments:
             return self._moments[0]
-        return np.zeros(2) if self._tick is None else _az_el(self._tick, "siderostat")
+        return np.zeros(2) if self._tick is None else az_el(self._tick, "siderostat")
 
     def position_at(self, time_s: float) -> Floats:
         """As the tick had it, shape (2,)."""
-        return _az_el(self._tick, "siderostat")
+        return az_el(self._tick, "siderostat")
 
-    def look(self) -> ServoState:
+    def read_state(self) -> ServoState:
         """As the tick found it; its time begins here."""
         tick = self._tick
         if tick is None:
-            return super().look()
-        self._told.tell(tick.time_s - tick.compute_s)  # exact, as these are close together
+            return super().read_state()
+        self._logged_clock.set(tick.time_s - tick.compute_s)  # exact, as these are close together
         read = not math.isnan(tick.encoder_read_s)
         if read and (not self._history or self._history[-1].time_s != tick.encoder_read_s):
             position_rad = (tick.encoder_az_rad, tick.encoder_el_rad)
             self._history.append(ServoReading(tick.encoder_read_s, position_rad, True, ""))
         return ServoState(
-            _az_el(tick, "siderostat"),
+            az_el(tick, "siderostat"),
             self._history[-1] if read else None,
             self.fault,
             tick.following_error_rad,
@@ -221,32 +226,32 @@ class LoggedServo(SiderostatServo):
     def close(self) -> None:
         """Nothing to disconnect."""
 
-    def take_timing(self) -> ServoTiming:
+    def drain_timing(self) -> ServoTiming:
         """As the log has it of this second."""
         return self._timing
 
 
-class LoggedStages(Stages):
-    """Stages that end up, at each tick, where the log says they were sent.
+class LoggedMirror(MirrorStage):
+    """A mirror that ends up, at each tick, where the log says it was sent.
 
-    What today's code wants is kept aside: the frames that follow show the stages as they were sent then, and
+    What today's code wants is kept aside: the frames that follow show the mirror as it was sent then, and
     not otherwise.
     """
 
-    def __init__(self, name: str, rig: Rig, servo: LoggedServo, clock: LoggedClock) -> None:
-        self._written = LoggedDac(clock)
-        super().__init__(rig, name, servo, self._written, clock)
-        self.injector: LoggedInjector = LoggedInjector(self._written, clock)
+    def __init__(self, name: str, rig: Rig, clock: LoggedClock) -> None:
+        self._logged_dac = LoggedDac(clock)
+        self._logged_injector = LoggedInjector(self._logged_dac, clock)
+        super().__init__(rig, name, self._logged_dac, clock, self._logged_injector)
         self._wanted_v: Floats | None = None
         self._name = name
         self._tick: Any = None
 
-    def tell(self, step: LoggedStep) -> None:
-        """What is known of them in a step."""
+    def load_step(self, step: LoggedStep) -> None:
+        """What is known of it in a step."""
         self._tick = step.ticks.get(self._name)
         failed = failures(step, self._name)
-        self._written.tell(self._tick, failed.get("D/A"))
-        self.injector.tell(step, self._name)
+        self._logged_dac.load_tick(self._tick, failed.get("D/A"))
+        self._logged_injector.load_step(step, self._name)
         self.injector.fault = failed.get("injector", self.injector.fault)
 
     @property
@@ -254,40 +259,39 @@ class LoggedStages(Stages):
         """What today's code wants at the D/A, shape (3,)."""
         return self.stack_v if self._wanted_v is None else self._wanted_v
 
-    def write(self) -> None:
-        """Take what was written then for written now."""
+    def send(self) -> None:
+        """Send what was sent then."""
         self._wanted_v = self.stack_v
         if self._tick is not None:
             self.stack_v = _stacks(self._tick)
-        super().write()
+        super().send()
 
     def follow(self) -> None:
-        """After the tick: go on from where they were sent then."""
+        """After the tick: go on from where it was sent then."""
         tick = self._tick
         self.stack_v, self._wanted_v = _stacks(tick), None
-        self.mirror_rad = _az_el(tick, "fsm")
-        self.setpoint_rad = _az_el(tick, "siderostat_setpoint")
+        self.command_rad = az_el(tick, "fsm")
         self.written_s, self.round_trip_s = tick.fsm_written_s, tick.dac_round_trip_s
 
 
 class LoggedDac(NoDevice):
-    """Takes voltages when the log says so, or fails as it says."""
+    """Confirms voltages when the log says so, or fails as it says."""
 
     def __init__(self, clock: LoggedClock) -> None:
         self._clock = clock
         self._written_s = math.nan
         self._error: DeviceError | None = None
 
-    def tell(self, tick: Any, error: DeviceError | None) -> None:
+    def load_tick(self, tick: Any, error: DeviceError | None) -> None:
         """How the next write ends."""
         self._written_s = math.nan if tick is None else tick.fsm_written_s
         self._error = error
 
-    def write_v(self, volts: Floats) -> None:
+    def confirm(self) -> None:
         """At the time of the log."""
         if self._error is not None:
             raise self._error
-        self._clock.tell(self._written_s)
+        self._clock.set(self._written_s)
 
 
 class LoggedInjector(Injector):
@@ -297,13 +301,15 @@ class LoggedInjector(Injector):
         super().__init__(dac, clock, np.zeros((3, 2)), 0.0, 0.0)
         self._logged: list[Injection] = []
 
-    def tell(self, step: LoggedStep, loop: str) -> None:
+    def load_step(self, step: LoggedStep, loop: str) -> None:
         """What was written in a step; the first after a start is where the voltages were before."""
         injections = step.of(InjectionRecord, loop)
         skipped = len(step.of(ExperimentStart, loop))
-        self._logged = [Injection(told.time_s, _stacks(told)) for told in injections[skipped:]]
+        self._logged = [
+            Injection(message.time_s, _stacks(message)) for message in injections[skipped:]
+        ]
 
-    def take_written(self) -> list[Injection]:
+    def drain_written(self) -> list[Injection]:
         """What was written since last asked."""
         logged, self._logged = self._logged, []
         return logged
@@ -326,11 +332,11 @@ class LoggedExecutor(Executor):
         self._openings: list[_Waiting] = []
         self._designs: list[tuple[tuple[str, str], _Waiting]] = []
 
-    def tell(self, step: LoggedStep) -> None:
+    def load_step(self, step: LoggedStep) -> None:
         """What ends in a step."""
-        for told in step.of(DevicesOpened):
-            self._opened[told.loop].append(told)
-        self._designed = [(told.loop, told.target) for told in step.of(ControllerChange)]
+        for message in step.of(DevicesOpened):
+            self._opened[message.loop].append(message)
+        self._designed = [(message.loop, message.target) for message in step.of(ControllerChange)]
         self._end_what_ends()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
@@ -347,7 +353,7 @@ class LoggedExecutor(Executor):
             self._designs.append(((loop, controller), waiting))
         elif fn is close_devices:
             future.set_result(None)
-        # What the piezo amplifier answers is told to its watch as the log has it.
+        # What the piezo amplifier answers reaches its watch as the log has it.
         self._end_what_ends()
         return future
 
@@ -364,10 +370,10 @@ class LoggedExecutor(Executor):
 
     def _found(self, loops: Sequence[str]) -> Opened:
         opened = [self._opened[loop].popleft() for loop in loops]
-        for told in opened:
-            if told.error:
-                raise logged_error("DeviceError", told.error)
-        return Opened({}, {told.loop: _stacks(told) for told in opened})
+        for message in opened:
+            if message.error:
+                raise logged_error("DeviceError", message.error)
+        return Opened({}, {message.loop: _stacks(message) for message in opened})
 
 
 def _end(waiting: _Waiting) -> None:
@@ -381,5 +387,6 @@ def _stacks(message: Any) -> Floats:
     return np.array([message.stack1_v, message.stack2_v, message.stack3_v])
 
 
-def _az_el(message: Any, name: str) -> Floats:
+def az_el(message: Any, name: str) -> Floats:
+    """Both axes of a field of a record, shape (2,)."""
     return np.array([getattr(message, f"{name}_az_rad"), getattr(message, f"{name}_el_rad")])

@@ -63,6 +63,9 @@ class LoggedStep:
     ticks : dict of str to Message
         By loop; of a loop that is OFF only those with a frame.
     frame : Message or None
+        On which the ticks acted.
+    older : list of Message
+        Frames that came with it, and on which no tick acted.
     records_lost : int
         On the way to the log until then, where the recorder said so in this step.
     timing : dict of str to Message
@@ -75,9 +78,18 @@ class LoggedStep:
     before_tick: dict[str, list[Logged]] = field(default_factory=lambda: defaultdict(list))
     ticks: dict[str, Any] = field(default_factory=dict)
     frame: Any = None
+    older: list[Any] = field(default_factory=list)
     records_lost: int = 0
     timing: dict[str, Any] = field(default_factory=dict)
     reported_s: float = math.nan
+
+    def add_frame(self, message: Any, number: int) -> None:
+        """One frame of the step; one that is damaged counts for none."""
+        whole = len(message.data) == message.step * message.height
+        if number in {tick.number % 2**32 for tick in self.ticks.values()}:
+            self.frame = message if whole else None
+        elif whole:
+            self.older.append(message)
 
     def of(self, kind: type[AnyRecord], loop: str | None = None) -> list[Any]:
         """Messages of one kind, of the beginning, or of what came before a loop's tick."""
@@ -143,9 +155,7 @@ def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
             step.before_tick[loop] = before_tick.pop(loop, [])
             step.ticks[loop] = message
         elif kind is FrameRecord:
-            numbers = {tick.number % 2**32 for tick in step.ticks.values()}
-            whole = len(message.data) == message.step * message.height
-            step.frame = message if sequence in numbers and whole else None
+            step.add_frame(message, sequence)
         elif kind is LoopTiming:
             step.timing[loop] = message
         elif kind is RecorderStatus:

@@ -29,19 +29,23 @@ from fitctl.logging.records import (
     QuantityReading,
     Tick,
 )
+from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.modes import Mode
 from fitctl.replay.devices import (
     LoggedCamera,
     LoggedClock,
     LoggedExecutor,
+    LoggedMirror,
     LoggedServo,
-    LoggedStages,
     NoDevice,
+    az_el,
     logged_error,
 )
 from fitctl.replay.log import LoggedStep
 from fitctl.replay.result import COMPARED, LoopReplay, ReplayResult
+from fitctl.stages.journal import Journal
+from fitctl.stages.siderostat import SiderostatStage
 from fitctl.supervisor.supervisor import Supervisor
 
 # Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well.
@@ -62,65 +66,72 @@ class Replay:
         self._clock = LoggedClock()
         self._camera = LoggedCamera()
         self._executor = LoggedExecutor()
+        self._servos = {name: LoggedServo(name, rig, self._clock) for name in rig.loops}
+        self._mirrors = {name: LoggedMirror(name, rig, self._clock) for name in rig.loops}
         nothing = NoDevice()
         devices = {name: LoopDevices(nothing, nothing, nothing) for name in rig.loops}
         self._supervisor = Supervisor(
-            rig, Devices(self._camera, devices), self._clock, self._executor, self._take
+            rig,
+            Devices(self._camera, devices),
+            self._clock,
+            self._executor,
+            self._receive,
+            self._make_loop,
         )
-        self._servos: dict[str, LoggedServo] = {}
-        self._stages: dict[str, LoggedStages] = {}
-        for name, loop in self._supervisor.loops.items():
-            servo = self._servos[name] = LoggedServo(name, rig, self._clock)
-            stages = self._stages[name] = LoggedStages(name, rig, servo, self._clock)
-            loop.servo = self._supervisor.servos[name] = servo
-            loop.stages = stages
         self._step = LoggedStep()
         self._waiting: set[str] = set()
+
+    def _make_loop(
+        self, name: str, rig: Rig, _devices: LoopDevices, journal: Journal
+    ) -> StellarLoop:
+        siderostat = SiderostatStage(rig, name, self._servos[name])
+        return StellarLoop(name, rig, siderostat, self._mirrors[name], journal)
 
     def play(self, step: LoggedStep) -> None:
         """Make one step as it was made then, and compare its ticks with the log's."""
         self._step, self._waiting = step, set(step.ticks)
         self.result.records_lost = max(self.result.records_lost, step.records_lost)
-        self._tell(step)
+        self._load_step(step)
         self._supervisor.step()
         for name in self._waiting:  # today they are OFF, which gives no tick
             self._compare(name, None)
 
-    def _tell(self, step: LoggedStep) -> None:
+    def _load_step(self, step: LoggedStep) -> None:
         supervisor = self._supervisor
         for reading in step.of(QuantityReading):
-            self._clock.tell(reading.time_s)
-            supervisor.measured(reading.name, reading.value)
-        self._clock.tell(_begin_s(step))
-        self._camera.tell(step)
-        self._executor.tell(step)
+            self._clock.set(reading.time_s)
+            supervisor.report_quantity(reading.name, reading.value)
+        self._clock.set(_begin_s(step))
+        self._camera.load_step(step)
+        self._executor.load_step(step)
         for name, servo in self._servos.items():
-            servo.tell(step)
-            self._stages[name].tell(step)
+            servo.load_step(step)
+            self._mirrors[name].load_step(step)
             for failure in step.of(DeviceFailure, name):
                 if failure.device == "piezo":
-                    supervisor.piezos[name].take(_piezo_answer(failure))
+                    supervisor.piezos[name].evaluate(_piezo_answer(failure))
         for reading in step.of(PiezoReading):
-            supervisor.piezos[reading.loop].take(_piezo_answer(reading))
+            supervisor.piezos[reading.loop].evaluate(_piezo_answer(reading))
         for command in step.of(CommandRecord):
-            if command.accepted and command.command not in _OF_PEOPLE:
+            # A refused Off takes the mirror to its bias.
+            if command.command not in _OF_PEOPLE and (command.accepted or command.command == "Off"):
                 self._post(command)
 
-    def _post(self, told: Any) -> None:
+    def _post(self, message: Any) -> None:
         try:
-            arguments = msgspec.json.decode(told.values_json)
-            given = arguments | {"type": told.command, "loop": told.loop}
+            arguments = msgspec.json.decode(message.values_json)
+            given = arguments | {"type": message.command, "loop": message.loop}
             command = msgspec.convert(given, AnyCommand)
         except msgspec.MsgspecError as error:
-            self._answered(told.command, Reply(accepted=False, text=f"not a command: {error}"))
+            self._answered(message, Reply(accepted=False, text=f"not a command: {error}"))
             return
-        self._supervisor.post(command, lambda reply: self._answered(told.command, reply))
+        self._supervisor.post(command, lambda reply: self._answered(message, reply))
 
-    def _answered(self, command: str, reply: Reply) -> None:
-        if not reply.accepted:
-            self.result.refused.append(f"{command}: {reply.text}")
+    def _answered(self, message: Any, reply: Reply) -> None:
+        if message.accepted and not reply.accepted:
+            self.result.refused.append(f"{message.command}: {reply.text}")
 
-    def _take(self, record: AnyRecord) -> None:
+    def _receive(self, record: AnyRecord) -> None:
         """What today's supervisor records, while it does."""
         match record:
             case ModeChange() | ControllerChange():
@@ -130,7 +141,7 @@ class Replay:
                 self._compare(record.loop, record)
 
     def _compare(self, name: str, now: Tick | None) -> None:
-        then, stages, found = self._step.ticks[name], self._stages[name], self.result.loops[name]
+        then, mirror, found = self._step.ticks[name], self._mirrors[name], self.result.loops[name]
         found.ticks += 1
         found.frames_missing += then.number >= 0 and self._step.frame is None
         mode = Mode.OFF.name if now is None else now.mode
@@ -138,17 +149,19 @@ class Replay:
         if now is not None and mode == then.mode:
             for what, fields in COMPARED.items():
                 values = (
-                    tuple(stages.wanted_v.tolist())
+                    tuple(mirror.wanted_v.tolist())
                     if what == "stacks_v"
                     else tuple(getattr(now, part) for part in fields)
                 )
                 logged = tuple(getattr(then, part) for part in fields)
                 found.differences[what].add(then.time_s, logged, values)
-        stages.follow()
-        self._supervisor.loops[name].measured.of_tick(then.compute_s, then.time_s)
-        self._clock.tell(then.time_s)
+        mirror.follow()
+        loop = self._supervisor.loops[name]
+        loop.siderostat.setpoint_rad = az_el(then, "siderostat_setpoint")
+        loop.quantities.record_tick(then.compute_s, then.time_s)
+        self._clock.set(then.time_s)
         if not self._waiting:
-            self._clock.tell(self._step.reported_s)
+            self._clock.set(self._step.reported_s)
         if math.isnan(self.result.start_s):
             self.result.start_s = then.time_s
         self.result.end_s = then.time_s
@@ -179,12 +192,12 @@ def _begin_s(step: LoggedStep) -> float:
     return step.begin[0].message.time_s if step.begin else math.nan
 
 
-def _piezo_answer(told: Any) -> Future:
+def _piezo_answer(message: Any) -> Future:
     """A piezo amplifier's answer, or its error."""
     future: Future = Future()
-    if hasattr(told, "error"):
-        future.set_exception(logged_error(told.kind, told.error))
+    if hasattr(message, "error"):
+        future.set_exception(logged_error(message.kind, message.error))
     else:
-        values = {name: getattr(told, name) for name in PiezoReading.__struct_fields__}
+        values = {name: getattr(message, name) for name in PiezoReading.__struct_fields__}
         future.set_result(PiezoReading(**values))
     return future

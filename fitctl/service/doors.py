@@ -43,7 +43,7 @@ class Door:
         self.router = router
         self._frames: list[zmq.Frame] = []
 
-    def take(self, messages: int) -> list[Parcel]:
+    def receive(self, messages: int) -> list[Parcel]:
         """What is in the frames of so many messages, at most.
 
         What is not of the right shape is thrown away, however many parts it has.

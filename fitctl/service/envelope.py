@@ -27,7 +27,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown
     """All keys that may come in, as of now, and what people should know."""
 
     keys: list[AllowedKey]
-    told: list[tuple[Severity, str]]
+    events: list[tuple[Severity, str]]
 
 
 def decode_envelope(payload: bytes) -> Passed | Report | None:

@@ -40,7 +40,7 @@ _LOOK_S = 0.25
 _HUNG_S = 10
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
 _NO_SUPERVISOR = Reply(accepted=False, text="the supervisor takes no commands just now; try again")
-_UNTOLD = 100  # lines that wait for a supervisor that takes none
+_MOST_EVENTS = 100  # lines that wait for a supervisor that takes none
 
 Route = tuple[bytes, bytes]
 """Identity and tag of whoever asked; the supervisor hands it back with its reply."""
@@ -62,15 +62,15 @@ def show_life() -> None:
     signal.alarm(_HUNG_S)
 
 
-def judge(
+def admit(
     key: AllowedKey | None, address: str, payload: bytes, intake: Intake, now_s: float
 ) -> Passed | Reply:
     """What becomes of a message: it is passed on for its key (None if that was revoked), or turned back."""
     if key is None:
         return _REVOKED
-    taken = intake.take(key.name, payload, now_s)
-    if isinstance(taken, Reply):
-        return taken
+    accepted = intake.accept(key.name, payload, now_s)
+    if isinstance(accepted, Reply):
+        return accepted
     return Passed(name=key.name, role=key.role, address=address, payload=payload)
 
 
@@ -99,13 +99,13 @@ class Gateway:
         self._clock = clock
         self._alive = alive
         self._intake = Intake(service.commands_per_s)
-        self._told: deque[tuple[Severity, str]] = deque(maxlen=_UNTOLD)
+        self._events: deque[tuple[Severity, str]] = deque(maxlen=_MOST_EVENTS)
         self._reported: dict[str, AllowedKey] | None = None
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode_route = msgspec.msgpack.Decoder(Route).decode
         self._context = zmq.Context()
         try:
-            self._keyed = KeyedDoor(rig, self._context, partial(self._tell, "warning"))
+            self._keyed = KeyedDoor(rig, self._context, partial(self._report_event, "warning"))
         except BaseException:
             self._context.destroy(linger=0)
             raise
@@ -120,7 +120,7 @@ class Gateway:
         self._telemetry.subscribe(b"")
         self._telemetry.connect(f"ipc://{folder / TELEMETRY_SOCKET}")
         ports = f"ports {service.command_port} and {service.telemetry_port}"
-        self._tell("info", f"listening at {service.tcp_address}, {ports}")
+        self._report_event("info", f"listening at {service.tcp_address}, {ports}")
 
     def run(self, ending: threading.Event) -> None:
         """Serve until `ending`; however much comes in, a bounded part of it is taken in each round."""
@@ -136,7 +136,7 @@ class Gateway:
                     self._alive()
                     self._keyed.refresh()
                     for line in self._intake.dropped(now_s):
-                        self._tell("warning", line)
+                        self._report_event("warning", line)
                     look_s = now_s + _LOOK_S
                 self._keyed.admit(_HANDSHAKES_A_ROUND)
                 self._report()  # of a key first, then what it says
@@ -156,17 +156,17 @@ class Gateway:
         for _ in range(_MESSAGES_A_ROUND):
             if not self._supervisor.poll(0, zmq.POLLOUT):
                 return
-            for parcel in self._keyed.door.take(1):
+            for parcel in self._keyed.door.receive(1):
                 self._receive(parcel)
 
     def _receive(self, parcel: Parcel) -> None:
         key = self._keyed.key_of(parcel.payload)
         address = frame_property(parcel.payload, "Peer-Address")
         payload, now_s = bytes(parcel.payload.buffer), self._clock.now_s()
-        judged = judge(key, address, payload, self._intake, now_s)
-        if isinstance(judged, Reply):
-            self._answer(parcel, judged)
-        elif not self._send(self._encode((parcel.identity, parcel.tag)), judged):
+        admitted = admit(key, address, payload, self._intake, now_s)
+        if isinstance(admitted, Reply):
+            self._answer(parcel, admitted)
+        elif not self._send(self._encode((parcel.identity, parcel.tag)), admitted):
             self._answer(parcel, _NO_SUPERVISOR)
 
     def _pass_replies(self) -> None:
@@ -197,14 +197,14 @@ class Gateway:
     def _report(self) -> None:
         """Tell the supervisor what is new; what it does not take now waits."""
         keys = self._keyed.allowed
-        if self._told or keys is not self._reported:
-            report = Report(keys=list(keys.values()), told=list(self._told))
+        if self._events or keys is not self._reported:
+            report = Report(keys=list(keys.values()), events=list(self._events))
             if self._send(b"", report):
-                self._told.clear()
+                self._events.clear()
                 self._reported = keys
 
-    def _tell(self, severity: Severity, text: str) -> None:
-        self._told.append((severity, text))
+    def _report_event(self, severity: Severity, text: str) -> None:
+        self._events.append((severity, text))
 
     def _send(self, route: bytes, envelope: Passed | Report) -> bool:
         try:

@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 from fitctl.messages.commands import AnyCommand, Reply, Stop, decode_command
 
-_TELL_S = 5.0
+_REPORT_PERIOD_S = 5.0
 
 
-class Taken(NamedTuple):
+class Accepted(NamedTuple):
     """A command; a stop is taken even when it is one too many."""
 
     command: AnyCommand
-    is_too_many: bool
+    over_rate: bool
 
 
 class Intake:
@@ -37,9 +37,9 @@ class Intake:
         )
         self._buckets: dict[str, tuple[float, float]] = {}
         self._dropped: Counter[tuple[str, str]] = Counter()
-        self._tell_s = 0.0
+        self._report_s = 0.0
 
-    def take(self, name: str, payload: bytes, now_s: float) -> Taken | Reply:
+    def accept(self, name: str, payload: bytes, now_s: float) -> Accepted | Reply:
         """Somebody's message: the command in it, or why it is turned back."""
         command = decode_command(payload)
         within_rate = self.within_rate(name, now_s)
@@ -49,7 +49,7 @@ class Intake:
         if isinstance(command, Reply):
             self.drop(name, "no commands")
             return command
-        return Taken(command, not within_rate)
+        return Accepted(command, not within_rate)
 
     def within_rate(self, name: str, now_s: float) -> bool:
         """Count one message; whether its sender may send so many."""
@@ -64,9 +64,9 @@ class Intake:
 
     def dropped(self, now_s: float) -> list[str]:
         """What is to be told of it now; nothing if something was told a moment ago."""
-        if not self._dropped or now_s < self._tell_s:
+        if not self._dropped or now_s < self._report_s:
             return []
-        self._tell_s = now_s + _TELL_S
+        self._report_s = now_s + _REPORT_PERIOD_S
         lines = [f"{name}: {count} messages, {why}" for (name, why), count in self._dropped.items()]
         self._dropped.clear()
         return lines

@@ -29,7 +29,7 @@ class KeyedDoor:
     rig : Rig
     context : zmq.Context
         It answers who may come in for all of its sockets (ZAP).
-    note : callable
+    report : callable
         Hears of key files that cannot be used.
 
     Attributes
@@ -46,12 +46,12 @@ class KeyedDoor:
     """
 
     def __init__(
-        self, rig: Rig, context: zmq.Context[zmq.Socket[bytes]], note: Callable[[str], None]
+        self, rig: Rig, context: zmq.Context[zmq.Socket[bytes]], report: Callable[[str], None]
     ) -> None:
         self.allowed: dict[str, AllowedKey] = {}
         self._rig = rig
         self._context = context
-        self._note = note
+        self._report = report
         self._pair = server_pair(rig)
         self._signature: object = None
         self._publisher: zmq.Socket[bytes] | None = None
@@ -121,7 +121,7 @@ class KeyedDoor:
         self._signature = signature
         before, (self.allowed, problems) = self.allowed, allowed_keys(self._rig)
         for problem in problems:
-            self._note(problem)
+            self._report(problem)
         gone = any(self.allowed.get(public) != key for public, key in before.items())
         if gone and self._publisher is not None:
             self._publisher.close(linger=0)

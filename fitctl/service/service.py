@@ -44,7 +44,7 @@ GATEWAY = "gateway"  # of what that tells
 _ROUND_MS = 5
 _MESSAGES_A_ROUND = 8
 _JOINED_STOPS = 1000
-_TELL_S = 0.25
+_REPORT_PERIOD_S = 0.25
 
 
 class Waiting(NamedTuple):
@@ -110,7 +110,7 @@ class Service(threading.Thread):
         poller = zmq.Poller()
         for door in (self._local, self._gateway):
             poller.register(door.router, zmq.POLLIN)
-        publish_s = tell_s = self._clock.now_s()
+        publish_s = report_s = self._clock.now_s()
         try:
             while not self._ending.is_set():
                 if poller.poll(_ROUND_MS):
@@ -122,10 +122,10 @@ class Service(threading.Thread):
                 if now_s >= publish_s:
                     self._publish(now_s)
                     publish_s = max(publish_s + self._period_s, now_s)
-                if now_s >= tell_s:
+                if now_s >= report_s:
                     for line in self._intake.dropped(now_s):
-                        self._supervisor.note("warning", SOURCE, line)
-                    tell_s = now_s + _TELL_S
+                        self._supervisor.report_event("warning", SOURCE, line)
+                    report_s = now_s + _REPORT_PERIOD_S
             self._send_replies()
             self._publish(self._clock.now_s())
         finally:
@@ -137,12 +137,12 @@ class Service(threading.Thread):
 
     def _serve(self) -> None:
         """Take a bounded number of messages from each door."""
-        for parcel in self._local.take(_MESSAGES_A_ROUND):
+        for parcel in self._local.receive(_MESSAGES_A_ROUND):
             waiting = Waiting(
                 self._local, parcel.identity, parcel.tag, local_sender(parcel.payload)
             )
             self._receive(waiting, bytes(parcel.payload.buffer))
-        for parcel in self._gateway.take(_MESSAGES_A_ROUND):
+        for parcel in self._gateway.receive(_MESSAGES_A_ROUND):
             self._open(parcel.identity, parcel.tag, bytes(parcel.payload.buffer))
 
     def _open(self, identity: bytes, tag: bytes, payload: bytes) -> None:
@@ -152,29 +152,31 @@ class Service(threading.Thread):
                 sender = Sender(passed.name, passed.address, passed.role, is_local=False)
                 self._receive(Waiting(self._gateway, identity, tag, sender), passed.payload)
             case Report() as report:
-                self._heed(report)
+                self._apply_report(report)
             case None:
                 self._intake.drop(GATEWAY, "no envelopes")
 
-    def _heed(self, report: Report) -> None:
+    def _apply_report(self, report: Report) -> None:
         """Take the instrument from whoever is no longer let in, and tell what the gateway has to say."""
         before, self._keys = self._keys, {key.name: key for key in report.keys}
         for name, key in before.items():
             if self._keys.get(name) != key:
                 self._admission.release(name)
-                self._supervisor.note("warning", SOURCE, f"the key {name} was revoked or changed")
-        for severity, text in report.told:
-            self._supervisor.note(severity, GATEWAY, text)
+                self._supervisor.report_event(
+                    "warning", SOURCE, f"the key {name} was revoked or changed"
+                )
+        for severity, text in report.events:
+            self._supervisor.report_event(severity, GATEWAY, text)
 
     def _receive(self, waiting: Waiting, payload: bytes) -> None:
         sender, now_s = waiting.sender, self._clock.now_s()
-        taken = self._intake.take(sender.name, payload, now_s)
-        if isinstance(taken, Reply):
-            self._answer(waiting, taken)
-        elif taken.is_too_many and self._joins_a_stop(waiting, taken.command):
+        accepted = self._intake.accept(sender.name, payload, now_s)
+        if isinstance(accepted, Reply):
+            self._answer(waiting, accepted)
+        elif accepted.over_rate and self._joins_a_stop(waiting, accepted.command):
             self._intake.drop(sender.name, "stops besides one under way")
         else:
-            self._obey(waiting, taken.command, now_s)
+            self._obey(waiting, accepted.command, now_s)
 
     def _joins_a_stop(self, waiting: Waiting, command: AnyCommand) -> bool:
         """Whether this stop, of too many, waits for the answer to one that is under way."""
@@ -196,8 +198,8 @@ class Service(threading.Thread):
             case RecentEvents():
                 events = self._buffer.recent_events()
                 text = f"the last {len(events)} events"
-                told = Reply(accepted=True, text=text, events=events)
-                self._answer_here(waiting, command, told)
+                reply = Reply(accepted=True, text=text, events=events)
+                self._answer_here(waiting, command, reply)
             case RecorderReport():
                 self._buffer.recorder = command.status
                 self._answer_here(waiting, command, Reply(accepted=True))
@@ -212,11 +214,11 @@ class Service(threading.Thread):
                 self._supervisor.post(command, done, sender.name, sender.address)
 
     def _taken_over(self, before: str, now: str) -> str:
-        told = f"{now} has the instrument"
+        text = f"{now} has the instrument"
         if before not in {"", now}:
-            told += f", taken over from {before}"
-            self._supervisor.note("warning", SOURCE, told)
-        return told
+            text += f", taken over from {before}"
+            self._supervisor.report_event("warning", SOURCE, text)
+        return text
 
     def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
         """Leave the reply for this thread; called from the supervisor's."""

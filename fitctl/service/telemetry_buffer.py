@@ -21,7 +21,6 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.loop.loop_state import loop_state
 from fitctl.messages.telemetry import Telemetry
 from fitctl.supervisor.supervisor import Supervisor
 
@@ -54,11 +53,11 @@ class CountingBuffer(Generic[T]):
 
     def drain(self) -> list[T]:
         """Take all of them, oldest first."""
-        taken: list[T] = []
+        drained: list[T] = []
         with suppress(IndexError):
             while True:
-                taken.append(self._waiting.popleft())
-        return taken
+                drained.append(self._waiting.popleft())
+        return drained
 
 
 class TelemetryBuffer:
@@ -105,7 +104,7 @@ class TelemetryBuffer:
             wall_minus_monotonic_s=state.wall_minus_monotonic_s,
             rig_name=supervisor.rig.name,
             pid=state.pid,
-            loops=[loop_state(supervisor.rig, loop, now_s) for loop in supervisor.loops.values()],
+            loops=[loop.state(now_s) for loop in supervisor.loops.values()],
             ticks=self._ticks.drain(),
             events=events,
             mode_changes=self._changes.drain(),
@@ -122,14 +121,14 @@ class TelemetryBuffer:
 
     def recent_events(self) -> list[Event]:
         """The newest that were published, oldest first, as many as one answer may hold."""
-        told: deque[Event] = deque()
+        newest: deque[Event] = deque()
         room_bytes = _REMEMBERED_BYTES
         for event in reversed(self._published):
             room_bytes -= len(msgspec.msgpack.encode(event))
             if room_bytes < 0:
                 break
-            told.appendleft(event)
-        return list(told)
+            newest.appendleft(event)
+        return list(newest)
 
     def losses(self, state: ServiceState, now_s: float) -> Losses:
         """What every queue has let go so far."""

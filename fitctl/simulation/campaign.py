@@ -1,4 +1,4 @@
-"""Many runs of one rig, on every core or on a Dask cluster, and what they say together.
+"""Many runs of one rig, on every core or on a Dask cluster, and their statistics.
 
 A run of a campaign with seed s is the run that `fitctl simulate --seed s` makes.
 """
@@ -12,16 +12,17 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from fitctl.config import ConfigError, Rig
 from fitctl.simulation.batch.batch import Batch
-from fitctl.simulation.batch.settings import TooLargeForBatchError
+from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import simulate
 from fitctl.simulation.statistics import SimulationResult
 
@@ -58,7 +59,7 @@ class SeedRms:
 
 @dataclass(frozen=True)
 class LoopSummary:
-    """What the runs say of one loop.
+    """Statistics of one loop over all runs.
 
     Attributes
     ----------
@@ -84,22 +85,34 @@ class LoopSummary:
     worst_seeds: list[SeedRms]
 
 
+class _Runner(NamedTuple):
+    """The quickest way to a rig's runs, and why that is not the batch."""
+
+    run: Callable[[int, float], dict[str, SimulationResult]]
+    refusal: str
+
+
 def run_seeds(rig_json: str, seeds: Sequence[int], duration_s: float) -> Results:
     """Some runs one after the other; what a worker does."""
-    run = _runner(rig_json)
+    run = _runner(rig_json).run
     return {seed: run(seed, duration_s) for seed in seeds}
 
 
+def batch_refusal(rig_json: str) -> str:
+    """Why this process simulates the rig without the batch, a hundred times slower; empty if it does not."""
+    return _runner(rig_json).refusal
+
+
 @functools.lru_cache(maxsize=4)
-def _runner(rig_json: str) -> Callable[[int, float], dict[str, SimulationResult]]:
-    """The quickest way to a rig's runs. Its designs and tables take longer to make than a run."""
+def _runner(rig_json: str) -> _Runner:
+    """A rig's designs and tables take longer to make than a run."""
     rig = Rig.model_validate_json(rig_json)
-    if len(rig.loops) == 1:
-        with suppress(ImportError, TooLargeForBatchError):
-            (name,), batch = rig.loops, Batch(rig)
-            return lambda seed, duration_s: {name: batch.result(seed, duration_s)}
-    # Without numba, or with more than a batch holds: the same runs, slower.
-    return partial(simulate, rig)
+    try:
+        batch = Batch(rig)
+    except BatchRefusalError as refusal:
+        return _Runner(partial(simulate, rig), str(refusal))
+    (name,) = rig.loops
+    return _Runner(lambda seed, duration_s: {name: batch.result(seed, duration_s)}, "")
 
 
 def run_campaign(
@@ -109,10 +122,12 @@ def run_campaign(
     executor: Executor,
     workers: int,
     on_progress: Callable[[int], None] = lambda _: None,
+    on_refusal: Callable[[str], None] = lambda _: None,
 ) -> Results:
     """All runs on an executor's workers; by seed, in the order of `seeds`.
 
-    `on_progress` is called with the number of runs done, as they come.
+    `on_progress` is called with the number of runs done, as they come. `on_refusal` is called once, with
+    the reason, if the workers cannot use the batch.
 
     Raises
     ------
@@ -122,9 +137,12 @@ def run_campaign(
     per_task = max(1, min(_MOST_RUNS_PER_TASK, math.ceil(len(seeds) / (workers * _TASKS_PER_CORE))))
     tasks = [seeds[first : first + per_task] for first in range(0, len(seeds), per_task)]
     rig_json = rig.model_dump_json()
+    refusal: Future[str] = executor.submit(batch_refusal, rig_json)
     futures = [executor.submit(run_seeds, rig_json, task, duration_s) for task in tasks]
     done: Results = {}
     try:
+        if reason := refusal.result():
+            on_refusal(reason)
         for future in as_completed(futures):
             done |= future.result()
             on_progress(len(done))
@@ -207,7 +225,7 @@ def dask_executor(address: str, workers: int = 1) -> Iterator[tuple[Executor, in
 
 
 def summarize(results: Results) -> dict[str, LoopSummary]:
-    """What all runs say of each loop."""
+    """Statistics of each loop over all runs."""
     loops = next(iter(results.values()))
     return {
         name: _summarize({seed: loops[name] for seed, loops in results.items()}) for name in loops

@@ -94,7 +94,7 @@ class SimulatedMirror:
         self._plant = plant
         self._clock = clock
         self._stack_v = plant.inputs.stack_v[0]
-        self._step_v = fsm.dac.full_scale_v / (2**fsm.dac.bits - 1)
+        self._step_v = fsm.dac.step_v
         self._gain = fsm.piezo.gain
         self._limit_v = fsm.piezo.limit_v
         self._most_v = fsm.piezo.limit_v / fsm.piezo.gain
@@ -103,11 +103,14 @@ class SimulatedMirror:
         """Nothing to connect."""
         return _identity("mirror")
 
-    def write_v(self, volts: Floats) -> None:
+    def send_v(self, volts: Floats) -> None:
         """Set the stacks at the present virtual time."""
         self._plant.advance(self._clock.now_s())
         step_v, most_v = self._step_v, self._most_v
         self._stack_v[:] = [min(round(volt / step_v) * step_v, most_v) for volt in volts.tolist()]
+
+    def confirm(self) -> None:
+        """Done when it was sent."""
 
     def read_v(self) -> Floats:
         """What the D/A is set to."""
@@ -161,8 +164,10 @@ class SimulatedCamera:
         """Go on to the next frame's arrival, or by `timeout_s`."""
         exposed_s = self._start_s + self._frames * self._camera.period_s
         arrives_s = exposed_s + self._camera.frame_delay_s
-        if arrives_s > self._clock.now_s() + timeout_s + 1e-9:
-            self._go_on_to(self._clock.now_s() + timeout_s)
+        now_s = self._clock.now_s()
+        if arrives_s > now_s + timeout_s + 1e-9:
+            if timeout_s > 0.0:
+                self._go_on_to(now_s + timeout_s)
             return None
         self._go_on_to(arrives_s)
         self._frames += 1
@@ -182,11 +187,11 @@ class SimulatedCamera:
         """Nothing to disconnect."""
 
     def _go_on_to(self, time_s: float) -> None:
-        due = self._due
+        due, works, sleep_until = self._due, self.on_servo_period, self._clock.sleep_until
         while due[0][0] <= time_s:
             due_s, which = due[0]
-            period_s, run = self.on_servo_period[which]
-            self._clock.sleep_until(due_s)
+            period_s, run = works[which]
+            sleep_until(due_s)
             run()
             heapq.heapreplace(due, (due_s + period_s, which))
-        self._clock.sleep_until(time_s)
+        sleep_until(time_s)

@@ -86,7 +86,7 @@ class Injector:
         with self._turn:
             pass
 
-    def take_written(self) -> list[Injection]:
+    def drain_written(self) -> list[Injection]:
         """What was written since last asked."""
         return [self._written.popleft() for _ in range(len(self._written))]
 
@@ -100,7 +100,8 @@ class Injector:
             try:
                 wanted = self.volts(self._drives, self._clock.now_s() - self._start_s)
                 volts = np.clip(wanted, 0.0, self._full_scale_v)
-                self._dac.write_v(volts)
+                self._dac.send_v(volts)
+                self._dac.confirm()
             except Exception as error:  # else the thread would end, and nothing ever move again
                 self.fault = error
                 self._running.clear()

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fitctl.clock import Clock
 from fitctl.config import Loop
-from fitctl.controllers.position_servo import PositionServo
+from fitctl.controllers.position_servo import position_servo
 from fitctl.drivers.interface import (
     AzEl,
     DeviceError,
@@ -105,30 +105,25 @@ class SiderostatServo:
         self._settings = siderostat.servo
         self._amplifiers = amplifiers
         self._clock = clock
-        self._servo = PositionServo(
-            siderostat.servo.gain_per_s,
-            siderostat.velocity_limit_rad_s,
-            siderostat.acceleration_limit_rad_s2,
-            self.period_s,
-            setpoint_period_s,
-            2 * math.pi / siderostat.encoder_counts_per_rev,
-        )
+        self._servo = position_servo(siderostat, setpoint_period_s)
         self._stopped = True
         self._position_rad: AzEl = (0.0, 0.0)
-        self._wish_rad: AzEl | None = None
+        self._wanted_rad: AzEl | None = None  # written by other threads, never by the servo's
+        self._applied_rad: AzEl | None = None  # the newest of those that the servo has read
         self._requests: deque[tuple[Callable[[], DeviceIdentity | None], Future]] = deque()
         self._history: deque[ServoReading] = deque(maxlen=round(HISTORY_S / self.period_s))
         self._blind_s = 1.0 / siderostat.servo.gain_per_s  # an older reading would make it swing
         self._read_s = -math.inf
         self._timely_s = 0.0
         self._missed_readings = 0
+        self._drained = (0, 0)  # missed and skipped, as last asked
         self._followed_s = 0.0
         self.encoders_jumped = False
         self._disabling = False
         self.late_s: deque[float] = deque(maxlen=4096)
         self.skipped = 0
         self.round_trip_s = 0.0
-        self._least_following_rad = math.nan
+        self._following_rad: deque[float] = deque(maxlen=4096)
 
     # ------------------------------------------------------------ from any thread
 
@@ -141,21 +136,25 @@ class SiderostatServo:
         """Wanted motor angles one set-point period from now, shape (2,)."""
         self.setpoint_rad = setpoint_rad
         az_rad, el_rad = setpoint_rad.tolist()
-        self._wish_rad = (az_rad, el_rad)
+        self._wanted_rad = (az_rad, el_rad)
 
     def stop(self) -> None:
         """Velocity zero from the next period on, until :meth:`hold`."""
         self._stopped = True
-        self._wish_rad = None
+        self._wanted_rad = None
 
     def hold(self, position_rad: Floats) -> None:
         """Servo about where the motors are, shape (2,), by their newest reading."""
         self.move_to(position_rad)
         self._stopped = False
 
-    def look(self) -> ServoState:
+    def read_state(self) -> ServoState:
         """How it is now; the following error is taken anew from here on."""
-        following_rad, self._least_following_rad = self._least_following_rad, math.nan
+        following_rad = math.nan
+        for _ in range(len(self._following_rad)):
+            following_error_rad = self._following_rad.popleft()
+            if not following_rad <= following_error_rad:  # not a number fails this too
+                following_rad = following_error_rad
         try:
             reading = self._history[-1]
         except IndexError:  # none since it was opened
@@ -178,24 +177,25 @@ class SiderostatServo:
 
     def open(self) -> DeviceIdentity:
         """Connect, clear a latched fault, read the encoders and enable; the motors stand still."""
-        return self._ask(self._open)
+        return self._request(self._open)
 
     def disable(self) -> None:
         """Take power from the motors, without waiting for it; a failure shows as a fault."""
         if self.opened and self.enabled and not self._disabling:
             self._disabling = True
-            self._post(self._disable)
+            self._queue_request(self._disable)
 
     def close(self) -> None:
         """Disable and disconnect."""
-        self._ask(self._close)
+        self._request(self._close)
 
-    def take_timing(self) -> ServoTiming:
+    def drain_timing(self) -> ServoTiming:
         """Lateness, missed readings and skipped periods since the last call."""
         late = [self.late_s.popleft() for _ in range(len(self.late_s))]
-        missed, self._missed_readings = self._missed_readings, 0
-        skipped, self.skipped = self.skipped, 0
-        return ServoTiming(late, missed, skipped)
+        # The servo's thread counts on and on: what it counts meanwhile is in the next difference.
+        missed, skipped = self._missed_readings, self.skipped
+        before, self._drained = self._drained, (missed, skipped)
+        return ServoTiming(late, missed - before[0], skipped - before[1])
 
     # ------------------------------------------------------------ on the servo's thread
 
@@ -230,7 +230,7 @@ class SiderostatServo:
         if reading is None:
             self._missed_readings += 1
         else:
-            self._take(reading, now_s)
+            self._accept_reading(reading, now_s)
         if now_s - self._timely_s > self._settings.reading_timeout_s:
             raise self._no_reading()
         if reading is None:
@@ -245,8 +245,7 @@ class SiderostatServo:
             self._servo.reset(reading.position_rad)
             return
         following_rad = self._servo.following_error_rad(reading.position_rad)
-        if not self._least_following_rad <= following_rad:  # not a number fails this too
-            self._least_following_rad = following_rad
+        self._following_rad.append(following_rad)
         if following_rad <= self._settings.following_error_limit_rad:
             self._followed_s = reading.time_s
         # A reversal at full speed is behind for a moment; a stuck axis stays behind.
@@ -254,16 +253,18 @@ class SiderostatServo:
             raise self._not_following(following_rad)
 
     def _velocity_rad_s(self, now_s: float) -> AzEl:
-        wish, self._wish_rad = self._wish_rad, None
+        wanted_rad = self._wanted_rad  # read once: another thread may replace it at any moment
+        is_new = wanted_rad is not self._applied_rad
+        self._applied_rad = wanted_rad
         if self._stopped or not self.enabled:
             return _STILL
-        if wish is not None:
-            self._servo.move_to(wish)
+        if is_new and wanted_rad is not None:
+            self._servo.move_to(wanted_rad)
         if now_s - self._read_s > self._blind_s:
             return _STILL  # blind motors stand still, and the reference waits for them
         return self._servo.step(self._position_rad)
 
-    def _take(self, reading: ServoReading, now_s: float) -> None:
+    def _accept_reading(self, reading: ServoReading, now_s: float) -> None:
         self._read_s = reading.time_s
         if now_s - reading.time_s <= self._blind_s:
             self._timely_s = now_s
@@ -321,7 +322,7 @@ class SiderostatServo:
         while (reading := self._amplifiers.exchange(_STILL)) is None:
             if self._clock.now_s() > deadline_s:
                 raise self._no_reading()
-        self._take(reading, self._clock.now_s())
+        self._accept_reading(reading, self._clock.now_s())
         az_rad, el_rad = reading.position_rad
         self._servo.reset(reading.position_rad)
         jump_rad = max(abs(az_rad - last_az_rad), abs(el_rad - last_el_rad))
@@ -343,13 +344,13 @@ class SiderostatServo:
         self.opened = self.enabled = False
         self._amplifiers.close()
 
-    def _post(self, action: Callable[[], DeviceIdentity | None]) -> Future:
+    def _queue_request(self, action: Callable[[], DeviceIdentity | None]) -> Future:
         future: Future = Future()
         self._requests.append((action, future))
         return future
 
-    def _ask(self, action: Callable[[], DeviceIdentity | None]) -> DeviceIdentity:
-        future = self._post(action)
+    def _request(self, action: Callable[[], DeviceIdentity | None]) -> DeviceIdentity:
+        future = self._queue_request(action)
         if not self.threaded:
             self.period()
         try:

@@ -9,6 +9,7 @@ from fitctl.config import Rig
 from fitctl.drivers.interface import CameraCounts, CameraDriver, DeviceError, Frame
 
 _SILENT_FRAMES = 10  # fewer may be missing when the machine stands still
+_MOST_OLDER = 1000  # frames of a stall; a camera that sends faster than we receive has no newest
 
 
 class CameraWatch:
@@ -26,12 +27,18 @@ class CameraWatch:
     ----------
     ready : bool
         Frames may be asked for.
+    older : list of Frame
+        That came with the newest frame: it is acted on, they are not.
+    skipped : int
+        How many those were, since the camera was opened.
     """
 
     def __init__(
         self, rig: Rig, camera: CameraDriver, clock: Clock, failed: Callable[[DeviceError], None]
     ) -> None:
         self.ready = False
+        self.older: list[Frame] = []
+        self.skipped = 0
         self._period_s = rig.camera.period_s
         self._silent_after_s = rig.camera.frame_delay_s + _SILENT_FRAMES * self._period_s
         self._camera = camera
@@ -42,20 +49,32 @@ class CameraWatch:
     def begin(self) -> None:
         """It was opened just now."""
         self.ready = True
+        self.skipped = 0
         self._last_frame_s = self._clock.now_s()
 
     def next_frame(self) -> Frame | None:
-        """Wait for it, no longer than two frame periods."""
+        """Wait for the next, no longer than two frame periods; after a stall, the newest of those that came."""
+        self.older.clear()
         if not self.ready:
             self._clock.sleep_until(self._clock.now_s() + self._period_s)
             return None
+        frame = None
         try:
             frame = self._camera.next_frame(2 * self._period_s)
+            while frame is not None and len(self.older) < _MOST_OLDER:
+                newer = self._camera.next_frame(0.0)
+                if newer is None:
+                    break
+                self.older.append(frame)
+                frame = newer
         except DeviceError as error:
             self.ready = False
+            if frame is not None:
+                self.older.append(frame)
             self._failed(error)
             return None
         if frame is not None:
+            self.skipped += len(self.older)
             self._last_frame_s = self._clock.now_s()
         return frame
 

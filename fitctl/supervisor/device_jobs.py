@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from functools import partial
 from typing import NamedTuple
 
-from fitctl.clock import Clock
 from fitctl.drivers.interface import DeviceIdentity, Devices
-from fitctl.logging.records import AnyRecord, DevicesOpened, Severity
-from fitctl.loop.loop import StellarLoop
+from fitctl.logging.records import DevicesOpened
+from fitctl.loop.loop import Loop
 from fitctl.messages.modes import Mode, Trigger
-from fitctl.stages.failures import error_text
-from fitctl.stages.servo import SiderostatServo
+from fitctl.stages.journal import Journal, error_text
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.power import Opened, close_devices, open_devices
 
-Tell = Callable[[Severity, str, str], None]
 _CLOSE_TIMEOUT_S = 30.0
 _SOURCE = "supervisor"  # of its events
 
@@ -37,15 +35,11 @@ class DeviceJobs:
     Parameters
     ----------
     devices : Devices
-    loops, servos, piezos : mappings by loop name
+    loops, piezos : mappings by loop name
     camera : CameraWatch
-    clock : Clock
     executor : Executor
         Runs device work; must run one piece at a time.
-    record : callable
-        Takes records; must not block.
-    event, note : callables
-        Take events: here and now, and from any thread.
+    journal : Journal
 
     Attributes
     ----------
@@ -56,30 +50,24 @@ class DeviceJobs:
     def __init__(
         self,
         devices: Devices,
-        loops: Mapping[str, StellarLoop],
-        servos: Mapping[str, SiderostatServo],
+        loops: Mapping[str, Loop],
         piezos: Mapping[str, PiezoWatch],
         camera: CameraWatch,
-        clock: Clock,
         executor: Executor,
-        record: Callable[[AnyRecord], None],
-        event: Tell,
-        note: Tell,
+        journal: Journal,
     ) -> None:
         self.identities: dict[str, DeviceIdentity] = {}
         self._devices = devices
         self._loops = loops
-        self._servos = servos
+        self._servos = {name: loop.servo for name, loop in loops.items()}
         self._piezos = piezos
         self._camera = camera
-        self._clock = clock
         self._executor = executor
-        self._record = record
-        self._event = event
-        self._note = note
+        self._journal = journal
         self._job: Job | None = None
         self._opening: set[str] = set()
         self._abandoned = False
+        self._closed_badly: deque[tuple[str, Exception]] = deque()  # filled by the executor
 
     @property
     def busy(self) -> bool:
@@ -89,10 +77,10 @@ class DeviceJobs:
     def open(self, names: list[str], trigger: Trigger) -> None:
         """Open the devices of these loops, then fire `trigger` on each."""
         for name in names:
-            self._loops[name].stages.ready = False
-            self._piezos[name].forget()
+            self._loops[name].release()
+        self._forget_piezos(names)
         self._opening, self._abandoned = set(names), False
-        self._event("info", _SOURCE, "opening and checking all devices")
+        self._journal.event("info", _SOURCE, "opening and checking all devices")
         with_camera = not self._camera.well
         self._camera.ready = not with_camera  # nobody asks it for frames while it is opened
         future = self._submit(open_devices, names, with_camera)
@@ -110,8 +98,9 @@ class DeviceJobs:
     def turn_off(self, names: list[str]) -> None:
         """OFF for these loops, and their devices let go."""
         for name in names:
-            self._loops[name].stages.ready = False
+            self._loops[name].release()
             self._loops[name].fire(Trigger.OFF, "operator")
+        self._forget_piezos(names)
         # The camera serves all loops; the last one out turns it off.
         with_camera = all(loop.mode is Mode.OFF for loop in self._loops.values())
         self._camera.ready = self._camera.ready and not with_camera
@@ -120,12 +109,15 @@ class DeviceJobs:
     def close_all(self) -> None:
         """Disable and let go of everything, whatever state it is in, and wait for that."""
         for loop in self._loops.values():
-            loop.stages.ready = False
+            loop.release()
         self._camera.ready = False
+        self._forget_piezos(list(self._loops))
         self._submit(close_devices, list(self._loops), True).result(timeout=_CLOSE_TIMEOUT_S)
+        self._report_closed_badly()
 
     def finish(self) -> None:
         """Do what follows from a job that has ended."""
+        self._report_closed_badly()
         job = self._job
         if job is not None and job.future.done():
             self._job = None
@@ -140,11 +132,13 @@ class DeviceJobs:
             names, None if error else future.result(), error_text(error) if error else ""
         )
         if error is not None:
-            self._event("error", _SOURCE, f"{trigger.name.lower()} failed: {error_text(error)}")
+            self._journal.event(
+                "error", _SOURCE, f"{trigger.name.lower()} failed: {error_text(error)}"
+            )
             self._close(names, with_camera)
             return
         if abandoned:
-            self._event("warning", _SOURCE, "stopped while opening; devices let go")
+            self._journal.event("warning", _SOURCE, "stopped while opening; devices let go")
             self._close(names, with_camera)
             return
         opened: Opened = future.result()
@@ -152,18 +146,20 @@ class DeviceJobs:
         self._camera.begin()
         for name in names:
             loop = self._loops[name]
-            loop.start_from(opened.stack_v[name])
-            self._piezos[name].begin()
+            loop.begin(opened.stack_v.get(name))
+            if name in self._piezos:
+                self._piezos[name].begin()
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
-            self._servos[name].take_timing()
+            self._servos[name].drain_timing()
             loop.fire(trigger, "all devices open, checked and enabled")
 
     def _log_opened(self, names: list[str], opened: Opened | None, error: str) -> None:
         for name in names:
-            v1, v2, v3 = [math.nan] * 3 if opened is None else opened.stack_v[name].tolist()
-            self._record(
+            found_v = None if opened is None else opened.stack_v.get(name)
+            v1, v2, v3 = [math.nan] * 3 if found_v is None else found_v.tolist()
+            self._journal.record(
                 DevicesOpened(
-                    time_s=self._clock.now_s(),
+                    time_s=self._journal.clock.now_s(),
                     loop=name,
                     stack1_v=v1,
                     stack2_v=v2,
@@ -180,8 +176,20 @@ class DeviceJobs:
         self, work: Callable[..., Opened | None], names: list[str], with_camera: bool
     ) -> Future:
         return self._executor.submit(
-            work, self._devices, self._servos, names, with_camera, self._closed_badly
+            work, self._devices, self._servos, names, with_camera, self._note_closed_badly
         )
 
-    def _closed_badly(self, device: str, error: Exception) -> None:
-        self._note("warning", _SOURCE, f"{device} did not close well: {error_text(error)}")
+    def _forget_piezos(self, names: list[str]) -> None:
+        for name in names:
+            if name in self._piezos:
+                self._piezos[name].forget()
+
+    def _note_closed_badly(self, device: str, error: Exception) -> None:
+        self._closed_badly.append((device, error))
+
+    def _report_closed_badly(self) -> None:
+        while self._closed_badly:
+            device, error = self._closed_badly.popleft()
+            self._journal.event(
+                "warning", _SOURCE, f"{device} did not close well: {error_text(error)}"
+            )

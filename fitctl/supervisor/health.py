@@ -7,58 +7,70 @@ from collections.abc import Mapping
 from fitctl.config import Rig
 from fitctl.drivers.interface import CameraCounts, DeviceIdentity
 from fitctl.logging.records import CAMERA, DeviceHealth
-from fitctl.loop.loop import StellarLoop
+from fitctl.loop.loop import Loop
+from fitctl.loop.stellar import StellarLoop
+from fitctl.supervisor.piezo import PiezoWatch
 
 Identities = Mapping[str, DeviceIdentity]
 
 
 def camera_health(
-    rig: Rig, counts: CameraCounts, is_open: bool, identities: Identities, now_s: float
+    rig: Rig,
+    counts: CameraCounts,
+    skipped: int,
+    is_open: bool,
+    identities: Identities,
+    now_s: float,
 ) -> DeviceHealth:
     """The camera, which all loops share."""
     return _health(
         CAMERA,
         rig.camera.device.endpoint,
         is_open,
-        f"{counts.frames} frames, {counts.lost} lost, {counts.packets_lost} packets missed",
+        f"{counts.frames} frames, {counts.lost} lost, {counts.packets_lost} packets missed, "
+        f"{skipped} skipped",
         identities,
         now_s,
     )
 
 
-def loop_health(
-    loop: StellarLoop, piezo_error: str, identities: Identities, now_s: float
-) -> list[DeviceHealth]:
-    """One loop's own devices."""
-    servo, settings, name = loop.servo, loop.settings, loop.name
+def siderostat_health(loop: Loop, identities: Identities, now_s: float) -> DeviceHealth:
+    """A loop's amplifiers."""
+    servo = loop.servo
     powered = "enabled" if servo.enabled else "disabled"
-    dac, piezo = settings.fsm.dac, settings.fsm.piezo
+    return _health(
+        f"{loop.name} siderostat",
+        servo.endpoint,
+        servo.opened,
+        str(servo.fault) if servo.fault else powered,
+        identities,
+        now_s,
+        fault=servo.fault is not None,
+    )
+
+
+def mirror_health(
+    loop: StellarLoop, piezo: PiezoWatch, identities: Identities, now_s: float
+) -> list[DeviceHealth]:
+    """What is before a loop's mirror: D/A and piezo amplifier."""
+    fsm, is_written = loop.settings.fsm, loop.mirror.ready
     return [
         _health(
-            f"{name} siderostat",
-            servo.endpoint,
-            servo.opened,
-            str(servo.fault) if servo.fault else powered,
-            identities,
-            now_s,
-            fault=servo.fault is not None,
-        ),
-        _health(
-            f"{name} D/A",
-            dac.endpoint,
-            loop.stages.ready,
-            "written every tick" if loop.stages.ready else "not written",
+            f"{loop.name} D/A",
+            fsm.dac.endpoint,
+            is_written,
+            "written every tick" if is_written else "not written",
             identities,
             now_s,
         ),
         _health(
-            f"{name} piezo",
-            piezo.port,
-            loop.stages.ready,
-            piezo_error or f"read every {piezo.poll_s:g} s",
+            f"{loop.name} piezo",
+            fsm.piezo.port,
+            piezo.is_open,
+            piezo.error or f"read every {fsm.piezo.poll_s:g} s",
             identities,
             now_s,
-            fault=bool(piezo_error),
+            fault=bool(piezo.error),
         ),
     ]
 

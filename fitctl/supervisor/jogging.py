@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.loop.loop import StellarLoop
+from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import Jog, SetBiasOffset
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
@@ -34,12 +34,12 @@ def move_by_hand(rig: Rig, loops: Sequence[StellarLoop], command: Jog | SetBiasO
         step_sky_arcsec = np.array([command.az_sky_arcsec, command.el_sky_arcsec])
         why_not = next(filter(None, (_beyond(rig, loop, step_sky_arcsec) for loop in loops)), "")
         for loop in () if why_not else loops:
-            loop.stages.jog(step_sky_arcsec)
+            loop.siderostat.jog(step_sky_arcsec)
         return why_not
     offset_rad = 1e-6 * np.array([command.az_urad, command.el_urad])
     why_not = next(filter(None, (_off_the_diamond(loop, offset_rad) for loop in loops)), "")
     for loop in () if why_not else loops:
-        loop.stages.rest_off_bias(offset_rad)
+        loop.mirror.rest_off_bias(offset_rad)
     return why_not
 
 
@@ -49,9 +49,9 @@ def _beyond(rig: Rig, loop: StellarLoop, step_sky_arcsec: Floats) -> str:
     most_arcsec = min(rig.camera.width_px, rig.camera.height_px) * scale.sky_arcsec_per_px
     if not np.abs(step_sky_arcsec).max() <= most_arcsec:  # not-a-number too
         return f"a jog is at most a field of view, {most_arcsec:.1f} arcsec on the sky"
-    stages = loop.stages
-    goes_rad = stages.setpoint_rad + step_sky_arcsec / scale.motor_sky_arcsec_per_rad
-    if np.abs(goes_rad).max() > stages.travel_rad:
+    siderostat = loop.siderostat
+    goes_rad = siderostat.setpoint_rad + step_sky_arcsec / scale.motor_sky_arcsec_per_rad
+    if np.abs(goes_rad).max() > siderostat.travel_rad:
         travel_arcsec = loop.settings.siderostat.travel_sky_arcsec
         return (
             f"siderostat {loop.name} would leave its travel of ±{travel_arcsec:g} arcsec on the sky; "

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import Rig
-from fitctl.loop.loop import StellarLoop
 from fitctl.loop.search import refused_search
+from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
@@ -45,7 +45,7 @@ def look(rig: Rig, loops: Loops, command: Look) -> str:
         return f"look means nothing in {loop.mode.name}; a star is followed in COARSE and VERNIER"
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"look {rig.camera.window_range_text}"
-    loop.sighting.look_at_px = (command.az_px, command.el_px)
+    loop.star_finder.look_at_px = (command.az_px, command.el_px)
     return ""
 
 

@@ -1,8 +1,7 @@
-"""The piezo amplifier between ticks: what it measures, and whether that is what it was told."""
+"""The piezo amplifier between ticks: what it measures, and whether that is what the D/A was sent."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor, Future
 
 import numpy as np
@@ -11,28 +10,28 @@ from numpy.typing import NDArray
 from fitctl.clock import Clock
 from fitctl.config import Mdt693Device
 from fitctl.drivers.interface import DeviceMismatch, PiezoAmplifier
-from fitctl.logging.records import AnyRecord, Event, PiezoReading
-from fitctl.loop.loop import StellarLoop
-from fitctl.stages.failures import error_text, failure_record
+from fitctl.logging.records import PiezoReading
+from fitctl.loop.stellar import StellarLoop
+from fitctl.stages.journal import Journal, error_text
 
 Floats = NDArray[np.float64]
 
 
 class PiezoWatch:
-    """Has one loop's piezo amplifier asked now and then, and judges what it answers.
+    """Has one loop's piezo amplifier asked now and then, and evaluates what it answers.
 
     Parameters
     ----------
     loop : StellarLoop
     piezo : PiezoAmplifier
-    clock : Clock
     executor : Executor
         Asks it: that takes longer than a tick.
-    record : callable
-        Takes readings and events; must not block.
+    journal : Journal
 
     Attributes
     ----------
+    is_open : bool
+        It was opened and checked, and not closed since; it is asked as long, whatever the D/A does.
     error : str
         What was wrong the last time; empty if nothing was.
     """
@@ -41,70 +40,67 @@ class PiezoWatch:
         self,
         loop: StellarLoop,
         piezo: PiezoAmplifier,
-        clock: Clock,
         executor: Executor,
-        record: Callable[[AnyRecord], None],
+        journal: Journal,
     ) -> None:
+        self.is_open = False
         self.error = ""
         self._loop = loop
         self._settings = loop.settings.fsm.piezo
         self._piezo = piezo
-        self._clock = clock
+        self._clock = journal.clock
         self._executor = executor
-        self._record = record
+        self._journal = journal
         self._asked_s = 0.0
         self._answer: Future[PiezoReading] | None = None
 
     def begin(self) -> None:
         """It was opened and checked just now."""
-        self.error = ""
+        self.is_open, self.error = True, ""
         self._asked_s = self._clock.now_s()
 
     def forget(self) -> None:
-        """It is opened anew: an answer that is still to come says nothing about it then."""
-        self._answer = None
+        """It is closed or opened anew: an answer that is still to come says nothing about it then."""
+        self.is_open, self._answer = False, None
 
     def ask(self) -> None:
-        """Ask, if it is time to."""
+        """Ask, if it is open and it is time to."""
+        if not self.is_open or self._answer is not None:
+            return
         now_s = self._clock.now_s()
-        if self._answer is None and now_s >= self._asked_s + self._settings.poll_s:
+        if now_s >= self._asked_s + self._settings.poll_s:
             self._asked_s = now_s
             self._answer = self._executor.submit(
                 read_piezo, self._piezo, self._loop.name, self._clock
             )
 
-    def judge(self) -> None:
-        """Take its answer, if it has come."""
+    def collect(self) -> None:
+        """Evaluate its answer, if it has come."""
         answer = self._answer
         if answer is None or not answer.done():
             return
         self._answer = None
-        self.take(answer)
+        self.evaluate(answer)
 
-    def take(self, answer: Future[PiezoReading]) -> None:
-        """Judge an answer: SAFE where a stack is not as told, or at the second bad one."""
-        error, told_v = answer.exception(), self._loop.stages.take_told_range()
+    def evaluate(self, answer: Future[PiezoReading]) -> None:
+        """Evaluate an answer: SAFE where a stack is not as commanded, or at the second bad answer."""
+        error, commanded_v = answer.exception(), self._loop.mirror.drain_commanded_range()
         if error is None:
             reading = answer.result()
-            self._loop.measured.of_piezo(reading)
-            self._record(reading)
-            error = disagreement(reading, self._settings, *told_v)
+            self._loop.quantities.record_piezo(reading)
+            self._journal.record(reading)
+            # Where the outputs of a D/A are that failed, nobody knows.
+            if self._loop.mirror.ready:
+                error = disagreement(reading, self._settings, *commanded_v)
         else:
-            self._record(failure_record(self._clock.now_s(), self._loop.name, "piezo", error))
+            self._journal.failure(self._loop.name, "piezo", error)
         before, self.error = self.error, "" if error is None else error_text(error)
         if error is None:
             return
         if before or isinstance(error, DeviceMismatch):
-            self._loop.fail(self.error)
+            self._loop.fail("piezo", self.error)
         else:  # on a line without checksum one bad answer says little
-            self._record(
-                Event(
-                    time_s=self._clock.now_s(),
-                    severity="warning",
-                    source=self._loop.name,
-                    message=f"{self.error}; asking again",
-                )
-            )
+            self._journal.event("warning", self._loop.name, f"{self.error}; asking again")
             self._asked_s -= self._settings.poll_s
 
 
@@ -129,14 +125,14 @@ def read_piezo(piezo: PiezoAmplifier, loop_name: str, clock: Clock) -> PiezoRead
 def disagreement(
     reading: PiezoReading, settings: Mdt693Device, lowest_v: Floats, highest_v: Floats
 ) -> DeviceMismatch | None:
-    """What was measured, where it is not what the D/A was told since the last reading.
+    """What was measured, where it is not what the D/A was sent since the last reading.
 
     Parameters
     ----------
     reading : PiezoReading
     settings : Mdt693Device
     lowest_v, highest_v : arrays, shape (3,)
-        The range of what the D/A was told, at the D/A.
+        The range of what the D/A was sent, at the D/A.
 
     Returns
     -------
@@ -144,10 +140,10 @@ def disagreement(
         Of the first stack that is outside its range by more than `follow_tolerance_v`.
     """
     measured_v = (reading.stack1_v, reading.stack2_v, reading.stack3_v)
-    told_v = np.clip(settings.gain * np.array([lowest_v, highest_v]), 0.0, settings.limit_v)
+    commanded_v = np.clip(settings.gain * np.array([lowest_v, highest_v]), 0.0, settings.limit_v)
     tolerance_v = settings.follow_tolerance_v
     for stack, volts in enumerate(measured_v):
-        low_v, high_v = told_v[:, stack]
+        low_v, high_v = commanded_v[:, stack]
         if not low_v - tolerance_v <= volts <= high_v + tolerance_v:
             return DeviceMismatch(
                 "piezo amplifier",

@@ -13,10 +13,11 @@ from fitctl.logging.records import CAMERA
 from fitctl.stages.servo import SiderostatServo
 
 ClosedBadly = Callable[[str, Exception], None]
+Servos = Mapping[str, SiderostatServo]
 
 
 class Opened(NamedTuple):
-    """What opening the devices found: who they are, and what the D/As are set to."""
+    """What opening the devices found: who they are, and by loop what its D/A is set to."""
 
     identities: dict[str, DeviceIdentity]
     stack_v: dict[str, NDArray[np.float64]]
@@ -24,7 +25,7 @@ class Opened(NamedTuple):
 
 def open_devices(
     devices: Devices,
-    servos: Mapping[str, SiderostatServo],
+    servos: Servos,
     names: Sequence[str],
     with_camera: bool,
     closed_badly: ClosedBadly,
@@ -40,9 +41,11 @@ def open_devices(
     opened = Opened({}, {})
     for name in names:
         loop = devices.loops[name]
-        opened.identities[f"{name} piezo"] = loop.piezo.open()
-        opened.identities[f"{name} D/A"] = loop.dac.open()
-        opened.stack_v[name] = loop.dac.read_v()
+        if loop.piezo is not None:
+            opened.identities[f"{name} piezo"] = loop.piezo.open()
+        if loop.dac is not None:
+            opened.identities[f"{name} D/A"] = loop.dac.open()
+            opened.stack_v[name] = loop.dac.read_v()
     if with_camera:
         opened.identities[CAMERA] = devices.camera.open()
     for name in names:
@@ -54,7 +57,7 @@ def open_devices(
 
 def close_devices(
     devices: Devices,
-    servos: Mapping[str, SiderostatServo],
+    servos: Servos,
     names: Sequence[str],
     with_camera: bool,
     closed_badly: ClosedBadly,
@@ -64,8 +67,10 @@ def close_devices(
     for name in names:
         loop = devices.loops[name]
         closing[f"{name} siderostat"] = servos[name].close
-        closing[f"{name} D/A"] = loop.dac.close
-        closing[f"{name} piezo"] = loop.piezo.close
+        if loop.dac is not None:
+            closing[f"{name} D/A"] = loop.dac.close
+        if loop.piezo is not None:
+            closing[f"{name} piezo"] = loop.piezo.close
     if with_camera:
         closing[CAMERA] = devices.camera.close
     for device, close in closing.items():

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import msgspec
 
-from fitctl.clock import Clock
-from fitctl.logging.records import AnyRecord, Event, Severity
+from fitctl.logging.records import Severity
 from fitctl.messages.commands import Reply, SequenceStatus
+from fitctl.stages.journal import Journal
 
 SILENCE_S = 3.0
+_SOURCE = "sequence"  # of its events
 _UNDER_WAY = ("running", "paused")
 _WANTED: dict[str, Literal["run", "pause", "stop"]] = {
     "pause": "pause",
@@ -21,21 +21,19 @@ _WANTED: dict[str, Literal["run", "pause", "stop"]] = {
 
 
 class SequenceBoard:
-    """What the newest sequence told; at most one is under way.
+    """What the newest sequence detail; at most one is under way.
 
     Reports and orders come from the loop's thread; :meth:`status` may be asked from any.
 
     Parameters
     ----------
-    clock : Clock
-    record : callable
-        Takes the records of attempts, and events.
+    journal : Journal
     """
 
-    def __init__(self, clock: Clock, record: Callable[[AnyRecord], None]) -> None:
-        self._clock = clock
-        self._record = record
-        self._heard_s = clock.now_s()
+    def __init__(self, journal: Journal) -> None:
+        self._clock = journal.clock
+        self._journal = journal
+        self._heard_s = journal.clock.now_s()
         self._status: SequenceStatus | None = None
 
     def status(self) -> SequenceStatus | None:
@@ -59,7 +57,7 @@ class SequenceBoard:
         self._status = msgspec.structs.replace(
             status, wanted="run" if before is None else before.wanted
         )
-        self._tell_change(before, status)
+        self._report_change(before, status)
         return Reply(accepted=True)
 
     def control(self, action: Literal["pause", "resume", "stop"]) -> Reply:
@@ -70,22 +68,17 @@ class SequenceBoard:
         if known.wanted == "stop":
             return Reply(accepted=False, text=f"{action}: sequence {known.name} is being stopped")
         self._status = msgspec.structs.replace(known, wanted=_WANTED[action])
-        self._event("info", f"{known.name}: {action}, asked for by the operator")
+        self._journal.event("info", _SOURCE, f"{known.name}: {action}, asked for by the operator")
         return Reply(accepted=True)
 
-    def _tell_change(self, before: SequenceStatus | None, now: SequenceStatus) -> None:
+    def _report_change(self, before: SequenceStatus | None, now: SequenceStatus) -> None:
         if now.last_attempt is not None and (
             before is None or before.last_attempt != now.last_attempt
         ):
-            self._record(now.last_attempt)
+            self._journal.record(now.last_attempt)
         if before is None:
-            self._event("info", f"{now.name} begins, {now.steps} steps")
+            self._journal.event("info", _SOURCE, f"{now.name} begins, {now.steps} steps")
         elif before.state != now.state:
             severity: Severity = "warning" if now.state in {"failed", "stopped"} else "info"
-            told = f": {now.message}" if now.message else ""
-            self._event(severity, f"{now.name} {now.state}{told}")
-
-    def _event(self, severity: Severity, message: str) -> None:
-        self._record(
-            Event(time_s=self._clock.now_s(), severity=severity, source="sequence", message=message)
-        )
+            detail = f": {now.message}" if now.message else ""
+            self._journal.event(severity, _SOURCE, f"{now.name} {now.state}{detail}")

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
-from fitctl.drivers.interface import DeviceError, Devices
+from fitctl.drivers.interface import DeviceError, Devices, Frame, LoopDevices
 from fitctl.logging.records import (
     CAMERA,
     AnyRecord,
@@ -26,7 +26,8 @@ from fitctl.logging.records import (
     QuantityReading,
     Severity,
 )
-from fitctl.loop.loop import StellarLoop
+from fitctl.loop.loop import Loop
+from fitctl.loop.stellar import StellarLoop, stellar_loop
 from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
     Acquire,
@@ -43,12 +44,11 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import Mode, Trigger, usable_commands
-from fitctl.stages.failures import error_text
+from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
-from fitctl.stages.servo import SiderostatServo
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.device_jobs import DeviceJobs, Job
-from fitctl.supervisor.health import camera_health, loop_health
+from fitctl.supervisor.health import camera_health, mirror_health, siderostat_health
 from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.sequence_board import SequenceBoard
@@ -63,6 +63,7 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
+MakeLoop = Callable[[str, Rig, LoopDevices, Journal], StellarLoop]
 
 
 class Posted(NamedTuple):
@@ -86,6 +87,8 @@ class Supervisor:
         Runs device work; must run one piece at a time.
     record : callable
         Takes every record (log and consoles); must not block.
+    make_loop : callable
+        Makes a loop of its name, the rig, its devices and the journal.
     """
 
     def __init__(
@@ -95,44 +98,33 @@ class Supervisor:
         clock: Clock,
         executor: Executor,
         record: Callable[[AnyRecord], None],
+        make_loop: MakeLoop = stellar_loop,
     ) -> None:
         self.rig = rig
-        self.servos = {
-            name: SiderostatServo(
-                name, loop, devices.loops[name].amplifiers, clock, rig.camera.period_s
-            )
-            for name, loop in rig.loops.items()
-        }
+        journal = Journal(clock, record)
         self.loops = {
-            name: StellarLoop(name, rig, servo, devices.loops[name].dac, clock, record)
-            for name, servo in self.servos.items()
+            name: make_loop(name, rig, devices.loops[name], journal) for name in rig.loops
         }
-        self.sequences = SequenceBoard(clock, record)
+        self.servos = {name: loop.servo for name, loop in self.loops.items()}
+        self.sequences = SequenceBoard(journal)
         self.shutdown_wanted = False
         self._clock = clock
         self._executor = executor
+        self._journal = journal
         self._record = record
         self._commands: deque[Posted] = deque()
         self._left: deque[AnyRecord] = deque()
-        self._measured: deque[QuantityReading] = deque()
+        self._quantities: deque[QuantityReading] = deque()
         self._designs: deque[Job] = deque()
         self._reported_s = clock.now_s()
         self.piezos = {
-            name: PiezoWatch(loop, devices.loops[name].piezo, clock, executor, record)
+            name: PiezoWatch(loop, piezo, executor, journal)
             for name, loop in self.loops.items()
+            if (piezo := devices.loops[name].piezo) is not None
         }
         self._camera = CameraWatch(rig, devices.camera, clock, self._camera_failed)
         self._device_jobs = DeviceJobs(
-            devices,
-            self.loops,
-            self.servos,
-            self.piezos,
-            self._camera,
-            clock,
-            executor,
-            record,
-            self._event,
-            self.note,
+            devices, self.loops, self.piezos, self._camera, executor, journal
         )
         self._timing = TimingBook(clock, rig, self._timed)
 
@@ -151,10 +143,10 @@ class Supervisor:
         """
         if isinstance(command, Stop):
             for name in self._named(command):
-                self.servos[name].stop()
+                self.loops[name].servo.stop()
         self._commands.append(Posted(command, reply, sender, address))
 
-    def note(self, severity: Severity, source: str, message: str) -> None:
+    def report_event(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
         now_s = self._clock.now_s()
         self.leave(Event(time_s=now_s, severity=severity, source=source, message=message))
@@ -163,52 +155,64 @@ class Supervisor:
         """Leave a record for the next step, from any thread."""
         self._left.append(record)
 
-    def measured(self, name: str, value: float) -> None:
+    def report_quantity(self, name: str, value: float) -> None:
         """Leave a quantity of all loops, for their interlocks, for the next step; from any thread."""
         reading = QuantityReading(time_s=self._clock.now_s(), name=name, value=value)
-        self._measured.append(reading)
+        self._quantities.append(reading)
 
     @property
     def periodic(self) -> list[Periodic]:
         """What runs at a pace of its own, beside the frames."""
-        return [*self.servos.values(), *(loop.stages.injector for loop in self.loops.values())]
+        return [work for loop in self.loops.values() for work in loop.periodic]
 
     # ------------------------------------------------------------ once a frame
 
     def step(self) -> None:
-        """Wait for the next frame, no longer than two frame periods, and act on it."""
+        """Wait for the next frame, no longer than two frame periods, and act on it.
+
+        Every loop has sent its stages what they are to do before the first waits for a confirmation.
+        """
         frame = self._camera.next_frame()
         self._finish_jobs()
         self._obey_posted()
-        self._take_left()
-        while self._measured:
-            self._take_measured(self._measured.popleft())
+        self._record_left()
         lost = self._camera.counts.lost if self._camera.ready else 0
-        for loop in self.loops.values():
-            was_safe = loop.mode is Mode.SAFE
-            tick = loop.tick(frame, lost)
+        loops = self.loops.values()
+        were_safe = [loop.mode is Mode.SAFE for loop in loops]
+        for loop in loops:
+            loop.sense(frame, lost, self._camera.skipped)
+            loop.decide()
+            loop.send()
+        for loop in loops:
+            loop.confirm()
+        for loop, was_safe in zip(loops, were_safe, strict=True):
+            tick = loop.tick_record()
             if frame is not None or loop.mode is not Mode.OFF:
                 self._record(tick)
             self._timing.add(tick)
             if was_safe:
                 self._make_safer(loop)
+        for older in self._camera.older:
+            self._record_frame(older)
         if frame is not None:
-            self._record(
-                FrameRecord(
-                    time_s=frame.mid_exposure_s,
-                    camera=CAMERA,
-                    number=frame.number,
-                    width_px=frame.image.shape[1],
-                    height_px=frame.image.shape[0],
-                    data=frame.image.tobytes(),
-                )
-            )
+            self._record_frame(frame)
         if not self._device_jobs.busy:
-            for name, piezo in self.piezos.items():
-                if self.loops[name].stages.ready:
-                    piezo.ask()
+            for piezo in self.piezos.values():
+                piezo.ask()
         if self._clock.now_s() - self._reported_s >= 1.0:
             self._once_a_second()
+
+    def _record_frame(self, frame: Frame) -> None:
+        self._record(
+            FrameRecord(
+                time_s=frame.mid_exposure_s,
+                camera=CAMERA,
+                number=frame.number,
+                width_px=frame.image.shape[1],
+                height_px=frame.image.shape[0],
+                data=frame.image.tobytes(),
+            )
+        )
 
     def stop(self, reason: str) -> None:
         """Every loop to SAFE."""
@@ -218,32 +222,28 @@ class Supervisor:
         self._record(command_record(Stop(), Reply(accepted=True, text=reason), "fitctl", "", now_s))
 
     def at_rest(self) -> bool:
-        """Every mirror that can still be commanded is at its bias."""
-        return all(self._at_bias(name) for name in self.loops)
-
-    def _at_bias(self, name: str) -> bool:
-        loop = self.loops[name]
-        return not loop.stages.ready or loop.stages.at_bias()
+        """Every stage that can still be commanded is where it may be left without power."""
+        return all(loop.at_rest() for loop in self.loops.values())
 
     def close(self) -> None:
         """Disable and let go of everything, whatever state it is in; nothing is asked of it any more."""
         self.shutdown_wanted = True
         self._device_jobs.close_all()
         self._obey_posted()
-        self._take_left()
+        self._record_left()
 
     def _camera_failed(self, error: DeviceError) -> None:
         for loop in self.loops.values():
             loop.device_failed(CAMERA, error)
 
-    def _take_left(self) -> None:
+    def _record_left(self) -> None:
         while self._left:
             self._record(self._left.popleft())
-
-    def _take_measured(self, reading: QuantityReading) -> None:
-        for loop in self.loops.values():
-            loop.measured.put(reading.name, reading.value, reading.time_s)
-        self._record(reading)
+        while self._quantities:
+            reading = self._quantities.popleft()
+            for loop in self.loops.values():
+                loop.quantities.put(reading.name, reading.value, reading.time_s)
+            self._record(reading)
 
     # ------------------------------------------------------------ commands
 
@@ -301,9 +301,9 @@ class Supervisor:
         if trigger in _POWER_UP:
             self._device_jobs.open(usable, trigger)
         elif trigger is Trigger.OFF:
-            moving = [name for name in usable if not self._at_bias(name)]
+            moving = [name for name in usable if not self.loops[name].at_rest()]
             for name in moving:
-                self.loops[name].stages.mirror_to_bias()  # where it rested off its bias
+                self.loops[name].rest()  # its ticks take it there
             if moving:
                 return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
             self._device_jobs.turn_off(usable)
@@ -312,7 +312,7 @@ class Supervisor:
                 self._device_jobs.abandon(usable)
             for name in usable:
                 if isinstance(command, Acquire):
-                    self.loops[name].look_for(command)
+                    self.loops[name].configure_search(command)
                 self.loops[name].fire(trigger, "operator")
         return Reply(accepted=True)
 
@@ -334,11 +334,11 @@ class Supervisor:
         if error is None:
             self.loops[name].use(future.result())
         else:
-            self._event("error", name, f"no design {controller}: {error_text(error)}")
+            self._journal.event("error", name, f"no design {controller}: {error_text(error)}")
 
     # ------------------------------------------------------------ beside the ticks
 
-    def _make_safer(self, loop: StellarLoop) -> None:
+    def _make_safer(self, loop: Loop) -> None:
         """Without power after a while in SAFE, but never what is being given power just now."""
         lasted_s = self._clock.now_s() - loop.mode_since_s
         being_opened = self._device_jobs.opens(loop.name)
@@ -351,7 +351,7 @@ class Supervisor:
             design = self._designs.popleft()
             design.done(design.future)
         for piezo in self.piezos.values():
-            piezo.judge()
+            piezo.collect()
 
     # ------------------------------------------------------------ once a second
 
@@ -367,26 +367,20 @@ class Supervisor:
                 }
             )
         camera, identities = self._camera, self._device_jobs.identities
-        self._record(camera_health(self.rig, camera.counts, camera.well, identities, now_s))
+        self._record(
+            camera_health(self.rig, camera.counts, camera.skipped, camera.well, identities, now_s)
+        )
         for name, loop in self.loops.items():
-            trouble = self.piezos[name].error
-            loop.measured.of_piezo_error(trouble, now_s)
-            for row in loop_health(loop, trouble, identities, now_s):
-                self._record(row)
+            self._record(siderostat_health(loop, identities, now_s))
+            if name in self.piezos:
+                piezo = self.piezos[name]
+                loop.quantities.record_piezo_error(piezo.error, now_s)
+                for row in mirror_health(loop, piezo, identities, now_s):
+                    self._record(row)
 
     def _timed(self, record: LoopTiming) -> None:
-        self.loops[record.loop].measured.of_timing(record)
+        self.loops[record.loop].quantities.record_timing(record)
         self._record(record)
-
-    def _event(self, severity: Severity, source: str, message: str) -> None:
-        self._record(
-            Event(
-                time_s=self._clock.now_s(),
-                severity=severity,
-                source=source,
-                message=message,
-            )
-        )
 
 
 def _refusal(text: str) -> Reply:

@@ -34,7 +34,7 @@ class TimingBook:
         """One record for each of the given loops, for the time since the last report."""
         for name, its_servo in servos.items():
             ticks = self._ticks[name]
-            servo = its_servo.take_timing()
+            servo = its_servo.drain_timing()
             compute = [tick.compute_s for tick in ticks]
             age = [tick.frame_age_s for tick in ticks]
             stalls = [late for late in servo.late_s if late > self._stall_s]

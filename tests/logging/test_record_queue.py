@@ -105,6 +105,7 @@ def test_a_new_recorder_is_sent_the_run_and_what_none_has_confirmed(queue, recor
     first = recorders()
     next_of(queue, first, 10)
     first.confirm(6)
+    first.confirm(3)  # of a recorder that says so late; the later records stay confirmed
     wait_until(lambda: waiting(queue) == 3)
     first.close()
 
@@ -124,6 +125,41 @@ def test_records_of_the_time_between_two_recorders_are_kept(queue, recorders):
     for number in range(1, 6):
         assert queue.offer(tick(number))
     assert sequences(next_of(queue, recorders(), 5)) == [1, 2, 3, 4, 5]
+
+
+def test_a_recorder_that_is_gone_is_noticed_at_the_next_record(queue, recorders):
+    recorder = recorders()
+    queue.offer(tick(0))
+    next_of(queue, recorder, 1)
+    assert queue.heard
+    recorder.close()
+
+    def noticed():
+        queue.offer(tick(1))
+        return not queue.heard
+
+    wait_until(noticed)
+    assert queue.unsent > 0
+
+
+def test_a_new_recorder_is_sent_nothing_that_is_confirmed_however_much_that_is(endpoint, recorders):
+    many = 2000
+    queue = RecordQueue(endpoint, many)
+    for number in range(many):
+        queue.offer(tick(number))
+    first = recorders()
+    next_of(queue, first, many)
+    first.confirm(many - 2)
+    time.sleep(0.2)
+    queue.pump()  # hears it, and lets go of some
+    assert queue.waiting > many // 2
+    second = recorders()
+    time.sleep(0.2)
+    try:
+        assert sequences(next_of(queue, second, 1)) == [many - 1]
+        assert queue.waiting == 1
+    finally:
+        queue.close(timeout_s=0.05)
 
 
 def test_only_the_newest_recorder_is_spoken_to(queue, recorders):
@@ -156,7 +192,7 @@ def test_closing_without_a_recorder_counts_what_was_never_sent(endpoint):
     queue.offer(tick(1))
     queue.close(timeout_s=0.05)
     queue.close()
-    assert queue.lost == 2
+    assert (queue.lost, queue.waiting, queue.unsent) == (2, 0, 0)
 
 
 def test_closing_sends_what_is_still_there(endpoint, recorders):
@@ -167,7 +203,7 @@ def test_closing_sends_what_is_still_there(endpoint, recorders):
     queue.close(timeout_s=5.0)
     arrived = [decode(recorder.receive(1.0)).sequence for _ in range(SIZE)]
     assert arrived == list(range(SIZE))
-    assert queue.lost == 0
+    assert (queue.lost, queue.waiting, queue.unsent) == (0, 0, 0)
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
@@ -178,6 +214,16 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 def test_what_is_no_address_is_named():
     with pytest.raises(LogError, match="nowhere: cannot be connected to"):
         RecordReceiver("nowhere")
+
+
+def test_a_confirmation_of_what_was_never_offered_is_ignored(queue, recorders):
+    recorder = recorders()
+    for number in range(3):
+        queue.offer(tick(number))
+    next_of(queue, recorder, 3)
+    recorder.confirm(3)
+    recorder.confirm(0)
+    wait_until(lambda: waiting(queue) == 2)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """An instrument that holds its star, and a way to strike each interlock of the shipped rig file."""
 
-import dataclasses
 from functools import partial
 
 import numpy as np
@@ -82,19 +81,21 @@ def light(factor, bench):
 
 def mirror_at_its_edge(bench):
     edge_rad = np.array([0.95 * bench.loop.settings.fsm.range_rad, 0.0])
-    move = bench.loop.stages.mirror_to
-    bench.laws(lambda _seen: move(edge_rad, hysteresis_inverse=False))
-    bench.replace(bench.loop.following, "judge", lambda *_: None)  # else it goes back to COARSE
+    move = bench.loop.mirror.move_to
+    bench.laws(lambda _observation: move(edge_rad, hysteresis_inverse=False))
+    bench.replace(bench.loop.following, "evaluate", lambda *_: None)  # else it goes back to COARSE
 
 
 def set_point_beyond_the_travel(bench):
-    stages = bench.loop.stages
-    bench.laws(lambda _seen: stages.siderostat_to(np.array([1.2 * stages.travel_rad, 0.0])))
+    siderostat = bench.loop.siderostat
+    bench.laws(
+        lambda _observation: siderostat.move_to(np.array([1.2 * siderostat.travel_rad, 0.0]))
+    )
 
 
 def motors_beyond_the_travel(bench):
-    stages, servo = bench.loop.stages, bench.loop.servo
-    bench.laws(lambda _seen: servo.move_to(np.array([1.03 * stages.travel_rad, 0.0])))
+    siderostat, servo = bench.loop.siderostat, bench.loop.servo
+    bench.laws(lambda _observation: servo.move_to(np.array([1.03 * siderostat.travel_rad, 0.0])))
 
 
 def motors_run_away(rate_rad_s, bench):
@@ -117,7 +118,7 @@ def motors_move_in_safe(bench):
 def motors_lag(bench):
     stuck_rad = bench.loop.servo.position_rad
     bench.replace(bench.devices.amplifiers, "exchange", lambda ask, _: ask((0.0, 0.0)))
-    bench.laws(lambda _seen: bench.loop.stages.siderostat_to(stuck_rad + np.array([0.9, 0.0])))
+    bench.laws(lambda _observation: bench.loop.siderostat.move_to(stuck_rad + np.array([0.9, 0.0])))
 
 
 def fail(owner, method, error, bench):
@@ -160,16 +161,17 @@ def servo_that_skips(bench):
 
 
 def write_slowly(bench):
-    def write(old, volts):
+    def confirm(old):
         bench.clock.sleep_until(bench.clock.now_s() + 0.03)
-        old(volts)
+        old()
 
-    bench.replace(bench.devices.dac, "write_v", write)
+    bench.replace(bench.devices.dac, "confirm", confirm)
 
 
 def stall(bench):
     def next_frame(old, timeout_s):
-        bench.clock.sleep_until(bench.clock.now_s() + 0.6)
+        if timeout_s > 0:  # not while it only looks for a newer one
+            bench.clock.sleep_until(bench.clock.now_s() + 0.6)
         return old(timeout_s)
 
     bench.replace(bench.camera, "next_frame", next_frame)
@@ -185,7 +187,7 @@ def no_frames(bench):
 def late_frames(bench):
     def next_frame(old, timeout_s):
         frame = old(timeout_s)
-        return frame and dataclasses.replace(frame, received_s=frame.received_s + 0.05)
+        return frame and frame._replace(received_s=frame.received_s + 0.05)
 
     bench.replace(bench.camera, "next_frame", next_frame)
 
@@ -200,7 +202,7 @@ def every_second_frame(bench):
 
 def computer(name, ill, well, bench):
     def say(value):
-        bench.each_step = lambda: bench.supervisor.measured(name, value)
+        bench.each_step = lambda: bench.supervisor.report_quantity(name, value)
 
     say(ill)
     bench._healing.append(lambda: say(well))

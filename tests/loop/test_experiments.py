@@ -110,7 +110,7 @@ def test_stop_ends_an_experiment_at_once_and_the_mirror_goes_home(held):
     simulation.command(Stop())
     assert loop.mode is Mode.SAFE
     simulation.run(1.0)
-    assert loop.stages.at_bias()
+    assert loop.mirror.at_bias()
     assert np.allclose(simulation.plants["right"].inputs.stack_v[0], 5.0, atol=1e-3)
 
 
@@ -138,7 +138,7 @@ def test_a_d_a_that_fails_in_an_experiment_leads_to_safe(held):
     def fails(_volts):
         raise DeviceTimeout("D/A", "here", "an answer", "none", "look at it")
 
-    loop.stages.injector._dac.write_v = fails
+    loop.mirror.injector._dac.send_v = fails
     simulation.run(0.1)
     assert loop.mode is Mode.SAFE
     assert any(isinstance(r, Event) and "D/A" in r.message for r in records)
@@ -147,7 +147,7 @@ def test_a_d_a_that_fails_in_an_experiment_leads_to_safe(held):
 def test_an_error_of_our_own_in_an_experiment_leads_to_safe_too(held, monkeypatch):
     simulation, loop, _ = held()
     begin(simulation, SWEEP)
-    monkeypatch.setattr(loop.stages.injector, "volts", lambda *_: 1 / 0)
+    monkeypatch.setattr(loop.mirror.injector, "volts", lambda *_: 1 / 0)
     simulation.run(0.1)
     assert loop.mode is Mode.SAFE
 

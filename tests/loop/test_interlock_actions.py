@@ -27,17 +27,17 @@ def test_flattened_the_mirror_is_at_its_bias_and_the_siderostat_held_until_it_is
     bench = with_action("flatten", "itself")
     bench.simulation.command(SetTarget(az_px=26.0, el_px=19.5))
     bench.run(3.0)
-    away_v = np.abs(bench.loop.stages.stack_v - 5.0).max()
+    away_v = np.abs(bench.loop.mirror.stack_v - 5.0).max()
     late_frames(bench)
     assert bench.until(lambda: bench.tripped, 2.0)
-    held_rad = bench.loop.stages.setpoint_rad.copy()
+    held_rad = bench.loop.siderostat.setpoint_rad.copy()
     bench.run(0.3)
-    assert bench.loop.stages.at_bias()
-    assert np.array_equal(bench.loop.stages.setpoint_rad, held_rad)
+    assert bench.loop.mirror.at_bias()
+    assert np.array_equal(bench.loop.siderostat.setpoint_rad, held_rad)
 
     bench.heal()
     assert bench.until(lambda: not bench.tripped, 2.0)
-    assert np.abs(bench.loop.stages.stack_v - 5.0).max() < 0.5 * away_v  # it does not jump back
+    assert np.abs(bench.loop.mirror.stack_v - 5.0).max() < 0.5 * away_v  # it does not jump back
     bench.run(20.0)
 
     assert bench.loop.mode is Mode.VERNIER
@@ -96,7 +96,7 @@ def test_encoders_that_count_anew_after_opening_are_no_runaway():
     assert bench.simulation.command(Standby()).accepted
     rates = []
     bench.each_step = lambda: rates.append(
-        bench.loop.measured.readings["siderostat_rate_fraction"][0]
+        bench.loop.quantities.readings["siderostat_rate_fraction"][0]
     )
     bench.run(1.0)
 
@@ -125,11 +125,13 @@ def test_hold_by_command_is_no_interlock():
 def test_everything_that_a_row_may_be_about_is_measured(tmp_path):
     bench = Bench()
     servo_that_skips(bench)
-    Machine(tmp_path, lambda: 0.0, bench.supervisor.measured, bench.supervisor.note).look()
-    until(lambda: any(row.name == "disk_free_bytes" for row in bench.supervisor._measured))
+    Machine(
+        tmp_path, lambda: 0.0, bench.supervisor.report_quantity, bench.supervisor.report_event
+    ).look()
+    until(lambda: any(row.name == "disk_free_bytes" for row in bench.supervisor._quantities))
     bench.run(2.0)
 
-    assert set(bench.loop.measured.readings) == set(QUANTITIES)
+    assert set(bench.loop.quantities.readings) == set(QUANTITIES)
 
 
 def test_the_computer_is_measured_and_an_interrupted_look_at_the_clocks_does_not_count(tmp_path):
@@ -211,11 +213,21 @@ def raised(error):
 def test_measuring_and_judging_costs_a_small_part_of_a_tick():
     bench = Bench()
     loop, frame = bench.loop, bench.camera.next_frame(0.04)
-    seen = loop._sense(frame, loop.servo.look(), frame.received_s)
+
+    def tick():
+        loop.sense(frame, 0, 0)
+        loop.decide()
+        loop.send()
+        loop.confirm()
+        loop.tick_record()
+
+    def evaluate():
+        loop.quantities.record_observation(loop.observation)
+        loop.quantities.record_stages(loop.observation, loop.siderostat, loop.mirror)
+        loop._evaluate_interlocks(loop.observation.now_s)
 
     def least_s(work):
         return min(timeit.repeat(work, number=100, repeat=20))
 
-    assert least_s(lambda: loop._judge_interlocks(frame, seen)) < 0.3 * least_s(
-        lambda: loop.tick(frame, 0)
-    )
+    tick()
+    assert least_s(evaluate) < 0.3 * least_s(tick)

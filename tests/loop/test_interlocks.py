@@ -43,7 +43,7 @@ class Course:
             self.now_s += TICK_S
             if value is not None:
                 self.readings[quantity] = (value, self.now_s, "")
-            changes += self.interlocks.judge(mode, self.now_s, self.readings)
+            changes += self.interlocks.evaluate(mode, self.now_s, self.readings)
         return changes
 
     @property
@@ -175,7 +175,9 @@ def test_what_is_not_tripped_or_not_there_cannot_be_reset(name, said):
 
 def test_an_error_of_a_device_is_told_in_its_own_words():
     interlocks = table(for_s=0.0)
-    (change,) = interlocks.judge("VERNIER", 1.0, {FIRST: (2.0, 1.0, "D/A at x: expected a, got b")})
+    (change,) = interlocks.evaluate(
+        "VERNIER", 1.0, {FIRST: (2.0, 1.0, "D/A at x: expected a, got b")}
+    )
 
     assert change.trip.reason == "D/A at x: expected a, got b"
 
@@ -184,7 +186,7 @@ def test_the_strongest_action_of_all_that_is_tripped_is_in_force():
     actions = ["hold", "safe", "warn", "flatten"]
     rows = {action: row(action=action, for_s=0.0, reset="hand") for action in actions}
     interlocks = Interlocks(rows, {})
-    interlocks.judge("VERNIER", 1.0, {FIRST: (2.0, 1.0, "")})
+    interlocks.evaluate("VERNIER", 1.0, {FIRST: (2.0, 1.0, "")})
     in_force = []
     while interlocks.action:
         in_force.append(interlocks.action)
@@ -219,7 +221,7 @@ def test_nothing_acts_untripped_and_nothing_that_needs_a_hand_goes_without(made,
         for quantity, value in ((FIRST, first), (SECOND, second)):
             if value is not None:
                 readings[quantity] = (value, now_s, "")
-        changes = interlocks.judge(mode, now_s, readings)
+        changes = interlocks.evaluate(mode, now_s, readings)
         for trip, over in changes:
             assert (trip.name in tripped) == over
             if over:
@@ -243,7 +245,7 @@ def test_values_in_range_and_fresh_trip_nothing(made, course):
         now_s += TICK_S
         readings = dict.fromkeys((FIRST, SECOND), (0.05, now_s, ""))
 
-        assert not interlocks.judge(mode, now_s, readings)
+        assert not interlocks.evaluate(mode, now_s, readings)
 
 
 # ---------------------------------------------------------------- the rig file

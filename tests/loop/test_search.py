@@ -95,18 +95,18 @@ def test_a_flux_that_is_asked_for_holds_until_the_next_search_by_command():
     loop.fire(Trigger.STAR_LOST, "a test")
     run_until(simulation, Mode.VERNIER, 30.0)  # found again, as the same star
 
-    assert loop.measured.readings["star_flux_fraction"][0] == pytest.approx(1 / 0.8, rel=0.05)
+    assert loop.quantities.readings["star_flux_fraction"][0] == pytest.approx(1 / 0.8, rel=0.05)
     simulation.command(Hold())
     simulation.command(Acquire())
     run_until(simulation, Mode.VERNIER, 30.0)
-    assert loop.measured.readings["star_flux_fraction"][0] == pytest.approx(1.0, rel=0.05)
+    assert loop.quantities.readings["star_flux_fraction"][0] == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_middle_beyond_the_travel_is_not_waited_for():
     simulation = star_at(0.0, 3000.0)  # nowhere near
     loop = simulation.supervisor.loops["right"]
     beyond_px = np.array([1300.0, 0.0]) / ARCSEC_PER_PX
-    loop.sighting.estimator.place(loop.target_px + beyond_px, np.zeros(2), np.zeros(2))
+    loop.star_finder.estimator.place(loop.target_px + beyond_px, np.zeros(2), np.zeros(2))
 
     simulation.command(Acquire())
     run_until(simulation, Mode.STANDBY, 60.0)

@@ -14,7 +14,7 @@ def test_every_shipped_row_is_struck_here():
 @pytest.mark.parametrize("name", STRIKES)
 def test_a_shipped_row_trips_and_acts(name):
     bench = struck(name)
-    trip, stages = bench.tripped[name], bench.loop.stages
+    trip, loop = bench.tripped[name], bench.loop
 
     assert trip.action == ROWS[name].action
     assert trip.reset == ROWS[name].reset
@@ -24,9 +24,9 @@ def test_a_shipped_row_trips_and_acts(name):
         assert bench.loop.mode is Mode.SAFE
         assert bench.loop.last_change.reason == trip.reason
     elif trip.action == "hold":
-        before = (*stages.stack_v, *stages.setpoint_rad)
+        before = (*loop.mirror.stack_v, *loop.siderostat.setpoint_rad)
         bench.run(0.5)
-        assert (*stages.stack_v, *stages.setpoint_rad) == before
+        assert (*loop.mirror.stack_v, *loop.siderostat.setpoint_rad) == before
 
 
 @pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.reset == "itself"])

@@ -87,7 +87,8 @@ def test_a_voltage_written_to_the_da_moves_the_star_on_the_camera(running, camer
     dac = ModbusDac(fsm.dac)
     dac.open()
     before = star_px(camera, time.monotonic() + 0.1)
-    dac.write_v(np.array([6.0, 5.0, 4.0]))  # Eq. 1: both axes, azimuth and elevation, half each
+    dac.send_v(np.array([6.0, 5.0, 4.0]))  # Eq. 1: both axes, azimuth and elevation, half each
+    dac.confirm()
     after = star_px(camera, time.monotonic() + 0.2)
     dac.close()
 
@@ -108,9 +109,11 @@ def test_a_voltage_written_to_the_da_moves_the_star_on_the_camera(running, camer
 def test_the_piezo_amplifiers_limit_holds_the_star_back(running, camera):
     dac = ModbusDac(running.rig.loops["right"].fsm.dac)
     dac.open()
-    dac.write_v(np.array([5.0, 5.0, 4.0]))
+    dac.send_v(np.array([5.0, 5.0, 4.0]))
+    dac.confirm()
     at_limit = star_px(camera, time.monotonic() + 0.2)
-    dac.write_v(np.array([5.5, 5.5, 4.0]))  # 82 V wanted, 75.5 V allowed: as good as 5.03 V
+    dac.send_v(np.array([5.5, 5.5, 4.0]))  # 82 V wanted, 75.5 V allowed: as good as 5.03 V
+    dac.confirm()
     beyond = star_px(camera, time.monotonic() + 0.2)
     dac.close()
 
@@ -160,7 +163,8 @@ def test_the_bench_knows_where_the_stages_truly_are(running):
     port = running.endpoints["mocks.bench_port"]
     dac = ModbusDac(running.rig.loops["right"].fsm.dac)
     dac.open()
-    dac.write_v(np.array([6.0, 5.0, 4.0]))
+    dac.send_v(np.array([6.0, 5.0, 4.0]))
+    dac.confirm()
     dac.close()
 
     stages = ask_bench(port, StagesQuestion("right"), StagesNow)

@@ -1,6 +1,7 @@
 import math
 
 import numpy as np
+import plant_references
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +10,7 @@ from scipy.signal import welch
 
 from fitctl.model import air_path
 from fitctl.model.air_path import discretize, state_space, stationary_covariance, step_matrices
-from fitctl.model.compiled import kernels
+from fitctl.model.compiled import compiled
 from fitctl.model.plant import Plant
 
 steps_s = st.floats(1e-4, 1.0)
@@ -120,17 +121,17 @@ def test_what_the_cubic_leaves_out_is_a_thousandth_of_what_is_measured(air, dyna
     assert air_path.bridge_rms_px(air) < 0.013 / 500
 
 
-@pytest.mark.skipif(kernels() is None, reason="numba is not installed (extra `fast`)")
+@pytest.mark.parametrize("motion", [compiled(air_path.air_motion), air_path.air_motion])
 @given(seed=st.integers(0, 2**31), steps=st.integers(1, 20), nodes=st.integers(1, 30))
-def test_the_compiled_motion_is_the_reference_motion(air, seed, steps, nodes):
+def test_the_motion_is_the_reference_motion(air, motion, seed, steps, nodes):
     random = np.random.default_rng(seed)
     normals, state = random.standard_normal((nodes, 2, 2)), random.standard_normal((2, 2))
     matrices = (*step_matrices(air, steps * 5e-4), air_path.bridge_weights(steps, 5e-4))
-    compiled_state, compiled_px = state.copy(), np.empty((nodes * steps, 2))
-    kernels().air_motion(compiled_state, normals, *matrices, compiled_px)
-    reference_px = air_path.air_motion(state, normals, *matrices)
-    assert compiled_px == pytest.approx(reference_px, rel=1e-9, abs=1e-12)
-    assert compiled_state == pytest.approx(state, rel=1e-9, abs=1e-12)
+    found_state, found_px = state.copy(), np.empty((nodes * steps, 2))
+    motion(found_state, normals, *matrices, found_px)
+    reference_px = plant_references.air_motion(state, normals, *matrices)
+    assert found_px == pytest.approx(reference_px, rel=1e-9, abs=1e-12)
+    assert found_state == pytest.approx(state, rel=1e-9, abs=1e-12)
 
 
 # ---------------------------------------------------------------- the plant's own motion

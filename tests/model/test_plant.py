@@ -1,13 +1,18 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from plant_references import bind_reference
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.controllers.position_servo import PositionServo
+from fitctl.model import plant_step
+from fitctl.model.compiled import numba_installed
 from fitctl.model.optics import piston_m, scales, stack_volts
 from fitctl.model.plant import Plant
-from fitctl.model.plant_step import PlantState, PlantTrace, bind_reference, compiled_advance
+from fitctl.model.plant_step import PlantState, PlantTrace, bound_step
 
 STILL_AIR = "plant.loops.right.air_path.gain_px=0.0"
 STRAIGHT_STACKS = [
@@ -34,7 +39,13 @@ def from_target(plant, rig, time_s):
 # ---------------------------------------------------------------- one result, however it is computed
 
 
-@pytest.mark.skipif(compiled_advance() is None, reason="numba is not installed (extra `fast`)")
+NEEDS_NUMBA = pytest.mark.skipif(
+    not numba_installed(), reason="numba is not installed (extra `fast`)"
+)
+STEPS = [pytest.param(True, marks=NEEDS_NUMBA, id="compiled"), pytest.param(False, id="plain")]
+
+
+@pytest.mark.parametrize("machine_code", STEPS)
 @settings(max_examples=15)
 @given(
     seed=seeds,
@@ -42,7 +53,7 @@ def from_target(plant, rig, time_s):
     steps=st.integers(1, 60),
     turned_deg=st.sampled_from([(0.0, 0.0), (30.0, 30.0), (-70.0, 120.0)]),
 )
-def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turned_deg):
+def test_the_step_does_what_the_reference_does(machine_code, seed, runs, steps, turned_deg):
     siderostat_deg, mirror_deg = turned_deg
     rig = rig_with(
         f"loops.right.siderostat.rotation_deg={siderostat_deg}",
@@ -59,11 +70,11 @@ def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turne
     state.stack_v[:] = random.uniform(0, 10, (runs, 3))
     air_px = 0.3 * random.standard_normal((steps + 5, runs, 2, 2))
     outcomes = []
-    for kernel in (compiled_advance(), bind_reference):
+    for bind in (partial(bound_step, machine_code=machine_code), bind_reference):
         own = PlantState(runs, state.plays_v.shape[-1])
         own.rows[:], own.plays_v[:] = state.rows, state.plays_v
         trace = PlantTrace(np.zeros((steps + 3, runs, 2, 2)), np.zeros((steps + 3, runs)))
-        kernel(plant.constants, own, air_px, trace)(5, 3, steps)
+        bind(plant.constants, own, air_px, trace)(5, 3, steps)
         outcomes.append(
             (
                 *trace,
@@ -71,8 +82,8 @@ def test_the_compiled_step_does_what_the_reference_does(seed, runs, steps, turne
                 *(own.rows[name] for name in own.rows.dtype.names if name != "stacks_at_v"),
             )
         )
-    for compiled, reference in zip(*outcomes, strict=True):
-        assert compiled == pytest.approx(reference, rel=1e-9, abs=1e-12)
+    for found, reference in zip(*outcomes, strict=True):
+        assert found == pytest.approx(reference, rel=1e-9, abs=1e-12)
 
 
 @settings(max_examples=20)
@@ -94,10 +105,10 @@ def test_the_motion_does_not_depend_on_how_the_time_is_cut(rig, cuts):
     assert np.array_equal(cut[1], whole[1])
 
 
-@pytest.mark.parametrize("kernel", [None, bind_reference])
-def test_a_run_does_not_depend_on_the_runs_beside_it(rig, kernel):
-    together = Plant(rig, "right", [3, 4, 5], kernel=kernel)
-    alone = Plant(rig, "right", [4], kernel=kernel)
+@pytest.mark.parametrize("machine_code", STEPS)
+def test_a_run_does_not_depend_on_the_runs_beside_it(rig, machine_code, monkeypatch):
+    monkeypatch.setattr(plant_step, "numba_installed", lambda: machine_code)
+    together, alone = Plant(rig, "right", [3, 4, 5]), Plant(rig, "right", [4])
     for plant in (together, alone):
         plant.inputs.velocity_rad_s[:] = [3.0, -2.0]
     assert together.spots_px(0.5)[1] == pytest.approx(alone.spots_px(0.5)[0], abs=1e-12)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.controllers.centroid import StarSensor
-from fitctl.model.compiled import kernels
+from fitctl.model.compiled import numba_installed
 from fitctl.model.scene import FULL_WELL_DN, Scene, centroid_noise_px
 
 within = st.floats(6.0, 33.0)  # a spot's light is all on the frame
@@ -111,7 +111,7 @@ def test_centroid_noise_over_rendered_frames_is_what_the_formula_says(rig, star_
     assert np.abs(errors_px.mean()) < 4 * expected_px / np.sqrt(errors_px.size) + 1e-4
 
 
-@pytest.mark.skipif(kernels() is None, reason="numba is not installed (extra `fast`)")
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
 @given(
     places=st.lists(st.tuples(st.floats(-20, 60), st.floats(-20, 60)), min_size=2, max_size=2),
     key=st.integers(0, 2**64 - 1),

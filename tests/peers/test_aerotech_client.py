@@ -12,10 +12,6 @@ from fitctl.mocks.ensemble.controller import EnsembleControllerMock
 
 pytestmark = pytest.mark.peer
 
-aerotech = pytest.importorskip(
-    "aerotech", reason="aerotech.py of github.com/robmarkcole/aerotech is not on the path"
-)
-
 RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
 SIDEROSTAT = RIG.loops["right"].siderostat
 SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
@@ -57,6 +53,9 @@ def served(in_loop):
 
 
 def test_it_enables_moves_and_reads_positions(served):
+    aerotech = pytest.importorskip(
+        "aerotech", reason="aerotech.py of github.com/robmarkcole/aerotech is not on the path"
+    )
     motors, port = served
     client = aerotech.Ensemble("127.0.0.1", port)
     client.connect()

@@ -9,10 +9,6 @@ from fitctl.mocks.mdt693.server import Mdt693Mock
 
 pytestmark = pytest.mark.peer
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", SyntaxWarning)  # `port is ""` in its source
-    mdt69x = pytest.importorskip("mdt69x", reason="PyPI mdt69x is not installed")
-
 RIG = load_rig(default_rig_path())
 PIEZO = RIG.loops["right"].fsm.piezo
 # It takes no echo, and wants the prompt of firmware 1.10 until it has turned compatibility mode on.
@@ -33,6 +29,10 @@ SETTINGS = RIG.mocks.loops["right"].mdt693.model_copy(
 
 @pytest.fixture
 def controller(in_loop):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SyntaxWarning)  # `port is ""` in its source
+        mdt69x = pytest.importorskip("mdt69x", reason="PyPI mdt69x is not installed")
+
     async def made():
         mock = Mdt693Mock(SETTINGS, PIEZO, lambda volts: None, port=0)
         return mock, await mock.start()

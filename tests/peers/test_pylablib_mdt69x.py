@@ -9,10 +9,6 @@ from fitctl.mocks.mdt693.server import Mdt693Mock
 
 pytestmark = pytest.mark.peer
 
-thorlabs = pytest.importorskip(
-    "pylablib.devices.Thorlabs", reason="PyPI pylablib-lightweight is not installed"
-)
-
 RIG = load_rig(default_rig_path())
 PIEZO = RIG.loops["right"].fsm.piezo
 SETTINGS = RIG.mocks.loops["right"].mdt693.model_copy(
@@ -30,6 +26,10 @@ B_COMPATIBLE = {"model": "MDT693B", "firmware": "1.10", "prompt": ">", "compatib
 
 @pytest.fixture(params=[A, B_105, B_COMPATIBLE], ids=["A 3.01", "B 1.05", "B 1.10, cm=1"])
 def source(request, in_loop):
+    thorlabs = pytest.importorskip(
+        "pylablib.devices.Thorlabs", reason="PyPI pylablib-lightweight is not installed"
+    )
+
     async def made():
         mock = Mdt693Mock(
             SETTINGS.model_copy(update=request.param), PIEZO, lambda volts: None, port=0

@@ -44,7 +44,8 @@ def test_it_writes_and_reads_back(terminal_server, dac_mock):
     dac = ModbusDac(settings)
     assert dac.open().model == "mock D/A"
     volts = np.array([1.0, 2.0, 3.0])
-    dac.write_v(volts)
+    dac.send_v(volts)
+    dac.confirm()
     assert dac_mock.outputs_v == pytest.approx(volts, abs=1e-4)
     assert dac.read_v() == pytest.approx(volts, abs=1e-4)
     dac.close()

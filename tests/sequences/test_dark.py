@@ -12,7 +12,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.modes import Mode
 from fitctl.sequences.dark import measure_dark
 from fitctl.simulation.batch.batch import Batch
-from fitctl.simulation.batch.settings import TooLargeForBatchError
+from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation
 
 NEAR = ["plant.loops.right.star_offset_sky_arcsec_max=5.0"]
@@ -110,5 +110,5 @@ def test_a_dark_frame_that_was_measured_is_used_and_the_star_is_held_in_its_plac
 def test_a_batch_leaves_pixels_that_differ_to_the_simulation(tmp_path):
     np.save(tmp_path / "dark.npy", np.full((40, 40), 1000.0))
     for override in (HOT, f"camera.dark_file={tmp_path / 'dark.npy'}"):
-        with pytest.raises(TooLargeForBatchError, match="pixels differ"):
+        with pytest.raises(BatchRefusalError, match="pixels differ"):
             Batch(load_rig(default_rig_path(), [override]))

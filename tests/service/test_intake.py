@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.messages.commands import Reply, Status, Stop
-from fitctl.service.intake import Intake, Taken
+from fitctl.service.intake import Accepted, Intake
 
 STATUS, STOP = msgspec.msgpack.encode(Status()), msgspec.msgpack.encode(Stop())
 
@@ -35,29 +35,29 @@ def test_one_persons_flood_takes_nothing_from_another(intake):
 
 
 def test_a_stop_is_taken_even_when_it_is_one_too_many(intake):
-    taken = [intake.take("anna", STATUS, 0.0) for _ in range(11)]
+    taken = [intake.accept("anna", STATUS, 0.0) for _ in range(11)]
 
-    assert taken[:10] == [Taken(Status(), is_too_many=False)] * 10
+    assert taken[:10] == [Accepted(Status(), over_rate=False)] * 10
     assert taken[10].text.startswith("more than 10 commands a second")
-    assert intake.take("anna", STOP, 0.0) == Taken(Stop(), is_too_many=True)
+    assert intake.accept("anna", STOP, 0.0) == Accepted(Stop(), over_rate=True)
 
 
 @given(st.binary(max_size=100))
 def test_whatever_comes_is_taken_or_told_why_not(payload):
     taken = Intake(commands_per_s=10.0).take("anna", payload, 0.0)
 
-    assert isinstance(taken, Taken) or (isinstance(taken, Reply) and not taken.accepted)
+    assert isinstance(taken, Accepted) or (isinstance(taken, Reply) and not taken.accepted)
 
 
 def test_what_was_turned_back_is_told_by_whose_it_was_and_not_too_often(intake):
     for _ in range(13):
-        intake.take("anna", STATUS, 0.0)
-    intake.take("bob", b"garbage", 0.0)
+        intake.accept("anna", STATUS, 0.0)
+    intake.accept("bob", b"garbage", 0.0)
 
     assert intake.dropped(0.0) == [
         "anna: 3 messages, over the rate limit",
         "bob: 1 messages, no commands",
     ]
-    intake.take("bob", b"garbage", 1.0)
+    intake.accept("bob", b"garbage", 1.0)
     assert intake.dropped(1.0) == []
     assert intake.dropped(10.0) == ["bob: 1 messages, no commands"]

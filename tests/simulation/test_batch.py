@@ -7,13 +7,15 @@ import pytest
 
 from fitctl.config import StackHysteresis, default_rig_path, load_rig
 from fitctl.messages.modes import Mode
-from fitctl.model.compiled import kernels
+from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.simulation.batch.batch import Batch
-from fitctl.simulation.batch.settings import TooLargeForBatchError
+from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation, simulate
 
-pytestmark = pytest.mark.skipif(kernels() is None, reason="numba is not installed (extra `fast`)")
+pytestmark = pytest.mark.skipif(
+    not numba_installed(), reason="numba is not installed (extra `fast`)"
+)
 
 CONTROLLER = "loops.right.vernier.controller={}"
 FIELDS = {
@@ -171,7 +173,7 @@ def test_what_a_batch_does_not_know_is_simulated():
 
 
 def test_a_rig_with_more_than_fits_is_refused():
-    with pytest.raises(TooLargeForBatchError, match="steps to remember"):
+    with pytest.raises(BatchRefusalError, match="steps to remember"):
         Batch(rig_with("plant.step_s=0.00005"))
 
 
@@ -186,5 +188,5 @@ def test_a_rig_with_more_than_fits_is_refused():
     ],
 )
 def test_a_rig_whose_interlocks_may_act_is_refused(overrides):
-    with pytest.raises(TooLargeForBatchError, match="may act"):
+    with pytest.raises(BatchRefusalError, match="may act"):
         Batch(rig_with(*overrides))

@@ -15,6 +15,7 @@ import pytest
 
 from fitctl.cli import main
 from fitctl.simulation import campaign
+from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.campaign import (
     CampaignError,
     SeedRms,
@@ -90,14 +91,16 @@ def test_every_seed_of_a_campaign_is_the_run_that_it_is_alone(rig):
 
 def test_without_the_batch_the_same_runs_are_simulated(rig, monkeypatch):
     def no_batch(_rig):
-        raise ImportError
+        raise BatchRefusalError("numba is not installed")
 
     quick = campaign.run_seeds(rig.model_dump_json(), [3], 12.0)
     campaign._runner.cache_clear()
     monkeypatch.setattr(campaign, "Batch", no_batch)
     slow = campaign.run_seeds(rig.model_dump_json(), [3], 12.0)
+    reason = campaign.batch_refusal(rig.model_dump_json())
     campaign._runner.cache_clear()
 
+    assert reason == "numba is not installed"
     assert slow[3]["right"].acquired_s == quick[3]["right"].acquired_s
     assert slow[3]["right"].mode_times == pytest.approx(quick[3]["right"].mode_times)
 
@@ -123,6 +126,31 @@ def test_simulate_runs_prints_one_json_object(capsys):
     assert summary["runs"] == summary["held"] == 3
     assert set(summary["rms_px"]) == {"az", "el", "worst_axis"}
     assert {run["seed"] for run in summary["worst_seeds"]} == {0, 1, 2}
+
+
+def test_a_rig_that_the_batch_refuses_is_simulated_slowly_and_says_why_once(capsys):
+    with pytest.raises(SystemExit):
+        main(
+            [
+                "simulate", "--runs", "3", "--duration", "1", "--json",
+                "--set", "interlocks.fsm_edge.action=flatten",
+            ]
+        )  # fmt: skip
+
+    printed = capsys.readouterr()
+    reason = "interlock fsm_edge may act, and the batch has no interlocks"
+    assert json.loads(printed.out)["batch_refusal"] == reason
+    assert printed.err.count(f"The batch simulator cannot run this rig: {reason}.") == 1
+    assert "a hundred times slower" in printed.err
+
+
+def test_a_rig_that_the_batch_runs_says_nothing_of_it(capsys):
+    with pytest.raises(SystemExit):
+        main(["simulate", "--runs", "2", "--duration", "1", "--json"])
+
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["batch_refusal"] is None
+    assert "batch" not in printed.err
 
 
 # ---------------------------------------------------------------- on a cluster

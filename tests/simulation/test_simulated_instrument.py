@@ -9,7 +9,6 @@ from simulated import NEAR, darken, events_of, mode_of, until
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import save_design
-from fitctl.loop.loop_state import loop_state
 from fitctl.messages.commands import (
     Acquire,
     Hold,
@@ -276,7 +275,7 @@ def test_telemetry_tells_which_file_the_design_at_work_is_from(tmp_path, monkeyp
     simulation = Simulation(rig, 0)
 
     def at_work():
-        state = loop_state(rig, simulation.supervisor.loops["right"], simulation.clock.now_s())
+        state = simulation.supervisor.loops["right"].state(simulation.clock.now_s())
         return state.controller, state.controller_file
 
     assert at_work() == ("eq20", str(tmp_path / "mine.json"))

@@ -1,5 +1,8 @@
 """The siderostat's servo: what it commands, and when it calls a fault."""
 
+import sys
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -131,7 +134,7 @@ def test_a_missing_reading_is_bridged_and_many_are_a_fault(servo, amplifiers):
     run(servo, 200)
 
     assert isinstance(servo.fault, DeviceTimeout)
-    assert servo.take_timing().missed_readings > 100
+    assert servo.drain_timing().missed_readings > 100
 
 
 def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
@@ -298,10 +301,58 @@ def test_the_thread_keeps_its_rate_and_ends(amplifiers):
     servo.open()
     begun_s = clock.now_s()
     clock.sleep_until(begun_s + 0.5)
-    periods = len(servo.take_timing().late_s)
+    periods = len(servo.drain_timing().late_s)
     gone_s = clock.now_s() - begun_s
     servo.close()
     thread.stop()
 
     # A missed deadline is skipped, so there may be fewer periods than time for them, never more.
     assert 0.3 * gone_s / 0.002 < periods <= gone_s / 0.002 + 20
+
+
+class Interruption:
+    """Calls `action` before one bytecode instruction of a function: where another thread may come in."""
+
+    def __init__(self, code, instruction, action):
+        self._code, self._left, self._action = code, instruction, action
+        self.happened = False
+
+    def __enter__(self):
+        sys.settrace(self._enter_function)
+        return self
+
+    def __exit__(self, *_error):
+        sys.settrace(None)
+
+    def _enter_function(self, frame, _event, _argument):
+        if frame.f_code is not self._code or self.happened:
+            return None
+        frame.f_trace_opcodes = True
+        return self._instruction
+
+    def _instruction(self, _frame, event, _argument):
+        if event == "opcode":
+            if self._left == 0:
+                sys.settrace(None)
+                self.happened = True
+                self._action()
+            self._left -= 1
+        return self._instruction
+
+
+def test_a_set_point_is_never_lost_whenever_within_a_period_it_comes(servo, amplifiers):
+    servo.hold(servo.position_rad)
+    instruction, happened = 0, True
+    while happened:
+        first, second = ([0.2, 0.0], [0.0, 0.2]) if instruction % 2 else ([0.0, 0.0], [0.2, 0.2])
+        servo.move_to(np.array(first))
+        give = partial(servo.move_to, np.array(second))
+        with Interruption(servo._velocity_rad_s.__code__, instruction, give) as interruption:
+            servo.period()
+        happened = interruption.happened
+        if happened:
+            run(servo, 60)
+            assert amplifiers.position_rad == pytest.approx(second, abs=2e-3), instruction
+        instruction += 1
+
+    assert instruction > 20

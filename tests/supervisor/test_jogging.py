@@ -33,7 +33,7 @@ def test_a_jog_moves_the_siderostat_by_as_much_as_was_asked_and_no_mirror(standb
     standby.run(2.0)
 
     assert sky_arcsec(standby) - before == pytest.approx([10.0, -4.0], abs=0.05)
-    assert loop_of(standby).stages.at_bias()
+    assert loop_of(standby).mirror.at_bias()
 
 
 def test_jogs_add_up(standby):
@@ -47,12 +47,12 @@ def test_jogs_add_up(standby):
 
 @pytest.mark.parametrize("az", [200.0, -200.0, math.nan, math.inf])
 def test_a_jog_beyond_a_field_of_view_is_refused_and_moves_nothing(standby, az):
-    before = loop_of(standby).stages.setpoint_rad.copy()
+    before = loop_of(standby).siderostat.setpoint_rad.copy()
     reply = standby.command(Jog(az_sky_arcsec=az, el_sky_arcsec=0.0))
 
     assert not reply.accepted
     assert "at most a field of view, 108.3 arcsec" in reply.text
-    assert (loop_of(standby).stages.setpoint_rad == before).all()
+    assert (loop_of(standby).siderostat.setpoint_rad == before).all()
 
 
 def test_no_jog_leaves_the_travel(standby):
@@ -62,8 +62,8 @@ def test_no_jog_leaves_the_travel(standby):
 
     assert not replies[-1].accepted
     assert "would leave its travel" in replies[-1].text
-    stages = loop_of(standby).stages
-    assert abs(stages.setpoint_rad).max() <= stages.travel_rad
+    siderostat = loop_of(standby).siderostat
+    assert abs(siderostat.setpoint_rad).max() <= siderostat.travel_rad
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_the_mirror_goes_to_its_offset_no_faster_than_it_may_and_back_with_it(st
     loop = loop_of(standby)
     assert standby.command(SetBiasOffset(az_urad=40.0, el_urad=-20.0)).accepted
     standby.run(3.0)
-    assert loop.stages.mirror_now_rad * 1e6 == pytest.approx([40.0, -20.0], abs=0.5)
+    assert loop.mirror.now_rad * 1e6 == pytest.approx([40.0, -20.0], abs=0.5)
 
     stack_v = np.array([[t.stack1_v, t.stack2_v, t.stack3_v] for t in standby.ticks])
     most_v = loop.settings.fsm.slew_v_per_s * standby.supervisor.rig.camera.period_s
@@ -90,7 +90,7 @@ def test_the_mirror_goes_to_its_offset_no_faster_than_it_may_and_back_with_it(st
 
     assert standby.command(SetBiasOffset(az_urad=0.0, el_urad=0.0)).accepted
     standby.run(3.0)
-    assert loop.stages.at_bias()
+    assert loop.mirror.at_bias()
 
 
 @pytest.mark.parametrize("az", [500.0, math.nan])
@@ -100,7 +100,7 @@ def test_an_offset_beyond_the_diamond_is_refused(standby, az):
     assert not reply.accepted
     assert "within the mirror's 177." in reply.text
     standby.run(0.5)
-    assert loop_of(standby).stages.at_bias()
+    assert loop_of(standby).mirror.at_bias()
 
 
 @pytest.mark.parametrize("ending", [Stop(), Off()])
@@ -113,8 +113,8 @@ def test_stop_and_off_forget_the_offset(standby, ending):
         assert standby.clock.now_s() < 60.0
     standby.run(3.0)
 
-    assert not loop.stages.bias_offset_rad.any()
-    assert loop.stages.at_bias()
+    assert not loop.mirror.bias_offset_rad.any()
+    assert loop.mirror.at_bias()
 
 
 def test_after_a_stop_nothing_moves_by_itself(standby):
@@ -126,7 +126,7 @@ def test_after_a_stop_nothing_moves_by_itself(standby):
     standby.run(2.0)
 
     assert loop_of(standby).mode is Mode.STANDBY
-    assert loop_of(standby).stages.at_bias()
+    assert loop_of(standby).mirror.at_bias()
 
 
 def test_the_search_leaves_the_mirror_where_the_operator_put_it(standby):
@@ -134,7 +134,7 @@ def test_the_search_leaves_the_mirror_where_the_operator_put_it(standby):
     standby.run(2.0)
     standby.command(Acquire())
     standby.run(0.5)
-    assert loop_of(standby).stages.mirror_now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)
+    assert loop_of(standby).mirror.now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)
     standby.command(Hold())
     standby.run(0.5)
-    assert loop_of(standby).stages.mirror_now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)
+    assert loop_of(standby).mirror.now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)

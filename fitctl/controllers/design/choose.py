@@ -59,7 +59,7 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
 
 @contextmanager
 def solving(what: str, loop_name: str) -> Iterator[None]:
-    """For the mathematics of designs: what has no solution is a rig file's fault, and told as such.
+    """For the mathematics of designs: a problem without a solution is reported as the rig file's error.
 
     Raises
     ------

@@ -34,7 +34,7 @@ class DeadzoneResult(NamedTuple):
     ----------
     largest_real : float
         Largest real part of M: bounded and at rest in the end if below 1; infinite where the loop is
-        unstable without any limit, so that neither criterion says anything.
+        unstable without any limit, so that neither criterion applies.
     largest_crossing : float
         Largest real value at which M crosses the real axis: no limit cycle if below 1.
     at_hz : float
@@ -62,7 +62,7 @@ def deadzone_response(design: Design, basis: Basis, omega_rad_s: Floats) -> NDAr
     frames = timing(basis.period_s, basis.delay_s).frames
     n = len(loop.a)
     own = n - len(design.a)
-    # One more state: what passed the range a frame ago, which the design is told.
+    # One more state: what passed the range a frame ago, which is an input of the design.
     a, b = np.zeros((n + 1, n + 1)), np.zeros((n + 1, 1))
     a[:n, :n] = loop.a + np.outer(loop.b, loop.star)
     a[0, n], a[frames, n] = design.d[:, 1]  # into the newest mirror command, and the siderostat's

@@ -164,7 +164,7 @@ def _shown(value: object) -> str:
 
 
 def _refusal(path: Path, key: str, expected: str, got: str, hint: str) -> ConfigError:
-    # Whatever the file held, it is told on one line.
+    # Whatever the file held, one line reports it.
     return ConfigError(
         f"{path}: {key}: expected {expected}, got {textwrap.shorten(got, 120)}; {hint}"
     )

@@ -51,7 +51,7 @@ def design_fslq(basis: Basis) -> Design:
         motor=-gain[:, 1],
         memory=-gain[:, :1],
         keep=np.array([[keep]]),
-        take=np.array([[1.0 - keep, 0.0]]),
+        drive=np.array([[1.0 - keep, 0.0]]),
     )
     return predicting_design("fslq", basis, found, gains, design_parameters(basis, "fslq"))
 

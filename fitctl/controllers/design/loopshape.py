@@ -23,7 +23,7 @@ _POINTS = 6000
 
 
 class LoopShape(NamedTuple):
-    """What a loop shape tells.
+    """Margins and attenuation of a loop.
 
     Attributes
     ----------

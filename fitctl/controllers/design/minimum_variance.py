@@ -32,7 +32,7 @@ def design_minimum_variance(basis: Basis) -> Design:
         motor=-outputs,
         memory=np.zeros((2, 0)),
         keep=np.zeros((0, 0)),
-        take=np.zeros((0, 2)),
+        drive=np.zeros((0, 2)),
     )
     return predicting_design(
         "minimum-variance",

@@ -60,15 +60,15 @@ class Gains(NamedTuple):
     motor : array, shape (2,)
         On where the siderostat will be when the command begins.
     memory : array, shape (2, n)
-        On a memory of the law's own: m+ = keep m + take @ (mirror, motor step).
-    keep, take : arrays, shapes (n, n), (n, 2)
+        On a memory of the law's own: m+ = keep m + drive @ (mirror, motor step).
+    keep, drive : arrays, shapes (n, n), (n, 2)
     """
 
     star: Floats
     motor: Floats
     memory: Floats
     keep: Floats
-    take: Floats
+    drive: Floats
 
 
 def predicting_design(
@@ -89,7 +89,7 @@ def predicting_design(
     now_state = np.zeros((own, n))
     now_state[:, :own] = np.eye(own) - np.outer(found.gain, SEEN)
     now_input = np.outer(found.gain, frame)
-    # Where the siderostat will be: where it was seen, and the steps that it had not yet made.
+    # Where the siderostat will be: where it was at the frame, and the steps that it had not yet made.
     motor_state, motor_input = np.zeros(n), np.eye(5)[motor]
     motor_state[own : own + steps] = 1.0
     motor_state[own + steps - 1] = 1.0 - walked
@@ -104,8 +104,8 @@ def predicting_design(
     a[own], b[own] = c[1], d[1]
     a[own + 1 : own + steps, own : own + steps - 1] = np.eye(steps - 1)
     a[own + steps :, own + steps :] = gains.keep
-    a[own + steps :] += gains.take @ c
-    b[own + steps :] = gains.take @ d
+    a[own + steps :] += gains.drive @ c
+    b[own + steps :] = gains.drive @ d
     return Design(
         name=name,
         period_s=basis.period_s,

@@ -20,10 +20,7 @@ from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, LinkedAmplifiers
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
-    EXCEPTION_FLAG,
     EXCEPTIONS,
-    READ_HOLDING_REGISTERS,
-    Message,
     decode_registers,
     encode_exchange,
     encode_read,
@@ -41,6 +38,7 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     ServoReading,
 )
+from fitctl.drivers.modbus import EXCEPTION_FLAG, READ_HOLDING_REGISTERS, Message
 from fitctl.drivers.probe import Probe, round_trip_s
 
 _STILL = (0.0, 0.0)

@@ -1,7 +1,6 @@
 """The Modbus/TCP connection to the I/O station: requests out, answers in, matched by their number.
 
-Own code and not pymodbus, whose client waits for each answer as long as its time limit: a servo goes on
-after one period, and takes a late answer when it comes.
+A servo goes on after one period, and takes a late answer when it comes.
 """
 
 from __future__ import annotations
@@ -12,15 +11,15 @@ import time
 
 from fitctl.config import BalAnalogDevice
 from fitctl.drivers.amplifiers import DEVICE
-from fitctl.drivers.bal_analog.protocol import (
+from fitctl.drivers.endpoint import Endpoint
+from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
+from fitctl.drivers.modbus import (
     Message,
     decode_identity,
     encode_identify,
     frame,
     pop_message,
 )
-from fitctl.drivers.endpoint import Endpoint
-from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
 
 _MESSAGE_BYTES_MAX = 260
 

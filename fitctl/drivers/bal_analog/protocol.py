@@ -1,8 +1,8 @@
-"""The I/O station before the analogue amplifiers as both sides see it: registers, counts, Modbus frames.
+"""The I/O station before the analogue amplifiers as both sides see it: registers and counts.
 
-Function 23 (Read/Write Multiple Registers) of the MODBUS Application Protocol Specification V1.1b3, in the
-frame of MODBUS Messaging on TCP/IP V1.0b. Outputs are two analogue channels and a word of digital ones;
-inputs two counters and a word of digital ones: analogue before digital, as stations map them.
+Function 23 (Read/Write Multiple Registers) of the MODBUS Application Protocol Specification V1.1b3. Outputs are
+two analogue channels and a word of digital ones; inputs two counters and a word of digital ones: analogue
+before digital, as stations map them.
 """
 
 from __future__ import annotations
@@ -10,21 +10,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from typing import NamedTuple
+
+from fitctl.drivers.modbus import READ_HOLDING_REGISTERS
 
 REGISTERS = 3
 COUNTER_MODULUS = 1 << 16
 
-READ_HOLDING_REGISTERS = 3
 READ_WRITE_MULTIPLE_REGISTERS = 23
-READ_DEVICE_IDENTIFICATION = 43
-EXCEPTION_FLAG = 0x80
-
-_HEADER = struct.Struct(">HHHB")  # transaction, protocol, length from the unit on, unit
-_PDU_BYTES_MAX = 253
-_MEI_IDENTIFICATION = 0x0E
-_BASIC_STREAM = 1
-_OBJECTS = 3
 
 EXCEPTIONS = {
     0x01: "illegal function: the station does not know function 23",
@@ -35,42 +27,6 @@ EXCEPTIONS = {
     0x0A: "gateway path unavailable",
     0x0B: "gateway target does not respond",
 }
-
-
-class Message(NamedTuple):
-    """One message without its frame; `protocol` is 0 for Modbus."""
-
-    transaction: int
-    unit: int
-    pdu: bytes
-    protocol: int = 0
-
-
-def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
-    """A PDU in its frame."""
-    return _HEADER.pack(transaction, 0, 1 + len(pdu), unit) + pdu
-
-
-def pop_message(pending: bytearray) -> Message | None:
-    """Remove the first whole message from `pending`; None while there is none.
-
-    Raises
-    ------
-    ValueError
-        If no message can be that long, so that nobody knows where the next one begins.
-    """
-    if len(pending) < _HEADER.size:
-        return None
-    transaction, protocol, length, unit = _HEADER.unpack_from(pending)
-    if not 2 <= length <= 1 + _PDU_BYTES_MAX:
-        msg = f"protocol {protocol}, length {length}"
-        raise ValueError(msg)
-    end = _HEADER.size - 1 + length
-    if len(pending) < end:
-        return None
-    pdu = bytes(pending[_HEADER.size : end])
-    del pending[:end]
-    return Message(transaction, unit, pdu, protocol)
 
 
 def encode_exchange(first_input: int, first_output: int, outputs: Sequence[int]) -> bytes:
@@ -108,25 +64,6 @@ def decode_registers(pdu: bytes, function_code: int = READ_WRITE_MULTIPLE_REGIST
         msg = f"{len(pdu)} bytes: {pdu[:16].hex(' ')}"
         raise ValueError(msg)
     return registers
-
-
-def encode_identify() -> bytes:
-    """The request for a station's basic identification."""
-    return bytes([READ_DEVICE_IDENTIFICATION, _MEI_IDENTIFICATION, _BASIC_STREAM, 0])
-
-
-def decode_identity(pdu: bytes) -> list[str]:
-    """Vendor, product and revision; empty where the answer does not have them."""
-    texts = [""] * _OBJECTS
-    if pdu[:2] != bytes([READ_DEVICE_IDENTIFICATION, _MEI_IDENTIFICATION]):
-        return texts
-    rest = pdu[7:]
-    while len(rest) >= 2 and len(rest) >= 2 + rest[1]:
-        number, size = rest[0], rest[1]
-        if number < _OBJECTS:
-            texts[number] = rest[2 : 2 + size].decode("ascii", "replace")
-        rest = rest[2 + size :]
-    return texts
 
 
 def velocity_to_counts(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fitctl.drivers.bal_analog.protocol import Message, frame, pop_message
+from fitctl.drivers.modbus import Message, frame, pop_message
 from fitctl.drivers.modbus_dac.protocol import NO_SUCH_DEVICE
 from fitctl.mocks.faults import Faults
 from fitctl.mocks.modbus.pdu import DataModel, answer, exception

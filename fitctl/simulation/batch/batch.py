@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.messages.modes import Mode
+from fitctl.model.compiled import compiled, numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import PlantState
 from fitctl.model.randomness import place_star, run_randomness
-from fitctl.simulation.batch.settings import DONE, RUN, WORK, batch_settings
+from fitctl.simulation.batch.records import DONE, RUN, WORK
+from fitctl.simulation.batch.run import run
+from fitctl.simulation.batch.settings import BatchRefusalError, batch_settings
 from fitctl.simulation.simulation import simulate
 from fitctl.simulation.statistics import SETTLE_S, SimulationResult, pair
 
@@ -39,18 +42,21 @@ class Batch:
 
     Raises
     ------
-    ImportError
-        Without numba.
-    TooLargeForBatchError
-        If the rig has more of something than a batch can hold.
+    BatchRefusalError
+        Without numba, or if the rig has more than one loop, more of something than the records hold, or
+        something that the batch does not model.
     """
 
     def __init__(self, rig: Rig) -> None:
-        from fitctl.simulation.batch.run_kernel import run
-
+        if not numba_installed():
+            msg = "numba is not installed: pip install 'fitctl[fast]'"
+            raise BatchRefusalError(msg)
+        if len(rig.loops) > 1:
+            msg = f"it has {len(rig.loops)} loops, and the batch runs rigs of one"
+            raise BatchRefusalError(msg)
         (self._name,) = rig.loops
         self._rig = rig
-        self._run = run
+        self._run = compiled(run)
         self._constants = plant_constants(rig, self._name, np.zeros((1, 2)))
         self._settings = batch_settings(rig, self._name, self._constants)
         self._frames_dn = np.empty((2, rig.camera.height_px, rig.camera.width_px))
@@ -63,7 +69,7 @@ class Batch:
         place_px = place_star(self._rig, self._name, streams.place)
         state, work = np.zeros(1, RUN), np.zeros(1, WORK)
         state["acquired_s"] = state["vernier_s"] = math.nan
-        state["judged_from"] = _NOT_YET
+        state["residual_from"] = _NOT_YET
         state["pixel_key"] = streams.pixels
         state["command_px"] = s["target_px"]
         state["stack_v"] = s["bias_v"]
@@ -87,7 +93,6 @@ class Batch:
             ticks,
             true_px,
             duration_s,
-            SETTLE_S,
         )
         last = state[0]
         return BatchRun(last, ended, ticks[: last["frames"]], true_px[: last["steps"]])
@@ -95,7 +100,7 @@ class Batch:
     def result(self, seed: int, duration_s: float) -> SimulationResult:
         """One run's result: what :func:`fitctl.simulation.simulation.simulate` gives, but for its speed.
 
-        What the batch does not know is simulated.
+        A run that meets what the batch does not model is simulated.
         """
         run = self.run(seed, duration_s)
         if run.ended == DONE:
@@ -104,7 +109,7 @@ class Batch:
 
 
 def _result(state: np.void) -> SimulationResult:
-    steps, frames = state["judged_steps"], state["judged_frames"]
+    steps, frames = state["residual_steps"], state["residual_frames"]
     start_s = state["vernier_s"] + SETTLE_S
     piston_m = _mean(state["piston_sum_m"], steps)
     piston_m2 = _mean(state["piston_sum_m2"], steps) - piston_m**2

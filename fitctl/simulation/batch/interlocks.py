@@ -1,4 +1,4 @@
-"""Which interlocks a batched run, which knows of none, might have tripped."""
+"""Which interlocks might trip in a run: the batch, which has none, refuses a rig that has one of them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fitctl.model.optics import scales
 def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
     """Interlocks that do more than warn, and that a simulated run without them might have tripped."""
     loop, camera, scale = rig.loops[loop_name], rig.camera, scales(rig, rig.loops[loop_name])
-    travel_rad = loop.siderostat.travel_sky_arcsec / scale.motor_sky_arcsec_per_rad
+    travel_rad = scale.travel_rad(loop.siderostat)
     rate_rad_s = loop.siderostat.velocity_limit_rad_s
-    count_rad = 2 * math.pi / loop.siderostat.encoder_counts_per_rev
+    count_rad = loop.siderostat.encoder_count_rad
     late_s = rig.true_camera.frame_delay_s - camera.frame_delay_s
     # How far each gets while nothing fails; its set-points are limited, and it counts in steps.
     reached = {

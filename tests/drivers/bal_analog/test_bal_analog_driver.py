@@ -9,7 +9,6 @@ from scripted_server import scripted_server
 
 from fitctl import config
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers, probe_bal_analog
-from fitctl.drivers.bal_analog.protocol import frame, pop_message
 from fitctl.drivers.interface import (
     DeviceFault,
     DeviceProtocolError,
@@ -17,6 +16,7 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
+from fitctl.drivers.modbus import frame, pop_message
 
 STILL = (0.0, 0.0)
 MOCK = "mocks.loops.right.bal_analog"

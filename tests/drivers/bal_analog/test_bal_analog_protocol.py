@@ -5,21 +5,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.drivers.bal_analog.protocol import (
-    READ_HOLDING_REGISTERS,
-    Message,
     counts_to_volts,
-    decode_identity,
     decode_registers,
     encode_exchange,
-    encode_identify,
     encode_read,
-    frame,
     lines,
-    pop_message,
     signed,
     unwrap,
     velocity_to_counts,
     word_of,
+)
+from fitctl.drivers.modbus import (
+    READ_HOLDING_REGISTERS,
+    Message,
+    decode_identity,
+    encode_identify,
+    frame,
+    pop_message,
 )
 
 

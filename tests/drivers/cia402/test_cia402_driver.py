@@ -4,7 +4,15 @@ import math
 import threading
 
 import pytest
-from cia402_bench import STILL, Bench, bridged, exchange_until, reading_of, wait_until
+from cia402_bench import (
+    STILL,
+    Bench,
+    bridged,
+    exchange_until,
+    is_to_drive,
+    reading_of,
+    wait_until,
+)
 
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
@@ -51,6 +59,44 @@ def test_disable_stops_and_takes_current_away(bench, amplifiers):
     assert bench.motors.enabled == [False, False]
     assert bench.motors.velocity_rad_s == [0.0, 0.0]
     assert not reading_of(amplifiers).enabled
+
+
+SDO_REQUEST, RPDO = 0x601, 0x201
+ZERO_AZ = (SDO_REQUEST, bytes.fromhex("23 FF60 00 00000000"))
+ZERO_EL = (SDO_REQUEST, bytes.fromhex("23 FF68 00 00000000"))
+ZERO_BOTH = (RPDO, bytes(8))
+CONTROLWORDS = (bytes.fromhex("4060"), bytes.fromhex("4068"))
+
+
+@pytest.mark.parametrize("action", ["enable", "disable"])
+def test_zero_velocity_is_written_and_sent_before_the_power_changes(bench, action):
+    """Written, because the drive confirms it; sent, because an older velocity may wait for its SYNC."""
+    to_drive = []
+
+    def carry(message):
+        if is_to_drive(message):
+            to_drive.append((message.arbitration_id, bytes(message.data)))
+        return [message]
+
+    with bridged(bench, carry) as siderostat:
+        amplifiers = Cia402Amplifiers(siderostat)
+        try:
+            amplifiers.open()
+            if action == "disable":
+                amplifiers.enable()
+            reading_of(amplifiers, [1.5, -0.25])
+            to_drive.clear()
+            getattr(amplifiers, action)()
+            frames = list(to_drive)
+        finally:
+            amplifiers.close()
+
+    powers = [
+        can_id == SDO_REQUEST and data[0] & 0xE0 == 0x20 and data[1:3] in CONTROLWORDS
+        for can_id, data in frames
+    ]
+    before = frames[: powers.index(True)]
+    assert {ZERO_AZ, ZERO_EL, ZERO_BOTH} <= set(before)
 
 
 def test_a_fault_is_reported_stays_and_is_reset(bench, amplifiers):

@@ -1,11 +1,18 @@
+import contextlib
+import os
+import pty
+import select
 import socket
 import threading
 import time
+import tty
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
 from scripted_server import scripted_server
 
 from fitctl.config import ConfigError, Fault, default_rig_path, load_rig
@@ -16,7 +23,9 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
+from fitctl.drivers.modbus import rtu_frame
 from fitctl.drivers.modbus_dac.driver import ModbusDac
+from fitctl.drivers.modbus_dac.protocol import WRITE_MULTIPLE_REGISTERS
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
 
 RIG = load_rig(default_rig_path())
@@ -24,6 +33,11 @@ DAC = RIG.loops["right"].fsm.dac
 SETTINGS = RIG.mocks.loops["right"].dac.model_copy(update={"watchdog_s": 30.0})
 MID = np.full(3, 5.0)
 COUNT_V = 10 / 65535
+
+
+def write(dac, volts):
+    dac.send_v(volts)
+    dac.confirm()
 
 
 def station_at(port, **changes):
@@ -97,7 +111,7 @@ def test_opening_tells_who_is_there_and_changes_no_output(mock, dac):
 
 def test_a_write_sets_the_outputs_before_it_returns(mock, dac):
     volts = np.array([0.0, 3.3, 10.0])
-    dac.write_v(volts)
+    write(dac, volts)
     assert mock.outputs_v == pytest.approx(volts, abs=0.51 * COUNT_V)
     assert dac.read_v() == pytest.approx(volts, abs=0.51 * COUNT_V)
 
@@ -106,8 +120,53 @@ def test_a_write_sets_the_outputs_before_it_returns(mock, dac):
 def test_volts_out_of_range_are_never_sent(mock, dac, bad_v):
     before = mock.outputs_v
     with pytest.raises(ValueError, match="channel 2 gives 0 to 10 V"):
-        dac.write_v(np.array([1.0, bad_v, 1.0]))
+        write(dac, np.array([1.0, bad_v, 1.0]))
     assert mock.outputs_v == before
+
+
+def test_a_write_is_sent_at_once_and_its_answer_waited_for_when_asked(dac, wrong):
+    wrong("delay", value=0.1)
+    started_s = time.monotonic()
+    dac.send_v(MID)
+    assert time.monotonic() - started_s < 0.05
+    dac.confirm()
+    assert time.monotonic() - started_s > 0.1
+    dac.confirm()  # nothing is left to wait for
+    assert time.monotonic() - started_s < 0.2
+
+
+def test_a_write_that_was_not_confirmed_is_confirmed_before_the_next_one(mock, dac, wrong):
+    wrong("drop")
+    dac.send_v(np.zeros(3))
+    with pytest.raises(DeviceTimeout):
+        dac.send_v(MID)
+    assert mock.outputs_v == [0, 0, 0]  # nothing was sent after what nobody confirmed
+    wrong()
+    write(dac, MID)
+    assert mock.outputs_v == pytest.approx(MID, abs=COUNT_V)
+
+
+def test_an_answer_that_came_during_a_stall_is_an_answer(dac):
+    dac.send_v(MID)
+    threading.Event().wait(2 * DAC.response_timeout_s)
+    dac.confirm()
+
+
+def test_an_answer_in_two_pieces_is_one_answer():
+    def talk(link):
+        while len(request := link.recv(300)) >= 8:
+            pdu = correctly(request[7], request[8:])
+            message = request[:4] + (len(pdu) + 1).to_bytes(2, "big") + request[6:7] + pdu
+            for piece in (message[:5], message[5:9], message[9:]):
+                link.sendall(piece)
+                threading.Event().wait(0.01)
+
+    with scripted_server(talk) as port:
+        driver = ModbusDac(station_at(port))
+        driver.open()
+        write(driver, MID)
+        assert driver.read_counts() == [0x8000] * 3
+        driver.close()
 
 
 # ---------------------------------------------------------------- faults
@@ -116,20 +175,20 @@ def test_volts_out_of_range_are_never_sent(mock, dac, bad_v):
 def test_a_tripped_watchdog_is_refused_with_a_next_step_and_the_outputs_are_read_as_they_are(
     mock, dac, wrong
 ):
-    dac.write_v(np.zeros(3))
+    write(dac, np.zeros(3))
     wrong("watchdog_trip")
     with pytest.raises(DeviceRefused, match=r"exception 04, device failure; .*watchdog"):
-        dac.write_v(MID)
+        write(dac, MID)
     with pytest.raises(DeviceRefused):
         dac.read_v()
     wrong()
     assert dac.read_v() == pytest.approx(MID, abs=COUNT_V)
-    dac.write_v(np.zeros(3))
+    write(dac, np.zeros(3))
     assert mock.outputs_v == [0, 0, 0]
 
 
 def test_a_watchdog_that_ran_out_unseen_shows_when_the_outputs_are_read(mock, dac, wrong):
-    dac.write_v(np.zeros(3))
+    write(dac, np.zeros(3))
     wrong("watchdog_trip", for_s=1e-3)
     threading.Event().wait(0.01)
     assert dac.read_v() == pytest.approx(MID, abs=COUNT_V)
@@ -140,34 +199,77 @@ def test_silence_is_a_timeout_and_the_next_write_works(mock, dac, wrong, kind):
     wrong(kind)
     started_s = time.monotonic()
     with pytest.raises(DeviceTimeout, match=r"within 0\.25 s, got none"):
-        dac.write_v(np.zeros(3))
+        write(dac, np.zeros(3))
     assert 0.2 < time.monotonic() - started_s < 2
     wrong()
-    dac.write_v(MID)
+    write(dac, MID)
     assert mock.outputs_v == pytest.approx(MID, abs=COUNT_V)
 
 
 def test_a_late_answer_within_the_time_limit_is_an_answer(dac, wrong):
     wrong("delay", value=0.05)
-    dac.write_v(np.array([1.0, 2.0, 3.0]))
+    write(dac, np.array([1.0, 2.0, 3.0]))
     assert dac.read_v() == pytest.approx([1, 2, 3], abs=COUNT_V)
 
 
 def test_an_answer_that_is_too_late_is_never_taken_for_the_next_ones(mock, dac, wrong):
-    dac.write_v(np.zeros(3))
+    write(dac, np.zeros(3))
     wrong("delay", value=0.35)
     with pytest.raises(DeviceTimeout):
         dac.read_v()  # its answer, zeros, is still on its way
     wrong()
-    dac.write_v(np.array([1.0, 2.0, 3.0]))
+    write(dac, np.array([1.0, 2.0, 3.0]))
     assert dac.read_v() == pytest.approx([1, 2, 3], abs=COUNT_V)
 
 
 def test_answers_that_come_twice_or_swapped_do_no_harm(dac, wrong):
     for kind, volts in (("duplicate", [1.0, 2.0, 3.0]), ("reorder", [4.0, 5.0, 6.0])):
         wrong(kind)
-        dac.write_v(np.array(volts))
+        write(dac, np.array(volts))
         assert dac.read_v() == pytest.approx(volts, abs=COUNT_V)
+
+
+@contextlib.contextmanager
+def repeating_line():
+    """A station on a serial line whose every answer comes again just before the next one; gives the path."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    ending = threading.Event()
+
+    def serve():
+        counts, before = bytes(6), b""
+        while not ending.is_set():
+            if not select.select([ours], [], [], 0.01)[0]:
+                continue
+            request = os.read(ours, 300)
+            counts = request[7:13] if request[1] == WRITE_MULTIPLE_REGISTERS else counts
+            pdu = {3: bytes([3, 6]) + counts, 16: request[1:6]}.get(request[1], b"\xab\x01")
+            answer = rtu_frame(request[0], pdu)
+            os.write(ours, before)
+            threading.Event().wait(0.002)
+            os.write(ours, answer)
+            before = answer
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(theirs)
+    finally:
+        ending.set()
+        thread.join()
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_over_rtu_an_answer_that_comes_again_during_the_next_request_is_no_answer_to_it():
+    with repeating_line() as path:
+        dac = ModbusDac(station_at(1, transport="rtu", serial_port=path))
+        dac.open()
+        for volts in ([1.0, 2.0, 3.0], [4.0, 5.0, 6.0]):
+            write(dac, np.array(volts))
+            counts = dac.read_counts()  # while the answer to the write comes again
+            assert np.array(counts) * COUNT_V == pytest.approx(volts, abs=COUNT_V)
+        dac.close()
 
 
 def test_a_turned_bit_is_an_error_or_harmless_and_never_another_voltage(station, wrong):
@@ -178,7 +280,7 @@ def test_a_turned_bit_is_an_error_or_harmless_and_never_another_voltage(station,
     for _ in range(8):
         wrong()
         driver.open()
-        driver.write_v(volts)
+        write(driver, volts)
         wrong("corrupt")
         try:
             assert driver.read_v() == pytest.approx(volts, abs=COUNT_V)
@@ -197,13 +299,13 @@ def test_a_lost_link_over_tcp_is_an_error_until_it_is_opened_again(mock, wrong, 
     for _ in range(3):
         started_s = time.monotonic()
         with pytest.raises(DeviceUnreachable):
-            dac.write_v(MID)
+            write(dac, MID)
         assert time.monotonic() - started_s < 0.3
     with pytest.raises(DeviceUnreachable):
         dac.open()
     wrong()
     dac.open()
-    dac.write_v(MID)
+    write(dac, MID)
     dac.close()
 
 
@@ -213,9 +315,9 @@ def test_an_unplugged_serial_line_is_silent_until_it_is_plugged_in_again(mock, w
     dac.open()
     wrong(kind, value=30.0 if kind == "reboot" else None)
     with pytest.raises(DeviceTimeout):
-        dac.write_v(MID)
+        write(dac, MID)
     wrong()
-    dac.write_v(MID)
+    write(dac, MID)
     dac.close()
 
 
@@ -224,9 +326,9 @@ def test_a_serial_port_that_goes_away_is_unreachable(mock, in_loop):
     dac.open()
     in_loop(mock.stop())
     with pytest.raises(DeviceUnreachable, match="broken connection"):
-        dac.write_v(MID)
+        write(dac, MID)
     with pytest.raises(DeviceUnreachable, match="open it again"):
-        dac.write_v(MID)
+        write(dac, MID)
     dac.close()
 
 
@@ -242,7 +344,7 @@ def test_opening_the_wrong_registers_or_station_names_the_key_to_correct(mock, c
     with pytest.raises(DeviceRefused, match=says):
         driver.open()
     with pytest.raises(DeviceUnreachable):
-        driver.write_v(MID)
+        write(driver, MID)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +393,7 @@ def test_a_station_without_identification_is_usable():
     with scripted_station(correctly) as port:
         driver = ModbusDac(station_at(port))
         assert driver.open().maker == "unknown"
-        driver.write_v(MID)
+        write(driver, MID)
         driver.close()
 
 
@@ -306,9 +408,26 @@ def test_an_answer_that_does_not_fit_the_write_is_a_protocol_error(lie):
         driver = ModbusDac(station_at(port))
         driver.open()
         with pytest.raises(DeviceProtocolError):
-            driver.write_v(MID)
+            write(driver, MID)
         with pytest.raises(DeviceUnreachable):
-            driver.write_v(MID)
+            write(driver, MID)
+
+
+def test_pymodbus_own_server_is_a_station_too(in_loop):
+    async def serve():
+        registers = SimData(0, values=[0x8000] * 3, datatype=DataType.REGISTERS)
+        server = ModbusTcpServer(SimDevice(DAC.device_id, registers), address=("127.0.0.1", 0))
+        await server.listen()
+        return server
+
+    server = in_loop(serve())
+    driver = ModbusDac(station_at(server.transport.sockets[0].getsockname()[1]))
+    driver.open()
+    assert driver.read_v() == pytest.approx(MID, abs=COUNT_V)
+    write(driver, np.array([1.0, 2.0, 3.0]))
+    assert driver.read_v() == pytest.approx([1, 2, 3], abs=COUNT_V)
+    driver.close()
+    in_loop(server.shutdown())
 
 
 @settings(max_examples=40, deadline=None)
@@ -321,7 +440,7 @@ def test_whatever_is_answered_nothing_but_device_errors_come_out(noise, spoilt):
         driver = ModbusDac(station_at(port, response_timeout_s=0.05))
         try:
             driver.open()
-            driver.write_v(MID)
+            write(driver, MID)
         except DeviceError:
             pass
         finally:

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.framer.rtu import FramerRTU
 
-from fitctl.drivers.bal_analog.protocol import Message, frame, pop_message
+from fitctl.drivers.modbus import Message, frame, pop_message
 from fitctl.drivers.modbus_dac.protocol import rtu_silence_s
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu

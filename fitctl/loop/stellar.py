@@ -1,0 +1,374 @@
+"""A stellar loop's tick, from a camera frame to commands for mirror and siderostat.
+
+frame -> centroid (or star finder) -> interlocks -> mode's control law -> saturate on the mirror's
+diamond -> D/A write and siderostat set-point -> record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.controllers.centroid import Star
+from fitctl.controllers.pair import Design
+from fitctl.controllers.spiral import plan_spiral
+from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
+from fitctl.logging.records import ControllerChange, Tick
+from fitctl.loop.experiments import Experiments
+from fitctl.loop.following import Following
+from fitctl.loop.loop import Loop
+from fitctl.loop.observation import Observation
+from fitctl.loop.pointing import Pointing
+from fitctl.loop.search import Search
+from fitctl.loop.star_finder import StarFinder
+from fitctl.loop.tick_record import TickRecords, TickTimes
+from fitctl.messages.commands import Acquire
+from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger, usable_commands
+from fitctl.messages.telemetry import LoopLimits, LoopState, SpotPlace
+from fitctl.model.drives import Drive
+from fitctl.model.optics import scales
+from fitctl.stages.journal import Journal
+from fitctl.stages.mirror import MirrorStage
+from fitctl.stages.periodic import Periodic
+from fitctl.stages.servo import SiderostatServo
+from fitctl.stages.siderostat import SiderostatStage
+
+Floats = NDArray[np.float64]
+
+
+class StellarLoop(Loop):
+    """One stellar loop: star finder, control laws, mirror.
+
+    Parameters
+    ----------
+    name : str
+    rig : Rig
+    siderostat : SiderostatStage
+    mirror : MirrorStage
+    journal : Journal
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        siderostat: SiderostatStage,
+        mirror: MirrorStage,
+        journal: Journal,
+    ) -> None:
+        super().__init__(name, rig, siderostat, journal)
+        self.mirror = mirror
+        self.target_px = np.array([self.settings.target_px.az, self.settings.target_px.el])
+        scale = scales(rig, self.settings)
+        self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
+        self.search = Search(rig, name, self.star_finder.estimator)
+        self.following = Following(self.settings, scale)
+        self.pointing = Pointing(rig, name, self.target_px)
+        self._limits = _limits(rig, name)
+        self._scale = scale
+        self._period_s = rig.camera.period_s
+        self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
+        self._tick_records = TickRecords(rig, name)
+        self._flattened = False
+        self._laws: dict[Mode, Callable[[Observation], None]] = {
+            Mode.OFF: self._rest,
+            Mode.STANDBY: self._stand_by,
+            Mode.ACQUISITION: self._search,
+            Mode.COARSE: self._pull_in,
+            Mode.VERNIER: self._hold_star,
+            Mode.EXPERIMENT: self._run_experiment,
+            Mode.SAFE: self._rest,
+        }
+
+    # ------------------------------------------------------------ the tick
+
+    def sense(self, frame: Frame | None, frames_lost: int, frames_skipped: int) -> None:
+        """Find the star, and where the stages were when the frame was exposed; without one, where they are."""
+        servo = self.servo.read_state()
+        begun_s = self._clock.now_s()
+        self._experiments.record_injections(self.mirror)
+        star = None
+        if frame is None:
+            mirror_rad, motor_rad = self.mirror.now_rad, servo.position_rad
+        else:
+            motor_rad = self.servo.position_at(frame.mid_exposure_s)
+            mirror_rad = self.mirror.at(frame.mid_exposure_s)
+            star = self._find(frame, mirror_rad, motor_rad)
+        self.observation = Observation(
+            frame, frames_lost, frames_skipped, star, mirror_rad, motor_rad, servo, begun_s
+        )
+        self._sensed_s = self._clock.now_s()
+
+    def decide(self) -> None:
+        """Errors and findings first, then interlocks, then the mode's control law."""
+        observation = self.observation
+        self._evaluate_findings(observation)
+        self.quantities.record_observation(observation)
+        self.quantities.record_stages(observation, self.siderostat, self.mirror)
+        self._evaluate_interlocks(observation.now_s)
+        self._move(observation)
+        self._decided_s = self._clock.now_s()
+
+    def send(self) -> None:
+        """Send the D/A its voltages, at every tick, so that its watchdog sees that we live."""
+        if self.mirror.ready and self.mode not in {Mode.OFF, Mode.EXPERIMENT}:
+            self._use_dac(self.mirror.send)
+
+    def confirm(self) -> None:
+        """Wait until the D/A confirms its voltages."""
+        self._use_dac(self.mirror.confirm)
+        self._done_s = self._clock.now_s()
+
+    def _use_dac(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except DeviceError as error:
+            self.device_failed("D/A", error)
+
+    def tick_record(self) -> Tick:
+        """What the tick was decided by, and what it did."""
+        tick = self._tick_records.make(
+            self.mode,
+            self.observation,
+            self.siderostat,
+            self.mirror,
+            self.pointing,
+            self.search,
+            TickTimes(self._sensed_s, self._decided_s, self._done_s),
+        )
+        self.quantities.record_tick(tick.compute_s, tick.time_s)
+        return tick
+
+    def _move(self, observation: Observation) -> None:
+        """Follow the mode's law, unless an interlock holds or flattens."""
+        action = self.interlocks.action if self.mode in TRACKING else None
+        if action == "flatten":
+            self.mirror.step_to_bias()
+        elif self._flattened and self.mode is Mode.VERNIER:
+            self.pointing.start_pair(self.mirror, observation.motor_rad)
+        self._flattened = action == "flatten"
+        # Without a frame to track by, the stages wait where they are.
+        waits = observation.frame is None and self.mode in TRACKING
+        if action not in {"hold", "flatten"} and not waits:
+            self._laws[self.mode](observation)
+
+    def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
+        if self.mode is Mode.ACQUISITION and not self.search.has_arrived(motor_rad):
+            return None  # what is seen on the way is another star
+        follows = self.mode in FOLLOWING and self.following.lost == 0
+        return self.star_finder.find(frame.image, self.mode, motor_rad, mirror_rad, follows=follows)
+
+    def _evaluate_findings(self, observation: Observation) -> None:
+        """Errors of devices, and what the frame means for the mode."""
+        servo, injector = observation.servo, self.mirror.injector
+        if servo.fault is not None:
+            self.device_failed("siderostat", servo.fault)
+        elif self.mode is Mode.EXPERIMENT and injector.fault is not None:
+            self.mirror.ready = False
+            self.device_failed("injector", injector.fault)
+        elif (frame := observation.frame) is not None:
+            found = self._find_trigger(frame, observation.star)
+            if found is not None and found.trigger is None:
+                self._report_event("warning", found.reason)
+            elif found is not None and found.trigger is not None:
+                self.fire(found.trigger, found.reason)
+
+    def _find_trigger(self, frame: Frame, star: Star | None) -> Finding | None:
+        if self.mode is Mode.ACQUISITION:
+            return self.search.evaluate(star, frame.mid_exposure_s)
+        if self.mode in FOLLOWING:
+            return self.following.evaluate(self.mode, star, self.pointing.command_px)
+        return None
+
+    # ------------------------------------------------------------ modes
+
+    def _enter(self, source: Mode, motor_rad: Floats) -> None:
+        self.following.begin()
+        if source is Mode.EXPERIMENT:
+            self._end_experiment()
+        super()._enter(source, motor_rad)
+        if self.mode is Mode.ACQUISITION:
+            self._start_search(motor_rad)
+        elif self.mode is Mode.COARSE:
+            self.pointing.start_coarse(self.target_px)
+        elif self.mode is Mode.VERNIER:
+            self.pointing.start_pair(self.mirror, motor_rad)
+
+    def configure_search(self, asked: Acquire) -> None:
+        """What the next search is to find, and how, as a command asks that was not refused."""
+        flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
+        self.star_finder.expect_flux(flux_dn)
+        self.quantities.star_flux_dn = flux_dn
+        self.search.configure(asked)
+
+    def _start_search(self, motor_rad: Floats) -> None:
+        """As asked; else about where the star is expected: on the target, or where it was last seen."""
+        self.star_finder.estimator.expect(self.target_px, motor_rad, np.zeros(2))
+        self.search.begin()
+
+    # ------------------------------------------------------------ control laws
+
+    def _rest(self, _observation: Observation) -> None:
+        """Mirror back to its bias; the siderostat is held or stopped by its servo."""
+        self.mirror.step_to_bias()
+
+    def _stand_by(self, _observation: Observation) -> None:
+        """Both stages rest where the operator has put them."""
+        self.mirror.step_to_rest()
+
+    def _search(self, observation: Observation) -> None:
+        self.mirror.step_to_rest()
+        self.siderostat.move_to(self.search.advance(self._period_s, observation.motor_rad))
+
+    def _pull_in(self, observation: Observation) -> None:
+        self.mirror.step_to_rest()
+        step_rad = self.pointing.step_coarse(observation, self.target_px)
+        if step_rad is not None:
+            self.siderostat.move_by(step_rad)
+
+    def _hold_star(self, observation: Observation) -> None:
+        command = self.pointing.step_pair(observation, self.target_px)
+        if command is not None:
+            self.siderostat.move_by(command.motor_step_rad)
+            self.mirror.move_to(
+                command.mirror_rad, hysteresis_inverse=self.pointing.design.hysteresis_inverse
+            )
+
+    def _run_experiment(self, observation: Observation) -> None:
+        setpoint_rad = self._experiments.setpoint_rad(observation.now_s)
+        if setpoint_rad is None:
+            self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
+        else:
+            self.siderostat.move_to(setpoint_rad)
+
+    # ------------------------------------------------------------ designs and experiments
+
+    @property
+    def controller(self) -> str:
+        """The design at work in VERNIER."""
+        return self.pointing.design.name
+
+    def use(self, design: Design) -> None:
+        """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
+        before, motor_rad = self.controller, self.servo.position_rad
+        self.pointing.use(design)
+        if self.mode is Mode.VERNIER:
+            self.pointing.start_pair(self.mirror, motor_rad)
+        az_rad, el_rad = motor_rad.tolist()
+        self._journal.record(
+            ControllerChange(
+                time_s=self._clock.now_s(),
+                loop=self.name,
+                source=before,
+                target=design.name,
+                siderostat_az_rad=az_rad,
+                siderostat_el_rad=el_rad,
+            )
+        )
+        self._report_event("info", f"controller {before} -> {design.name}")
+
+    def start_experiment(self, name: str, drives: list[Drive]) -> bool:
+        """Move the stages as told, from the next tick on; False where this mode has no star to watch."""
+        now_s = self._clock.now_s()
+        if not self.fire(Trigger.EXPERIMENT, name):
+            return False
+        self._experiments.begin(name, drives, self.siderostat, self.mirror, now_s)
+        return True
+
+    def _end_experiment(self) -> None:
+        held_rad = self._experiments.end(self.mirror)
+        if held_rad is not None and self.mode is not Mode.SAFE:
+            self.siderostat.move_to(held_rad)
+
+    # ------------------------------------------------------------ for the supervisor
+
+    @property
+    def periodic(self) -> list[Periodic]:
+        """The siderostat's servo, and the injector of experiments."""
+        return [self.servo, self.mirror.injector]
+
+    def state(self, now_s: float) -> LoopState:
+        """The newest of everything, for consoles."""
+        scale, mode = self._scale, self.mode
+        centre_sky_arcsec = (self.search.centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
+        az_urad, el_urad = (1e6 * self.mirror.bias_offset_rad).tolist()
+        return LoopState(
+            name=self.name,
+            mode=mode.name,
+            since_s=self.mode_since_s,
+            requirement_px=self.settings.requirement_px,
+            sky_arcsec_per_px=scale.sky_arcsec_per_px,
+            usable_commands=[trigger.name.capitalize() for trigger in usable_commands(mode)],
+            controller=self.controller,
+            last_change=self.last_change,
+            interlocks=list(self.interlocks.tripped),
+            limits=self._limits,
+            watched=self.interlocks.watched(now_s, self.quantities.readings),
+            bias_offset_urad=(az_urad, el_urad),
+            search_centre_sky_arcsec=tuple(centre_sky_arcsec) if mode is Mode.ACQUISITION else None,
+            other_spots=[
+                SpotPlace(
+                    name=spot.name, az_offset_px=spot.offset_px.az, el_offset_px=spot.offset_px.el
+                )
+                for spot in self.settings.other_spots
+            ],
+            controller_file=self.pointing.design.file,
+        )
+
+    def begin(self, stack_v: Floats | None) -> None:
+        """Begin anew; the mirror goes to its bias from the D/A's outputs as found.
+
+        If the encoders count from elsewhere than before, the star's place is unknown.
+        """
+        if stack_v is not None:
+            self.mirror.start_from(stack_v)
+        super().begin(stack_v)
+        if self.servo.encoders_jumped:
+            self.star_finder.estimator.forget()
+            self._report_event(
+                "warning", "encoders read elsewhere than before; the star's place is forgotten"
+            )
+
+    def release(self) -> None:
+        """Send the D/A nothing more."""
+        self.mirror.ready = False
+
+    def rest(self) -> None:
+        """From now on the mirror rests at its bias."""
+        self.mirror.rest_at_bias()
+
+    def at_rest(self) -> bool:
+        """The mirror is at its bias, if it can still be commanded."""
+        return not self.mirror.ready or self.mirror.at_bias()
+
+
+def stellar_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) -> StellarLoop:
+    """A stellar loop on its devices.
+
+    Raises
+    ------
+    ValueError
+        If there is no D/A among them.
+    """
+    if devices.dac is None:
+        msg = f"loop {name}: a stellar loop needs the D/A of its mirror"
+        raise ValueError(msg)
+    servo = SiderostatServo(
+        name, rig.loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
+    )
+    mirror = MirrorStage(rig, name, devices.dac, journal.clock)
+    return StellarLoop(name, rig, SiderostatStage(rig, name, servo), mirror, journal)
+
+
+def _limits(rig: Rig, name: str) -> LoopLimits:
+    loop = rig.loops[name]
+    return LoopLimits(
+        fsm_range_rad=loop.fsm.range_rad,
+        siderostat_travel_sky_arcsec=loop.siderostat.travel_sky_arcsec,
+        search_radius_sky_arcsec=loop.acquisition.search_radius_sky_arcsec,
+        spiral_pitch_sky_arcsec=plan_spiral(rig, name).pitch_px
+        * scales(rig, loop).sky_arcsec_per_px,
+    )

@@ -1,0 +1,207 @@
+"""One loop's fast steering mirror: what its D/A is commanded, at which slew, and where it was when."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.clock import Clock
+from fitctl.config import Rig
+from fitctl.controllers.mirror import Mirror
+from fitctl.drivers.interface import MirrorDac
+from fitctl.model.optics import saturate_diamond, scales
+from fitctl.stages.injector import Injection, Injector, stack_v_per_px
+
+Floats = NDArray[np.float64]
+HISTORY_S = 0.3  # of mirror angles; frames are far younger when they are used
+
+
+class MirrorStage:
+    """Commands of one mirror.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    dac : MirrorDac
+    clock : Clock
+    injector : Injector, optional
+        Instead of one that writes `dac`.
+
+    Attributes
+    ----------
+    ready : bool
+        The D/A may be written to.
+    stack_v : array, shape (3,)
+        Wanted at the D/A, from the next write on.
+    command_rad : array, shape (2,)
+        Commanded mirror angles.
+    sent_s, written_s, round_trip_s : float
+        When the last write was on its way, when the D/A confirmed it, and how long both took.
+    bias_offset_rad : array, shape (2,)
+        How far from its bias the mirror rests.
+    injector : Injector
+        Writes the D/A in the tick's stead while an experiment runs.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        loop_name: str,
+        dac: MirrorDac,
+        clock: Clock,
+        injector: Injector | None = None,
+    ) -> None:
+        fsm = rig.loops[loop_name].fsm
+        mirror_px_per_rad = scales(rig, rig.loops[loop_name]).mirror_px_per_rad
+        self.ready = False
+        self.stack_v = np.full(3, fsm.bias_v)
+        self.command_rad = np.zeros(2)
+        self.bias_offset_rad = np.zeros(2)
+        self.sent_s = math.nan
+        self.written_s = clock.now_s()
+        self.round_trip_s = 0.0
+        self.injector = injector or Injector(
+            dac,
+            clock,
+            stack_v_per_px(fsm.stack_radius_m, fsm.stack_scale_m_per_v, mirror_px_per_rad),
+            fsm.bias_v,
+            fsm.dac.full_scale_v,
+        )
+        self._rest_v = self.stack_v
+        self._fsm = fsm
+        self._dac = dac
+        self._clock = clock
+        self._mirror = Mirror(fsm)
+        self._most_slew_v = fsm.slew_v_per_s * rig.camera.period_s
+        self._begun_s = math.nan  # of a write that is not confirmed yet
+        self._lowest_v = self._highest_v = self.stack_v
+        shortest_s = min(rig.camera.period_s, self.injector.period_s)
+        self._history: deque[tuple[float, Floats]] = deque(
+            [(-math.inf, np.zeros(2))], maxlen=math.ceil(HISTORY_S / shortest_s)
+        )
+
+    @property
+    def now_rad(self) -> Floats:
+        """Where the mirror is, as far as it is known, shape (2,)."""
+        return self._mirror.angles_rad
+
+    def held_rad(self, *, hysteresis_inverse: bool) -> Floats:
+        """What :meth:`move_to` must be given, shape (2,), to leave the mirror as it is."""
+        return self._mirror.held_rad(hysteresis_inverse=hysteresis_inverse)
+
+    def at(self, time_s: float) -> Floats:
+        """Where it was at a recent time, shape (2,)."""
+        for since_s, mirror_rad in reversed(self._history):
+            if since_s <= time_s:
+                return mirror_rad
+        return self._history[0][1]
+
+    def at_bias(self) -> bool:
+        """The mirror is commanded to its bias."""
+        return bool(np.allclose(self.stack_v, self._fsm.bias_v))
+
+    # ------------------------------------------------------------ commands
+
+    def start_from(self, stack_v: Floats) -> None:
+        """Begin with the D/A's outputs, shape (3,), as found."""
+        self.rest_off_bias(np.zeros(2))
+        self._mirror.assume(stack_v)
+        self.stack_v = self._mirror.stack_v
+        self.command_rad = self._mirror.angles_rad
+        self.drain_commanded_range()
+        self.written_s = self._clock.now_s()
+        self._begun_s = math.nan
+        self.ready = True
+
+    def move_to(self, mirror_rad: Floats, *, hysteresis_inverse: bool) -> None:
+        """Turn the mirror, no farther than its diamond."""
+        self.command_rad = saturate_diamond(mirror_rad, self._fsm.range_rad)
+        self.stack_v = self._mirror.volts_for(
+            self.command_rad, hysteresis_inverse=hysteresis_inverse
+        )
+
+    def rest_off_bias(self, offset_rad: Floats) -> None:
+        """From now on the mirror rests this far from its bias, shape (2,), within its diamond."""
+        self.bias_offset_rad = saturate_diamond(offset_rad, self._fsm.range_rad)
+        # Without one, the bias itself; with one, the angle that was asked for, from where the mirror is now.
+        self._rest_v = self._mirror.volts_for(
+            self.bias_offset_rad, hysteresis_inverse=bool(self.bias_offset_rad.any())
+        )
+
+    def rest_at_bias(self) -> None:
+        """From now on the mirror rests at its bias."""
+        if self.bias_offset_rad.any():
+            self.rest_off_bias(np.zeros(2))
+
+    def step_to_rest(self) -> None:
+        """One frame's way back to where it rests, as far as the slew limit lets it."""
+        left_v = self._rest_v - self.stack_v
+        if left_v.any():
+            self.stack_v = self.stack_v + np.clip(left_v, -self._most_slew_v, self._most_slew_v)
+        self.command_rad = self._mirror.angles_rad
+
+    def step_to_bias(self) -> None:
+        """One frame's way back to the bias; an offset from it is forgotten."""
+        self.rest_at_bias()
+        self.step_to_rest()
+
+    # ------------------------------------------------------------ the D/A
+
+    def send(self) -> None:
+        """Send the D/A what is wanted; :meth:`confirm` is next.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be sent; then nothing more is sent until :meth:`start_from`.
+        """
+        self.ready = False
+        begun_s = self._clock.now_s()
+        self._dac.send_v(self.stack_v)
+        self.sent_s, self._begun_s = self._clock.now_s(), begun_s
+        self.ready = True
+
+    def confirm(self) -> None:
+        """Wait until the D/A confirms what was sent; nothing to wait for is well.
+
+        Raises
+        ------
+        DeviceError
+            If it does not; then nothing more is sent until :meth:`start_from`.
+        """
+        if math.isnan(self._begun_s):
+            return
+        begun_s, self._begun_s = self._begun_s, math.nan
+        self.ready = False
+        self._dac.confirm()
+        self.ready = True
+        self.written_s = self._clock.now_s()
+        self.round_trip_s = self.written_s - begun_s
+        self._extend_commanded_range(self.stack_v)
+        self._mirror.written(self.stack_v)
+        self._history.append((self.written_s, self._mirror.angles_rad))
+
+    def drain_commanded_range(self) -> tuple[Floats, Floats]:
+        """Lowest and highest voltages, shape (3,) each, that the D/A was sent since last asked."""
+        commanded = self._lowest_v, self._highest_v
+        self._lowest_v = self._highest_v = self.stack_v
+        return commanded
+
+    def _extend_commanded_range(self, stack_v: Floats) -> None:
+        self._lowest_v = np.minimum(self._lowest_v, stack_v)
+        self._highest_v = np.maximum(self._highest_v, stack_v)
+
+    def drain_injections(self) -> list[Injection]:
+        """What an experiment has written since last asked."""
+        injections = self.injector.drain_written()
+        for time_s, stack_v in injections:
+            self._mirror.written(stack_v)
+            self._extend_commanded_range(stack_v)
+            self.stack_v, self.command_rad = stack_v, self._mirror.angles_rad
+            self._history.append((time_s, self.command_rad))
+            self.written_s = time_s
+        return injections

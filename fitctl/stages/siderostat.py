@@ -1,0 +1,65 @@
+"""One loop's siderostat as the loop commands it: a set-point within its travel."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.model.optics import scales
+from fitctl.stages.servo import SiderostatServo
+
+Floats = NDArray[np.float64]
+
+
+class SiderostatStage:
+    """Set-points of one siderostat.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    servo : SiderostatServo
+
+    Attributes
+    ----------
+    servo : SiderostatServo
+        Follows the set-point, at a pace of its own.
+    setpoint_rad : array, shape (2,)
+        Motor angles as commanded.
+    travel_rad : float
+        Of the motors, each way from the encoders' zero.
+    wanted_fraction : float
+        Of the travel: the set-point before it was limited.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str, servo: SiderostatServo) -> None:
+        loop = rig.loops[loop_name]
+        self.servo = servo
+        self.setpoint_rad = np.zeros(2)
+        self.wanted_fraction = 0.0
+        self._motor_sky_arcsec_per_rad = scales(rig, loop).motor_sky_arcsec_per_rad
+        self.travel_rad = loop.siderostat.travel_sky_arcsec / self._motor_sky_arcsec_per_rad
+
+    def hold(self, motor_rad: Floats) -> None:
+        """Servo about where the motors are, shape (2,)."""
+        self.servo.hold(motor_rad)
+        self.setpoint_rad = self.servo.setpoint_rad
+        self.wanted_fraction = 0.0
+
+    def jog(self, step_sky_arcsec: Floats) -> None:
+        """Move the set-point by an angle on the sky, shape (2,)."""
+        self.move_by(step_sky_arcsec / self._motor_sky_arcsec_per_rad)
+
+    def move_by(self, step_rad: Floats) -> None:
+        """Move the set-point by motor angles, shape (2,)."""
+        self.move_to(self.setpoint_rad + step_rad)
+
+    def move_to(self, setpoint_rad: Floats) -> None:
+        """Move the set-point, shape (2,), no farther than its travel."""
+        az_rad, el_rad = setpoint_rad.tolist()
+        most_rad = self.travel_rad
+        self.wanted_fraction = max(abs(az_rad), abs(el_rad)) / most_rad
+        within = self.wanted_fraction <= 1.0
+        self.setpoint_rad = setpoint_rad if within else np.clip(setpoint_rad, -most_rad, most_rad)
+        self.servo.move_to(self.setpoint_rad)

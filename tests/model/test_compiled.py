@@ -1,0 +1,103 @@
+"""Machine code is kept for other processes, and made anew when any source of it changes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fitctl
+from fitctl.model.compiled import numba_installed, sources_of
+
+KERNEL = """
+from fitctl.model.compiled import compilable, compiled
+from fitctl.controllers.trial_rule import gained
+
+@compilable()
+def doubled(value):
+    return 2 * gained(value)
+
+
+kernel = compiled(doubled)
+print(kernel(1.0), sum(kernel.stats.cache_hits.values()))
+"""
+RULE = """
+from fitctl.loop.trial_gain import GAIN
+from fitctl.model.compiled import compilable
+
+@compilable()
+def gained(value):
+    return GAIN * value
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package with the real `compiled.py` and functions in three rooms."""
+    copy = tmp_path / "fitctl"
+    for name, source in {
+        "__init__.py": "",
+        "model/__init__.py": "",
+        "model/compiled.py": Path(fitctl.__file__).parent.joinpath("model/compiled.py").read_text(),
+        "controllers/__init__.py": "",
+        "controllers/trial_rule.py": RULE,
+        "loop/__init__.py": "",
+        "loop/trial_gain.py": "GAIN = 3.0\n",
+        "simulation/__init__.py": "",
+        "simulation/trial_kernel.py": KERNEL,
+        "tui/__init__.py": "",
+    }.items():
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        (copy / name).write_text(source)
+    return copy
+
+
+def run_kernel(package):
+    """Value, and how many compilations were found in the cache, of a new process."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import fitctl.simulation.trial_kernel"],
+        cwd=package.parent, capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    value, hits = done.stdout.split()
+    return float(value), int(hits)
+
+
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
+def test_a_constant_that_changes_in_any_room_is_compiled_in_anew(package):
+    assert run_kernel(package) == (6.0, 0)
+    assert run_kernel(package) == (6.0, 1)
+
+    (package / "loop" / "trial_gain.py").write_text("GAIN = 5.0\n")
+
+    assert run_kernel(package) == (10.0, 0)
+
+
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
+def test_a_file_that_no_kernel_imports_leaves_the_machine_code_valid(package):
+    run_kernel(package)
+
+    (package / "tui" / "look.py").write_text("COLOUR = 1\n")
+    (package / "simulation" / "__init__.py").write_text('"""A room."""\n')  # a parent: imported
+
+    assert run_kernel(package) == (6.0, 0)
+    (package / "tui" / "look.py").write_text("COLOUR = 2\n")
+    assert run_kernel(package) == (6.0, 1)
+
+
+def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():
+    program = (
+        "import sys, fitctl.simulation.batch.run\n"
+        "print(*(name for name in sys.modules if name.startswith('fitctl')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    root = Path(fitctl.__file__).parents[1]
+
+    sources = sources_of("fitctl.simulation.batch.run")
+
+    read = {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+        for path in sources
+    }
+    assert read >= set(done.stdout.split())
