@@ -6,6 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PEERS := $(VENV)/.peers
+PYRTC := $(VENV)/pyrtc
 FUZZ_S ?= 120
 SEED ?= 1
 COUNT ?= 200
@@ -18,7 +19,7 @@ FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-loop bench-sim soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -120,6 +121,24 @@ bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN serv
 	$(BIN)/python -m benchmarks.can
 	$(BIN)/python -m benchmarks.gvsp
 
+bench-loop: $(READY) $(PYRTC)/.ready  ## From the last packet to the D/A at 50 to 2000 Hz, beside pyRTC and C (8 minutes)
+	@tests/install-packages rt-tests
+	@$(CC) -O2 -Wall -Wextra -o $(VENV)/loop-floor benchmarks/loop/floor.c
+	$(BIN)/python -m benchmarks.loop --floor $(VENV)/loop-floor --pyrtc $(PYRTC)/bin/python \
+	    --pyrtc-example $(PYRTC)/source/examples/synthetic_shwfs $(ARGS)
+
+# An environment of its own: pyRTC's package brings a module `benchmarks` too. Its example is in the source alone.
+$(PYRTC)/.ready: $(READY) requirements/pyrtc.lock
+	@echo "Getting pyRTC ..."
+	@rm -rf $(PYRTC)
+	@$(PYTHON) -m venv $(PYRTC)
+	@$(PYRTC)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/pyrtc.lock
+	@sed -n '/^pyrtcao==/,/[^\\]$$/p' requirements/pyrtc.lock > $(PYRTC)/source.txt
+	@$(PYRTC)/bin/python -m pip download --quiet --disable-pip-version-check --no-deps --no-binary pyrtcao --require-hashes -r $(PYRTC)/source.txt -d $(PYRTC)
+	@mkdir $(PYRTC)/source
+	@tar -xzf $(PYRTC)/pyrtcao-*.tar.gz --strip-components 1 -C $(PYRTC)/source
+	@touch $@
+
 docs: $(READY)  ## The documentation as a site, dist/docs/index.html (needs npm)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/docs.lock
 	@npm --prefix requirements/site ci --silent --no-audit --no-fund
@@ -142,6 +161,7 @@ lock: $(READY)  ## Resolve the requirements anew (needs uv and npm)
 	uv pip compile --group docs $(LOCK) --constraint requirements/dev.lock -o requirements/docs.lock
 	uv pip compile --group bench $(LOCK) --constraint requirements/dev.lock -o requirements/bench.lock
 	uv pip compile --group mutants $(LOCK) --constraint requirements/dev.lock -o requirements/mutants.lock
+	uv pip compile --group pyrtc $(LOCK) --constraint requirements/dev.lock -o requirements/pyrtc.lock
 	npm --prefix requirements/site install --package-lock-only --omit-lockfile-registry-resolved --silent
 
 clean:  ## Remove .venv and caches

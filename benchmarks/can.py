@@ -72,10 +72,14 @@ def start_cyclictest(rate_hz: float, duration_s: float) -> subprocess.Popen[str]
     )
 
 
-def late_us(histogram: str) -> list[float]:
-    """Median, 99 % and worst of cyclictest's histogram, us."""
+def late_counts(histogram: str) -> dict[int, int]:
+    """How many wake-ups were late by so many us, from cyclictest's histogram."""
     lines = [line.split() for line in histogram.splitlines() if line and line[0].isdigit()]
-    counts = {int(late): int(count) for late, count in lines if int(count)}
+    return {int(late): int(count) for late, count in lines if int(count)}
+
+
+def late_us(counts: dict[int, int]) -> list[float]:
+    """Median, 99 % and worst of cyclictest's wake-ups, us."""
     total, seen, found = sum(counts.values()), 0, []
     for late in sorted(counts):
         seen += counts[late]
@@ -129,7 +133,7 @@ def main() -> None:
     if cyclictest is None:
         print("cyclictest is not installed: Debian package rt-tests")
     else:
-        print(line("cyclictest, late", late_us(cyclictest.communicate(timeout=60)[0])))
+        print(line("cyclictest, late", late_us(late_counts(cyclictest.communicate(timeout=60)[0]))))
     print(line("servo cycle, late", list(1e6 * np.percentile(woke_s - deadline_s, PERCENTILES))))
     print(line("servo cycle, period error", list(1e6 * np.percentile(steps_s, PERCENTILES))))
     print(line("from waking to both positions", list(1e6 * np.percentile(took_s, PERCENTILES))))

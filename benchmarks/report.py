@@ -35,7 +35,9 @@ RIG = load_rig(default_rig_path())
 
 def simulate(path: Path, duration_s: float) -> None:
     """A run on the virtual clock that acquires and holds its star, as a recorder would have it."""
-    info = msgspec.structs.replace(run_info(RIG, "simulated", 0.0), wall_minus_monotonic_s=1.8e9)
+    info = msgspec.structs.replace(
+        run_info(RIG, "simulated", 0.0, designs={}), wall_minus_monotonic_s=1.8e9
+    )
     with LogWriter(path, RIG.logging) as log:
 
         def take(record: AnyRecord) -> None:

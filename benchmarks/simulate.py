@@ -15,7 +15,7 @@ import numpy as np
 
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.model.air_path import NODE_S
-from fitctl.model.compiled import compilable
+from fitctl.model.compiled import compilable, compiled
 from fitctl.model.pixel_noise import mix, quantiles
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.simulation import Simulation
@@ -59,7 +59,8 @@ def normals_alone(rig: Rig) -> Callable[[int], object]:
     """Every normal deviate that a run of the batch uses, and nothing else."""
     air = 4 * round(RUN_S / NODE_S)
     pixels = 49 * round(RUN_S * rig.camera.frame_rate_hz)
-    return lambda seed: draw_normals(np.random.default_rng(seed), air, seed, pixels, quantiles())
+    draw = compiled(draw_normals)
+    return lambda seed: draw(np.random.default_rng(seed), air, seed, pixels, quantiles())
 
 
 def main() -> None:

@@ -1,74 +1,108 @@
-"""The command line: its commands in the order of ``--help``, and how a mistake in it is told."""
+"""The command line: its commands in the order of ``--help``, and how a mistake in it is reported."""
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from fitctl import __version__
-from fitctl.commands import (
-    attending,
-    computing,
-    describing,
-    faulting,
-    keys,
-    log,
-    reporting,
-    running,
-    sequence,
-)
-from fitctl.commands.exits import INTERRUPTED, UNUSABLE
-from fitctl.commands.welcome import welcome
-from fitctl.config import ConfigError
+from fitctl.commands.shared.exits import INTERRUPTED, UNUSABLE
+from fitctl.commands.shared.welcome import welcome
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
 # give, above all beside a loop that must not be late.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+
+class Command(NamedTuple):
+    """Where a command's module is, and what ``--help`` says of it: at most 45 characters.
+
+    Attributes
+    ----------
+    group : str
+        The module is ``fitctl.commands.GROUP.NAME``.
+    summary : str
+        Empty for a command that is not for people, which ``--help`` does not list.
+    """
+
+    group: str
+    summary: str = ""
+
+
+COMMANDS = {
+    "demo": Command("try_out", "Run the whole instrument on mock devices"),
+    "mocks": Command("try_out", "Serve the rig's mock devices"),
+    "doctor": Command("set_up", "Check that the devices of a rig answer"),
+    "discover": Command("set_up", "List cameras, serial ports and CAN interfaces"),
+    "run": Command("operate", "Supervise a rig"),
+    "console": Command("operate", "Open the operator console"),
+    "send": Command("operate", "Send one command to the supervisor"),
+    "status": Command("operate", "Show the state of the instrument"),
+    "watch": Command("operate", "Print a line a second, and every event"),
+    "simulate": Command("design", "Acquire and hold a star on a virtual clock"),
+    "replay": Command("analyse", "Run the frames of a log through today's code"),
+    "identify": Command("design", "Measure the parameters of a rig"),
+    "design": Command("design", "Design the controllers of a loop"),
+    "figures": Command("design", "Make the paper's figures from this system"),
+    "init": Command("set_up", "Write a rig file for your hardware"),
+    "report": Command("analyse", "Make a report of a night from its logs"),
+    "plot": Command("analyse", "Plot fields of a log in the terminal"),
+    "check": Command("set_up", "Validate a rig file"),
+    "record": Command("processes"),
+    "metrics": Command("processes"),
+    "gateway": Command("processes"),
+    "fault": Command("try_out", "Inject faults into running mocks"),
+    "log": Command("analyse", "Inspect, repair and convert logs"),
+    "sequence": Command("operate", "Run, check and steer sequences of steps"),
+    "keys": Command("set_up", "Manage keys for remote access"),
+}
+
+
+def load_command(name: str) -> Any:
+    """The command with its options; imports its module, which may take a second."""
+    module = importlib.import_module(f"fitctl.commands.{COMMANDS[name].group}.{name}")
+    alone = typer.Typer(rich_markup_mode=None)
+    if hasattr(module, "app"):
+        alone.add_typer(module.app, name=name)
+    else:
+        alone.command(name, **getattr(module, "SETTINGS", {}))(getattr(module, name))
+    return typer.main.get_group(alone).commands[name]
+
+
+class LazyGroup(TyperGroup):
+    """Lists commands from the table, and loads the one that the command line names."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = {
+            name: TyperCommand(name, short_help=command.summary, hidden=not command.summary)
+            for name, command in COMMANDS.items()
+        }
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Find the command that the arguments name, for its run, its help and its completion."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, None if command is None else load_command(str(command.name)), rest
+
+
 app = typer.Typer(
     name="fitctl",
+    cls=LazyGroup,
     help="Points starlight: acquires a star, pulls it in and holds it to a fraction of a pixel.",
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
-app.command()(running.demo)
-app.command()(running.mocks)
-app.command()(describing.doctor)
-app.command()(describing.discover)
-app.command()(running.run)
-app.command()(attending.console)
-app.command(
-    cls=attending.SendCommand,
-    context_settings={"ignore_unknown_options": True},  # -1 is a value
-)(attending.send)
-app.command()(attending.status)
-app.command()(attending.watch)
-app.command()(computing.simulate)
-app.command()(computing.replay)
-app.command()(computing.identify)
-app.command()(computing.design)
-app.command()(computing.figures)
-app.command()(describing.init)
-app.command()(reporting.report)
-app.command()(reporting.plot)
-app.command()(describing.check)
-app.command(hidden=True)(running.record)
-app.command(hidden=True)(running.metrics)
-app.command(hidden=True)(running.gateway)
-app.add_typer(faulting.app, name="fault")
-app.add_typer(log.app, name="log")
-app.add_typer(sequence.app, name="sequence")
-app.add_typer(keys.app, name="keys")
 
-
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"fitctl {__version__}")
         raise typer.Exit
@@ -78,7 +112,7 @@ def _say_version(wanted: bool) -> None:
 def _of_all_commands(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_say_version, is_eager=True, help="Say which this is."),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
     """Nothing: it has the options that stand before a command."""
@@ -92,9 +126,6 @@ def main(arguments: list[str] | None = None) -> None:
         return
     try:
         status = app(given, prog_name="fitctl", standalone_mode=False)
-    except ConfigError as error:
-        typer.echo(str(error), err=True)
-        status = UNUSABLE
     except TyperException as error:
         context = getattr(error, "ctx", None)
         command = "fitctl" if context is None else context.command_path
@@ -102,7 +133,16 @@ def main(arguments: list[str] | None = None) -> None:
         status = UNUSABLE
     except (KeyboardInterrupt, typer.Abort):
         status = INTERRUPTED
-    sys.exit(status)
+    except Exception as error:
+        # Not at the top: `fitctl --help` and Tab need no rig file, and take half the time without.
+        from fitctl.config import ConfigError
+        from fitctl.logging.errors import LogError
+
+        if not isinstance(error, ConfigError | LogError):
+            raise
+        typer.echo(str(error), err=True)
+        status = UNUSABLE
+    sys.exit(status or 0)
 
 
 def _message(error: TyperException) -> str:

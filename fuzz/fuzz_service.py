@@ -82,8 +82,8 @@ _ENVELOPES = [
     for envelope in (
         *(Passed(name="anna", role="commander", address="", payload=one) for one in _COMMANDS),
         Passed(name="bob", role="viewer", address="", payload=_COMMANDS[0]),
-        Report(keys=[key for key in _KEYS if key], told=[("info", "listening")]),
-        Report(keys=[], told=[]),
+        Report(keys=[key for key in _KEYS if key], events=[("info", "listening")]),
+        Report(keys=[], events=[]),
     )
 ]
 

@@ -2,12 +2,18 @@
 
 import msgspec
 
+from fitctl.controllers.design.choose import design_for
 from fitctl.daemon.run import run_info
 from fitctl.logging.writer import LogWriter
 from fitctl.simulation.simulation import Simulation
 
 WALL_S = 1_795_000_000.0
 NEAR_PX = (2.0, -1.0)
+
+
+def designs_of(rig):
+    """The designs that a rig's supervisor starts with."""
+    return {name: design_for(rig, name) for name in rig.loops}
 
 
 class LoggedSimulation(Simulation):
@@ -22,7 +28,7 @@ class LoggedSimulation(Simulation):
     ):
         self.change = change
         self.info = msgspec.structs.replace(
-            run_info(rig, "virtual", start_s), wall_minus_monotonic_s=WALL_S
+            run_info(rig, "virtual", start_s, designs_of(rig)), wall_minus_monotonic_s=WALL_S
         )
         self.go_on_in(path, rig)
         super().__init__(rig, 0, record=self.log, star_offset_px=star_offset_px)

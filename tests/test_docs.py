@@ -19,8 +19,9 @@ from documents import (
     blocks,
     commands,
 )
+from logged_simulation import designs_of
 
-from fitctl.cli import app, main
+from fitctl.cli import COMMANDS, app, load_command, main
 from fitctl.config import default_rig_path, load_rig
 from fitctl.daemon.run import run_info
 from fitctl.logging.records import QuantityReading, RecorderStatus
@@ -53,15 +54,15 @@ NEARBY_PX = np.array([30.0, -10.0])  # a star that is found and held within 20 s
 NOT_RUN = {
     "fitctl console*": "wants a terminal: tests/system/test_console.py",
     "fitctl demo*": "a whole instrument, in real time: tests/system/test_demos.py",
-    "fitctl fault clear": "needs running mocks: tests/test_cli_fault.py",
-    "fitctl fault now": "needs running mocks: tests/test_cli_fault.py",
-    "fitctl fault set *": "needs running mocks: tests/test_cli_fault.py",
+    "fitctl fault clear": "needs running mocks: tests/commands/test_cli_fault.py",
+    "fitctl fault now": "needs running mocks: tests/commands/test_cli_fault.py",
+    "fitctl fault set *": "needs running mocks: tests/commands/test_cli_fault.py",
     "fitctl figures *": "takes minutes: tests/figures/test_figures.py makes them with --quick's amounts",
-    "fitctl identify hysteresis*": "needs a rig that holds a star, or a log of it: tests/test_cli_identify.py",
-    "fitctl init my-rig.toml": "asks a person on a terminal: tests/test_cli_init.py",
-    "fitctl mocks*": "a server: tests/test_cli_doctor.py, and below",
-    "fitctl plot *--window": "opens a window: tests/test_cli_report.py without a display",
-    "fitctl report *--open": "opens a browser: tests/test_cli_report.py with another in its place",
+    "fitctl identify hysteresis*": "needs a rig with a star, or its log: tests/commands/test_cli_identify.py",
+    "fitctl init my-rig.toml": "asks a person on a terminal: tests/commands/test_cli_init.py",
+    "fitctl mocks*": "a server: tests/commands/test_cli_doctor.py, and below",
+    "fitctl plot *--window": "opens a window: tests/commands/test_cli_report.py without a display",
+    "fitctl report *--open": "opens a browser: tests/commands/test_cli_report.py with another in its place",
     "fitctl run*": "a server: tests/system/test_first_light.py",
     "fitctl send *": "needs a running supervisor: tests/system/test_tutorial.py, and below",
     "fitctl sequence pause*": "needs a running supervisor: tests/system/test_sequences.py",
@@ -118,7 +119,7 @@ def to_run():
 
 def parsed(name, arguments):
     """The options of a subcommand; raises if it does not know one or its value is wrong."""
-    return CLI.commands[name].make_context(name, list(arguments)).params
+    return load_command(name).make_context(name, list(arguments)).params
 
 
 # ---------------------------------------------------------------- a folder to run things in
@@ -129,7 +130,7 @@ def sample_log(tmp_path_factory):
     """What a recorder would have written of the first 30 s, but on the virtual clock."""
     rig = load_rig(default_rig_path())
     path = tmp_path_factory.mktemp("sample") / "sample.mcap"
-    info = run_info(rig, "simulated", now_s=0.0)
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
 
     def log_time_s():
         return simulation.clock.now_s() + info.wall_minus_monotonic_s
@@ -187,7 +188,7 @@ def test_every_command_exists_with_its_options(found):
             known = {option for parameter in CLI.params for option in parameter.opts}
             assert set(arguments) <= known | {"--help"}
             return
-        assert arguments[0] in CLI.commands, f"fitctl has no command {arguments[0]}"
+        assert arguments[0] in COMMANDS, f"fitctl has no command {arguments[0]}"
         if arguments[0] == "send" and "--help" not in arguments:
             sent_command(arguments[1:])
         with contextlib.suppress(typer.Exit):  # --help
@@ -312,7 +313,7 @@ def test_the_session_in_operating_is_what_the_supervisor_answers():
     pytest.fail("operating.md shows no session that ends in a shutdown")
 
 
-@pytest.mark.parametrize("name", [name for name, c in CLI.commands.items() if not c.hidden])
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.summary])
 def test_every_command_is_documented_and_has_help(name, capsys):
     assert any(found.words[1:2] == (name,) for found in ours()), f"no document shows fitctl {name}"
     with pytest.raises(typer.Exit):

@@ -5,7 +5,7 @@ import tomllib
 
 from documents import ROOT, between, blocks, table
 
-from fitctl.commands.fault import kinds as fault_kinds
+from fitctl.commands.shared.fault_kinds import kinds as fault_kinds
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.command_table import COMMANDS as COMMAND_ROWS
@@ -14,7 +14,7 @@ from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.service.metrics import InstrumentCollector
 from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 
 
 def test_the_table_of_modes_is_that_of_the_code():

@@ -1,18 +1,14 @@
 """What a soak would say of an instrument that leaks, loses or does not come back."""
 
 import random
-import sys
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "logging"))
 from log_samples import RUN_INFO, SETTINGS, WALL_S, filled, tick
 
 from benchmarks.soak import growth, logs, strikes
-from fitctl.commands.fault import kinds
+from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.logging.records import Event, RecorderStatus
 from fitctl.logging.writer import LogWriter
 

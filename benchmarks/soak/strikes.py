@@ -12,7 +12,7 @@ from functools import partial
 import psutil
 
 from benchmarks.soak.consoles import Console
-from fitctl.commands.fault import kinds
+from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.demo import Instrument
 from fitctl.messages.commands import Off, Stop
 from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench

@@ -14,7 +14,7 @@ import typer
 from tomlkit.items import AoT, Item, Table
 from typer.cli import get_docs_for_click
 
-from fitctl.cli import app
+from fitctl.cli import COMMANDS, app, load_command
 from fitctl.config import Rig, default_rig_path
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.commands import AnyCommand
@@ -34,7 +34,7 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 def command_line() -> str:
     """Every command that is not hidden, with its options."""
     group = copy.copy(typer.main.get_command(app))
-    group.commands = {name: c for name, c in group.commands.items() if not c.hidden}
+    group.commands = {name: load_command(name) for name, each in COMMANDS.items() if each.summary}
     _not_cut_short(group)
     text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="fitctl")
     return text.replace("# `fitctl`\n", "# Command line\n", 1)

@@ -1,6 +1,5 @@
-"""What each command of fitctl does.
+"""The commands of ``fitctl``, one module each; ``fitctl/cli.py`` lists them and imports what is needed.
 
-The command lines themselves are in `running`, `attending`, `describing`, `computing`, `reporting`, `faulting`,
-`keys`, `log` and `sequence`. All of these are imported for any command and for ``--help``, so what is slow to
-import, they import inside the command that needs it.
+A module holds a command's options and what it does. It has a function of the command's name, or where the
+command has commands of its own, a typer app `app`.
 """

@@ -7,12 +7,14 @@ linear is here, once for all designs: the mirror's diamond, and the deadzone fee
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import Rig
 from fitctl.model.optics import Scales, saturate_diamond
 
 Floats = NDArray[np.float64]
@@ -64,6 +66,10 @@ class Design:
     hysteresis_inverse: bool
     parameters: dict[str, Any] = field(repr=False)
     file: str = ""
+
+
+Designer = Callable[[Rig, str, str], Design]
+"""Makes the design of a rig's loop by its controller's name or file; empty for the one of the rig file."""
 
 
 class Measurement(NamedTuple):

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -19,8 +19,9 @@ from pathlib import Path
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.dark import dark_bytes
-from fitctl.controllers.design.choose import design_for
-from fitctl.controllers.design.files import design_json
+from fitctl.controllers.design.document import design_json
+from fitctl.controllers.design.own_process import design_in_own_process
+from fitctl.controllers.pair import Design
 from fitctl.daemon.children import Child
 from fitctl.daemon.devices import rig_devices
 from fitctl.daemon.last_records import finish_log
@@ -48,8 +49,8 @@ from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.stages.periodic import PeriodicThread
 from fitctl.stages.realtime import (
+    Collector,
     become_realtime,
-    collect_young,
     lock_memory,
     quiet_interpreter,
 )
@@ -148,7 +149,9 @@ def run_supervisor(
             buffer.add(record)
 
         executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
-        supervisor = Supervisor(rig, rig_devices(rig), clock, executor, record)
+        supervisor = Supervisor(
+            rig, rig_devices(rig), clock, executor, record, design_in_own_process
+        )
         children = _children(rig, rig_arguments, folder, supervisor.report_event)
         for child in children:
             stack.callback(child.end)
@@ -159,7 +162,12 @@ def run_supervisor(
             supervisor.report_event,
         )
         scheduling = f"{become_realtime(priority=50)}; {lock_memory()}"
-        info = run_info(rig, scheduling, clock.now_s())
+        info = run_info(
+            rig,
+            scheduling,
+            clock.now_s(),
+            {name: loop.pointing.design for name, loop in supervisor.loops.items()},
+        )
         record(info)
         state = ServiceState(
             pid=os.getpid(),
@@ -172,11 +180,12 @@ def run_supervisor(
         def housekeep() -> None:
             queue.pump()
             record(buffer.losses(state, clock.now_s()))
-            collect_young()
+            collector.collect(pointing=supervisor.pointing)
 
         service = Service(supervisor, buffer, folder, state, clock)
         threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
         quiet_interpreter()
+        collector = Collector()
         service.start()
         for thread in threads:
             thread.start()
@@ -248,7 +257,7 @@ def _loop(
         supervisor.close()
 
 
-def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
+def run_info(rig: Rig, scheduling: str, now_s: float, designs: Mapping[str, Design]) -> RunInfo:
     """What is needed to understand this run's records; a dark frame's file is read (ConfigError)."""
     dark_file = rig.camera.dark_file
     versions = {name: importlib.metadata.version(name) for name in _VERSIONED}
@@ -258,7 +267,7 @@ def run_info(rig: Rig, scheduling: str, now_s: float) -> RunInfo:
         rig_name=rig.name,
         rig_json=rig.model_dump_json(indent=1),
         versions=versions | {"python": platform.python_version()},
-        designs={name: design_json(design_for(rig, name)) for name in rig.loops},
+        designs={name: design_json(design) for name, design in designs.items()},
         scheduling=scheduling,
         dark_npy=None if dark_file is None else dark_bytes(Path(dark_file)),
     )

@@ -8,23 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.config import Rig
-from fitctl.figures.plate import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    VERMILION,
-    Comparison,
-    Plate,
-    new_figure,
-    save,
-)
+from fitctl.figures.plate import Comparison, Plate, save
 from fitctl.identify.air_fit import Interval, fit_air_path
 from fitctl.identify.airpath import (
     RECOMMENDED_S,
-    AirPathResult,
     analyse,
-    model_psd_px2_per_hz,
     plan,
 )
 from fitctl.identify.frames import frames_of_records, track_spots
@@ -33,13 +21,12 @@ from fitctl.model.plant import Plant
 from fitctl.model.scene import centroid_noise_px
 
 _PAPER_GAIN_PX, _PAPER_B1_S2, _PAPER_B2_S, _PAPER_NOISE_PX = 0.45, 0.517, 2.5, 0.01  # Eq. 9
-_COLORS = (BLUE, VERMILION, GREEN, ORANGE)
 
 
 def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) -> list[Plate]:
     """A minute of frames in open loop, tracked, transformed and fitted.
 
-    `minutes` of the plant's air path, each of another seed, tell how often the intervals hold the truth.
+    `minutes` of the plant's air path, each of another seed, show how often the intervals hold the truth.
     """
     records = on_simulation(
         rig, loop_name, "airpath", plan(rig, loop_name), seed, lambda _part: None
@@ -71,7 +58,7 @@ def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) ->
             f"of {3 * minutes}, in {minutes} other minutes; should be 95",
         ),
     ]
-    _draw(found, folder)
+    save(found.draw(), folder, "fig07-airpath")
     caption = (
         f"Power spectral densities of {tracks.px.shape[1]} spots' centroids in both axes, "
         f"{tracks.duration_s:.0f} s of whole frames at {1 / tracks.period_s:g} Hz with the stages at rest, "
@@ -106,28 +93,3 @@ def _row(quantity: str, paper: float, found: Interval, truth: float) -> Comparis
     inside = "inside" if found.covers(truth) else "outside"
     note = f"95 %: {found.low:.4g} to {found.high:.4g}; plant: {truth:.4g}, {inside}"
     return Comparison(quantity, paper, found.value, note)
-
-
-def _draw(found: AirPathResult, folder: Path) -> None:
-    figure = new_figure()
-    axes = figure.add_subplot()
-    hz = found.frequency_hz[1:]  # the means are removed
-    names = ["pointing", "fringe", *(f"spot {n}" for n in range(2, found.psd_px2_per_hz.shape[1]))]
-    for spot in range(found.psd_px2_per_hz.shape[1]):
-        for i, axis in enumerate(("az", "el")):
-            axes.loglog(
-                hz,
-                found.psd_px2_per_hz[1:, spot, i],
-                color=_COLORS[(2 * spot + i) % len(_COLORS)],
-                linewidth=0.8,
-                label=f"{names[spot]} {axis}",
-            )
-    period_s, fit = found.tracks.period_s, found.joint
-    both = model_psd_px2_per_hz(fit, hz, period_s)
-    axes.loglog(hz, both, color=BLACK, linewidth=1.8, label="Eq. 8 and noise, fitted")
-    floor = 2 * period_s * fit.noise_px.value**2
-    axes.loglog(hz, np.maximum(both - floor, 1e-12), ":", color=BLACK, label="Eq. 8 alone")
-    axes.set(xlabel="frequency (Hz)", ylabel="power spectral density (px²/Hz)", ylim=(1e-7, 3))
-    axes.grid(which="both", alpha=0.3)
-    axes.legend(ncols=2)
-    save(figure, folder, "fig07-airpath")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
 from fitctl.config import Fsm, Rig
 from fitctl.identify.errors import IdentifyError
-from fitctl.logging.records import Tick
+from fitctl.identify.record import axis_pair
 from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import displacement_series, raised_displacement
 from fitctl.model.optics import mirror_angles, mirror_from_stacks, scales
@@ -51,21 +50,12 @@ class Spectra(NamedTuple):
     disturbance: Floats
 
 
-def tick_columns(ticks: Iterable[Tick]) -> dict[str, NDArray[Any]]:
-    """Ticks in hand in the form of :func:`fitctl.logging.reading.tick_arrays`."""
-    rows = [msgspec.structs.astuple(tick) for tick in ticks]
-    names = (field.name for field in msgspec.structs.fields(Tick))
-    return {
-        name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
-    }
-
-
 def rebuilt(rig: Rig, loop_name: str, ticks: Ticks) -> Rebuilt:
     """Open the loop again, on paper: the error less where both stages had moved the star at mid-exposure.
 
     The last stretch of VERNIER counts, from `SETTLE_S` after its start. The mirror is where the rig
     file's hysteresis puts it for the logged stack voltages (Eq. 5 where it is not known), the siderostat
-    where its encoders were. What neither tells, backlash and unknown hysteresis, stays in both series.
+    where its encoders were. What neither shows, backlash and unknown hysteresis, stays in both series.
 
     Parameters
     ----------
@@ -79,7 +69,7 @@ def rebuilt(rig: Rig, loop_name: str, ticks: Ticks) -> Rebuilt:
     """
     inside = _last_vernier(ticks)
     exposed_s = ticks["mid_exposure_s"][inside]
-    error_px = _pair(ticks, "error_{}_px")[inside]
+    error_px = axis_pair(ticks, "error_{}_px")[inside]
     return Rebuilt(exposed_s, error_px, error_px - stages_px(rig, loop_name, ticks)[inside])
 
 
@@ -100,20 +90,26 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
     exposed_s = ticks["mid_exposure_s"]
     in_force = np.searchsorted(ticks["time_s"], exposed_s, side="right") - 1
     mirror_px = scale.mirror_px(angles_rad[np.maximum(in_force, 0)])
-    motor_px = scale.motor_px(_pair(ticks, "siderostat_{}_rad"))
+    motor_px = scale.motor_px(axis_pair(ticks, "siderostat_{}_rad"))
     return np.where(np.isnan(exposed_s)[:, None], np.nan, mirror_px + motor_px)
+
+
+def stacks_m(ticks: Ticks, fsm: Fsm, half_widths_v: Floats, gains_m_per_v: Floats) -> Floats:
+    """Displacements of the stacks about where they rest at the bias, shape (ticks, 3)."""
+    volts = np.stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)], axis=-1, dtype=float)
+    moved_m = displacement_series(volts, half_widths_v, gains_m_per_v)
+    moved_m -= raised_displacement(fsm.bias_v, half_widths_v, gains_m_per_v)
+    return moved_m
 
 
 def _mirror_angles_rad(fsm: Fsm, ticks: Ticks) -> Floats:
     """After each tick's command, shape (ticks, 2)."""
-    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
     known = fsm.hysteresis
     if known is None:
+        volts = np.stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)], axis=-1, dtype=float)
         return mirror_angles(volts, fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v)
-    half_width_v, gains = np.asarray(known.half_widths_v), np.asarray(known.gains_m_per_v)
-    moved_m = displacement_series(volts, half_width_v, gains)
-    moved_m -= raised_displacement(fsm.bias_v, half_width_v, gains)
-    return mirror_from_stacks(moved_m, fsm.stack_radius_m)
+    half_widths_v, gains = np.asarray(known.half_widths_v), np.asarray(known.gains_m_per_v)
+    return mirror_from_stacks(stacks_m(ticks, fsm, half_widths_v, gains), fsm.stack_radius_m)
 
 
 def _last_vernier(ticks: Ticks) -> NDArray[np.intp]:
@@ -133,10 +129,6 @@ def _last_vernier(ticks: Ticks) -> NDArray[np.intp]:
         )
         raise IdentifyError(msg)
     return frames
-
-
-def _pair(ticks: Ticks, name: str) -> Floats:
-    return np.column_stack([ticks[name.format(axis)] for axis in ("az", "el")])
 
 
 def spectra(series: Rebuilt, period_s: float) -> Spectra:
@@ -160,12 +152,13 @@ def spectra(series: Rebuilt, period_s: float) -> Spectra:
     return Spectra(frequency_hz, error.mean(axis=1), disturbance.mean(axis=1))
 
 
-def mean_spectra(of_runs: list[Spectra]) -> Spectra:
-    """The mean over runs."""
+def mean_spectra(of_runs: list[Spectra], weights: list[float] | None = None) -> Spectra:
+    """The mean over runs, each with its weight; by default all alike."""
+    frequency_hz, error, disturbance = zip(*of_runs, strict=True)
     return Spectra(
-        of_runs[0].frequency_hz,
-        np.mean([one.error for one in of_runs], axis=0),
-        np.mean([one.disturbance for one in of_runs], axis=0),
+        frequency_hz[0],
+        np.average(error, axis=0, weights=weights),
+        np.average(disturbance, axis=0, weights=weights),
     )
 
 
@@ -173,7 +166,7 @@ def attenuation(measured: Spectra, at_hz: float) -> float:
     """Disturbance over error about a frequency, as amplitudes.
 
     The centroid noise n needs no subtraction: the rebuilt disturbance is d + n, and the loop, which
-    cannot tell the two apart, makes S (d + n) of it, the measured error. To take a white floor off each
+    cannot distinguish the two, makes S (d + n) of it, the measured error. To take a white floor off each
     spectrum would be wrong, because in closed loop the star's true motion follows the noise.
     """
     near = np.abs(measured.frequency_hz - at_hz) <= BAND_HZ

@@ -48,9 +48,10 @@ def figure_9(rig: Rig, loop_name: str, _seed: int, folder: Path) -> list[Plate]:
         Comparison("phase margin, deg", None, shape.phase_margin_deg),
         Comparison("gain margin, dB", None, shape.gain_margin_db),
         Comparison("peak sensitivity", None, shape.peak_sensitivity),
-        Comparison("attenuation at 0.1 Hz", None, shape.attenuation[0.1]),
-        Comparison("attenuation at 0.5 Hz", None, shape.attenuation[0.5]),
-        Comparison("attenuation at 2 Hz", None, shape.attenuation[2.0]),
+        *(
+            Comparison(f"attenuation at {hz:g} Hz", None, shape.attenuation[hz])
+            for hz in (0.1, 0.5, 2.0)
+        ),
         Comparison(
             "coarse crossover, Hz", None, its_basis.coarse_per_s / (2 * math.pi),
             "from the printed gain, 3227",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import as_completed
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,9 +19,6 @@ from fitctl.figures.stacks import figure_3
 from fitctl.figures.steps import figure_11, figure_12
 from fitctl.simulation.campaign import local_executor
 
-# Matrices here are small: a second BLAS thread makes them many times slower when cores are shared.
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
 
 class Amount(NamedTuple):
     """How much is simulated.
@@ -35,7 +30,7 @@ class Amount(NamedTuple):
     step_s : float
         After the step of Fig. 11.
     minutes : int
-        Of frames that judge the intervals of Fig. 7.
+        Of frames that check the intervals of Fig. 7.
     """
 
     runs: performance.Effort
@@ -77,7 +72,8 @@ def make(
     measured = performance.jobs(rig, loop_name, seed, amount.runs)
     plates: list[Plate] = []
     results: dict[int, Any] = {}
-    with _one_blas_thread(), local_executor() as (workers, _):
+    # Matrices here are small, and cores shared: fitctl/cli.py gives each process one BLAS thread.
+    with local_executor() as (workers, _):
         drawing = [workers.submit(draw, rig, loop_name, seed, folder) for draw in figures]
         running = {
             workers.submit(job.work, *job.arguments): number for number, job in enumerate(measured)
@@ -95,18 +91,3 @@ def make(
     write_figures(rig, seed, plates, folder)
     write_performance(rig, loop_name, rows, f"{amount.runs}; first seed {seed}.", folder)
     return plates, rows
-
-
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """For processes that start meanwhile."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

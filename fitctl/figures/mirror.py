@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.figures.plate import BLACK, BLUE, VERMILION, Comparison, Plate, new_figure, save
+from fitctl.figures.plate import Comparison, Plate, save
+from fitctl.identify.drawing import new_figure
 from fitctl.identify.plays import trail
 from fitctl.identify.response import AMPLITUDE_RAD, AXES, ResponseResult, analyse, measure
 from fitctl.mocks.detector import DetectorBench
@@ -100,7 +101,10 @@ def _plate(
         ),
     ]
     stem = f"fig{number:02d}-response-{name}"
-    _draw(found, truth, axis, folder, stem)
+    figure = new_figure(7.0, 6.4)
+    panels = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.0, 1.0])
+    found.draw(panels, axis, truth[:, :, axis], "plant")
+    save(figure, folder, stem)
     caption = (
         f"Mirror driven in {_IN_WORDS[name]} by a chirp of ±7.2 arcsec from 0.1 Hz to 1 kHz, both axes "
         f"read on a position-sensing detector at 12.8 kHz. H1 and coherence by Welch's method. Dashed: "
@@ -108,34 +112,3 @@ def _plate(
         f"hysteresis; above, two lightly damped modes couple the axes."
     )
     return Plate(stem, f"Fig. {number}: mirror response, {_IN_WORDS[name]}", caption, rows)
-
-
-def _draw(found: ResponseResult, truth: Complexes, axis: int, folder: Path, stem: str) -> None:
-    figure = new_figure(7.0, 6.4)
-    gain, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.0, 1.0])
-    hz = found.frequency_hz
-    for row, color, word in ((axis, BLUE, "excited"), (1 - axis, VERMILION, "cross")):
-        h = found.response[:, row, axis]
-        gain.semilogx(
-            hz, 20 * np.log10(np.abs(h)), color=color, linewidth=0.9, label=f"{AXES[row]}, {word}"
-        )
-        # The plant's axes are exactly uncoupled at rest: below, there is no cross motion to show.
-        own = np.abs(truth[:, row, axis])
-        gain.semilogx(
-            hz, 20 * np.log10(np.maximum(own, 1e-6)), color=BLACK, linestyle="--", linewidth=0.7,
-            label="plant" if row == axis else None,
-        )  # fmt: skip
-        coherence.semilogx(hz, found.coherence[:, row, axis], color=color, linewidth=0.8)
-    phase.semilogx(
-        hz,
-        np.degrees(np.unwrap(np.angle(found.response[:, axis, axis]))),
-        color=BLUE,
-        linewidth=0.9,
-    )
-    gain.set(ylabel="mirror / command (dB)", ylim=(-80, 25))
-    gain.legend(loc="lower left")
-    phase.set(ylabel="phase, excited (deg)")
-    coherence.set(ylabel="coherence", xlabel="frequency (Hz)", ylim=(0, 1.05))
-    for axes in (gain, phase, coherence):
-        axes.grid(which="both", alpha=0.3)
-    save(figure, folder, stem)

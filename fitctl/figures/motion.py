@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.figures.attenuation import tick_columns
+from fitctl.identify.record import axis_pair, tick_columns
+from fitctl.identify.run import hold_on_simulation
 from fitctl.messages.commands import SetTarget
-from fitctl.messages.modes import Mode
 from fitctl.model.optics import mirror_from_stacks, scales
 from fitctl.simulation.simulation import Simulation
 
@@ -19,7 +19,6 @@ Floats = NDArray[np.float64]
 _NEAR_PX = np.array(
     [2.0, 1.0]
 )  # the star's place at the start: the search is not what is looked at
-_ACQUIRE_LIMIT_S = 60.0
 SETTLE_S = 20.0  # in VERNIER, before the clock of a motion starts
 
 
@@ -66,7 +65,7 @@ class Held:
 
     Raises
     ------
-    RuntimeError
+    IdentifyError
         If it does not come to hold the star.
     """
 
@@ -75,14 +74,7 @@ class Held:
         self.simulation = Simulation(rig, seed, star_offset_px=_NEAR_PX, history_s=history_s)
         self._loop_name = loop_name
         self._plant = self.simulation.plants[loop_name]
-        loop = self.simulation.supervisor.loops[loop_name]
-        self.simulation.acquire()
-        while loop.mode is not Mode.VERNIER:
-            if self.simulation.clock.now_s() > _ACQUIRE_LIMIT_S:
-                msg = f"star not held within {_ACQUIRE_LIMIT_S:g} s: {loop.mode.name}"
-                raise RuntimeError(msg)
-            self.simulation.run(0.5)
-        self.simulation.run(SETTLE_S)
+        hold_on_simulation(self.simulation, loop_name, SETTLE_S)
         self._first_tick = len(self.simulation.ticks)
         self._start_s = self.simulation.clock.now_s()
         self._stages: list[tuple[float, Floats, Floats]] = []
@@ -129,25 +121,21 @@ class Held:
         ]
         tick = tick_columns(frames)
         exposed_s = tick["mid_exposure_s"]
-        seen_s = np.array([time_s for time_s, _, _ in self._stages])
-        row = np.clip(np.searchsorted(seen_s, exposed_s + 1e-6), 0, len(seen_s) - 1)
+        sampled_s = np.array([time_s for time_s, _, _ in self._stages])
+        row = np.clip(np.searchsorted(sampled_s, exposed_s + 1e-6), 0, len(sampled_s) - 1)
         displacement_m = np.array([moved for _, moved, _ in self._stages])[row]
         beam_rad = np.array([beam for _, _, beam in self._stages])[row]
         mirror_rad = mirror_from_stacks(displacement_m, loop.fsm.stack_radius_m)
-        setpoint_rad = _pair(tick, "siderostat_setpoint_{}_rad")
+        setpoint_rad = axis_pair(tick, "siderostat_setpoint_{}_rad")
         return Motion(
             time_s=exposed_s - self._start_s,
             star_px=np.array([self._plant.spots_px(time_s)[0, 0] for time_s in exposed_s]),
-            measured_px=_pair(tick, "star_{}_px"),
-            target_px=_pair(tick, "target_{}_px"),
+            measured_px=axis_pair(tick, "star_{}_px"),
+            target_px=axis_pair(tick, "target_{}_px"),
             mirror_px=scale.mirror_px(mirror_rad),
-            mirror_command_px=scale.mirror_px(_pair(tick, "fsm_{}_rad")),
+            mirror_command_px=scale.mirror_px(axis_pair(tick, "fsm_{}_rad")),
             motor_px=scale.motor_px(beam_rad - beam_rad[0]),
             motor_command_px=scale.motor_px(setpoint_rad - setpoint_rad[0]),
             saturated=tick["fsm_saturated"],
             mode=tick["mode"],
         )
-
-
-def _pair(tick: dict[str, NDArray], name: str) -> Floats:
-    return np.column_stack([tick[name.format(axis)] for axis in ("az", "el")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from fitctl.figures.attenuation import (
     mean_spectra,
     rebuilt,
     spectra,
-    tick_columns,
 )
 from fitctl.figures.rigs import at_flight_rate, with_controller, with_rougher_stages
 from fitctl.figures.steps import (
@@ -33,7 +33,7 @@ from fitctl.figures.steps import (
     step_response,
     target_step,
 )
-from fitctl.model.optics import scales
+from fitctl.identify.record import tick_columns
 from fitctl.simulation.campaign import Results, run_seeds
 from fitctl.simulation.simulation import Simulation
 
@@ -67,7 +67,8 @@ class Effort(NamedTuple):
         )
 
 
-class Steps(NamedTuple):
+@dataclass(frozen=True)
+class Steps:
     """What a controller did about steps of 20 px and jogs of 1 px."""
 
     star: Response
@@ -76,7 +77,8 @@ class Steps(NamedTuple):
     jog_saturated_s: float
 
 
-class Residual(NamedTuple):
+@dataclass(frozen=True)
+class Residual:
     """What many runs left.
 
     Attributes
@@ -95,7 +97,8 @@ class Residual(NamedTuple):
     piston_m: float
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True)
+class Row:
     """One controller."""
 
     controller: str
@@ -212,8 +215,3 @@ def _residual(results: Results, loop_name: str, least_px: float) -> Residual:
     spread_px = float(rms_px[:, worst].std(ddof=1)) if len(runs) > 1 else math.nan
     piston_m = math.sqrt(np.mean([run.piston_rms_m**2 for run in runs]))
     return Residual(mean_px, spread_px, mean_px / least_px, piston_m)
-
-
-def arcsec(rig: Rig, loop_name: str, px: float) -> float:
-    """Pixels as beam angle on the sky."""
-    return px * scales(rig, rig.loops[loop_name]).sky_arcsec_per_px

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,16 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which colour-blind people tell apart; lines differ in style besides.
-BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, BLACK = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#56B4E9",
-    "#CC79A7",
-    "#000000",
-)
 _DPI = 120
 
 
@@ -35,7 +23,7 @@ class Comparison(NamedTuple):
         None where the paper prints no number.
     ours : float
     note : str
-        What the paper says in words, or what ours is judged by.
+        What the paper says in words, or what ours is compared with.
     """
 
     quantity: str
@@ -70,41 +58,6 @@ class Plate:
         """For JSON."""
         rows = [row._asdict() | {"ratio": row.ratio} for row in self.rows]
         return asdict(self) | {"rows": rows}
-
-    def markdown(self) -> list[str]:
-        """Picture, caption and table."""
-        head = ["quantity", "paper", "ours", "ratio", "remark"]
-        rows = [
-            [
-                row.quantity,
-                "not printed" if row.paper is None else f"{row.paper:.4g}",
-                "never" if math.isnan(row.ours) else f"{row.ours:.4g}",
-                "" if row.ratio is None else f"{row.ratio:.3f}",
-                row.note,
-            ]
-            for row in self.rows
-        ]
-        return [
-            f"## {self.title}",
-            "",
-            f"![{self.title}]({self.name}.svg)",
-            "",
-            self.caption,
-            "",
-            *table(head, rows),
-        ]
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
-
-
-def new_figure(width_in: float = 7.0, height_in: float = 4.8) -> Figure:
-    """An empty figure whose lettering can be read in print."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:

@@ -39,13 +39,7 @@ def settling(time_s: Floats, distance_px: Floats, stepped_s: float, within_px: f
     since_s, distance_px = time_s[after] - stepped_s, distance_px[after]
     if len(distance_px) == 0:
         return Settling(math.nan, math.nan)
-    outside = np.flatnonzero(np.abs(distance_px) > within_px)
-    if len(outside) == 0:
-        settled_s = 0.0
-    elif outside[-1] == len(distance_px) - 1:
-        settled_s = math.nan
-    else:
-        settled_s = float(since_s[outside[-1] + 1])
+    settled_s = _last_left_s(since_s, np.abs(distance_px) > within_px)
     side = np.sign(distance_px[np.argmax(np.abs(distance_px))])
     return Settling(settled_s, float(max(0.0, (-side * distance_px).max())))
 
@@ -54,16 +48,12 @@ def decayed_s(time_s: Floats, value: Floats, stepped_s: float, part: float) -> f
     """From a step until a value stays below a part of the largest that it had since; nan if never."""
     after = time_s >= stepped_s
     size = np.abs(value[after])
-    outside = np.flatnonzero(size > part * size.max())
-    if len(outside) == 0:
+    return _last_left_s(time_s[after] - stepped_s, size > part * size.max())
+
+
+def _last_left_s(since_s: Floats, outside: NDArray[np.bool_]) -> float:
+    """The first time from which on nothing is outside; 0 if nothing ever was, nan if the last still is."""
+    rows = np.flatnonzero(outside)
+    if len(rows) == 0:
         return 0.0
-    if outside[-1] == len(size) - 1:
-        return math.nan
-    return float(time_s[after][outside[-1] + 1] - stepped_s)
-
-
-def smoothed(values: Floats, samples: int) -> Floats:
-    """Running mean over an odd number of samples, shape as given (n,); its ends are held."""
-    half = samples // 2
-    held = np.pad(values, half, mode="edge")
-    return np.convolve(held, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")
+    return math.nan if rows[-1] == len(since_s) - 1 else float(since_s[rows[-1] + 1])

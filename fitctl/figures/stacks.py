@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.signal import lti, step
 
 from fitctl.config import Rig
-from fitctl.figures.plate import BLACK, GREEN, ORANGE, Comparison, Plate, new_figure, save
+from fitctl.figures.plate import Comparison, Plate, save
+from fitctl.identify.drawing import BLACK, GREEN, ORANGE, new_figure
 from fitctl.identify.plays import ELEMENTS, model_from_ramp, trail
 from fitctl.model.hysteresis import (
     half_widths_v,
@@ -47,21 +48,21 @@ def figure_3(rig: Rig, loop_name: str, _seed: int, folder: Path) -> list[Plate]:
     full_scale_v = fsm.dac.full_scale_v
     half_v, gains = half_widths_v(settings), stack_gains(settings, fsm)
 
-    def measured_m(volts: Floats) -> Floats:
+    def read_m(volts: Floats) -> Floats:
         plays_v = trail(volts[:, None], half_v)[:, 0]
         return interferometer_m(hysteresis_output(plays_v, gains))
 
     ramp_v = np.linspace(0.0, full_scale_v, round(_RAMP_S * SAMPLE_HZ) + 1)
-    model = model_from_ramp(ramp_v, measured_m(ramp_v), "virgin")
+    model_half_v, model_gains = model_from_ramp(ramp_v, read_m(ramp_v))
     time_s = np.arange(round(_STEP_S * SAMPLE_HZ)) / SAMPLE_HZ
     volts = underdamped_step_v(time_s, full_scale_v)
-    seen_m = measured_m(volts)
-    plays_v = trail(volts[:, None], model.half_widths_v)[:, 0]
-    modelled_m = hysteresis_output(plays_v, model.gains_m_per_v)
+    measured_m = read_m(volts)
+    plays_v = trail(volts[:, None], model_half_v)[:, 0]
+    modelled_m = hysteresis_output(plays_v, model_gains)
     stroke_m = swept_stroke(half_v, gains, full_scale_v)
     width_m = swept_loop_width(half_v, gains, full_scale_v)
-    error = float(np.sqrt(np.mean((modelled_m - seen_m) ** 2))) / stroke_m
-    _draw(time_s, volts, seen_m, modelled_m, folder)
+    error = float(np.sqrt(np.mean((modelled_m - measured_m) ** 2))) / stroke_m
+    _draw(time_s, volts, measured_m, modelled_m, folder)
     caption = (
         f"One stack under the step response of an underdamped second-order system, read "
         f"{SAMPLE_HZ:g} times a second to {RESOLUTION_M * 1e9:g} nm. Points: the plant's stack. Line: "
@@ -88,18 +89,22 @@ def figure_3(rig: Rig, loop_name: str, _seed: int, folder: Path) -> list[Plate]:
     return [Plate("fig03-hysteresis", "Fig. 3: hysteresis of a stack", caption, rows)]
 
 
-def _draw(time_s: Floats, volts: Floats, seen_m: Floats, modelled_m: Floats, folder: Path) -> None:
+def _draw(
+    time_s: Floats, volts: Floats, measured_m: Floats, modelled_m: Floats, folder: Path
+) -> None:
     figure = new_figure(7.0, 6.4)
     loops, command, left = figure.subplot_mosaic(
         [["loops", "loops"], ["command", "left"]], height_ratios=[2.2, 1.0]
     ).values()
-    loops.plot(volts, seen_m * 1e6, ".", color=ORANGE, markersize=3.5, label="stack, 5 Hz readings")
+    loops.plot(
+        volts, measured_m * 1e6, ".", color=ORANGE, markersize=3.5, label="stack, 5 Hz readings"
+    )
     loops.plot(volts, modelled_m * 1e6, color=BLACK, linewidth=0.8, label="13 plays, Eq. 6")
     loops.set(xlabel="D/A voltage (V)", ylabel="displacement (µm)")
     loops.legend(loc="upper left", markerscale=2)
     command.plot(time_s, volts, color=BLACK, linewidth=0.8)
     command.set(xlabel="time (s)", ylabel="D/A voltage (V)")
-    left.plot(time_s, (modelled_m - seen_m) * 1e9, color=GREEN, linewidth=0.7)
+    left.plot(time_s, (modelled_m - measured_m) * 1e9, color=GREEN, linewidth=0.7)
     left.set(xlabel="time (s)", ylabel="model less stack (nm)")
     for axes in (loops, command, left):
         axes.grid(alpha=0.3)

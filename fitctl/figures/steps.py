@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from fitctl.config import Rig
 from fitctl.figures.motion import Held, Motion
-from fitctl.figures.plate import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    VERMILION,
-    Comparison,
-    Plate,
-    new_figure,
-    save,
-)
-from fitctl.figures.settling import decayed_s, settling, smoothed
+from fitctl.figures.plate import Comparison, Plate, save
+from fitctl.figures.settling import decayed_s, settling
+from fitctl.identify.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
@@ -41,7 +35,8 @@ _PAPER_STEADY_PX = 1 / 35
 _PAPER_REQUIREMENT_PX = 0.1
 
 
-class Response(NamedTuple):
+@dataclass(frozen=True)
+class Response:
     """What a loop did about a step.
 
     Attributes
@@ -54,7 +49,7 @@ class Response(NamedTuple):
     bias_s : float
         Until the mirror's command stays within a third of the most that it came to.
     bias_px : float
-        What the mirror is still told to give at the end.
+        What the mirror is still commanded to give at the end.
     modes : str
         That the loop went through.
     """
@@ -68,11 +63,12 @@ class Response(NamedTuple):
 
 
 def step_response(motion: Motion, axis: int, stepped_s: float, within_px: float) -> Response:
-    """Judge one axis after a step."""
+    """Evaluate one axis after a step."""
     period_s = float(np.median(np.diff(motion.time_s)))
     distance_px = motion.star_px[:, axis] - motion.target_px[-1, axis]
     found = settling(motion.time_s, distance_px, stepped_s, within_px)
-    slow_px = smoothed(motion.mirror_command_px[:, axis], round(_BIAS_SMOOTHED_S / period_s))
+    samples = 2 * (round(_BIAS_SMOOTHED_S / period_s) // 2) + 1
+    slow_px = uniform_filter1d(motion.mirror_command_px[:, axis], samples, mode="nearest")
     changes = np.flatnonzero(motion.mode[1:] != motion.mode[:-1]) + 1
     return Response(
         settled_s=found.settled_s,
@@ -103,26 +99,24 @@ def far_step(rig: Rig, loop_name: str) -> tuple[float, float]:
     raise IdentifyError(msg)
 
 
-def star_step(
-    rig: Rig, loop_name: str, seed: int, px: tuple[float, float], after_s: float
+def _step(
+    move: Callable[[Held, tuple[float, float]], None],
+    rig: Rig,
+    loop_name: str,
+    seed: int,
+    px: tuple[float, float],
+    after_s: float,
 ) -> Motion:
-    """The star truly jumps at `STEP_AT_S`."""
+    """What a jump at `STEP_AT_S` by `px` leads to."""
     held = Held(rig, loop_name, seed, history_s=after_s + STEP_AT_S + 1.0)
     held.run(STEP_AT_S)
-    held.star_jumps(px)
+    move(held, px)
     held.run(after_s)
     return held.motion()
 
 
-def target_step(
-    rig: Rig, loop_name: str, seed: int, px: tuple[float, float], after_s: float
-) -> Motion:
-    """The target jumps at `STEP_AT_S`, and the prefilter leads the star there."""
-    held = Held(rig, loop_name, seed, history_s=after_s + STEP_AT_S + 1.0)
-    held.run(STEP_AT_S)
-    held.target_jumps(px)
-    held.run(after_s)
-    return held.motion()
+star_step = partial(_step, Held.star_jumps)
+target_step = partial(_step, Held.target_jumps)  # through the prefilter, which leads the star there
 
 
 def jogs(rig: Rig, loop_name: str, seed: int) -> Motion:

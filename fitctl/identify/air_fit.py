@@ -21,8 +21,8 @@ _PARAMETERS = ("gain_px", "b1_s2", "b2_s", "noise_px")
 _Z_95 = 1.96
 _LARGEST_CHANGE = 3.0  # of a logarithm from where the search begins: a factor of 20
 # Directions in the logarithms: strength gain / b1 above the poles, where the fast pole is (b2 / b1), where
-# the slow one is, and the noise. Gain, b1 and b2 by themselves are told almost only together.
-_TOLD = np.array(
+# the slow one is, and the noise. Gain, b1 and b2 by themselves are known almost only together.
+_DIRECTIONS = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 _PROBE = 0.02  # of a logarithm, for the likelihood's curvature
@@ -74,7 +74,7 @@ def fit_air_path(series_px: Floats, period_s: float, start: AirPathModel) -> Air
     Raises
     ------
     IdentifyError
-        If the series do not tell the parameters.
+        If the series do not determine the parameters.
     """
     begin = _begin(series_px, start)
 
@@ -84,13 +84,13 @@ def fit_air_path(series_px: Floats, period_s: float, start: AirPathModel) -> Air
         return negative_log_likelihood(air, noise_px, series_px, period_s)
 
     found = minimize(
-        lambda told: cost(begin + told @ _TOLD),
+        lambda along: cost(begin + along @ _DIRECTIONS),
         np.zeros(4),
         method="L-BFGS-B",
         bounds=[(-_LARGEST_CHANGE, _LARGEST_CHANGE)] * 4,
         options={"eps": 1e-4},
     )
-    logs = begin + found.x @ _TOLD
+    logs = begin + found.x @ _DIRECTIONS
     curvature = _curvature(cost, logs)
     at_bound = np.any(np.abs(found.x) > 0.99 * _LARGEST_CHANGE)
     if at_bound or not np.all(np.linalg.eigvalsh(curvature) > 0):

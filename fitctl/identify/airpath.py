@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,14 @@ from scipy.signal import welch
 
 from fitctl.config import AirPathModel, Rig
 from fitctl.identify.air_fit import AirFit, fit_air_path
+from fitctl.identify.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.frames import Tracks
 from fitctl.model.air_path import rms_px, state_space
 from fitctl.model.drives import Drive
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
@@ -45,7 +50,7 @@ class RelativeMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class AirPathResult:
-    """What the frames told.
+    """What the frames show.
 
     Attributes
     ----------
@@ -84,10 +89,10 @@ class AirPathResult:
         ]
         if self.tracks.duration_s < RECOMMENDED_S:
             lines.append(f"shorter than {RECOMMENDED_S:.0f} s: the intervals are wide")
-        lines.append(f"pointing spot, both axes: {_told(self.joint)}")
+        lines.append(f"pointing spot, both axes: {_fit_text(self.joint)}")
         for spot, pair in enumerate(self.fits):
             lines += [
-                f"spot {spot} ({self.tracks.flux_dn[spot]:.0f} DN) {axis}: {_told(fit)}"
+                f"spot {spot} ({self.tracks.flux_dn[spot]:.0f} DN) {axis}: {_fit_text(fit)}"
                 for axis, fit in zip(AXES, pair, strict=True)
             ]
         lines += [
@@ -100,33 +105,31 @@ class AirPathResult:
         return lines
 
     def plot(self, path: Path) -> None:
-        """Fig. 7: spectra of all spots and the joint fit."""
-        from matplotlib.figure import Figure
+        """Write :meth:`draw` to a file."""
+        self.draw().savefig(path)
 
-        figure = Figure(figsize=(7.0, 4.8), layout="constrained")
+    def draw(self) -> Figure:
+        """Fig. 7: spectra of all spots and the joint fit."""
+        figure = new_figure()
         axes = figure.add_subplot()
-        shown = slice(1, None)  # the means are removed
-        for spot in range(self.psd_px2_per_hz.shape[1]):
-            for i, axis in enumerate(AXES):
-                axes.loglog(
-                    self.frequency_hz[shown],
-                    self.psd_px2_per_hz[shown, spot, i],
-                    linewidth=0.8,
-                    label=f"spot {spot} {axis}",
-                )
-        axes.loglog(
-            self.frequency_hz[shown],
-            model_psd_px2_per_hz(self.joint, self.frequency_hz[shown], self.tracks.period_s),
-            "k",
-            linewidth=1.8,
-            label="Eq. 8 and white noise, fitted to spot 0",
-        )
-        axes.set_xlabel("frequency (Hz)")
-        axes.set_ylabel("power spectral density (px²/Hz)")
+        hz = self.frequency_hz[1:]  # the means are removed
+        colors = itertools.cycle((BLUE, VERMILION, GREEN, ORANGE))
+        names = ("pointing", "fringe", *(f"spot {n}" for n in range(2, self.tracks.px.shape[1])))
+        for name, psd_px2_per_hz in zip(
+            names, self.psd_px2_per_hz[1:].swapaxes(0, 1), strict=False
+        ):
+            for axis, shown in zip(AXES, psd_px2_per_hz.T, strict=True):
+                label = f"{name} {axis}"
+                axes.loglog(hz, shown, color=next(colors), linewidth=0.8, label=label)
+        both = model_psd_px2_per_hz(self.joint, hz, self.tracks.period_s)
+        axes.loglog(hz, both, color=BLACK, linewidth=1.8, label="Eq. 8 and noise, fitted")
+        floor = 2 * self.tracks.period_s * self.joint.noise_px.value**2
+        axes.loglog(hz, np.maximum(both - floor, 1e-12), ":", color=BLACK, label="Eq. 8 alone")
+        axes.set(xlabel="frequency (Hz)", ylabel="power spectral density (px²/Hz)", ylim=(1e-7, 3))
         axes.set_title(f"Centroids of loop {self.loop}, {self.tracks.duration_s:.0f} s, open loop")
         axes.grid(which="both", alpha=0.3)
-        axes.legend(fontsize=8)
-        figure.savefig(path)
+        axes.legend(ncols=2)
+        return figure
 
 
 def plan(_rig: Rig, _loop_name: str) -> list[Drive]:
@@ -206,7 +209,7 @@ def _relative(px: Floats, fits: list[tuple[AirFit, AirFit]], spot: int) -> Relat
     )
 
 
-def _told(fit: AirFit) -> str:
+def _fit_text(fit: AirFit) -> str:
     model: AirPathModel = fit.model
     return (
         f"gain {fit.gain_px} px, b1 {fit.b1_s2} s², b2 {fit.b2_s} s, noise {fit.noise_px} px, "

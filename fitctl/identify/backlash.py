@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from fitctl.config import Rig
-from fitctl.identify.errors import IdentifyError
+from fitctl.identify.drawing import new_figure
+from fitctl.identify.errors import IdentifyError, require_room, require_star
 from fitctl.identify.record import ExperimentRecord
 from fitctl.identify.whitening import whitener
 from fitctl.model.drives import SIDEROSTAT, Drive
@@ -24,7 +25,6 @@ FREQUENCY_HZ, END_FREQUENCY_HZ = 0.6, 1.4  # two rates: a late frame looks like 
 SCAN_S = 25.0
 _LEAST_SWING_PX = 1.0
 _LEAST_FRAMES = 250
-_LEAST_SEEN = 0.9  # of the frames
 _FIRST_WIDTHS = np.linspace(0.0, 0.6, 13)  # of the swing, tried before the search
 
 
@@ -36,15 +36,8 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
     IdentifyError
         If the star would leave the frame.
     """
-    target = rig.loops[loop_name].target_px
     reach_px = AMPLITUDE_PX + 1.0
-    for sign in (-1, 1):
-        if not rig.camera.window_fits(target.az + sign * reach_px, target.el + sign * reach_px):
-            msg = (
-                f"the scan moves the star by {AMPLITUDE_PX:g} px, which must stay on the frame; move "
-                f"loops.{loop_name}.target_px nearer to the frame's middle"
-            )
-            raise IdentifyError(msg)
+    require_room(rig, loop_name, "the scan", reach_px, reach_px)
     return [
         Drive(
             channel=channel,
@@ -74,7 +67,7 @@ class AxisBacklash:
         By how much the exposures were later than the encoders' times say.
     excess : float
         RMS of what is left, over what the rig file's air path and centroid noise explain.
-    motor_px, seen_px, modelled_px : arrays, shape (frames,)
+    motor_px, measured_px, modelled_px : arrays, shape (frames,)
         Motor by the plate scale, star, and model, each about its mean.
     """
 
@@ -86,7 +79,7 @@ class AxisBacklash:
     late_sd_s: float
     excess: float
     motor_px: Floats = field(repr=False)
-    seen_px: Floats = field(repr=False)
+    measured_px: Floats = field(repr=False)
     modelled_px: Floats = field(repr=False)
 
 
@@ -143,12 +136,10 @@ class BacklashResult:
 
     def plot(self, path: Path) -> None:
         """The loop of each axis: what the camera saw, air path included, and the model."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10, 5), layout="constrained")
+        figure = new_figure(10, 5)
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
         for panel, (name, axis) in zip(panels, self.axes.items(), strict=True):
-            panel.plot(axis.motor_px, axis.seen_px, ".", ms=3, color="0.6", label="seen")
+            panel.plot(axis.motor_px, axis.measured_px, ".", ms=3, color="0.6", label="seen")
             panel.plot(axis.motor_px, axis.modelled_px, ".", ms=2, color="tab:blue", label="model")
             panel.set(
                 title=f"{self.loop} {name}: {axis.width_px:.3f} ± {axis.width_sd_px:.3f} px",
@@ -191,9 +182,9 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
     motor_px -= motor_px.mean()
     frames = _usable_frames(AXES[axis], motor_px, star_px)
     times_s = record.tick["mid_exposure_s"]
-    seen_px = star_px[frames]
+    measured_px = star_px[frames]
     whiten = whitener(rig, record.loop, times_s[frames])
-    seen = whiten(seen_px[:, None])[:, 0]
+    whitened = whiten(measured_px[:, None])[:, 0]
     # Not by interpolation: it would smooth the encoders' counts, and be preferred for that.
     rate_px_s = np.gradient(motor_px, times_s)
 
@@ -203,7 +194,7 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
         return ratio * behind_play(motor_px + late_s * rate_px_s, width_px / 2)[frames]
 
     def left_over(values: Floats) -> Floats:
-        return np.asarray(seen - whiten(modelled_px(values)[:, None])[:, 0])
+        return np.asarray(whitened - whiten(modelled_px(values)[:, None])[:, 0])
 
     swing_px = float(np.ptp(motor_px))
     starts = [np.array([1.0, width_px, 0.0]) for width_px in swing_px * _FIRST_WIDTHS]
@@ -234,7 +225,7 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
         late_sd_s=float(late_sd_s),
         excess=float(np.sqrt(variance)),
         motor_px=motor_px[frames],
-        seen_px=seen_px - seen_px.mean(),
+        measured_px=measured_px - measured_px.mean(),
         modelled_px=model_px - model_px.mean(),
     )
 
@@ -251,13 +242,7 @@ def _usable_frames(axis: str, motor_px: Floats, star_px: Floats) -> NDArray[np.i
     far = [motor_px <= motor_px.min() + swing_px / 4, motor_px >= motor_px.max() - swing_px / 4]
     first = max(int(side.argmax()) for side in far)
     frames = first + np.flatnonzero(np.isfinite(star_px[first:]))
-    due = len(star_px) - first
-    if len(frames) < max(_LEAST_FRAMES, _LEAST_SEEN * due):
-        msg = (
-            f"the star is on {len(frames)} of {due} frames of {axis}, expected at least "
-            f"{_LEAST_FRAMES} and {100 * _LEAST_SEEN:g} %; look at the flux, then run it again"
-        )
-        raise IdentifyError(msg)
+    require_star(len(frames), len(star_px) - first, f"frames of {axis}", _LEAST_FRAMES)
     return frames
 
 

@@ -1,8 +1,8 @@
-"""The loop's delay, from a known mirror motion seen by the camera, to a small part of a frame.
+"""The loop's delay, from a known mirror motion that the camera observes, to a small part of a frame.
 
 The mirror is moved in slow and quick swings by voltages whose times are known. Hysteresis holds a swing
 back by the same angle however quick it is, a delay by more the quicker it is: fitted together, both are
-told apart. What is found is by how much the frames' time stamps are wrong, and with it the delay.
+separated. What is found is by how much the frames' time stamps are wrong, and with it the delay.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.identify.drawing import new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.plays import ELEMENTS, trail
 from fitctl.identify.record import ExperimentRecord
@@ -40,14 +41,14 @@ _NARROWEST_PLOT_S = 0.0005
 
 @dataclass(frozen=True)
 class DelayResult:
-    """What the motion told.
+    """What the motion shows.
 
     Attributes
     ----------
     loop : str
     stamp_error_s, stamp_error_std_s : float
         By how much later than its time stamp a frame was truly exposed. Voltages that take effect later
-        than they are said to, and a mirror that follows late, count here too, against it.
+        than recorded, and a mirror that follows late, count here too, against it.
     delay_s : float
         T_fd: from true mid-exposure to the command made from the frame, median over ticks.
     delay_std_s : float
@@ -94,9 +95,7 @@ class DelayResult:
 
     def plot(self, path: Path) -> None:
         """How well each time shift explains the frames, and each tick's delay."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        figure = new_figure(10.0, 4.2)
         left, right = figure.subplots(1, 2)
         left.semilogy(1e3 * self.shift_s, self.misfit, linewidth=1.0)
         left.axvline(1e3 * self.stamp_error_s, color="k", linestyle="--", linewidth=0.8)
@@ -143,11 +142,11 @@ def analyse(rig: Rig, record: ExperimentRecord) -> DelayResult:
     """
     hypotheses = [_Motion(record, rig), _Motion(record, rig, rig.camera.exposure_s)]
     shifts_s = np.arange(-_WIDEST_SHIFT_S, _WIDEST_SHIFT_S, _COARSE_STEP_S)
-    misfits = [seen.misfits(shifts_s) for seen in hypotheses]
+    misfits = [motion.misfits(shifts_s) for motion in hypotheses]
     blurred = bool(misfits[1].min() < misfits[0].min())
-    seen, misfit = hypotheses[blurred], misfits[blurred]
-    stamp_error_s, std_s, left = _lowest(seen, float(shifts_s[np.argmin(misfit)]))
-    if left > _MOST_LEFT**2 or abs(stamp_error_s) > _WIDEST_SHIFT_S - seen.hold_s:
+    motion, misfit = hypotheses[blurred], misfits[blurred]
+    stamp_error_s, std_s, left = _lowest(motion, float(shifts_s[np.argmin(misfit)]))
+    if left > _MOST_LEFT**2 or abs(stamp_error_s) > _WIDEST_SHIFT_S - motion.hold_s:
         msg = (
             f"delay: the frames do not show the mirror's motion (unexplained: {np.sqrt(left):.1f} times "
             f"the noise, at {1e3 * stamp_error_s:+.1f} ms); expected below {_MOST_LEFT:g} times, within "
@@ -165,7 +164,7 @@ def analyse(rig: Rig, record: ExperimentRecord) -> DelayResult:
         delay_s=float(np.median(delays_s)),
         delay_std_s=float(np.hypot(std_s, median_std_s)),
         jitter_s=jitter_s,
-        frames=seen.frames,
+        frames=motion.frames,
         left=float(np.sqrt(left)),
         blurred=blurred,
         shift_s=shifts_s,
@@ -182,7 +181,7 @@ class _Motion:
     """
 
     def __init__(self, record: ExperimentRecord, rig: Rig, exposure_s: float = 0.0) -> None:
-        self._injected_s = record.injected_s
+        self._record = record
         self._exposure_s = exposure_s
         self._plays_v = _plays(record.injected_v)
         # Integrals, so that an exposure's mean is a difference.
@@ -191,19 +190,22 @@ class _Motion:
         self.hold_s = float(np.median(lasted_s[:-1]))
         exposed_s = record.tick["mid_exposure_s"]
         stamped = np.isfinite(exposed_s)
-        seen = stamped & np.isfinite(record.star_px).all(axis=1)
-        self.frames, lost = int(np.count_nonzero(seen)), int(np.count_nonzero(stamped & ~seen))
+        with_star = stamped & np.isfinite(record.star_px).all(axis=1)
+        self.frames, lost = (
+            int(np.count_nonzero(with_star)),
+            int(np.count_nonzero(stamped & ~with_star)),
+        )
         if self.frames < _LEAST_FRAMES or lost > _MOST_LOST * self.frames:
             msg = (
                 f"delay: {self.frames} frames with the star and {lost} without; expected at least "
                 f"{_LEAST_FRAMES}, and at most {_MOST_LOST:.0%} without; swing less or centre the star"
             )
             raise IdentifyError(msg)
-        self._exposed_s = exposed_s[seen]
+        self._exposed_s = exposed_s[with_star]
         self._whiten = whitener(rig, record.loop, self._exposed_s)
         # Until the first full swing is over, the plays' beginnings are not known.
-        self._judged = self._exposed_s > record.injected_s[0] + 1.5 / SLOWEST_HZ
-        self._wanted = self._whiten(record.star_px[seen])[self._judged]
+        self._used = self._exposed_s > record.injected_s[0] + 1.5 / SLOWEST_HZ
+        self._wanted = self._whiten(record.star_px[with_star])[self._used]
 
     def misfits(self, shifts_s: Floats) -> Floats:
         """Mean square of what is left over for each shift, in units of the noise, both axes."""
@@ -218,25 +220,22 @@ class _Motion:
         columns = np.stack([self._plays_at(self._exposed_s + shift) for shift in shifts_s], axis=1)
         white = self._whiten(columns.reshape(self.frames, -1)).reshape(columns.shape)
         left = []
-        for by in np.moveaxis(white[self._judged], 1, 0):
+        for by in np.moveaxis(white[self._used], 1, 0):
             gains, *_ = np.linalg.lstsq(by, self._wanted, rcond=1e-9)
             left.append(np.mean((self._wanted - by @ gains) ** 2))
         return np.array(left)
 
     def _plays_at(self, time_s: Floats) -> Floats:
         if self._exposure_s == 0.0:
-            return self._plays_v[self._row(time_s)]
+            return self._plays_v[self._record.row_at(time_s)]
         half_s = self._exposure_s / 2
         moved_vs = self._integral_at(time_s + half_s) - self._integral_at(time_s - half_s)
         return moved_vs / self._exposure_s
 
     def _integral_at(self, time_s: Floats) -> Floats:
-        row = self._row(time_s)
-        since_s = (time_s - self._injected_s[row])[:, None]
+        row = self._record.row_at(time_s)
+        since_s = (time_s - self._record.injected_s[row])[:, None]
         return self._integral_vs[row] + self._plays_v[row] * since_s
-
-    def _row(self, time_s: Floats) -> NDArray[np.intp]:
-        return np.maximum(np.searchsorted(self._injected_s, time_s, side="right") - 1, 0)
 
 
 def _plays(volts: Floats) -> Floats:

@@ -1,7 +1,43 @@
-"""What stops an identification."""
+"""What stops an identification, before its experiment and after it."""
 
 from __future__ import annotations
+
+from fitctl.config import Rig
+
+_LEAST_SEEN = 0.9  # of the frames
 
 
 class IdentifyError(ValueError):
     """A record, or a rig, from which nothing can be learned: one line with what, expected, next step."""
+
+
+def require_room(rig: Rig, loop_name: str, what: str, az_px: float, el_px: float) -> None:
+    """Refuse motions that would take the star off the frame, az_px or el_px to either side of its target.
+
+    Raises
+    ------
+    IdentifyError
+    """
+    target = rig.loops[loop_name].target_px
+    for sign in (-1, 1):
+        if not rig.camera.window_fits(target.az + sign * az_px, target.el + sign * el_px):
+            msg = (
+                f"{what} needs {max(az_px, el_px):.1f} px to either side of the star, which must stay on the "
+                f"frame; move loops.{loop_name}.target_px nearer to the frame's middle"
+            )
+            raise IdentifyError(msg)
+
+
+def require_star(with_star: int, due: int, frames: str, least: int) -> None:
+    """Refuse a record with the star on too few of the `due` frames, which `frames` names.
+
+    Raises
+    ------
+    IdentifyError
+    """
+    if with_star < max(least, _LEAST_SEEN * due):
+        msg = (
+            f"the star is on {with_star} of {due} {frames}, expected at least {least} and "
+            f"{100 * _LEAST_SEEN:g} %; look at the flux, then run it again"
+        )
+        raise IdentifyError(msg)

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 from fitctl.config import Rig
 from fitctl.identify import airpath, backlash, delay, hysteresis, response
-from fitctl.identify.frames import frames_of_log, frames_of_records, track_spots
+from fitctl.identify.frames import TimedImage, frames_of_log, frames_of_records, track_spots
 from fitctl.identify.record import gather, gather_log
 from fitctl.logging.records import AnyRecord
 from fitctl.mocks.detector import DetectorBench
 from fitctl.model.drives import Drive
 
-
-class Finding(Protocol):
-    """What an identification found."""
-
-    def fragment(self) -> dict[str, Any]:
-        """What to lay over the rig file."""
-
-    def lines(self) -> list[str]:
-        """For an operator."""
-
-    def plot(self, path: Path) -> None:
-        """PNG or SVG, by the path's suffix."""
+Finding = (
+    hysteresis.HysteresisResult
+    | backlash.BacklashResult
+    | delay.DelayResult
+    | airpath.AirPathResult
+    | response.ResponseResult
+)
+"""Each has `fragment`, to lay over the rig file, `lines`, for an operator, and `plot`, a PNG or SVG."""
 
 
 class Identification(NamedTuple):
@@ -59,14 +55,7 @@ def _of_stages(
     )
 
 
-def _air_path_from_log(rig: Rig, loop_name: str, path: Path) -> Finding:
-    frames = frames_of_log(path, loop_name)
-    tracks = track_spots(frames, rig.camera, rig.loops[loop_name])
-    return airpath.analyse(rig, loop_name, tracks)
-
-
-def _air_path_from_records(rig: Rig, loop_name: str, records: list[AnyRecord]) -> Finding:
-    frames = frames_of_records(records, loop_name)
+def _air_path(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> airpath.AirPathResult:
     tracks = track_spots(frames, rig.camera, rig.loops[loop_name])
     return airpath.analyse(rig, loop_name, tracks)
 
@@ -87,6 +76,10 @@ EXPERIMENTS: dict[str, Identification] = {
     "hysteresis": _of_stages("hysteresis", hysteresis.plan, hysteresis.analyse),
     "backlash": _of_stages("backlash", backlash.plan, backlash.analyse),
     "delay": _of_stages("delay", delay.plan, delay.analyse),
-    "airpath": Identification(airpath.plan, _air_path_from_log, _air_path_from_records),
+    "airpath": Identification(
+        airpath.plan,
+        lambda rig, loop, path: _air_path(rig, loop, frames_of_log(path, loop)),
+        lambda rig, loop, records: _air_path(rig, loop, frames_of_records(records, loop)),
+    ),
     "response": Identification(None, _response_from_file, None),
 }

@@ -14,5 +14,5 @@ from fitctl.config import Rig
 def fragment_text(by: str, rig: Rig, lines: Iterable[str], fragment: Mapping[str, Any]) -> str:
     """A fragment for a rig file's include list, under who wrote it and what it says for people."""
     when = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
-    said = "".join(f"# {line}\n" for line in lines)
-    return f"# Written by `{by}` for rig {rig.name}, {when}.\n{said}\n" + tomli_w.dumps(fragment)
+    notes = "".join(f"# {line}\n" for line in lines)
+    return f"# Written by `{by}` for rig {rig.name}, {when}.\n{notes}\n" + tomli_w.dumps(fragment)

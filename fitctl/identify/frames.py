@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop, Range
 from fitctl.controllers.centroid import Star, StarSensor
 from fitctl.identify.errors import IdentifyError
+from fitctl.identify.record import tick_columns
 from fitctl.logging.reading import log_info, read_records, tick_arrays
 from fitctl.logging.records import AnyRecord, FrameRecord, Tick
 from fitctl.logging.schemas import TOPICS
@@ -148,7 +149,7 @@ def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
 
 
 def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[TimedImage]:
-    """Frames from the longest stretch in which the loop's stages were told to stand still.
+    """Frames from the longest stretch in which the loop's stages were commanded to stand still.
 
     Raises
     ------
@@ -157,10 +158,7 @@ def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[
     """
     kept = list(records)
     ticks = [record for record in kept if isinstance(record, Tick) and record.loop == loop_name]
-    names = ("time_s", "mid_exposure_s", *_STAGES)
-    start_s, end_s = longest_rest(
-        {name: np.array([getattr(tick, name) for tick in ticks]) for name in names}
-    )
+    start_s, end_s = longest_rest(tick_columns(ticks))
     for record in kept:
         if isinstance(record, FrameRecord) and start_s <= record.time_s <= end_s:
             yield TimedImage(record.time_s, _image(record.data, record.height_px))

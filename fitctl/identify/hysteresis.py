@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.identify.errors import IdentifyError
+from fitctl.identify.drawing import new_figure
+from fitctl.identify.errors import IdentifyError, require_room, require_star
 from fitctl.identify.plays import (
     ELEMENTS,
     Fit,
@@ -32,7 +34,6 @@ _WIPES = 2  # sweeps of all together; one would do if the machine never stood st
 FULL_S, MINOR_S = 12.0, 20.0
 _LEAST_SWING = 0.5  # of the D/A's full scale
 _LEAST_FRAMES = 500
-_LEAST_SEEN = 0.9  # of the frames
 _AT_END = 0.02  # of the swing
 _UNSURE_S = 0.001  # so near to a change of voltage, a frame may have seen either side
 _LATE_S = np.linspace(-0.010, 0.010, 81)  # tried
@@ -49,38 +50,22 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
     fsm = rig.loops[loop_name].fsm
     amplitude_v = min(fsm.bias_v, fsm.dac.full_scale_v - fsm.bias_v)
     _check_star_stays(rig, loop_name, amplitude_v)
-    drives = [
-        Drive(
-            channel=stack,
-            shape="triangle",
-            amplitude=amplitude_v,
-            frequency_hz=SLOW_HZ,
-            duration_s=_WIPES / SLOW_HZ,
-        )
-        for stack in STACKS
-    ]
-    start_s = _WIPES / SLOW_HZ
-    for stack in STACKS:
+    sweep = partial(Drive, shape="triangle", amplitude=amplitude_v)
+    wipe_s = _WIPES / SLOW_HZ
+    drives = [sweep(channel=stack, frequency_hz=SLOW_HZ, duration_s=wipe_s) for stack in STACKS]
+    for number, stack in enumerate(STACKS):
+        start_s = wipe_s + number * (FULL_S + MINOR_S)
+        minor_s = start_s + FULL_S
         drives += [
-            Drive(
+            sweep(channel=stack, frequency_hz=SLOW_HZ, start_s=start_s, duration_s=FULL_S),
+            sweep(
                 channel=stack,
-                shape="triangle",
-                amplitude=amplitude_v,
-                frequency_hz=SLOW_HZ,
-                start_s=start_s,
-                duration_s=FULL_S,
-            ),
-            Drive(
-                channel=stack,
-                shape="triangle",
-                amplitude=amplitude_v,
                 end_amplitude=0.0,
                 frequency_hz=FAST_HZ,
-                start_s=start_s + FULL_S,
+                start_s=minor_s,
                 duration_s=MINOR_S,
             ),
         ]
-        start_s += FULL_S + MINOR_S
     return drives
 
 
@@ -88,18 +73,12 @@ def _check_star_stays(rig: Rig, loop_name: str, amplitude_v: float) -> None:
     loop = rig.loops[loop_name]
     per_stack_rad = loop.fsm.stack_scale_m_per_v / (2 * loop.fsm.stack_radius_m)
     swing_rad = 1.2 * amplitude_v * per_stack_rad
-    scale, target = scales(rig, loop), loop.target_px
+    scale = scales(rig, loop)
     # The second stack moves both of the mirror's axes, and what that is on the frame, its rotation decides.
     az_px, el_px = (
         swing_rad * scale.mirror_px_per_rad * np.abs(scale.mirror_turn).sum(axis=1)
     ).tolist()
-    for sign in (-1, 1):
-        if not rig.camera.window_fits(target.az + sign * az_px, target.el + sign * el_px):
-            msg = (
-                f"a full swing of one stack moves the star by {max(az_px, el_px):.1f} px, which must stay on "
-                f"the frame; move loops.{loop_name}.target_px nearer to the frame's middle"
-            )
-            raise IdentifyError(msg)
+    require_room(rig, loop_name, "a full swing of one stack", az_px, el_px)
 
 
 @dataclass(frozen=True)
@@ -112,12 +91,12 @@ class HysteresisResult:
     full_scale_v : float
         Of the D/A.
     half_widths_v : array, shape (n,)
-    gains_m_per_v, gains_sd_m_per_v : arrays, shape (3, n)
-        The elements' gains, and one standard deviation of them.
+    gains_m_per_v : array, shape (3, n)
+        The elements' gains.
     output_sd : array, shape (3,)
         One standard deviation of the model's output, RMS over the record, as a part of the stroke.
     late_s : float
-        By how much the exposures were later than the record says, beside the voltages; taken account of.
+        By how much the exposures were later than the record says, beside the voltages; corrected for.
     excess : float
         RMS of what the model leaves, over what the rig file's air path and centroid noise explain.
     volts, modelled_m, measured_m : arrays, shape (frames, 3)
@@ -128,7 +107,6 @@ class HysteresisResult:
     full_scale_v: float
     half_widths_v: Floats
     gains_m_per_v: Floats
-    gains_sd_m_per_v: Floats
     output_sd: Floats
     late_s: float
     excess: float
@@ -163,9 +141,7 @@ class HysteresisResult:
 
     def plot(self, path: Path) -> None:
         """Each stack's loops: what the camera saw, air path included, and the model."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(12, 4.5), layout="constrained")
+        figure = new_figure(12, 4.5)
         for stack, axes in enumerate(figure.subplots(1, 3, sharex=True, sharey=True)):
             own = np.isfinite(self.measured_m[:, stack])
             volts, model_um = self.volts[own, stack], self.modelled_m[own, stack] * 1e6
@@ -194,7 +170,7 @@ def analyse(rig: Rig, record: ExperimentRecord) -> HysteresisResult:
 
     Notes
     -----
-    A star cannot tell where the mirror stood before its stacks were first swept: the model's output is
+    A star does not show where the mirror stood before its stacks were first swept: the model's output is
     known but for a constant, which depends on the widest elements, that a full swing moves last.
     """
     end_v = float(np.ptp(record.injected_v, axis=0).min()) / 2
@@ -227,14 +203,9 @@ def _usable_frames(
     at_ends = np.stack([volts <= low_v + margin_v, volts >= high_v - margin_v])
     wiped_s = record.injected_s[at_ends.argmax(axis=1).max()]
     after = exposed_s > wiped_s
-    seen = np.isfinite(record.star_px).all(axis=1)
-    frames = np.flatnonzero(after & seen)
-    if len(frames) < max(_LEAST_FRAMES, _LEAST_SEEN * np.count_nonzero(after)):
-        msg = (
-            f"the star is on {len(frames)} of {np.count_nonzero(after)} frames, expected at least "
-            f"{_LEAST_FRAMES} and {100 * _LEAST_SEEN:g} %; look at the flux, then run it again"
-        )
-        raise IdentifyError(msg)
+    with_star = np.isfinite(record.star_px).all(axis=1)
+    frames = np.flatnonzero(after & with_star)
+    require_star(len(frames), int(np.count_nonzero(after)), "frames", _LEAST_FRAMES)
     changed_s = record.injected_s[1:][np.diff(volts, axis=0).any(axis=1)]
     return frames[_distance(changed_s, exposed_s[frames]) >= unsure_s]
 
@@ -267,29 +238,27 @@ class _Evidence:
 
     def plays_v(self, half_widths_v: Floats) -> Floats:
         """Plays at the frames, shape (frames, stacks, n)."""
-        return trail(self.record.injected_v, half_widths_v)[self._rows(self.exposed_s)]
+        return trail(self.record.injected_v, half_widths_v)[self.record.row_at(self.exposed_s)]
 
     def fit(self, half_widths_v: Floats, prior: Floats) -> Fit:
         """Gains from all frames and both axes at once."""
         plays_v = self.plays_v(half_widths_v)
-        seen = self.px_per_m.T[:, None, :, None] * plays_v
-        plays = self._whitened(seen.reshape(2, len(plays_v), -1)).reshape(-1, *plays_v.shape[1:])
+        moved_px = self.px_per_m.T[:, None, :, None] * plays_v
+        plays = self._whitened(moved_px.reshape(2, len(plays_v), -1)).reshape(
+            -1, *plays_v.shape[1:]
+        )
         return fit_gains(plays, self._white_star[:, 0], prior)
 
     def late_s(self, half_widths_v: Floats, gains: Floats) -> float:
         """By how much exposures are later than their times: as what a model explains most.
 
-        Voltages go in steps, so a frame that is told the wrong time was often told a wrong voltage.
+        Voltages go in steps, so a frame with a wrong time often has a wrong voltage too.
         """
         moved_m = hysteresis_output(trail(self.record.injected_v, half_widths_v), gains)
-        rows = self._rows(self.exposed_s[:, None] + _LATE_S)
-        seen_px = np.einsum("fls,sa->afl", moved_m[rows], self.px_per_m)
-        left_over = self._white_star - self._whitened(seen_px)
+        rows = self.record.row_at(self.exposed_s[:, None] + _LATE_S)
+        modelled_px = np.einsum("fls,sa->afl", moved_m[rows], self.px_per_m)
+        left_over = self._white_star - self._whitened(modelled_px)
         return float(_LATE_S[np.argmin((left_over**2).sum(axis=0))])
-
-    def _rows(self, times_s: Floats) -> NDArray[np.intp]:
-        row = np.searchsorted(self.record.injected_s, times_s, side="right") - 1
-        return np.maximum(row, 0)
 
     def _whitened(self, columns: Floats) -> Floats:
         """From (axes, frames, m) to (axes * frames, m)."""
@@ -304,7 +273,7 @@ def _result(
     modelled_m = hysteresis_output(plays_v, fit.gains)
     left_over_px = evidence.star_px - modelled_m @ evidence.px_per_m
     left_over_px -= left_over_px.mean(axis=0)
-    volts = evidence.record.stack_v_at(evidence.exposed_s)
+    volts = evidence.record.injected_v[evidence.record.row_at(evidence.exposed_s)]
     stacks = range(modelled_m.shape[1])
     output_sd = []
     for stack in stacks:
@@ -323,7 +292,6 @@ def _result(
         full_scale_v=full_scale_v,
         half_widths_v=half_widths_v,
         gains_m_per_v=fit.gains,
-        gains_sd_m_per_v=np.sqrt(np.diag(fit.covariance)).reshape(3, n),
         output_sd=np.array(output_sd),
         late_s=late_s,
         excess=fit.excess,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import find_peaks
+from scipy.signal import find_peaks, peak_widths
 
 from fitctl.identify.errors import IdentifyError
 
@@ -145,8 +145,8 @@ def fit_modes(frequency_hz: Floats, response: Complexes, driven: tuple[int, ...]
     )
 
     def misfit(values: Floats) -> Floats:
-        seen = _response(values, frequency_hz, driven)
-        difference = ((seen - response) / size[:, None, None]).ravel()
+        modelled = _response(values, frequency_hz, driven)
+        difference = ((modelled - response) / size[:, None, None]).ravel()
         return np.concatenate([difference.real, difference.imag])
 
     found = least_squares(misfit, begin, x_scale=scale)
@@ -191,8 +191,12 @@ def _begin(
     strongest = peaks[np.argsort(-found["prominences"])[:_MOST_MODES]]
     gain = np.abs(response[:20, list(driven), range(len(driven))]).mean(axis=0)
     values = [*gain, 0.0, 0.0]
+    # Damping from the width at half the power, of the whole height and not of what stands out of the rest.
+    whole = (size[peaks], np.zeros_like(peaks), np.full_like(peaks, len(size) - 1))
+    widths, *_ = peak_widths(size, peaks, 1 - np.sqrt(0.5), whole)
+    width_hz = dict(zip(peaks, widths * (frequency_hz[1] - frequency_hz[0]), strict=True))
     for peak in np.sort(strongest):
-        damping = _half_power_damping(frequency_hz, size, int(peak))
+        damping = width_hz[peak] / (2 * frequency_hz[peak])
         # At resonance G = -j / (2 zeta): the imaginary part is p / (2 zeta) phi phi'. Of it, the column
         # that moves most.
         strength = -(response[peak] / gain).imag
@@ -202,14 +206,3 @@ def _begin(
         angle_rad = float(np.arctan2(column[1], column[0]))
         values += [frequency_hz[peak], damping, 2 * damping * power, angle_rad]
     return np.array(values)
-
-
-def _half_power_damping(frequency_hz: Floats, size: Floats, peak: int) -> float:
-    """Damping from a peak's width at half its power."""
-    low = high = peak
-    half = size[peak] / np.sqrt(2)
-    while low > 0 and size[low] > half:
-        low -= 1
-    while high < len(size) - 1 and size[high] > half:
-        high += 1
-    return float((frequency_hz[high] - frequency_hz[low]) / (2 * frequency_hz[peak]))

@@ -1,4 +1,4 @@
-"""Eq. 8 seen by a camera: the exact likelihood of centroids.
+"""Eq. 8 as a camera observes it: the exact likelihood of centroids.
 
 The centroid is the air path at the frame's time plus white noise. The exposure's own average is left
 out: at 10 ms it takes 0.1 % off a motion of 3 Hz, where the air path has all but ended.
@@ -91,9 +91,9 @@ def negative_log_likelihood(
     prior = np.zeros((3, 3))
     prior[:2, :2] = np.linalg.inv(white.start_covariance)
     information = unknowns.T @ unknowns / white.innovation_px2 + prior
-    seen = unknowns.T @ innovations / white.innovation_px2
+    projected = unknowns.T @ innovations / white.innovation_px2
     square = np.sum(innovations**2) / white.innovation_px2 - np.sum(
-        seen * np.linalg.solve(information, seen)
+        projected * np.linalg.solve(information, projected)
     )
     determinants = (
         frames * np.log(white.innovation_px2)

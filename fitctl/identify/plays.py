@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +17,8 @@ _BEND_CHANGE = 0.3  # of the mean curvature, from one element to the next, one s
 _LEAST_SLOPE = 0.05  # of the mean: a slope that is zero has no inverse
 
 
-class Ramp(NamedTuple):
-    """Eq. 6: a model from a full-scale ramp.
-
-    Attributes
-    ----------
-    start : str
-        Which ramp it was read from.
-    half_widths_v : array, shape (n,)
-    gains_m_per_v : array, shape (..., n)
-    """
-
-    start: Literal["virgin", "swept"]
-    half_widths_v: Floats
-    gains_m_per_v: Floats
-
-
-def model_from_ramp(
-    volts: Floats,
-    displacement_m: Floats,
-    start: Literal["virgin", "swept"],
-    elements: int = ELEMENTS,
-) -> Ramp:
-    """Eq. 6: half widths and gains from one rising full-scale ramp of each stack.
+def model_from_ramp(volts: Floats, displacement_m: Floats) -> tuple[Floats, Floats]:
+    """Eq. 6: half widths and gains from one rising full-scale ramp of each stack, relaxed before.
 
     Parameters
     ----------
@@ -47,21 +26,23 @@ def model_from_ramp(
         Ascending; the ramp of all stacks.
     displacement_m : array, shape (..., m)
         Of one stack or of many.
-    start : str
-        "virgin" if the stacks were relaxed before, so that breakpoints read at half a deadband;
-        "swept" if they came down from full scale, so that they read at all of it.
+
+    Returns
+    -------
+    half_widths_v : array, shape (n,)
+    gains_m_per_v : array, shape (..., n)
 
     Notes
     -----
     The local slopes are those of the best piecewise linear curve, not differences of single readings.
     """
     risen_v = volts - volts[0]
-    look = np.arange(elements // 2 + 1) * risen_v[-1] / (elements // 2 + 1)
-    gains = gains_from_slopes(_ramp_slopes(risen_v, displacement_m, look))
-    bend = np.abs(gains).reshape(-1, len(look)).mean(axis=0)
-    breakpoints_v = place_breakpoints(look, bend, float(risen_v[-1]), elements)
-    gains = gains_from_slopes(_ramp_slopes(risen_v, displacement_m, breakpoints_v))
-    return Ramp(start, breakpoints_v if start == "virgin" else breakpoints_v / 2, gains)
+    look_v = np.arange(ELEMENTS // 2 + 1) * risen_v[-1] / (ELEMENTS // 2 + 1)
+    gains = gains_from_slopes(_ramp_slopes(risen_v, displacement_m, look_v))
+    bend = np.abs(gains).reshape(-1, len(look_v)).mean(axis=0)
+    half_widths_v = place_breakpoints(look_v, bend, float(risen_v[-1]))
+    slopes = _ramp_slopes(risen_v, displacement_m, half_widths_v)
+    return half_widths_v, gains_from_slopes(slopes)
 
 
 def _ramp_slopes(risen_v: Floats, displacement_m: Floats, breakpoints_v: Floats) -> Floats:
@@ -83,7 +64,7 @@ def place_breakpoints(at_v: Floats, bend: Floats, end_v: float, count: int = ELE
         By how much the slope changes at each of some evenly spread voltages; the first, zero, where
         the curve begins, is not a bend.
     end_v : float
-        The largest that could be seen.
+        The largest that could show.
 
     Notes
     -----
@@ -127,7 +108,7 @@ class Fit(NamedTuple):
 def smoothness(half_widths_v: Floats, end_v: float, bend_m_per_v2: float) -> Floats:
     """Rows that ask neighbouring elements of one stack to bend alike, shape (n - 2, n).
 
-    Elements so wide that a full swing hardly moves them are told by little else. A row is the change of
+    Elements so wide that a full swing hardly moves them are determined by little else. A row is the change of
     curvature over what is expected of it, so that it may stand below whitened measurements.
 
     Parameters

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.identify.errors import IdentifyError
-from fitctl.logging.reading import read_records
-from fitctl.logging.records import AnyRecord, ExperimentStart, InjectionRecord, Tick
+from fitctl.logging.reading import Columns, read_records
+from fitctl.logging.records import ExperimentStart, InjectionRecord, Tick
 from fitctl.logging.schemas import TOPICS
 
 Floats = NDArray[np.float64]
 _TICK_FIELDS = tuple(field.name for field in msgspec.structs.fields(Tick))
 _EXPERIMENT = "EXPERIMENT"
+_KINDS = {kind.__name__ for kind in (Tick, ExperimentStart, InjectionRecord)}
 
 
 @dataclass(frozen=True)
@@ -39,104 +41,73 @@ class ExperimentRecord:
     """
 
     loop: str
-    tick: dict[str, NDArray[Any]]
+    tick: Columns
     injected_s: Floats
     injected_v: Floats
 
-    def stack_v_at(self, time_s: Floats) -> Floats:
-        """Voltages in force at given times, shape (..., 3)."""
-        row = np.searchsorted(self.injected_s, time_s, side="right") - 1
-        return self.injected_v[np.maximum(row, 0)]
+    def row_at(self, time_s: Floats) -> NDArray[np.intp]:
+        """The row of the injected voltages that was in force at each time, shape as `time_s`."""
+        return np.maximum(np.searchsorted(self.injected_s, time_s, side="right") - 1, 0)
 
     @property
     def star_px(self) -> Floats:
         """Centroids (az, el), shape (ticks, 2); NaN without a star."""
-        return np.column_stack([self.tick["star_az_px"], self.tick["star_el_px"]])
+        return axis_pair(self.tick, "star_{}_px")
 
     @property
     def motor_rad(self) -> Floats:
         """Encoders at mid-exposure (az, el), shape (ticks, 2)."""
-        return np.column_stack([self.tick["siderostat_az_rad"], self.tick["siderostat_el_rad"]])
+        return axis_pair(self.tick, "siderostat_{}_rad")
 
 
-class Gatherer:
-    """Takes records as they come and keeps those of the last experiment of a name.
-
-    Parameters
-    ----------
-    loop, name : str
-    """
-
-    def __init__(self, loop: str, name: str) -> None:
-        self._loop = loop
-        self._name = name
-        self._begun = self._over = False
-        self._ticks: list[tuple[Any, ...]] = []
-        self._injected: list[tuple[float, float, float, float]] = []
-
-    def take(self, record: Any) -> None:
-        """Take one record: a struct, or a log's message with the same fields."""
-        kind = type(record).__name__
-        if kind not in _KINDS or record.loop != self._loop:
-            return
-        if kind == ExperimentStart.__name__:
-            self._begun, self._over = record.name == self._name, False
-            if self._begun:
-                self._ticks.clear()
-                self._injected.clear()
-        elif not self._begun or self._over:
-            return
-        elif kind == InjectionRecord.__name__:
-            self._injected.append(
-                (record.time_s, record.stack1_v, record.stack2_v, record.stack3_v)
-            )
-        elif record.mode == _EXPERIMENT:
-            if record.number >= 0:
-                self._ticks.append(tuple(getattr(record, name) for name in _TICK_FIELDS))
-        else:
-            self._over = bool(self._ticks)
-
-    def experiment(self) -> ExperimentRecord:
-        """What was gathered.
-
-        Raises
-        ------
-        IdentifyError
-            If there was no such experiment, or nothing of it.
-        """
-        if not self._ticks or not self._injected:
-            msg = (
-                f"no experiment {self._name} on loop {self._loop} in these records; "
-                f"run `fitctl identify {self._name}` on the rig first"
-            )
-            raise IdentifyError(msg)
-        columns = zip(*self._ticks, strict=True)
-        injected = np.array(self._injected)
-        return ExperimentRecord(
-            loop=self._loop,
-            tick={
-                name: np.array(column) for name, column in zip(_TICK_FIELDS, columns, strict=True)
-            },
-            injected_s=injected[:, 0],
-            injected_v=injected[:, 1:],
-        )
+def tick_columns(ticks: Iterable[Any]) -> Columns:
+    """Ticks, structs or a log's messages, in the form of :func:`fitctl.logging.reading.tick_arrays`."""
+    rows = zip(*map(attrgetter(*_TICK_FIELDS), ticks), strict=True)
+    return {name: np.array(column) for name, column in zip(_TICK_FIELDS, rows, strict=True)}
 
 
-_KINDS = {kind.__name__ for kind in (Tick, ExperimentStart, InjectionRecord)}
+def axis_pair(columns: Mapping[str, NDArray[Any]], name: str) -> Floats:
+    """The columns of azimuth and elevation, shape (rows, 2); ``{}`` stands for the axis in their `name`."""
+    return np.stack([columns[name.format(axis)] for axis in ("az", "el")], axis=-1, dtype=float)
 
 
-def gather(records: Iterable[AnyRecord], loop: str, name: str) -> ExperimentRecord:
-    """The last experiment of a name among records.
+def gather(records: Iterable[Any], loop: str, name: str) -> ExperimentRecord:
+    """The last experiment of a name, finished or not, among records: structs, or a log's messages.
 
     Raises
     ------
     IdentifyError
-        If there is none.
+        If there is none, or nothing of it.
     """
-    gatherer = Gatherer(loop, name)
+    begun = over = False
+    ticks: list[Any] = []
+    injected: list[tuple[float, float, float, float]] = []
     for record in records:
-        gatherer.take(record)
-    return gatherer.experiment()
+        kind = type(record).__name__
+        if kind not in _KINDS or record.loop != loop:
+            continue
+        if kind == ExperimentStart.__name__:
+            begun, over = record.name == name, False
+            if begun:
+                ticks.clear()
+                injected.clear()
+        elif not begun or over:
+            continue
+        elif kind == InjectionRecord.__name__:
+            injected.append((record.time_s, record.stack1_v, record.stack2_v, record.stack3_v))
+        elif record.mode == _EXPERIMENT:
+            if record.number >= 0:
+                ticks.append(record)
+        else:
+            over = bool(ticks)
+    if not ticks or not injected:
+        msg = (
+            f"no experiment {name} on loop {loop} in these records; "
+            f"run `fitctl identify {name}` on the rig first"
+        )
+        raise IdentifyError(msg)
+    table = np.array(injected)
+    return ExperimentRecord(loop, tick_columns(ticks), table[:, 0], table[:, 1:])
 
 
 def gather_log(path: Path, loop: str, name: str) -> ExperimentRecord:
@@ -150,7 +121,4 @@ def gather_log(path: Path, loop: str, name: str) -> ExperimentRecord:
         If the log cannot be read.
     """
     topics = [TOPICS[kind].format(loop=loop) for kind in (Tick, ExperimentStart, InjectionRecord)]
-    gatherer = Gatherer(loop, name)
-    for entry in read_records(path, topics):
-        gatherer.take(entry.message)
-    return gatherer.experiment()
+    return gather((entry.message for entry in read_records(path, topics)), loop, name)

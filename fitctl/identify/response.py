@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 from zipfile import BadZipFile
 
 import numpy as np
@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from scipy.signal import chirp, coherence, csd, welch
 
 from fitctl.config import ARCSEC_PER_RAD, Fsm
+from fitctl.identify.drawing import BLACK, BLUE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.modes_fit import ModesFit, fit_modes, modes_response
+from fitctl.mocks.detector import DetectorBench
 from fitctl.model.detector import DETECTOR_RANGE_V, SAMPLE_RATE_HZ, mirror_angles_seen
 
 Floats = NDArray[np.float64]
@@ -41,13 +43,6 @@ _BANDS = ((LOWEST_HZ, 10.0, 20.0), (10.0, HIGHEST_HZ, 1.25))
 _COLUMNS = ("time_s", "drive_v", "detector_az_v", "detector_el_v")
 _CLIPPED = 0.999
 _FLAT_HZ = 100.0  # the paper: no resonance appears below
-
-
-class Bench(Protocol):
-    """A signal generator on the stacks and a detector: the mock's, or a real one's."""
-
-    def measure(self, axis: Axis, drive_rad: Floats) -> Floats:
-        """Inject wanted mirror angles, shape (n,) at 12.8 kHz; detector volts, shape (n, 2)."""
 
 
 @dataclass(frozen=True)
@@ -132,46 +127,36 @@ class ResponseResult:
 
     def plot(self, path: Path) -> None:
         """Figs. 5-6: magnitude, phase and coherence, excited and cross axis, with the fitted modes."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(11.0, 7.5), layout="constrained")
+        figure = new_figure(11.0, 7.5)
         panels = figure.subplots(3, len(self.fit.driven), sharex=True, sharey="row", squeeze=False)
         fitted = modes_response(self.fit, self.frequency_hz)
         for column, axis in enumerate(self.fit.driven):
-            driven = AXES[axis]
-            for row, seen in enumerate(AXES):
-                h = self.response[:, row, column]
-                name = f"{seen}, {'excited' if seen == driven else 'cross'}"
-                color = "C0" if seen == driven else "C1"
-                panels[0, column].semilogx(
-                    self.frequency_hz, 20 * np.log10(np.abs(h)), color, linewidth=0.9, label=name
-                )
-                panels[0, column].semilogx(
-                    self.frequency_hz,
-                    20 * np.log10(np.abs(fitted[:, row, column])),
-                    "k--",
-                    linewidth=0.7,
-                    label=None if row else "fit",
-                )
-                panels[2, column].semilogx(
-                    self.frequency_hz, self.coherence[:, row, column], color, linewidth=0.9
-                )
-            excited = self.response[:, axis, column]
-            panels[1, column].semilogx(
-                self.frequency_hz, np.degrees(np.unwrap(np.angle(excited))), "C0"
-            )
-            panels[0, column].set_title(f"{driven} driven, loop {self.loop}")
-            panels[0, column].legend(fontsize=8)
-            panels[2, column].set_xlabel("frequency (Hz)")
-        for panel, label in zip(
-            panels[:, 0], ("magnitude (dB)", "phase, excited (deg)", "coherence"), strict=True
-        ):
-            panel.set_ylabel(label)
-        panels[0, 0].set_ylim(-70, 25)
-        panels[2, 0].set_ylim(0, 1.05)
-        for panel in panels.flat:
-            panel.grid(which="both", alpha=0.3)
+            self.draw(panels[:, column], column, fitted[:, :, column], "fit")
+            panels[0, column].set_title(f"{AXES[axis]} driven, loop {self.loop}")
+        for panel in panels[:, 1:].flat:
+            panel.set_ylabel("")
         figure.savefig(path)
+
+    def draw(self, panels: NDArray[Any], column: int, beside: Complexes, label: str) -> None:
+        """Gain, phase and coherence of one driven axis on three axes; dashed another response, (n, 2)."""
+        gain, phase, coherence = panels
+        hz, driven = self.frequency_hz, self.fit.driven[column]
+        for row, color, word in ((driven, BLUE, "excited"), (1 - driven, VERMILION, "cross")):
+            gain_db = 20 * np.log10(np.abs(self.response[:, row, column]))
+            gain.semilogx(hz, gain_db, color=color, linewidth=0.9, label=f"{AXES[row]}, {word}")
+            # Axes that are exactly uncoupled at rest have no cross motion to show below.
+            beside_db = 20 * np.log10(np.maximum(np.abs(beside[:, row]), 1e-6))
+            label_once = label if row == driven else None
+            gain.semilogx(hz, beside_db, "--", color=BLACK, linewidth=0.7, label=label_once)
+            coherence.semilogx(hz, self.coherence[:, row, column], color=color, linewidth=0.8)
+        phase_deg = np.degrees(np.unwrap(np.angle(self.response[:, driven, column])))
+        phase.semilogx(hz, phase_deg, color=BLUE, linewidth=0.9)
+        gain.set(ylabel="mirror / command (dB)", ylim=(-80, 25))
+        gain.legend(loc="lower left")
+        phase.set(ylabel="phase, excited (deg)")
+        coherence.set(ylabel="coherence", xlabel="frequency (Hz)", ylim=(0, 1.05))
+        for panel in panels:
+            panel.grid(which="both", alpha=0.3)
 
 
 def drive() -> Floats:
@@ -183,7 +168,7 @@ def drive() -> Floats:
 
 
 def measure(
-    bench: Bench, on_axis: Callable[[Axis], None] = lambda _axis: None
+    bench: DetectorBench, on_axis: Callable[[Axis], None] = lambda _axis: None
 ) -> list[BenchRecord]:
     """Drive each axis of a bench; `on_axis` hears which one comes next.
 
@@ -298,7 +283,7 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
             f"response: sampled at {record.rate_hz:g} Hz; expected {2.5 * HIGHEST_HZ:g} Hz or more"
         )
         raise IdentifyError(msg)
-    drive_rad, seen_rad = record.drive_rad, mirror_angles_seen(record.detector_v).T
+    drive_rad, mirror_rad = record.drive_rad, mirror_angles_seen(record.detector_v).T
     parts = []
     for low_hz, high_hz, segment_s in _BANDS:
         welch_of: dict[str, Any] = {
@@ -306,8 +291,8 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
             "nperseg": round(segment_s * record.rate_hz),
         }
         frequency_hz, driven = welch(drive_rad, **welch_of)
-        _, cross = csd(drive_rad, seen_rad, **welch_of)
-        _, coherent = coherence(drive_rad, seen_rad, **welch_of)
+        _, cross = csd(drive_rad, mirror_rad, **welch_of)
+        _, coherent = coherence(drive_rad, mirror_rad, **welch_of)
         # A stretch has its lower end and leaves its upper end to the next.
         inside = (frequency_hz > low_hz - 1e-9) & (frequency_hz < high_hz - 1e-9)
         parts.append((frequency_hz[inside], (cross / driven)[:, inside].T, coherent[:, inside].T))

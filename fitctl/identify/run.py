@@ -24,6 +24,26 @@ _FLUSH_SLACK_S = 2.0
 Progress = Callable[[float], None]
 
 
+def hold_on_simulation(simulation: Simulation, loop_name: str, settle_s: float) -> None:
+    """Acquire on the virtual clock, and hold the star in VERNIER for `settle_s`.
+
+    Raises
+    ------
+    IdentifyError
+        If the star is not found in time.
+    """
+    loop = simulation.supervisor.loops[loop_name]
+    simulation.acquire()
+    while loop.mode is not Mode.VERNIER:
+        if simulation.clock.now_s() > _ACQUIRE_LIMIT_S:
+            msg = (
+                f"the star was not in vernier within {_ACQUIRE_LIMIT_S:g} s; mode {loop.mode.name}"
+            )
+            raise IdentifyError(msg)
+        simulation.run(0.5)
+    simulation.run(settle_s)
+
+
 def on_simulation(
     rig: Rig, loop_name: str, name: str, drives: list[Drive], seed: int, on_progress: Progress
 ) -> list[AnyRecord]:
@@ -36,16 +56,8 @@ def on_simulation(
     """
     records: list[AnyRecord] = []
     simulation = Simulation(rig, seed, record=records.append, history_s=1.0)
+    hold_on_simulation(simulation, loop_name, _SETTLE_S)
     loop = simulation.supervisor.loops[loop_name]
-    simulation.acquire()
-    while loop.mode is not Mode.VERNIER:
-        if simulation.clock.now_s() > _ACQUIRE_LIMIT_S:
-            msg = (
-                f"the star was not in vernier within {_ACQUIRE_LIMIT_S:g} s; mode {loop.mode.name}"
-            )
-            raise IdentifyError(msg)
-        simulation.run(0.5)
-    simulation.run(_SETTLE_S)
     records.clear()
     reply = simulation.command(Experiment(loop=loop_name, name=name, drives=drives))
     if not reply.accepted:
@@ -54,7 +66,7 @@ def on_simulation(
     while loop.mode is Mode.EXPERIMENT:
         simulation.run(0.5)
         on_progress(min(1.0, (simulation.clock.now_s() - start_s) / duration_s))
-    _insist_on_end(loop.mode.name, loop.last_change.reason if loop.last_change else "")
+    _require_end(loop.mode.name, loop.last_change.reason if loop.last_change else "")
     return records
 
 
@@ -78,7 +90,7 @@ def on_rig(
         client.send(Hold(loop=loop_name))  # nobody waits for it any more
         raise
     change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
-    _insist_on_end(_mode(telemetry, loop_name), change.reason if change else "")
+    _require_end(_mode(telemetry, loop_name), change.reason if change else "")
     end_s = time.monotonic() + rig.logging.flush_s + _FLUSH_SLACK_S
     while time.monotonic() < end_s:  # until the log's newest second is on disk
         _hear(client, paths)
@@ -120,7 +132,7 @@ def _followed(
             return telemetry
 
 
-def insist_on_vernier(client: Client, loop_name: str) -> None:
+def require_vernier(client: Client, loop_name: str) -> None:
     """Refuse to begin without a star that is held.
 
     Raises
@@ -148,7 +160,7 @@ def _mode(telemetry: Telemetry, loop_name: str) -> str:
     return next((loop.mode for loop in telemetry.loops if loop.name == loop_name), "unknown")
 
 
-def _insist_on_end(mode: str, reason: str) -> None:
+def _require_end(mode: str, reason: str) -> None:
     if mode not in {Mode.COARSE.name, Mode.VERNIER.name}:
         msg = f"the experiment did not come to its end; mode {mode}: {reason}"
         raise IdentifyError(msg)

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design, Measurement, Pair, PairCommand
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.loop.observation import Observation
@@ -25,6 +24,8 @@ class Pointing:
     loop_name : str
     target_px : array, shape (2,)
         Where the star is held at first.
+    design : Design
+        At work in VERNIER at first.
 
     Attributes
     ----------
@@ -35,7 +36,7 @@ class Pointing:
         Of the motors' set-point, in a frame.
     """
 
-    def __init__(self, rig: Rig, loop_name: str, target_px: Floats) -> None:
+    def __init__(self, rig: Rig, loop_name: str, target_px: Floats, design: Design) -> None:
         loop, period_s = rig.loops[loop_name], rig.camera.period_s
         self._scale = scales(rig, loop)
         self._range_rad = loop.fsm.range_rad
@@ -43,7 +44,7 @@ class Pointing:
         self.coarse_step_rad_per_px = (
             loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * period_s
         )
-        self.use(design_for(rig, loop_name))
+        self.use(design)
 
     @property
     def design(self) -> Design:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.controllers.centroid import Star
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
 from fitctl.logging.records import ControllerChange, Tick
@@ -49,6 +49,8 @@ class StellarLoop(Loop):
     siderostat : SiderostatStage
     mirror : MirrorStage
     journal : Journal
+    design : Design
+        At work in VERNIER at first.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class StellarLoop(Loop):
         siderostat: SiderostatStage,
         mirror: MirrorStage,
         journal: Journal,
+        design: Design,
     ) -> None:
         super().__init__(name, rig, siderostat, journal)
         self.mirror = mirror
@@ -66,7 +69,7 @@ class StellarLoop(Loop):
         self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
         self.search = Search(rig, name, self.star_finder.estimator)
         self.following = Following(self.settings, scale)
-        self.pointing = Pointing(rig, name, self.target_px)
+        self.pointing = Pointing(rig, name, self.target_px, design)
         self._limits = _limits(rig, name)
         self._scale = scale
         self._period_s = rig.camera.period_s
@@ -345,7 +348,9 @@ class StellarLoop(Loop):
         return not self.mirror.ready or self.mirror.at_bias()
 
 
-def stellar_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) -> StellarLoop:
+def stellar_loop(
+    name: str, rig: Rig, devices: LoopDevices, journal: Journal, design: Designer
+) -> StellarLoop:
     """A stellar loop on its devices.
 
     Raises
@@ -360,7 +365,8 @@ def stellar_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) ->
         name, rig.loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
     )
     mirror = MirrorStage(rig, name, devices.dac, journal.clock)
-    return StellarLoop(name, rig, SiderostatStage(rig, name, servo), mirror, journal)
+    siderostat = SiderostatStage(rig, name, servo)
+    return StellarLoop(name, rig, siderostat, mirror, journal, design(rig, name, ""))
 
 
 def _limits(rig: Rig, name: str) -> LoopLimits:

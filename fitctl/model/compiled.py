@@ -57,7 +57,7 @@ def numba_installed() -> bool:
 def compiled(function: _Function) -> _Function:
     """A marked function, compiled at its first call; the function itself without numba.
 
-    The machine code is kept for other processes where the package's folder can be written.
+    The machine code of the package's own functions is kept for other processes, if its folder can be written.
     """
     if not numba_installed():
         return function
@@ -70,6 +70,8 @@ def compiled(function: _Function) -> _Function:
         register_jitable(**_options[marked])(marked)
     _registered.update(_options)
     options = _options[function]
+    if not function.__module__.startswith("fitctl."):
+        return njit(**options)(function)
     given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder(function.__module__))
     try:
         return njit(cache=True, **options)(function)

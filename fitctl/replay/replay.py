@@ -17,6 +17,8 @@ import msgspec
 import numpy as np
 
 from fitctl.config import Rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.pair import Designer
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import (
     AnyRecord,
@@ -76,16 +78,19 @@ class Replay:
             self._clock,
             self._executor,
             self._receive,
+            design_for,
             self._make_loop,
         )
         self._step = LoggedStep()
         self._waiting: set[str] = set()
 
     def _make_loop(
-        self, name: str, rig: Rig, _devices: LoopDevices, journal: Journal
+        self, name: str, rig: Rig, _devices: LoopDevices, journal: Journal, design: Designer
     ) -> StellarLoop:
         siderostat = SiderostatStage(rig, name, self._servos[name])
-        return StellarLoop(name, rig, siderostat, self._mirrors[name], journal)
+        return StellarLoop(
+            name, rig, siderostat, self._mirrors[name], journal, design(rig, name, "")
+        )
 
     def play(self, step: LoggedStep) -> None:
         """Make one step as it was made then, and compare its ticks with the log's."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import string
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import numpy as np
 
 from fitctl.messages.modes import Mode
 from fitctl.report import tables
-from fitctl.report.drawing import INK, SERIES, Plot, decimal, panels, styled
+from fitctl.report.drawing import SERIES, Plot, decimal, limit, panels, styled
 from fitctl.report.findings import AXES, Findings, LoopFindings
 from fitctl.report.make import plain, write
 from fitctl.report.page import SIGNS, Section
@@ -29,32 +31,23 @@ def make_comparison(nights: Sequence[Findings], folder: Path) -> Path:
     OSError
         If something cannot be written.
     """
-    letters = [chr(ord("A") + number) for number in range(len(nights))]
+    lettered = list(zip(string.ascii_uppercase, nights, strict=False))
     loops = dict.fromkeys(name for night in nights for name in night.loops)
     with styled():
         parts = [
             _loop(
                 name,
-                [
-                    (letter, night.loops[name])
-                    for letter, night in zip(letters, nights, strict=True)
-                    if name in night.loops
-                ],
+                [(letter, of.loops[name]) for letter, of in lettered if name in of.loops],
             )
             for name in loops
         ]
-    parts.insert(0, Section("Verdicts", [], [_nights(letters, nights)]))
-    figures = {
-        "nights": [
-            {"letter": letter, **plain(night)}
-            for letter, night in zip(letters, nights, strict=True)
-        ]
-    }
-    facts = [f"{letter}: {night.run.name}" for letter, night in zip(letters, nights, strict=True)]
-    return write(folder, "Nights side by side", facts, [], parts, figures)
+    parts.insert(0, Section("Verdicts", [], [_nights(lettered)]))
+    figures = {"nights": [{"letter": letter, **plain(night)} for letter, night in lettered]}
+    facts = [f"{letter}: {night.run.name}" for letter, night in lettered]
+    return write(folder, "Nights side by side", facts, parts, figures)
 
 
-def _nights(letters: Sequence[str], nights: Sequence[Findings]) -> Table:
+def _nights(lettered: Sequence[tuple[str, Findings]]) -> Table:
     rows = [
         [
             letter,
@@ -66,7 +59,7 @@ def _nights(letters: Sequence[str], nights: Sequence[Findings]) -> Table:
             f"{SIGNS[night.word]} {night.word}",
             tables.UNKNOWN if night.gathered.lost is None else str(night.gathered.lost),
         ]
-        for letter, night in zip(letters, nights, strict=True)
+        for letter, night in lettered
     ]
     head = ["night", "log", "rig", "begins", "lasts", "fitctl", "requirement", "records lost"]
     return Table("Nights", head, rows)
@@ -88,9 +81,9 @@ def _figures(nights: list[Night]) -> Table:
             ", ".join(one.controller for one in loop.rejections) or tables.UNKNOWN
         ),
         "rejection at 1 Hz": _at_1_hz,
-        "time in VERNIER": lambda loop: seconds(loop.judged.vernier_s),
-        "of it judged": lambda loop: seconds(loop.judged.judged_s),
-        "star seen": lambda loop: number(loop.judged.star_fraction, ".2f", "%", 100),
+        "time in VERNIER": lambda loop: seconds(loop.selection.vernier_s),
+        "of it judged": lambda loop: seconds(loop.selection.evaluated_s),
+        "star seen": lambda loop: number(loop.selection.star_fraction, ".2f", "%", 100),
         "mirror's range, mean": lambda loop: number(loop.stages.range_mean, ".1f", "%", 100),
         "mirror's range, worst": lambda loop: number(loop.stages.range_worst, ".1f", "%", 100),
         "piston, RMS": lambda loop: number(loop.stages.piston_rms_m, ".1f", "nm", 1e9),
@@ -100,13 +93,13 @@ def _figures(nights: list[Night]) -> Table:
         "frame's age, median": lambda loop: number(loop.timing["age_median_s"], ".2f", "ms", 1e3),
         "tick, worst": lambda loop: number(loop.timing["compute_worst_s"], ".2f", "ms", 1e3),
     }
-    rows = [[what, *(tell(loop) for _, loop in nights)] for what, tell in kinds.items()]
+    rows = [[what, *(text(loop) for _, loop in nights)] for what, text in kinds.items()]
     return Table("Measured", ["what", *(letter for letter, _ in nights)], rows)
 
 
 def _rms(found: Estimate) -> str:
-    told = number(found.rms_px, ".4f")
-    return told if math.isnan(found.rms_px) else f"{told} ({tables.interval(found)})"
+    text = number(found.rms_px, ".4f")
+    return text if math.isnan(found.rms_px) else f"{text} ({tables.interval(found)})"
 
 
 def _at_1_hz(loop: LoopFindings) -> str:
@@ -117,24 +110,23 @@ def _at_1_hz(loop: LoopFindings) -> str:
 def _spectra(name: str, nights: list[Night]) -> Plot:
     figure, (density, rejection) = panels(1, 3.8, 2)
     its = [(letter, one) for letter, loop in nights for one in loop.rejections]
-    for index, (letter, one) in enumerate(its):
-        color = SERIES[index % len(SERIES)]
-        shown = one.spectra.frequency_hz > 0
-        frequency_hz = one.spectra.frequency_hz[shown]
-        label = f"{letter}, {one.controller}"
-        density.loglog(frequency_hz, one.spectra.disturbance[shown], "--", color=color)
-        density.loglog(frequency_hz, one.spectra.error[shown], color=color, label=label)
-        rejection.loglog(frequency_hz, one.measured[shown], color=color, label=label)
-    density.set_title("Power spectral density: error, and disturbance (dashed)")
-    density.set_ylabel("px²/Hz")
-    rejection.set_title("Disturbance rejection, measured")
-    rejection.set_ylabel("disturbance over error")
-    for axes in (density, rejection):
-        axes.set_xlabel("Hz")
-        if its:
-            decimal(axes.xaxis)
-            decimal(axes.yaxis)
-            axes.legend(loc="best")
+    for (letter, one), color in zip(its, itertools.cycle(SERIES), strict=False):
+        frequency_hz, label = one.spectra.frequency_hz, f"{letter}, {one.controller}"
+        density.loglog(frequency_hz, one.spectra.disturbance, "--", color=color)
+        density.loglog(frequency_hz, one.spectra.error, color=color, label=label)
+        rejection.loglog(frequency_hz, one.measured, color=color, label=label)
+    density.set(
+        title="Power spectral density: error, and disturbance (dashed)",
+        xlabel="Hz",
+        ylabel="px²/Hz",
+    )
+    rejection.set(
+        title="Disturbance rejection, measured", xlabel="Hz", ylabel="disturbance over error"
+    )
+    for axes in (density, rejection) if its else ():
+        decimal(axes.xaxis)
+        decimal(axes.yaxis)
+        axes.legend(loc="best")
     caption = "Mean of both axes. The disturbance is the open loop, rebuilt from the log."
     return Plot(f"{name}-spectra", "Spectra", caption, figure)
 
@@ -149,12 +141,11 @@ def _residuals(name: str, nights: list[Night]) -> Plot:
             for one, axis in zip(axes, AXES, strict=True):
                 one.plot(after_min, rms[axis], color=SERIES[index % len(SERIES)], label=letter)
     for one, axis in zip(axes, AXES, strict=True):
-        requirement_px = min(loop.requirement_px for _, loop in nights)
-        one.axhline(requirement_px, color=INK, linestyle="--", linewidth=0.9)
+        limit(one, min(loop.requirement_px for _, loop in nights))
         one.set_yscale("log")
         decimal(one.yaxis, dense=True)
-        one.set_ylabel("px")
-        one.set_title(f"RMS of the measured error in VERNIER, {axis}, {WINDOW_S:g} s at a time")
+        title = f"RMS of the measured error in VERNIER, {axis}, {WINDOW_S:g} s at a time"
+        one.set(title=title, ylabel="px")
     if axes[0].lines[1:]:
         axes[0].legend(ncols=len(nights), loc="best")
     axes[-1].set_xlabel("min after VERNIER first began")

@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.figures.plate import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure
+from fitctl.identify.drawing import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,10 +137,9 @@ def envelope(time_s: Floats, values: Floats, bins: int = BINS) -> tuple[Floats, 
 
 
 def trace(
-    axes: Axes, time: TimeAxis, series: tuple[Floats, Floats], color: str, label: str
+    axes: Axes, time: TimeAxis, time_s: Floats, values: Floats, color: str, label: str
 ) -> None:
     """A series against time, as a band where there is more of it than a page can show."""
-    time_s, values = series
     if len(time_s) == 0:
         return
     at_s, low, high = envelope(time_s, values)
@@ -151,6 +150,23 @@ def trace(
     axes.fill_between(
         at_s / time.s_per_unit, low, high, color=color, alpha=0.6, linewidth=0.9, label=label
     )
+
+
+def limit(axes: Axes, value: float, label: str | None = None) -> None:
+    """A dashed line that is not to be passed."""
+    axes.axhline(value, color=INK, linestyle="--", linewidth=0.9, label=label)
+
+
+def legend_above(axes: Axes, columns: int) -> None:
+    """A legend beside the title, where it hides nothing."""
+    axes.legend(ncols=columns, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
+
+
+def nothing(axes: Axes, why: str = "no data that count") -> None:
+    """Why there is nothing to see."""
+    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", color=FAINT)
+    if not axes.lines:  # numbers would be of nothing
+        axes.set(xticks=[], yticks=[])
 
 
 def span(axes: Sequence[Axes], time: TimeAxis, duration_s: float) -> None:

@@ -14,22 +14,22 @@ from fitctl.logging.reading import Columns
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.report.gather import Gathered, gather
-from fitctl.report.judged import Judged, judge_by
 from fitctl.report.rejection import Rejection, rejections
 from fitctl.report.residual import Estimate, Verdict, Word, night_verdict, rms_estimate, verdict
 from fitctl.report.run import Run
+from fitctl.report.selection import Selection, select_frames
 from fitctl.report.stages import Stacks, Stages, stacks, stages
 
 AXES = ("az", "el")
-_Tell = Callable[[Any], Any]
-_OF_FRAMES: dict[str, tuple[str, _Tell]] = {
+_Statistic = Callable[[Any], Any]
+_OF_FRAMES: dict[str, tuple[str, _Statistic]] = {
     "age_median_s": ("frame_age_s", np.median),
     "age_worst_s": ("frame_age_s", np.max),
     "compute_median_s": ("compute_s", np.median),
     "compute_worst_s": ("compute_s", np.max),
 }
 # What is recorded of a second at a time: the median of medians, the worst of worsts.
-_OF_SECONDS: dict[str, _Tell] = {
+_OF_SECONDS: dict[str, _Statistic] = {
     "servo_late_median_s": np.median,
     "servo_late_worst_s": np.max,
     "worst_stall_s": np.max,
@@ -46,7 +46,7 @@ class LoopFindings:
     ticks : dict of str to array
         See :class:`fitctl.report.gather.Gathered`.
     requirement_px, sky_arcsec_per_px : float
-    judged : Judged
+    selection : Selection
     residual : dict of str to Estimate
         By axis.
     verdict : Verdict
@@ -58,14 +58,14 @@ class LoopFindings:
     counts : dict of str to int
         Frames, late ticks, frames lost, stalls.
     timing : dict of str to float
-        Medians and worsts, seconds; nan where nothing tells.
+        Medians and worsts, seconds; nan where nothing was recorded.
     """
 
     name: str
     ticks: Columns
     requirement_px: float
     sky_arcsec_per_px: float
-    judged: Judged
+    selection: Selection
     residual: dict[str, Estimate]
     verdict: Verdict
     mode_s: dict[str, float]
@@ -78,7 +78,7 @@ class LoopFindings:
 
 @dataclass(frozen=True)
 class Findings:
-    """A run, judged."""
+    """A run, evaluated."""
 
     gathered: Gathered
     loops: dict[str, LoopFindings]
@@ -95,7 +95,7 @@ class Findings:
 
 
 def find(run: Run) -> Findings:
-    """Read and judge a run.
+    """Read and evaluate a run.
 
     Raises
     ------
@@ -109,8 +109,8 @@ def find(run: Run) -> Findings:
 def _loop(gathered: Gathered, name: str) -> LoopFindings:
     rig: Rig = gathered.run.rig
     ticks, settings = gathered.ticks[name], rig.loops[name]
-    judged = judge_by(ticks, rig.camera.period_s, settings.requirement_px)
-    rows = judged.rows
+    selection = select_frames(ticks, rig.camera.period_s, settings.requirement_px)
+    rows = selection.rows
     residual = {axis: rms_estimate(ticks[f"error_{axis}_px"][rows]) for axis in AXES}
     found = stacks(rig, name, ticks)
     return LoopFindings(
@@ -118,13 +118,15 @@ def _loop(gathered: Gathered, name: str) -> LoopFindings:
         ticks=ticks,
         requirement_px=settings.requirement_px,
         sky_arcsec_per_px=scales(rig, settings).sky_arcsec_per_px,
-        judged=judged,
+        selection=selection,
         residual=residual,
-        verdict=verdict(residual, settings.requirement_px, judged.judged_s, judged.star_fraction),
+        verdict=verdict(
+            residual, settings.requirement_px, selection.evaluated_s, selection.star_fraction
+        ),
         mode_s=_mode_s(ticks, rig.camera.period_s),
-        rejections=rejections(gathered, name, judged),
+        rejections=rejections(gathered, name, selection),
         stacks=found,
-        stages=stages(rig, name, ticks, judged, found),
+        stages=stages(rig, name, ticks, selection, found),
         counts=_counts(ticks, gathered.timing[name]),
         timing=_timing(ticks, gathered.timing[name]),
     )
@@ -150,9 +152,9 @@ def _counts(ticks: Columns, timing: Columns) -> dict[str, int]:
 
 def _timing(ticks: Columns, timing: Columns) -> dict[str, float]:
     frames = ticks["number"] >= 0
-    series = {name: (ticks[field][frames], tell) for name, (field, tell) in _OF_FRAMES.items()}
-    series |= {name: (timing.get(name, np.empty(0)), tell) for name, tell in _OF_SECONDS.items()}
+    series = {name: (ticks[field][frames], of) for name, (field, of) in _OF_FRAMES.items()}
+    series |= {name: (timing.get(name, np.empty(0)), of) for name, of in _OF_SECONDS.items()}
     return {
-        name: float(tell(values)) if len(values) else math.nan
-        for name, (values, tell) in series.items()
+        name: float(of(values)) if len(values) else math.nan
+        for name, (values, of) in series.items()
     }

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fitctl.figures.plate import GREEN
-from fitctl.report.drawing import AZ, EL, FAINT, INK, SERIES, Plot, decimal, panels
+from fitctl.identify.drawing import GREEN
+from fitctl.report.drawing import AZ, EL, FAINT, INK, SERIES, Plot, decimal, nothing, panels
 from fitctl.report.findings import AXES, LoopFindings
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 _POINTS = 900  # of a path in the plane
-_NO_DATA = "no data that count"
 _DIRECTIONS = (
     (1, "^", AZ, "came from below"),
     (-1, "v", EL, "came from above"),
@@ -26,33 +22,23 @@ _DIRECTIONS = (
 def spectra(loop: LoopFindings) -> Plot:
     """Spectral densities before and after, and what they add up to."""
     figure, (density, sums) = panels(1, 3.8, 2)
-    for number, found in enumerate(loop.rejections):
-        color = SERIES[number % len(SERIES)]
-        shown = found.spectra.frequency_hz > 0
-        frequency_hz = found.spectra.frequency_hz[shown]
+    for found, color in zip(loop.rejections, itertools.cycle(SERIES), strict=False):
+        frequency_hz = found.spectra.frequency_hz
         for what, line in (("disturbance", "--"), ("error", "-")):
-            power = getattr(found.spectra, what)[shown]
-            density.loglog(
-                frequency_hz, power, line, color=color, label=f"{what}, {found.controller}"
-            )
+            power, label = getattr(found.spectra, what), f"{what}, {found.controller}"
+            density.loglog(frequency_hz, power, line, color=color, label=label)
             total = np.sqrt(np.cumsum(power) * frequency_hz[0])
-            sums.semilogx(
-                frequency_hz, total, line, color=color, label=f"{what}, {found.controller}"
-            )
-    sums.axhline(loop.requirement_px, color=INK, linestyle=":", label="requirement")
-    density.set_title("Power spectral density")
-    density.set_ylabel("px²/Hz")
-    sums.set_title("Cumulative RMS: of all below a frequency")
-    sums.set_ylabel("px")
+            sums.semilogx(frequency_hz, total, line, color=color)
+    sums.axhline(loop.requirement_px, color=INK, linestyle=":")
+    density.set(title="Power spectral density", xlabel="Hz", ylabel="px²/Hz")
+    sums.set(title="Cumulative RMS: of all below a frequency", xlabel="Hz", ylabel="px")
     sums.set_yscale("log")
-    for axes in (density, sums):
-        axes.set_xlabel("Hz")
-        decimal(axes.xaxis)
-        decimal(axes.yaxis)
+    for axis in (density.xaxis, density.yaxis, sums.xaxis, sums.yaxis):
+        decimal(axis)
     if loop.rejections:
         density.legend(loc="lower left")
     else:
-        _nothing(density)
+        nothing(density)
     caption = (
         "Mean of both axes, Welch's method, segments of 8 s. Dashed: the disturbance, which is the open loop "
         "rebuilt from the log, the error less where both stages had moved the star at mid-exposure. Solid: "
@@ -64,31 +50,24 @@ def spectra(loop: LoopFindings) -> Plot:
 def rejection(loop: LoopFindings) -> Plot:
     """Measured rejection over the design's."""
     figure, (axes,) = panels(1, 3.8)
-    for number, found in enumerate(loop.rejections):
-        color = SERIES[number % len(SERIES)]
-        shown = found.spectra.frequency_hz > 0
-        frequency_hz = found.spectra.frequency_hz[shown]
-        axes.loglog(
-            frequency_hz, found.measured[shown], color=color, label=f"measured, {found.controller}"
-        )
+    for found, color in zip(loop.rejections, itertools.cycle(SERIES), strict=False):
+        name, frequency_hz = found.controller, found.spectra.frequency_hz
+        axes.loglog(frequency_hz, found.measured, color=color, label=f"measured, {name}")
         if found.predicted is not None:
-            axes.loglog(
-                frequency_hz,
-                found.predicted.rejection[shown],
-                "--",
-                color=color,
-                label=f"design, {found.controller}",
-            )
+            predicted = found.predicted.rejection
+            axes.loglog(frequency_hz, predicted, "--", color=color, label=f"design, {name}")
     axes.axhline(1.0, color=FAINT, linewidth=0.9)
-    axes.set_xlabel("Hz")
+    axes.set(
+        title="Disturbance rejection: above 1 the loop helps, below it makes worse",
+        xlabel="Hz",
+        ylabel="disturbance over error",
+    )
     decimal(axes.xaxis, dense=True)
     decimal(axes.yaxis, dense=True)
-    axes.set_ylabel("disturbance over error")
-    axes.set_title("Disturbance rejection: above 1 the loop helps, below it makes worse")
     if loop.rejections:
         axes.legend(loc="upper right")
     else:
-        _nothing(axes)
+        nothing(axes)
     caption = (
         "Root of the ratio of both spectra, beside the sensitivity of the linear sampled loop of the logged "
         "design. Eq. 20 knows nothing of the stacks' hysteresis, which takes from its gain."
@@ -99,8 +78,8 @@ def rejection(loop: LoopFindings) -> Plot:
 def hysteresis(loop: LoopFindings) -> Plot:
     """Command against target, and displacement against voltage."""
     figure, (*commands, stack) = panels(1, 3.6, 3)
-    for number, (axis, axes) in enumerate(zip(AXES, commands, strict=True)):
-        dwells = loop.stages.gaps[number].dwells if loop.stages.gaps else []
+    dwells_of = [gap.dwells for gap in loop.stages.gaps] or [[], []]
+    for axis, axes, dwells in zip(AXES, commands, dwells_of, strict=True):
         moved = any(dwell.direction for dwell in dwells)
         middle_px = float(np.mean([dwell.command_px for dwell in dwells])) if dwells else 0.0
         for direction, sign, color, label in _DIRECTIONS if moved else ():
@@ -116,11 +95,13 @@ def hysteresis(loop: LoopFindings) -> Plot:
         if moved:
             axes.legend(loc="best")
         else:
-            _nothing(axes, "the target did not move" if dwells else _NO_DATA)
-        axes.set_title(f"Command where it stood, {axis}")
-        axes.set_xlabel("target (px)")
-        axes.set_ylabel("stages told, from their mean (px)")
-    rows = loop.judged.rows
+            nothing(axes, *(["the target did not move"] if dwells else []))
+        axes.set(
+            title=f"Command where it stood, {axis}",
+            xlabel="target (px)",
+            ylabel="stages told, from their mean (px)",
+        )
+    rows = loop.selection.rows
     if loop.stacks is not None and len(rows):
         some = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(int)]
         for number, color in enumerate((AZ, EL, GREEN)):
@@ -134,15 +115,13 @@ def hysteresis(loop: LoopFindings) -> Plot:
             )
         stack.legend(loc="upper left", markerscale=4)
     else:
-        _nothing(stack)
-    stack.set_title("Stacks, by their model")
-    stack.set_xlabel("voltage told (V)")
-    stack.set_ylabel("displacement (µm)")
+        nothing(stack)
+    stack.set(title="Stacks, by their model", xlabel="voltage told (V)", ylabel="displacement (µm)")
     return Plot(f"{loop.name}-hysteresis", "Hysteresis in the commands", _gap_text(loop), figure)
 
 
 def _gap_text(loop: LoopFindings) -> str:
-    told = [
+    gaps = [
         f"{axis} {gap.px:+.3f} px"
         + ("" if math.isnan(gap.error_px) else f" (standard error {gap.error_px:.3f})")
         for axis, gap in zip(AXES, loop.stages.gaps, strict=False)
@@ -150,8 +129,8 @@ def _gap_text(loop: LoopFindings) -> str:
     ]
     found = (
         "Difference of the commands at one place of the target, come from below less come from above: "
-        f"{', '.join(told)}."
-        if told
+        f"{', '.join(gaps)}."
+        if gaps
         else "The target did not come to one place from both sides, so the commands cannot show hysteresis."
     )
     return (
@@ -159,9 +138,3 @@ def _gap_text(loop: LoopFindings) -> str:
         f"the target came from, that is hysteresis and backlash, within what the air adds. {found} Right: what "
         "their model makes of the voltages; the width of each path is its hysteresis."
     )
-
-
-def _nothing(axes: Axes, why: str = _NO_DATA) -> None:
-    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", color=FAINT)
-    if not axes.lines:  # numbers would be of nothing
-        axes.set(xticks=[], yticks=[])

@@ -125,7 +125,7 @@ def gather(run: Run) -> Gathered:
                 filled[loop] += _fill(ticks[loop], filled[loop], columns, time_s, str(log.path))
                 continue
             block = columns | {"time_s": time_s}
-            if places[topic][0] == "health":  # tells the same every second, all night
+            if places[topic][0] == "health":  # says the same every second, all night
                 health += _changes(_rows([block]), states)
             else:
                 blocks[places[topic]].append(block)
@@ -196,12 +196,12 @@ def _rows(blocks: list[Columns]) -> list[dict[str, Any]]:
         for row in zip(*(column.tolist() for column in block.values()), strict=True)
     ]
     rows.sort(key=itemgetter("time_s"))
-    seen: set[tuple[Any, ...]] = set()
+    known: set[tuple[Any, ...]] = set()
     once = []
     for row in rows:
         key = tuple(value for name, value in row.items() if name not in HEADER[::2])
-        if key not in seen:
-            seen.add(key)
+        if key not in known:
+            known.add(key)
             once.append(row)
     return once
 

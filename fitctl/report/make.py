@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
+from fitctl.figures.pages import write_json, write_page
 from fitctl.report import tables
 from fitctl.report.drawing import draw, styled
 from fitctl.report.findings import Findings, LoopFindings
-from fitctl.report.page import Card, Section, card, render, sections
+from fitctl.report.page import EVALUATION, SIGNS, Section, sections
 
 PAGE = "report.html"
 
@@ -31,19 +31,22 @@ def make_report(findings: Findings, folder: Path) -> Path:
         parts = sections(findings)
     facts = [f"{len(run.logs)} files" if len(run.logs) > 1 else run.logs[0].path.name]
     facts += [tables.seconds(run.duration_s), f"requirement {findings.word}"]
-    cards = [card(loop) for loop in findings.loops.values()]
-    return write(folder, title, facts, cards, parts, plain(findings))
+    cards = [
+        (loop, [tables.residual(loop), tables.key_figures(loop)])
+        for loop in findings.loops.values()
+    ]
+    return write(folder, title, facts, parts, plain(findings), cards)
 
 
 def write(
     folder: Path,
     title: str,
     facts: Sequence[str],
-    cards: list[Card],
     parts: list[Section],
     figures: dict[str, Any],
+    cards: Sequence[tuple[LoopFindings, list[tables.Table]]] = (),
 ) -> Path:
-    """Page, plots and ``report.json``; returns the page.
+    """Page, plots and ``report.json``; returns the page, which is one file and needs nothing from elsewhere.
 
     Raises
     ------
@@ -53,10 +56,20 @@ def write(
     with styled():
         drawings = {plot.name: draw(plot, folder) for part in parts for plot in part.plots}
     page = folder / PAGE
-    page.write_text(render(title, facts, cards, parts, drawings), encoding="utf-8")
-    (folder / "report.json").write_bytes(
-        msgspec.json.format(msgspec.json.encode(figures), indent=2) + b"\n"
+    write_page(
+        page,
+        "fitctl.report",
+        "page.html.j2",
+        title=title,
+        facts=facts,
+        cards=cards,
+        sections=parts,
+        drawings=drawings,
+        signs=SIGNS,
+        evaluation=EVALUATION,
+        version=importlib.metadata.version("fitctl"),
     )
+    write_json(folder / "report.json", figures)
     return page
 
 
@@ -82,9 +95,9 @@ def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
         "requirement_px": loop.requirement_px,
         "sky_arcsec_per_px": loop.sky_arcsec_per_px,
         "residual": {axis: found._asdict() for axis, found in loop.residual.items()},
-        "vernier_s": loop.judged.vernier_s,
-        "judged_s": loop.judged.judged_s,
-        "star_fraction": loop.judged.star_fraction,
+        "vernier_s": loop.selection.vernier_s,
+        "judged_s": loop.selection.evaluated_s,
+        "star_fraction": loop.selection.star_fraction,
         "mode_s": loop.mode_s,
         "counts": loop.counts,
         "timing": loop.timing,
@@ -97,7 +110,7 @@ def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
         "controllers": [
             {
                 "name": found.controller,
-                "judged_s": found.judged_s,
+                "judged_s": found.evaluated_s,
                 "design_residual_px": math.nan
                 if found.predicted is None
                 else found.predicted.residual_px,

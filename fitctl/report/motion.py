@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.figures.plate import GREEN, PURPLE, SKY
+from fitctl.identify.drawing import GREEN, PURPLE, SKY
 from fitctl.messages.modes import Mode
 from fitctl.report.drawing import (
     AZ,
@@ -18,12 +18,14 @@ from fitctl.report.drawing import (
     TimeAxis,
     decimal,
     envelope,
+    legend_above,
+    limit,
     panels,
     span,
     trace,
 )
 from fitctl.report.findings import AXES, Findings, LoopFindings
-from fitctl.report.judged import last_marked
+from fitctl.report.selection import last_marked
 from fitctl.report.stages import motion_px
 
 if TYPE_CHECKING:
@@ -37,33 +39,20 @@ def mirror(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     ticks = loop.ticks
     ready = ticks["mode_number"] >= Mode.COARSE
     figure, (fraction, piston) = panels(2, 3.8)
-    trace(
-        fraction,
-        time,
-        (ticks["time_s"][ready], 100 * ticks["fsm_range_fraction"][ready]),
-        AZ,
-        "range",
-    )
-    fraction.axhline(100.0, color=INK, linestyle="--", linewidth=0.9)
-    fraction.set_ylim(0, 105)
-    fraction.set_ylabel("% of the diamond")
-    fraction.set_title(
-        "Range of the fast steering mirror: 100 % is the edge of what three stacks reach"
+    at_s = ticks["time_s"][ready]
+    trace(fraction, time, at_s, 100 * ticks["fsm_range_fraction"][ready], AZ, "range")
+    limit(fraction, 100.0)
+    fraction.set(
+        title="Range of the fast steering mirror: 100 % is the edge of what three stacks reach",
+        ylabel="% of the diamond",
+        ylim=(0, 105),
     )
     if loop.stacks is not None:
-        series = (ticks["time_s"][ready], 1e9 * loop.stacks.piston_m[ready])
-        trace(piston, time, series, PURPLE, "piston")
+        trace(piston, time, at_s, 1e9 * loop.stacks.piston_m[ready], PURPLE, "piston")
     else:
-        piston.text(
-            0.5,
-            0.5,
-            "not known: no hysteresis in the rig file",
-            transform=piston.transAxes,
-            ha="center",
-        )
-    piston.set_ylabel("nm")
-    piston.set_title("Piston of the mirror (Eq. 4)")
-    piston.set_xlabel(time.label)
+        why = "not known: no hysteresis in the rig file"
+        piston.text(0.5, 0.5, why, transform=piston.transAxes, ha="center")
+    piston.set(title="Piston of the mirror (Eq. 4)", xlabel=time.label, ylabel="nm")
     span([piston], time, findings.run.duration_s)
     source = (
         ""
@@ -83,28 +72,25 @@ def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     figure, (way, *offload) = panels(3, 5.8)
     for number, axis in enumerate(AXES):
         sky = motor_px[:, number] * loop.sky_arcsec_per_px
-        trace(way, time, (ticks["time_s"], sky), COLORS[axis], axis)
-    way.set_title("Siderostat, from where it was first (encoders)")
-    way.set_ylabel("arcsec on the sky")
+        trace(way, time, ticks["time_s"], sky, COLORS[axis], axis)
+    way.set(title="Siderostat, from where it was first (encoders)", ylabel="arcsec on the sky")
     way.legend(ncols=2, loc="best")
     held = np.flatnonzero(ticks["mode_number"] == Mode.VERNIER)
     # After a slew the siderostat is elsewhere: each stretch of VERNIER has a zero of its own.
     began = last_marked(held, np.diff(held, prepend=-2) > 1)
     for number, (axis, axes) in enumerate(zip(AXES, offload, strict=True)):
         if len(held):
+            offloaded_px = setpoint_px[held, number] - setpoint_px[began, number]
             for series, color, label in (
                 (mirror_px[held, number], SKY, "mirror"),
-                (
-                    setpoint_px[held, number] - setpoint_px[began, number],
-                    INK,
-                    "siderostat, set-point",
-                ),
+                (offloaded_px, INK, "siderostat, set-point"),
             ):
                 at_s, low, high = envelope(ticks["time_s"][held], series)
                 axes.plot(at_s / time.s_per_unit, (low + high) / 2, color=color, label=label)
-        axes.set_title(f"Offload in VERNIER, {axis}: motion of the star by either stage")
-        axes.set_ylabel("px")
-    offload[0].legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
+        axes.set(
+            title=f"Offload in VERNIER, {axis}: motion of the star by either stage", ylabel="px"
+        )
+    legend_above(offload[0], 2)
     offload[-1].set_xlabel(time.label)
     span(offload[-1:], time, findings.run.duration_s)
     caption = (
@@ -122,25 +108,24 @@ def timing(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     frames = ticks["number"] >= 0
     figure, (age, compute, servo, distribution) = panels(2, 4.6, 2)
     at_s = ticks["time_s"][frames]
-    trace(age, time, (at_s, 1e3 * ticks["frame_age_s"][frames]), AZ, "age")
-    age.set_title("Frame's age when it was used")
-    trace(compute, time, (at_s, 1e3 * ticks["compute_s"][frames]), GREEN, "compute")
-    compute.set_title("Tick: from frame to command")
+    age_ms, compute_ms = 1e3 * ticks["frame_age_s"][frames], 1e3 * ticks["compute_s"][frames]
+    trace(age, time, at_s, age_ms, AZ, "age")
+    trace(compute, time, at_s, compute_ms, GREEN, "compute")
     if len(seconds.get("servo_late_worst_s", ())):
         for name, color in (("worst", EL), ("median", AZ)):
             values = 1e3 * seconds[f"servo_late_{name}_s"]
             servo.plot(seconds["time_s"] / time.s_per_unit, values, color=color, label=name)
         servo.legend(ncols=2, loc="upper right")
-    servo.set_title("Servo's wake-ups: late, a second at a time")
-    for axes in (age, compute, servo):
-        axes.set_ylabel("ms")
-        axes.set_xlabel(time.label)
+    for axes, title in (
+        (age, "Frame's age when it was used"),
+        (compute, "Tick: from frame to command"),
+        (servo, "Servo's wake-ups: late, a second at a time"),
+    ):
+        axes.set(title=title, xlabel=time.label, ylabel="ms")
     span((age, compute, servo), time, findings.run.duration_s)
-    _exceeding(distribution, 1e3 * ticks["frame_age_s"][frames], AZ, "age")
-    _exceeding(distribution, 1e3 * ticks["compute_s"][frames], GREEN, "tick")
-    distribution.set_title("How many take longer")
-    distribution.set_xlabel("ms")
-    distribution.set_ylabel("part of the frames")
+    _exceeding(distribution, age_ms, AZ, "age")
+    _exceeding(distribution, compute_ms, GREEN, "tick")
+    distribution.set(title="How many take longer", xlabel="ms", ylabel="part of the frames")
     distribution.set_yscale("log")
     decimal(distribution.yaxis)
     distribution.legend(loc="upper right")

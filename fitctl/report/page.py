@@ -2,45 +2,26 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import re
-from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from fitctl.report import frequency, motion, tables, timeline
 from fitctl.report.drawing import Plot, time_axis
-from fitctl.report.findings import Findings, LoopFindings
-from fitctl.report.judged import TARGET_SETTLE_S
+from fitctl.report.findings import Findings
 from fitctl.report.residual import Word
+from fitctl.report.selection import TARGET_SETTLE_S
 from fitctl.report.tables import Table
 from fitctl.simulation.statistics import SETTLE_S
 
 SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
-JUDGED = (
+EVALUATION = (
     f"Judged is VERNIER, from {SETTLE_S:g} s after it began and {TARGET_SETTLE_S:g} s after the target last "
     "moved, on frames with a star. The error is the measured one: the camera's noise is in it. The interval "
     "knows that neighbouring frames are alike: so many independent values would leave the RMS as uncertain. "
     "Met: all of both axes' intervals is within the requirement. Not met: all of one is above. Else, or where "
     "the record is too short: not known."
 )
-
-
-class Card(NamedTuple):
-    """The verdict on one loop.
-
-    Attributes
-    ----------
-    title : str
-    word : Word
-    why : str
-    tables : list of Table
-    """
-
-    title: str
-    word: Word
-    why: str
-    tables: list[Table]
 
 
 class Section(NamedTuple):
@@ -66,13 +47,6 @@ class Section(NamedTuple):
     def anchor(self) -> str:
         """For links."""
         return re.sub(r"\W+", "-", self.title.lower())
-
-
-def card(loop: LoopFindings) -> Card:
-    """Verdict, residual and key figures of a loop."""
-    title = f"Loop {loop.name}: {loop.requirement_px:g} px RMS on each axis"
-    its_tables = [tables.residual(loop), tables.key_figures(loop)]
-    return Card(title, loop.verdict.word, loop.verdict.why, its_tables)
 
 
 def sections(findings: Findings) -> list[Section]:
@@ -101,7 +75,7 @@ def sections(findings: Findings) -> list[Section]:
             Section(f"Loop {loop.name}", plots, [tables.rejected(loop), tables.timings(loop)], text)
         )
     recorded = [tables.losses(findings), tables.files(run)]
-    told = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
+    happened = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
     rig = run.rig
     designs = {
         loop: json.loads(text).get("parameters")
@@ -109,7 +83,7 @@ def sections(findings: Findings) -> list[Section]:
     }
     return [
         *found,
-        Section("Events", [], told),
+        Section("Events", [], happened),
         Section("Losses and files", [], recorded),
         Section("Devices", [], [tables.devices(findings)]),
         Section(
@@ -120,28 +94,3 @@ def sections(findings: Findings) -> list[Section]:
             json.dumps({"rig": rig.model_dump(mode="json"), "designs": designs}, indent=1),
         ),
     ]
-
-
-def render(
-    title: str,
-    facts: Sequence[str],
-    cards: list[Card],
-    parts: list[Section],
-    drawings: Mapping[str, str],
-) -> str:
-    """The page: one file, nothing from elsewhere; `drawings` are its plots as SVG by name."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    pages = Environment(
-        loader=PackageLoader("fitctl.report"), autoescape=True, undefined=StrictUndefined
-    )
-    return pages.get_template("page.html.j2").render(
-        title=title,
-        facts=facts,
-        cards=cards,
-        sections=parts,
-        drawings=drawings,
-        signs=SIGNS,
-        judged=JUDGED,
-        version=importlib.metadata.version("fitctl"),
-    )

@@ -54,6 +54,6 @@ def print_pdf(page: Path, pdf: Path) -> None:
             msg = f"no PDF: {browser} cannot be started: {error.strerror}; print {page} from any browser"
             raise PdfError(msg) from None
     if done.returncode or not pdf.exists():
-        said = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-        msg = f"no PDF: {browser} ended with {done.returncode} and said: {said}; print {page} from any browser"
+        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        msg = f"no PDF: {browser} ended with {done.returncode} and said: {last}; print {page} from any browser"
         raise PdfError(msg)

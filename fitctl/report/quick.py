@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections import defaultdict
 from collections.abc import Sequence
@@ -123,22 +124,17 @@ def _matching(path: Path, text: str, fields: dict[str, list[str]]) -> list[tuple
     return found
 
 
-def _by_unit(series: Sequence[Series]) -> dict[str, list[Series]]:
-    grouped: dict[str, list[Series]] = defaultdict(list)
+def _layout(
+    path: Path, series: Sequence[Series]
+) -> tuple[dict[str, list[Series]], dict[str, str], TimeAxis]:
+    """Series by unit, their labels as short as they differ, and the time axis of all."""
+    by_unit: dict[str, list[Series]] = defaultdict(list)
     for one in series:
-        grouped[one.unit].append(one)
-    return grouped
-
-
-def _labels(series: Sequence[Series]) -> dict[str, str]:
-    """As short as they can be told apart."""
+        by_unit[one.unit].append(one)
     topics = {one.topic for one in series}
-    return {one.label: one.field if len(topics) == 1 else one.label for one in series}
-
-
-def _axis(path: Path, series: Sequence[Series]) -> TimeAxis:
+    labels = {one.label: one.field if len(topics) == 1 else one.label for one in series}
     last_s = max((float(one.time_s[-1]) for one in series if len(one.time_s)), default=0.0)
-    return time_axis(last_s, path.name)
+    return by_unit, labels, time_axis(last_s, path.name)
 
 
 def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
@@ -146,7 +142,7 @@ def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
     import plotext
 
     columns, lines = shutil.get_terminal_size()
-    grouped, labels, time = _by_unit(series), _labels(series), _axis(path, series)
+    grouped, labels, time = _layout(path, series)
     figure: Any = plotext.figure
     figure.clear()
     figure.plot_size(columns, max(lines - 2, _LEAST_LINES * len(grouped)))
@@ -171,13 +167,12 @@ def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
 
 def as_figure(path: Path, series: Sequence[Series]) -> Any:
     """One panel for each unit, as a matplotlib figure."""
-    grouped, labels, time = _by_unit(series), _labels(series), _axis(path, series)
+    grouped, labels, time = _layout(path, series)
     with styled():
         figure, axes = panels(len(grouped), 1.2 + 2.0 * len(grouped))
         for panel, (unit, its) in zip(axes, grouped.items(), strict=True):
-            for number, one in enumerate(its):
-                color = SERIES[number % len(SERIES)]
-                trace(panel, time, (one.time_s, one.values), color, labels[one.label])
+            for one, color in zip(its, itertools.cycle(SERIES), strict=False):
+                trace(panel, time, one.time_s, one.values, color, labels[one.label])
             panel.set_ylabel(unit)
             panel.legend(loc="best")
         axes[-1].set_xlabel(time.label)

@@ -17,10 +17,19 @@ from fitctl.controllers.design.choose import DESIGNS, design_for
 from fitctl.controllers.design.files import design_of
 from fitctl.controllers.design.loopshape import sampled_response
 from fitctl.controllers.pair import Design
-from fitctl.figures.attenuation import SEGMENT_S, Rebuilt, Spectra, attenuation, spectra, stages_px
+from fitctl.figures.attenuation import (
+    SEGMENT_S,
+    Rebuilt,
+    Spectra,
+    attenuation,
+    mean_spectra,
+    spectra,
+    stages_px,
+)
+from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
-from fitctl.report.judged import Judged, regular
+from fitctl.report.selection import Selection, regular
 
 Floats = NDArray[np.float64]
 AT_HZ = (0.25, 0.5, 1.0, 2.0, 5.0)
@@ -49,16 +58,16 @@ class Rejection(NamedTuple):
     Attributes
     ----------
     controller : str
-    judged_s : float
+    evaluated_s : float
         In pieces long enough for a spectrum.
     spectra : Spectra
-        Of error and rebuilt disturbance, the mean of both axes.
+        Of error and rebuilt disturbance, the mean of both axes, above frequency zero.
     predicted : Predicted or None
         None where the design cannot be made again; then `why` says why.
     """
 
     controller: str
-    judged_s: float
+    evaluated_s: float
     spectra: Spectra
     predicted: Predicted | None
     why: str
@@ -69,7 +78,7 @@ class Rejection(NamedTuple):
         return np.sqrt(self.spectra.disturbance / self.spectra.error)
 
     def table(self) -> list[tuple[float, float, float]]:
-        """Frequency, measured, design's (nan if unknown), where the camera can tell."""
+        """Frequency, measured, design's (nan if unknown), up to what the camera resolves."""
         frequency_hz = self.spectra.frequency_hz
         return [
             (
@@ -84,12 +93,12 @@ class Rejection(NamedTuple):
         ]
 
 
-def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejection]:
+def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list[Rejection]:
     """One for each controller that was in force long enough, in the order of their first use."""
     rig, ticks = gathered.run.rig, gathered.ticks[loop_name]
-    if not judged.pieces:
+    if not selection.pieces:
         return []
-    error_px = np.column_stack([ticks[f"error_{axis}_px"] for axis in ("az", "el")]).astype(float)
+    error_px = axis_pair(ticks, "error_{}_px")
     disturbance_px = error_px - stages_px(rig, loop_name, ticks)
     period_s = rig.camera.period_s
     controllers = _controllers(gathered, loop_name)
@@ -97,7 +106,7 @@ def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejec
     for name in dict.fromkeys(name for _, _, name in controllers):
         spans = [(begin_s, end_s) for begin_s, end_s, its in controllers if its == name]
         its_spectra, segments, seconds = [], [], 0.0
-        for piece in _within(judged, ticks, spans):
+        for piece in _within(selection, ticks, spans):
             time_s = ticks["mid_exposure_s"][piece]
             if time_s[-1] - time_s[0] < SEGMENT_S:
                 continue
@@ -108,11 +117,8 @@ def rejections(gathered: Gathered, loop_name: str, judged: Judged) -> list[Rejec
             seconds += len(both) * period_s
             segments.append(2 * len(both) * period_s / SEGMENT_S - 1)
         if its_spectra:
-            measured = Spectra(
-                its_spectra[0].frequency_hz,
-                np.average([one.error for one in its_spectra], axis=0, weights=segments),
-                np.average([one.disturbance for one in its_spectra], axis=0, weights=segments),
-            )
+            # Not at rest, where the siderostat integrates and a logarithm ends.
+            measured = Spectra(*(of[1:] for of in mean_spectra(its_spectra, segments)))
             predicted, why = _predicted(gathered, loop_name, name, measured.frequency_hz)
             found.append(Rejection(name, seconds, measured, predicted, why))
     return found
@@ -135,10 +141,10 @@ def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float,
 
 
 def _within(
-    judged: Judged, ticks: Columns, spans: list[tuple[float, float]]
+    selection: Selection, ticks: Columns, spans: list[tuple[float, float]]
 ) -> list[NDArray[np.intp]]:
     pieces = []
-    for piece in judged.pieces:
+    for piece in selection.pieces:
         time_s = ticks["time_s"][piece]
         for begin_s, end_s in spans:
             inside = piece[(time_s >= begin_s) & (time_s < end_s)]
@@ -155,18 +161,9 @@ def _predicted(
         design = _design(gathered, loop_name, name, its_basis)
     except ConfigError as error:
         return None, str(error)
-    rejection = np.full(len(frequency_hz), math.inf)  # at rest: the siderostat integrates
-    above = frequency_hz > 0
-    loop = sampled_response(design, its_basis)(2 * math.pi * frequency_hz[above])
-    rejection[above] = np.abs(1 + loop)
-    return (
-        Predicted(
-            rejection,
-            linear_residual(design, its_basis),
-            bound(its_basis).residual_px,
-        ),
-        "",
-    )
+    rejection = np.abs(1 + sampled_response(design, its_basis)(2 * math.pi * frequency_hz))
+    least_px = bound(its_basis).residual_px
+    return Predicted(rejection, linear_residual(design, its_basis), least_px), ""
 
 
 def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> Design:

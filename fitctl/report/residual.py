@@ -13,11 +13,11 @@ Floats = NDArray[np.floating]
 
 CONFIDENCE = 0.95
 WIDEST = 3.0
-"""No interval is told whose ends differ by more than this: so short a record may not have seen all there is."""
+"""No interval is reported whose ends differ by more than this: so short a record may not hold all there is."""
 LEAST_STAR_FRACTION = 0.98
 BATCHES = 10
 _LEAST_FRAMES = 2 * BATCHES
-_AT_REST_BINS = 4  # the lowest frequencies, which tell what noise there is at none
+_AT_REST_BINS = 4  # the lowest frequencies, which show what noise there is at none
 
 Word = Literal["met", "not met", "not known"]
 
@@ -30,7 +30,7 @@ class Estimate(NamedTuple):
     rms_px : float
         nan without data.
     low_px, high_px : float
-        nan where the record is too short to tell.
+        nan where the record is too short for an interval.
     independent : float
         So many independent values would leave the RMS as uncertain; nan without data.
     """
@@ -47,7 +47,7 @@ class Estimate(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Whether a requirement is met, and why it is said."""
+    """Whether a requirement is met, and why."""
 
     word: Word
     why: str
@@ -94,8 +94,8 @@ def _by_spectrum(error_px: Floats) -> tuple[float, float]:
     Each frequency of the periodogram is an independent chi-square of two degrees of freedom, so that half its
     square estimates its variance, and five times the sum of the fourth powers over 24 the variance of that.
     (Bendat and Piersol, Random Data, section 8.2: the mean square's error goes with the integral of the squared
-    spectrum; the degrees are Satterthwaite's.) At frequency zero noise cannot be told from a steady offset: its
-    noise is taken from the lowest frequencies, and adds with what is there as in a product of the two.
+    spectrum; the degrees are Satterthwaite's.) At frequency zero nothing distinguishes noise from a
+    steady offset: its noise is that of the lowest frequencies, and adds with what is there as in a product.
 
     The degrees of freedom are halved. From one record alone slow motion looks quicker than it is, and by as
     much did trials fall short (tests/report/test_residual.py, docs/measurements.md).
@@ -119,10 +119,10 @@ def _by_batches(error_px: Floats) -> tuple[float, float]:
 
 
 def verdict(
-    axes: dict[str, Estimate], requirement_px: float, judged_s: float, star_fraction: float
+    axes: dict[str, Estimate], requirement_px: float, evaluated_s: float, star_fraction: float
 ) -> Verdict:
     """Whether both axes stay within the requirement; never "met" without data that say so."""
-    if judged_s <= 0:
+    if evaluated_s <= 0:
         return Verdict("not known", "no time in VERNIER counts")
     above = [axis for axis, found in axes.items() if found.known and found.low_px > requirement_px]
     if above:
@@ -136,7 +136,7 @@ def verdict(
     if few:
         return Verdict(
             "not known",
-            f"too short to judge: the {judged_s:.0f} s that count hold too few independent values of the "
+            f"too short to judge: the {evaluated_s:.0f} s that count hold too few independent values of the "
             f"error in {' and '.join(few)} for an interval",
         )
     if all(found.high_px <= requirement_px for found in axes.values()):

@@ -45,11 +45,6 @@ class Run(NamedTuple):
         """Of the last file."""
         return self.logs[-1].metadata
 
-    @property
-    def told(self) -> str:
-        """Its files, for errors."""
-        return ", ".join(str(log.path) for log in self.logs)
-
 
 def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
     """The run that files, or the newest run that a folder holds.

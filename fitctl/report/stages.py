@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.figures.attenuation import stacks_m
+from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
-from fitctl.model.hysteresis import (
-    displacement_series,
-    half_widths_v,
-    raised_displacement,
-    stack_gains,
-)
+from fitctl.model.hysteresis import half_widths_v, stack_gains
 from fitctl.model.optics import piston_m, scales
-from fitctl.report.judged import Judged
+from fitctl.report.selection import Selection
 
 Floats = NDArray[np.float64]
 _SAME_PLACE_PX = 0.02  # of the target
@@ -48,7 +45,7 @@ class Dwell(NamedTuple):
     Attributes
     ----------
     target_px, command_px : float
-        Where it stood, and the mean of what both stages were told, as star motion.
+        Where it stood, and the mean of what both stages were commanded, as star motion.
     direction : int
         From where the target had come: 1 from below, -1 from above, 0 if this axis did not move.
     """
@@ -103,7 +100,7 @@ class Stages(NamedTuple):
 def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
     """Displacements and piston by the rig's identified hysteresis, or a mock's own; None without either.
 
-    Ideal stacks under Eq. 1 have no piston, so that without a model nothing can be said.
+    Ideal stacks under Eq. 1 have no piston, so that without a model nothing is known.
     """
     fsm = rig.loops[loop_name].fsm
     if fsm.hysteresis is not None:
@@ -117,11 +114,9 @@ def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
         gains = np.tile(stack_gains(settings, fsm), (3, 1))
     else:
         return None
-    volts = np.column_stack([ticks[f"stack{n}_v"] for n in (1, 2, 3)]).astype(float)
-    displacement_m = displacement_series(volts, half_v, gains)
-    displacement_m -= raised_displacement(fsm.bias_v, half_v, gains)
+    displacement_m = stacks_m(ticks, fsm, half_v, gains)
     # Piece by piece: its vectors would take ten times the room of what comes of them.
-    pieces = np.array_split(displacement_m, 1 + len(volts) // _PIECE)
+    pieces = np.array_split(displacement_m, 1 + len(displacement_m) // _PIECE)
     piston = np.concatenate([piston_m(piece, fsm.stack_radius_m) for piece in pieces])
     return Stacks(source, displacement_m, piston)
 
@@ -133,7 +128,7 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
     """
     scale = scales(rig, rig.loops[loop_name])
     mirror_rad, motor_rad, setpoint_rad = (
-        np.column_stack([ticks[name.format(axis)] for axis in ("az", "el")]).astype(float)
+        axis_pair(ticks, name)
         for name in ("fsm_{}_rad", "siderostat_{}_rad", "siderostat_setpoint_{}_rad")
     )
     known = motor_rad[~np.isnan(motor_rad).any(axis=1)]
@@ -146,16 +141,15 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
 
 
 def stages(
-    rig: Rig, loop_name: str, ticks: Columns, judged: Judged, found: Stacks | None
+    rig: Rig, loop_name: str, ticks: Columns, selection: Selection, found: Stacks | None
 ) -> Stages:
-    """The figures of what is judged; nan without any."""
+    """The figures of the frames that are evaluated; nan without any."""
     mirror_px, _, setpoint_px = motion_px(rig, loop_name, ticks)
-    rows, pieces = judged.rows, judged.pieces
+    rows, pieces = selection.rows, selection.pieces
     if len(rows) == 0:
-        nothing = np.full(2, math.nan)
-        return Stages(math.nan, math.nan, math.nan, math.nan, nothing, [])
-    told_px = mirror_px + setpoint_px
-    target_px = np.column_stack([ticks[f"target_{axis}_px"] for axis in ("az", "el")])
+        return Stages(math.nan, math.nan, math.nan, math.nan, np.full(2, math.nan), [])
+    command_px = mirror_px + setpoint_px
+    target_px = axis_pair(ticks, "target_{}_px")
     fraction = ticks["fsm_range_fraction"][rows]
     return Stages(
         range_mean=float(fraction.mean()),
@@ -163,18 +157,18 @@ def stages(
         saturated_fraction=float(ticks["fsm_saturated"][rows].mean()),
         piston_rms_m=math.nan if found is None else float(found.piston_m[rows].std()),
         motor_moved_px=setpoint_px[rows[-1]] - setpoint_px[rows[0]],
-        gaps=[_gap(_dwells(target_px[:, axis], told_px[:, axis], pieces)) for axis in range(2)],
+        gaps=[_gap(_dwells(target_px[:, axis], command_px[:, axis], pieces)) for axis in range(2)],
     )
 
 
-def _dwells(target_px: Floats, told_px: Floats, pieces: list[NDArray[np.intp]]) -> list[Dwell]:
-    """Pieces end where the target moves (see :func:`fitctl.report.judged.judge_by`)."""
+def _dwells(target_px: Floats, command_px: Floats, pieces: list[NDArray[np.intp]]) -> list[Dwell]:
+    """Pieces end where the target moves (see :func:`fitctl.report.selection.select_frames`)."""
     found: list[Dwell] = []
     for piece in pieces:
         at_px = float(target_px[piece[-1]])
         came_px = at_px - found[-1].target_px if found else 0.0
         direction = 0 if abs(came_px) < _SAME_PLACE_PX else int(math.copysign(1, came_px))
-        found.append(Dwell(at_px, float(told_px[piece].mean()), direction))
+        found.append(Dwell(at_px, float(command_px[piece].mean()), direction))
     return found
 
 

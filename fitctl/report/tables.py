@@ -87,11 +87,11 @@ def residual(loop: LoopFindings) -> Table:
 
 def key_figures(loop: LoopFindings) -> Table:
     """What else one asks first."""
-    judged, moved = loop.judged, loop.stages
+    selection, moved = loop.selection, loop.stages
     rows = [
-        ["time in VERNIER, all of the run", seconds(judged.vernier_s)],
-        ["judged", f"{seconds(judged.judged_s)}; pieces: {len(judged.pieces)}"],
-        ["star seen in it", number(judged.star_fraction, ".2f", "% of the frames", 100)],
+        ["time in VERNIER, all of the run", seconds(selection.vernier_s)],
+        ["judged", f"{seconds(selection.evaluated_s)}; pieces: {len(selection.pieces)}"],
+        ["star seen in it", number(selection.star_fraction, ".2f", "% of the frames", 100)],
         [
             "mirror's range",
             f"{number(moved.range_mean, '.1f', '% mean', 100)}, "
@@ -127,7 +127,7 @@ def rejected(loop: LoopFindings) -> Table:
         least, left = (
             (math.nan,) * 2 if predicted is None else (predicted.bound_px, predicted.residual_px)
         )
-        row = [found.controller, seconds(found.judged_s)]
+        row = [found.controller, seconds(found.evaluated_s)]
         row += [number(least, ".4f", "px"), number(left, ".4f", "px")]
         row += [
             f"{measured:.2f} / {number(design, '.2f')}" for _, measured, design in found.table()
@@ -173,12 +173,14 @@ def losses(findings: Findings) -> Table:
 
 
 def events(findings: Findings) -> Table:
-    """What an operator was told; of very many the worst first."""
-    told = findings.gathered.events
-    shown = sorted(told, key=lambda event: -event["level"])[:MOST_ROWS]
+    """Events as operators see them; of very many the worst first."""
+    recorded = findings.gathered.events
+    shown = sorted(recorded, key=lambda event: -event["level"])[:MOST_ROWS]
     shown.sort(key=lambda event: event["time_s"])
     caption = (
-        "Events" if len(shown) == len(told) else f"Events: {len(shown)} of {len(told)}, the gravest"
+        "Events"
+        if len(shown) == len(recorded)
+        else f"Events: {len(shown)} of {len(recorded)}, the gravest"
     )
     rows = [
         [

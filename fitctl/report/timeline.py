@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.figures.plate import GREEN, ORANGE, PURPLE, SKY
+from fitctl.identify.drawing import GREEN, ORANGE, PURPLE, SKY
 from fitctl.messages.modes import Mode
 from fitctl.report.drawing import (
     AZ,
     COLORS,
     EL,
     FAINT,
-    INK,
     Plot,
     TimeAxis,
     decimal,
+    legend_above,
+    limit,
     panels,
     span,
     trace,
@@ -82,9 +83,7 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
         if times_s:
             at = np.array(times_s) / time.s_per_unit
             modes.plot(at, np.full(len(at), 0.55), sign, color=color, markersize=6, label=label)
-    modes.set_ylim(-0.45, 0.8)
-    modes.set_yticks([])
-    modes.set_title("Modes and events")
+    modes.set(title="Modes and events", ylim=(-0.45, 0.8), yticks=[])
     modes.legend(ncols=9, loc="lower left", bbox_to_anchor=(0.18, 0.98), borderaxespad=0)
     modes.grid(visible=False, axis="y")
     at_s, rms = running_rms(loop)
@@ -92,18 +91,15 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
         line = "o-" if len(at_s) < 60 else "-"
         shown = at_s / time.s_per_unit
         residual.plot(shown, rms[axis], line, ms=3, color=COLORS[axis], label=axis)
-    residual.axhline(
-        loop.requirement_px,
-        color=INK,
-        linestyle="--",
-        label=f"requirement {loop.requirement_px:g} px",
-    )
+    limit(residual, loop.requirement_px, f"requirement {loop.requirement_px:g} px")
     residual.set_yscale("log")
     decimal(residual.yaxis, dense=True)
-    residual.set_ylabel("px")
-    residual.set_title(f"RMS of the measured error in VERNIER, {WINDOW_S:g} s at a time")
-    residual.set_xlabel(time.label)
-    residual.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
+    residual.set(
+        title=f"RMS of the measured error in VERNIER, {WINDOW_S:g} s at a time",
+        xlabel=time.label,
+        ylabel="px",
+    )
+    legend_above(residual, 3)
     span([residual], time, findings.run.duration_s)
     caption = (
         "Above: the loop's mode; marks are warnings and errors of the whole instrument. Below: RMS about the "
@@ -137,29 +133,19 @@ def traces(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     frames = ticks["star_visible"]
     held = frames & (ticks["mode_number"] == Mode.VERNIER)
     figure, (error, target, flux) = panels(3, 5.4)
+    time_s, tracked = ticks["time_s"], ticks["mode_number"] >= Mode.ACQUISITION
     for axis in AXES:
-        series = (ticks["time_s"][held], ticks[f"error_{axis}_px"][held])
-        trace(error, time, series, COLORS[axis], axis)
-        tracked = ticks["mode_number"] >= Mode.ACQUISITION
-        trace(
-            target,
-            time,
-            (ticks["time_s"][tracked], ticks[f"target_{axis}_px"][tracked]),
-            COLORS[axis],
-            axis,
-        )
+        error_px, target_px = ticks[f"error_{axis}_px"], ticks[f"target_{axis}_px"]
+        trace(error, time, time_s[held], error_px[held], COLORS[axis], axis)
+        trace(target, time, time_s[tracked], target_px[tracked], COLORS[axis], axis)
     for sign in (-1, 1):
-        error.axhline(sign * loop.requirement_px, color=INK, linestyle="--", linewidth=0.9)
+        limit(error, sign * loop.requirement_px)
     beyond = _limit(error, loop, held)
-    trace(flux, time, (ticks["time_s"][frames], ticks["star_flux_dn"][frames]), GREEN, "flux")
-    error.set_title(f"Error in VERNIER: star less target{beyond}")
-    error.set_ylabel("px")
-    target.set_title("Target, as filtered")
-    target.set_ylabel("px")
-    flux.set_title("Light in the window")
-    flux.set_ylabel("DN")
-    flux.set_xlabel(time.label)
-    error.legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
+    trace(flux, time, time_s[frames], ticks["star_flux_dn"][frames], GREEN, "flux")
+    error.set(title=f"Error in VERNIER: star less target{beyond}", ylabel="px")
+    target.set(title="Target, as filtered", ylabel="px")
+    flux.set(title="Light in the window", xlabel=time.label, ylabel="DN")
+    legend_above(error, 2)
     span([flux], time, findings.run.duration_s)
     caption = (
         "Dashed: the requirement, either side, for comparison with the error's size. Long series are bands "

@@ -13,7 +13,7 @@ from fitctl.messages.commands import Acquire, Hold, Standby
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
-from fitctl.sequences.behaviour import Behaviour, Result, let_go
+from fitctl.sequences.behaviour import Behaviour, Result, stop_tracking
 from fitctl.sequences.view import Figures, StepFailed, View
 
 _FOUND = ("found_az_sky_arcsec", "found_el_sky_arcsec", "found_flux_dn")
@@ -78,23 +78,27 @@ def _done(step: steps.Acquire, view: View) -> Result | None:
         return None
     if view.mode is Mode.OFF:
         return None
-    view.insist_on(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
+    view.require_mode(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
     if view.mode is not Mode.VERNIER:
         return None
-    return Result({"acquired_s": view.gone_s, **_found(view)}, f"held after {view.gone_s:.1f} s")
+    return Result(
+        {"acquired_s": view.elapsed_s, **_found(view)}, f"held after {view.elapsed_s:.1f} s"
+    )
 
 
 def _found(view: View) -> Figures:
-    """Where the star is on the sky, from where the encoders read zero, and its flux; nan if it was not seen."""
-    seen = [look for look in view.looks if math.isfinite(look.star_az_px)]
-    if not seen:
+    """Where the star is on the sky, from where the encoders read zero, and its flux; nan without a star."""
+    newest = next(
+        (one for one in reversed(view.measurements) if math.isfinite(one.star_az_px)), None
+    )
+    if newest is None:
         return dict.fromkeys(_FOUND, math.nan)
-    scale, target, look = scales(view.rig, view.settings), view.settings.target_px, seen[-1]
-    beside_px = np.array([look.star_az_px - target.az, look.star_el_px - target.el])
-    mirror_px = scale.mirror_px(np.array([look.mirror_az_rad, look.mirror_el_rad]))
-    motor_px = scale.motor_px(np.array([look.motor_az_rad, look.motor_el_rad]))
+    scale, target = scales(view.rig, view.settings), view.settings.target_px
+    beside_px = np.array([newest.star_az_px - target.az, newest.star_el_px - target.el])
+    mirror_px = scale.mirror_px(np.array([newest.fsm_az_rad, newest.fsm_el_rad]))
+    motor_px = scale.motor_px(np.array([newest.siderostat_az_rad, newest.siderostat_el_rad]))
     az, el = scale.sky_arcsec(beside_px - mirror_px - motor_px).tolist()
-    return dict(zip(_FOUND, (az, el, look.star_flux_dn), strict=True))
+    return dict(zip(_FOUND, (az, el, newest.star_flux_dn), strict=True))
 
 
 ACQUIRE = {
@@ -102,7 +106,7 @@ ACQUIRE = {
         frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER}),
         _done,
         _run,
-        let_go,
+        stop_tracking,
         _check,
         _own_s,
     )

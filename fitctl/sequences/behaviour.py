@@ -94,7 +94,7 @@ def too_far(step: Moving, rig: Rig, loop_name: str, offset_px: float) -> list[st
     return problems
 
 
-def let_go(_step: object, view: View) -> None:
+def stop_tracking(_step: object, view: View) -> None:
     """Stop tracking where the stages are."""
     if view.tracking:
         view.ask(Hold(loop=view.loop_name))

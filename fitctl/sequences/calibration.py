@@ -14,7 +14,7 @@ from fitctl.sequences.behaviour import Calibration
 CALIBRATING = frozenset({"dark", "plate_scale"})  # steps that measure something for the rig file
 
 
-def insist_on_folder(folder: Path) -> None:
+def require_folder(folder: Path) -> None:
     """Refuse, before anything moves, a folder in which nothing could be written afterwards.
 
     Raises

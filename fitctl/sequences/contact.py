@@ -1,4 +1,4 @@
-"""A sequence's contact with the supervisor: what it hears, what it tells, and who wants it to end."""
+"""A sequence's contact with the supervisor: telemetry in, reports out, and who wants it to end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _REPORT_S = 1.0
 
 
 class Stopped(Exception):
-    """Somebody wants the whole sequence to end; `hold` tells whether its loops are to be held then."""
+    """Somebody wants the whole sequence to end; `hold` says whether its loops are to be held then."""
 
     def __init__(self, message: str, *, hold: bool) -> None:
         super().__init__(message)
@@ -42,7 +42,7 @@ class Contact:
     steps : int
         How many there will be.
     on_status : callable
-        Hears of every change: a new attempt, a pause, an end.
+        Called at every change: a new attempt, a pause, an end.
     """
 
     def __init__(
@@ -51,18 +51,18 @@ class Contact:
         rig: Rig,
         name: str,
         steps: int,
-        on_status: Callable[[SequenceStatus], None],
+        on_status: Callable[[SequenceStatus], None] = lambda _status: None,
     ) -> None:
         self.stop_wanted = threading.Event()  # from another thread, such as a cancelled task's
         self.status = SequenceStatus(run=uuid.uuid4().hex, name=name, state="running", steps=steps)
-        self._link = link
-        self._rig = rig
+        self.link = link
+        self.rig = rig
         self._on_status = on_status
         self._wanted = "run"
         self._reported_s = 0.0
 
     def begin(self) -> None:
-        """Tell the supervisor that a sequence begins.
+        """Report to the supervisor that a sequence begins.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class Contact:
         self._on_status(self.status)
 
     def end(self, state: Literal["done", "failed", "stopped"], message: str = "") -> None:
-        """Tell the supervisor how it ended; one that is gone is not told."""
+        """Report to the supervisor how it ended, if it still answers."""
         with suppress(ConnectionError):
             self.report(state=state, message=message[:MESSAGE_CHARS])
 
@@ -88,43 +88,43 @@ class Contact:
 
     # ------------------------------------------------------------ telemetry
 
-    def look(self, loop_name: str) -> View:
+    def view_of(self, loop_name: str) -> View:
         """A view that begins with telemetry from now on: older may have queued up between two steps."""
-        since_s = self._link.now_s()
+        since_s = self.link.now_s()
         telemetry = self._receive()
         while telemetry.time_s < since_s:
             telemetry = self._receive()
         view = View(
-            self._link, self._rig, loop_name, telemetry, telemetry.time_s, self.status.attempt
+            self.link, self.rig, loop_name, telemetry, telemetry.time_s, self.status.attempt
         )
         self._obey(view)
         return view
 
     def next(self, view: View, *, paused: bool = False) -> None:
-        """Take the next message.
+        """Wait for the next message.
 
         Raises
         ------
         Stopped
             If the loop is made SAFE, or somebody stops the sequence.
         """
-        view.take(self._receive(), paused=paused)
+        view.update(self._receive(), paused=paused)
         self._obey(view)
         if paused:
             self.show_pause(paused=True)
-        if self._link.now_s() - self._reported_s >= _REPORT_S:
+        if self.link.now_s() - self._reported_s >= _REPORT_S:
             self.report()
 
     def _receive(self) -> Telemetry:
-        begun_s = self._link.now_s()
+        begun_s = self.link.now_s()
         while True:
-            telemetry = self._link.receive(_RECEIVE_S)
+            telemetry = self.link.receive(_RECEIVE_S)
             if telemetry is not None:
                 return telemetry
             if self.stop_wanted.is_set():
                 msg = "stopped by its program"
                 raise Stopped(msg, hold=True)
-            if self._link.now_s() - begun_s > _SILENCE_S:
+            if self.link.now_s() - begun_s > _SILENCE_S:
                 msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then begin again"
                 raise ConnectionError(msg)
 
@@ -136,17 +136,17 @@ class Contact:
         if self.stop_wanted.is_set():
             msg = "stopped by its program"
             raise Stopped(msg, hold=True)
-        told = view.telemetry.running_sequence
-        if told is not None and told.run == self.status.run:
-            self._wanted = told.wanted
+        running = view.telemetry.running_sequence
+        if running is not None and running.run == self.status.run:
+            self._wanted = running.wanted
         if self._wanted == "stop":
             msg = "stopped by the operator"
             raise Stopped(msg, hold=True)
 
-    # ------------------------------------------------------------ what is told
+    # ------------------------------------------------------------ reports
 
     def show_pause(self, *, paused: bool) -> bool:
-        """Tell when a pause begins or ends; True if one has just ended."""
+        """Report when a pause begins or ends; True if one has just ended."""
         state: Literal["paused", "running"] = "paused" if paused else "running"
         if self.status.state == state:
             return False
@@ -154,7 +154,7 @@ class Contact:
         return not paused
 
     def report(self, **changes: object) -> None:
-        """Tell the supervisor where the sequence is, with what has changed of it.
+        """Report to the supervisor where the sequence is, with what has changed of it.
 
         Raises
         ------
@@ -170,5 +170,5 @@ class Contact:
             self._on_status(self.status)
 
     def _send_report(self) -> Reply:
-        self._reported_s = self._link.now_s()
-        return self._link.send(SequenceReport(status=self.status))
+        self._reported_s = self.link.now_s()
+        return self.link.send(SequenceReport(status=self.status))

@@ -14,7 +14,7 @@ from fitctl.sequences.view import Figures, StepFailed, View
 
 Floats = NDArray[np.float64]
 _BRIGHT_NOISES = 5.0  # above the bias, and a pixel is bright
-_TOLD = 20  # bad pixels that are named
+_MOST_NAMED = 20  # bad pixels that are named
 _NOISE_RANGE = (1 / 3, 3.0)  # of the median: a pixel that is stuck, or restless, is bad
 
 
@@ -60,7 +60,7 @@ def dark_frame(stack: Floats) -> Floats:
     return np.where((noise_dn < low) | (noise_dn > high), np.nan, stack.mean(axis=0))
 
 
-def _calibration(rig: Rig, figures: Figures, dark_dn: Floats, said: str) -> Calibration:
+def _calibration(rig: Rig, figures: Figures, dark_dn: Floats, message: str) -> Calibration:
     name = f"{rig.name}-dark.npy"
     camera = {
         "bias_dn": round(figures["bias_dn"], 2),
@@ -68,18 +68,18 @@ def _calibration(rig: Rig, figures: Figures, dark_dn: Floats, said: str) -> Cali
         "dark_file": name,
     }
     bad = [f"az {column}, el {row}" for row, column in np.argwhere(np.isnan(dark_dn))]
-    more = f"; and {len(bad) - _TOLD} more" if len(bad) > _TOLD else ""
-    told = "; ".join(bad[:_TOLD]) or "none"
-    lines = [said, f"bad pixels, which are filled in from their neighbours: {told}{more}"]
+    more = f"; and {len(bad) - _MOST_NAMED} more" if len(bad) > _MOST_NAMED else ""
+    named = "; ".join(bad[:_MOST_NAMED]) or "none"
+    lines = [message, f"bad pixels, which are filled in from their neighbours: {named}{more}"]
     return Calibration("dark", lines, {"camera": camera}, {name: dark_dn.astype(np.float32)})
 
 
 def _done(step: steps.Dark, view: View) -> Result | None:
-    view.insist_on(Mode.STANDBY)
-    if any(np.isfinite(look.star_az_px) for look in view.looks):
+    view.require_mode(Mode.STANDBY)
+    if any(np.isfinite(one.star_az_px) for one in view.measurements):
         msg = "a star is on the frame; close the shutter or point elsewhere, then try again"
         raise StepFailed(msg)
-    view.looks.clear()
+    view.measurements.clear()
     newest = view.telemetry.frame
     if newest is not None and newest.time_s >= view.began_s and newest not in view.frames[-1:]:
         view.frames.append(newest)
@@ -87,14 +87,14 @@ def _done(step: steps.Dark, view: View) -> Result | None:
         return None
     stack, camera = stack_of(view.frames), view.rig.camera
     figures = measure_dark(stack)
-    said = (
+    message = (
         f"bias {figures['bias_dn']:.1f} DN (rig file {camera.bias_dn:g}), noise {figures['noise_dn']:.1f} DN "
         f"(rig file {camera.pixel_noise_dn:g}), {figures['bright_pixels']:.0f} bright pixels"
     )
     if figures["bright_pixels"] > step.max_bright_pixels:
-        msg = f"{said}; max_bright_pixels is {step.max_bright_pixels}: is there light?"
+        msg = f"{message}; max_bright_pixels is {step.max_bright_pixels}: is there light?"
         raise StepFailed(msg)
-    return Result(figures, said, _calibration(view.rig, figures, dark_frame(stack), said))
+    return Result(figures, message, _calibration(view.rig, figures, dark_frame(stack), message))
 
 
 def _own_s(step: steps.Dark, rig: Rig, _loop_name: str) -> float:

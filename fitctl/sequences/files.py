@@ -33,7 +33,7 @@ def shipped_sequences() -> list[Path]:
 
 
 def read_document(path: Path, missing: str) -> dict[str, Any]:
-    """The content of a TOML or YAML file, by its suffix; `missing` is said where there is no file.
+    """The content of a TOML or YAML file, by its suffix; `missing` is the error where there is no file.
 
     Raises
     ------
@@ -66,10 +66,10 @@ def parse_yaml(text: str, path: Path) -> Any:
     except MarkedYAMLError as error:
         mark = error.problem_mark
         where = "" if mark is None else f" (at line {mark.line + 1}, column {mark.column + 1})"
-        said = f"{error.problem}{where}"
+        problem = f"{error.problem}{where}"
     except (YAMLError, ValueError, RecursionError) as error:
-        said = str(error).splitlines()[0]
-    msg = f"{path}: not YAML: {said}"
+        problem = str(error).splitlines()[0]
+    msg = f"{path}: not YAML: {problem}"
     raise ConfigError(msg)
 
 
@@ -93,15 +93,13 @@ def read_table(path: Path, key: str, missing: str) -> list[tuple[str, Any]]:
 
 
 def _parse_csv(text: str, path: Path) -> list[tuple[str, Any]]:
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    reader = csv.reader([line for _, line in lines], skipinitialspace=True, strict=True)
     try:
-        rows = list(zip([number for number, _ in lines], reader, strict=True))
-    except (csv.Error, ValueError) as error:  # also a quoted text over several lines
+        rows = [
+            (number, next(csv.reader([line], skipinitialspace=True, strict=True)))
+            for number, line in enumerate(text.splitlines(), start=1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
+    except csv.Error as error:  # also a quoted text over several lines
         msg = f"{path}: not CSV: {error}"
         raise ConfigError(msg) from None
     if not rows:

@@ -23,6 +23,7 @@ from fitctl.messages.keys import RemoteKey, read_key_of
 from fitctl.messages.telemetry import Telemetry
 from fitctl.sequences import steps
 from fitctl.sequences.calibration import write_calibration
+from fitctl.sequences.contact import Contact
 from fitctl.sequences.files import find_sequence
 from fitctl.sequences.links import Link, SimulatedLink
 from fitctl.sequences.methods import StepMethods
@@ -72,18 +73,16 @@ class Instrument(StepMethods[Figures]):
     ) -> None:
         self.rig = rig if isinstance(rig, Rig) else load_rig(Path(rig or default_rig_path()))
         self._runner: Runner | None = None
-        self._client: Client | None = None
         self._link: Link
         if simulate:
             self.rig.mock_parts()
             self._link = SimulatedLink(self.rig, seed)
         else:
-            self._client = Client(_where(self.rig, folder, remote))
-            self._link = self._client
+            self._link = Client(_where(self.rig, folder, remote))
             try:
-                self._client.send(Status())
+                self._link.send(Status())
             except ConnectionError:
-                self._client.close()
+                self._link.close()
                 raise
 
     def __enter__(self) -> Instrument:
@@ -94,8 +93,7 @@ class Instrument(StepMethods[Figures]):
 
     def close(self) -> None:
         """Let go of the connection; the instrument goes on."""
-        if self._client is not None:
-            self._client.close()
+        self._link.close()
 
     def run(self, step: steps.Step) -> Figures:
         """Run one step; its figures, NaN where a value could not be had.
@@ -126,7 +124,7 @@ class Instrument(StepMethods[Figures]):
         return load_sequence(find_sequence(Path(file)), self.rig)
 
     def _runner_of(self, name: str, todo: Sequence[steps.Step]) -> Runner:
-        return Runner(self._link, self.rig, name, len(todo))
+        return Runner(Contact(self._link, self.rig, name, len(todo)))
 
     def _run(self, runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
         """Run steps; the figures of each, NaN where a value could not be had."""
@@ -200,7 +198,7 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
 
     Steps and files run one after the other, in a thread of their own. One that waits for another one's end
     has not begun: cancelled, it never does, and the other goes on. Commands, STOP above all, wait for none.
-    Takes what :class:`Instrument` takes, and is made by ``async with``.
+    Is given what :class:`Instrument` is given, and made by ``async with``.
     """
 
     def __init__(

@@ -1,35 +1,19 @@
-"""What a sequence needs of an instrument, and how the simulated one gives it."""
+"""What a sequence needs of an instrument: a client's methods, which the simulated instrument has too."""
 
 from __future__ import annotations
 
 import os
 import threading
 from concurrent.futures import Future
-from typing import Protocol
 
 from fitctl.config import Rig
+from fitctl.messages.client import Client
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.telemetry import Telemetry
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.simulation import Simulation
 
 _TURN_S = 0.01
-
-
-class Link(Protocol):
-    """Commands in, telemetry out; :class:`fitctl.messages.client.Client` is the one to a running rig."""
-
-    def now_s(self) -> float:
-        """The supervisor's time."""
-        ...
-
-    def send(self, command: AnyCommand) -> Reply:
-        """Give a command and wait for its reply; ConnectionError if none comes."""
-        ...
-
-    def receive(self, timeout_s: float) -> Telemetry | None:
-        """The next telemetry message, or None when none came in time."""
-        ...
 
 
 class SimulatedLink:
@@ -73,8 +57,15 @@ class SimulatedLink:
         """Go on until telemetry is due, or by `timeout_s`."""
         with self._stepping:
             self._simulation.run(min(timeout_s, self._period_s))
-            self._simulation.ticks.clear()  # for judging a run; nobody does here
+            self._simulation.ticks.clear()  # which a run is evaluated by; nothing is here
             if timeout_s < self._period_s:
                 return None
             self._state.sequence += 1
             return self._buffer.telemetry(self._simulation.supervisor, self._state, self.now_s())
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+Link = Client | SimulatedLink
+"""Commands in, telemetry out, and the supervisor's time."""

@@ -16,7 +16,7 @@ from fitctl.messages.modes import Mode, Trigger
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, Drive, channel_values, experiment_s
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
-from fitctl.sequences.behaviour import Behaviour, Result, let_go, too_far
+from fitctl.sequences.behaviour import Behaviour, Result, stop_tracking, too_far
 from fitctl.sequences.view import Figures, StepFailed, View, columns
 from fitctl.stages.drives import refused_drives
 from fitctl.stages.injector import stack_v_per_px
@@ -62,8 +62,8 @@ def checked(plan: Plan) -> Callable[[Any, Rig, str], list[str]]:
     return check
 
 
-def open_loop(plan: Plan, name: Callable[[Any], str], judge: Callable[..., Result]) -> Behaviour:
-    """The behaviour of a step whose motions `plan` makes; `judge` takes step, view and motions."""
+def open_loop(plan: Plan, name: Callable[[Any], str], evaluate: Callable[..., Result]) -> Behaviour:
+    """The behaviour of a step whose motions `plan` makes; `evaluate` is given step, view and motions."""
 
     def run(step: steps.Moving, view: View) -> None:
         drives = plan(step, view.rig, view.loop_name)
@@ -76,13 +76,13 @@ def open_loop(plan: Plan, name: Callable[[Any], str], judge: Callable[..., Resul
         change = view.loop.last_change
         ended_well = view.mode in {Mode.COARSE, Mode.VERNIER} and not view.errors
         drives = plan(step, view.rig, view.loop_name)
-        whole = view.gone_s >= experiment_s(drives)
+        whole = view.elapsed_s >= experiment_s(drives)
         if not (ended_well and whole):
             why = view.errors[0] if view.errors else view.why
             trigger = Trigger[change.trigger].name.lower().replace("_", " ") if change else ""
             msg = f"the motions ended early, in {view.mode.name}, by {trigger}: {why}"
             raise StepFailed(msg)
-        return judge(step, view, drives)
+        return evaluate(step, view, drives)
 
     def own_s(step: steps.Moving, rig: Rig, loop_name: str) -> float:
         return experiment_s(plan(step, rig, loop_name))
@@ -94,46 +94,48 @@ def open_loop(plan: Plan, name: Callable[[Any], str], judge: Callable[..., Resul
 def _end_motions(step: steps.Moving, view: View) -> None:
     """A loop that searches for the star that it lost may go on; the next attempt waits for it."""
     if view.mode is Mode.EXPERIMENT:
-        let_go(step, view)
+        stop_tracking(step, view)
 
 
 def watched(view: View, drives: list[Drive]) -> tuple[Floats, Figures]:
-    """The frames with a star while the stages moved, as :func:`columns`, and what can be said of all.
+    """The frames with a star while the stages moved, as :func:`columns`, and figures of all.
 
     Raises
     ------
     StepFailed
-        If the star was hardly seen.
+        If the star was on few of them.
     """
-    table = columns(view.looks)
+    table = columns(view.measurements)
     during = table[table[:, 0] < view.began_s + experiment_s(drives)]
-    seen = during[np.isfinite(during[:, 1])]
+    with_star = during[np.isfinite(during[:, 1])]
     if (
-        len(seen) == 0
-        or len(seen) < _LEAST_SEEN * experiment_s(drives) * view.rig.camera.frame_rate_hz
+        len(with_star) == 0
+        or len(with_star) < _LEAST_SEEN * experiment_s(drives) * view.rig.camera.frame_rate_hz
     ):
-        msg = (
-            f"the star was on {len(seen)} of {len(during)} frames; look at the flux, then try again"
-        )
+        msg = f"the star was on {len(with_star)} of {len(during)} frames; look at the flux, then try again"
         raise StepFailed(msg)
-    swing_px = np.ptp(seen[:, 1:3], axis=0)
+    swing_px = np.ptp(with_star[:, 1:3], axis=0)
     figures = {
-        "seen_fraction": len(seen) / len(during),
+        "seen_fraction": len(with_star) / len(during),
         "swing_az_px": float(swing_px[0]),
         "swing_el_px": float(swing_px[1]),
     }
-    return seen, figures
+    return with_star, figures
 
 
-def _judge_motion(step: steps.Experiment | steps.Chirp, view: View, drives: list[Drive]) -> Result:
+def _evaluate_motion(
+    step: steps.Experiment | steps.Chirp, view: View, drives: list[Drive]
+) -> Result:
     _, figures = watched(view, drives)
     recorder = view.telemetry.recorder
     log = ""
     if recorder is not None:
         learn = f"fitctl identify {step.what} --log " if isinstance(step, steps.Experiment) else ""
         log = f"; {learn}{recorder.path}"
-    said = f"star swung {figures['swing_az_px']:.2f} px az, {figures['swing_el_px']:.2f} px el{log}"
-    return Result(figures, said)
+    message = (
+        f"star swung {figures['swing_az_px']:.2f} px az, {figures['swing_el_px']:.2f} px el{log}"
+    )
+    return Result(figures, message)
 
 
 def _experiment_plan(step: steps.Experiment, rig: Rig, loop_name: str) -> list[Drive]:
@@ -156,6 +158,6 @@ def _chirp_plan(step: steps.Chirp, _rig: Rig, _loop_name: str) -> list[Drive]:
 
 
 OPEN_LOOP = {
-    "experiment": open_loop(_experiment_plan, lambda step: step.what, _judge_motion),
-    "chirp": open_loop(_chirp_plan, lambda _step: "chirp", _judge_motion),
+    "experiment": open_loop(_experiment_plan, lambda step: step.what, _evaluate_motion),
+    "chirp": open_loop(_chirp_plan, lambda _step: "chirp", _evaluate_motion),
 }

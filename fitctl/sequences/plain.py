@@ -6,7 +6,7 @@ from fitctl.config import Rig
 from fitctl.messages.commands import Hold, Off, SetController, Standby
 from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
-from fitctl.sequences.behaviour import POWERED, Behaviour, Result, let_go
+from fitctl.sequences.behaviour import POWERED, Behaviour, Result, stop_tracking
 from fitctl.sequences.view import StepFailed, View
 
 
@@ -34,8 +34,8 @@ def _controller_done(step: steps.Controller, view: View) -> Result | None:
 
 
 def _wait_done(step: steps.Wait, view: View) -> Result | None:
-    view.looks.clear()  # nobody judges them, and a long wait would fill the memory
-    return Result({}, "") if view.gone_s >= step.duration_s else None
+    view.measurements.clear()  # nothing evaluates them, and a long wait would fill the memory
+    return Result({}, "") if view.elapsed_s >= step.duration_s else None
 
 
 def _off_done(_step: steps.Off, view: View) -> Result | None:
@@ -52,5 +52,5 @@ PLAIN = {
     "standby": Behaviour(POWERED | {Mode.OFF}, _standby_done, _run_standby),
     "controller": Behaviour(POWERED | {Mode.OFF}, _controller_done, _run_controller),
     "wait": Behaviour(POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True),
-    "off": Behaviour(POWERED | {Mode.OFF}, _off_done, let_go),
+    "off": Behaviour(POWERED | {Mode.OFF}, _off_done, stop_tracking),
 }

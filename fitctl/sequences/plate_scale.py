@@ -188,18 +188,18 @@ def rotation_sd_deg(matrix: Floats, deviation: Floats) -> float:
     return math.degrees(across / (cos**2 + sin**2))
 
 
-def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
-    seen, figures = watched(view, drives)
+def _evaluate(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
+    frames, figures = watched(view, drives)
     scale = scales(view.rig, view.settings)
-    since_s = seen[:, 0] - view.marks[0]
+    since_s = frames[:, 0] - view.marks[0]
     # Along the siderostat's own axes: what they are on the frame is what is asked.
-    motor_px = (seen[:, 5:7] - np.median(seen[:, 5:7], axis=0)) * scale.motor_px_per_rad
+    motor_px = (frames[:, 5:7] - np.median(frames[:, 5:7], axis=0)) * scale.motor_px_per_rad
     measured_px = [None, None, motor_px[:, 0], motor_px[:, 1]]
     swings = [
         swing_of(drive, since_s, moved_px)
         for drive, moved_px in zip(drives, measured_px, strict=True)
     ]
-    fit = fit_plate_scale(seen[:, 0], seen[:, 1:3], swings)
+    fit = fit_plate_scale(frames[:, 0], frames[:, 1:3], swings)
     why_not = refusal(fit, step, scale)
     if why_not:
         raise StepFailed(why_not)
@@ -207,19 +207,19 @@ def _judge(step: steps.PlateScale, view: View, drives: list[Drive]) -> Result:
         ("fsm", fit.mirror, fit.mirror_sd, scale.mirror_px_per_rad),
         ("siderostat", fit.siderostat, fit.siderostat_sd, scale.motor_px_per_rad),
     )
-    said = []
+    found_lines = []
     for name, matrix, deviation, px_per_rad in stages:
         found = _in_figures(name, matrix, deviation, px_per_rad)
         figures |= found
-        said.append(
+        found_lines.append(
             f"{name} {found[f'{name}_scale']:.3f} of the rig file's, turned by "
             f"{found[f'{name}_rotation_deg']:+.2f} +- {found[f'{name}_rotation_sd_deg']:.2f} deg"
         )
     figures["residual_px"] = fit.residual_px
-    return Result(figures, "; ".join(said), _calibration(view, figures, said))
+    return Result(figures, "; ".join(found_lines), _calibration(view, figures, found_lines))
 
 
-def _calibration(view: View, figures: Figures, said: list[str]) -> Calibration:
+def _calibration(view: View, figures: Figures, found_lines: list[str]) -> Calibration:
     """Both scales and rotations, into the keys that stand for a stage alone."""
     fsm, siderostat = view.settings.fsm, view.settings.siderostat
     ball_screw = siderostat.ball_screw_m_per_rad * figures["siderostat_scale"]
@@ -228,7 +228,7 @@ def _calibration(view: View, figures: Figures, said: list[str]) -> Calibration:
         for name in ("siderostat", "fsm")
     }
     found["siderostat"]["ball_screw_m_per_rad"] = ball_screw
-    lines = [*said, "the siderostat's scale is taken into ball_screw_m_per_rad"]
+    lines = [*found_lines, "the siderostat's scale is taken into ball_screw_m_per_rad"]
     if fsm.hysteresis is None:
         found["fsm"]["beam_per_mirror"] = fsm.beam_per_mirror * figures["fsm_scale"]
         lines.append("the mirror's scale is taken into beam_per_mirror")
@@ -254,4 +254,4 @@ def _in_figures(name: str, matrix: Floats, deviation: Floats, px_per_rad: float)
     }
 
 
-PLATE_SCALE = {"plate_scale": open_loop(plan, lambda _step: "plate_scale", _judge)}
+PLATE_SCALE = {"plate_scale": open_loop(plan, lambda _step: "plate_scale", _evaluate)}

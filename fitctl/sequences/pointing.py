@@ -1,4 +1,4 @@
-"""Steps that hold the star and judge how well: hold, and target, jog and raster, which lead it about."""
+"""Steps that hold the star and measure how well: hold, and target, jog and raster, which lead it about."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ def _hold_done(step: steps.Hold, view: View) -> Result | None:
         msg = f"the star was not held all the time: {view.why}"
         raise StepFailed(msg)
     due = round(step.duration_s * view.rig.camera.frame_rate_hz)
-    if view.gone_s > step.settle_s:
-        view.squares.add(columns(view.looks)[: due - view.squares.frames, 3:5])
-    view.looks.clear()  # hours of them would fill the memory
-    if view.gone_s < step.settle_s + step.duration_s:
+    if view.elapsed_s > step.settle_s:
+        view.squares.add(columns(view.measurements)[: due - view.squares.frames, 3:5])
+    view.measurements.clear()  # hours of them would fill the memory
+    if view.elapsed_s < step.settle_s + step.duration_s:
         return None
-    return _judged(step, view, view.squares, due)
+    return _evaluate(step, view, view.squares, due)
 
 
-def _judged(step: steps.Hold | steps.Visiting, view: View, squares: Squares, due: int) -> Result:
+def _evaluate(step: steps.Hold | steps.Visiting, view: View, squares: Squares, due: int) -> Result:
     """RMS of each axis against what is required; of `due` frames."""
-    if squares.seen < _LEAST_SEEN * due:
+    if squares.with_star < _LEAST_SEEN * due:
         msg = (
-            f"the star was seen on {squares.seen} of {due} frames; expected at least "
+            f"the star was seen on {squares.with_star} of {due} frames; expected at least "
             f"{100 * _LEAST_SEEN:g} %"
         )
         raise StepFailed(msg)
@@ -62,11 +62,11 @@ def _judged(step: steps.Hold | steps.Visiting, view: View, squares: Squares, due
         figures[f"rms_{axis}_px"] = value_px
         figures[f"rms_{axis}_sky_arcsec"] = value_px * per_px
     figures["limit_px"] = limit_px
-    figures["frames_seen"] = float(squares.seen)
-    said = f"az {rms_px[0]:.4f}, el {rms_px[1]:.4f} px RMS; required {limit_px:g} px"
+    figures["frames_seen"] = float(squares.with_star)
+    message = f"az {rms_px[0]:.4f}, el {rms_px[1]:.4f} px RMS; required {limit_px:g} px"
     if rms_px.max() > limit_px:
-        raise StepFailed(said)
-    return Result(figures, said)
+        raise StepFailed(message)
+    return Result(figures, message)
 
 
 def _hold_s(step: steps.Hold, _rig: Rig, _loop_name: str) -> float:
@@ -132,19 +132,19 @@ def _run_visit(step: steps.Visiting, view: View) -> None:
 
 
 def _visit_done(step: steps.Visiting, view: View) -> Result | None:
-    view.insist_on(Mode.VERNIER, Mode.COARSE)  # a long way leads through COARSE
+    view.require_mode(Mode.VERNIER, Mode.COARSE)  # a long way leads through COARSE
     if view.now_s - view.marks[-1] < step.dwell_s:
         return None
     offsets = places(step)
     if len(view.marks) < len(offsets):
         _go(view, offsets[len(view.marks)])
         return None
-    return _judge_visits(step, view, offsets)
+    return _evaluate_visits(step, view, offsets)
 
 
-def _judge_visits(step: steps.Visiting, view: View, offsets: list[Offset]) -> Result:
+def _evaluate_visits(step: steps.Visiting, view: View, offsets: list[Offset]) -> Result:
     """Settling after each move; RMS about the places where each has died away."""
-    table, target = columns(view.looks), view.settings.target_px
+    table, target = columns(view.measurements), view.settings.target_px
     time_s, star_px = table[:, 0], table[:, 1:3]
     limit_px = step.rms_limit_px or view.settings.requirement_px
     settled_s, overshoot_px, steady = [0.0], [0.0], []
@@ -159,12 +159,12 @@ def _judge_visits(step: steps.Visiting, view: View, offsets: list[Offset]) -> Re
             overshoot_px.append(found.overshoot_px)
         steady.append(away_px[time_s[there] >= came_s + step.steady_after_s])
     view.squares.add(np.concatenate(steady))
-    judged = _judged(step, view, view.squares, due_each * len(offsets))
-    figures = judged.figures | {
+    held = _evaluate(step, view, view.squares, due_each * len(offsets))
+    figures = held.figures | {
         "settled_s": float(np.max(settled_s)),
         "overshoot_px": float(np.max(overshoot_px)),
     }
-    return Result(figures, f"settled in {figures['settled_s']:.1f} s; {judged.message}")
+    return Result(figures, f"settled in {figures['settled_s']:.1f} s; {held.message}")
 
 
 def _stop_visit(_step: steps.Visiting, view: View) -> None:

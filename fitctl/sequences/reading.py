@@ -89,7 +89,7 @@ def sequence_from_document(document: Mapping[str, Any], origin: str) -> Sequence
     try:
         return Sequence.model_validate(document)
     except ValidationError as error:
-        lines = [_told(*_place(origin, each["loc"]), each) for each in error.errors()]
+        lines = [_mistake(*_place(origin, each["loc"]), each) for each in error.errors()]
         raise ConfigError("\n".join(lines)) from None
 
 
@@ -106,7 +106,7 @@ def make_step(kind: type[Step], keys: Mapping[str, Any]) -> Step:
         return kind.model_validate({**keys, **more})
     except ValidationError as error:
         name = kind.model_fields["step"].default
-        lines = [_told(name, kind, _key(each["loc"]), each) for each in error.errors()]
+        lines = [_mistake(name, kind, _key(each["loc"]), each) for each in error.errors()]
         raise ConfigError("\n".join(lines)) from None
 
 
@@ -134,7 +134,7 @@ def read_stars(path: Path) -> list[Star]:
         try:
             stars.append(Star.model_validate(named))
         except ValidationError as error:
-            wrong += [_told(where, Star, _key(each["loc"]), each) for each in error.errors()]
+            wrong += [_mistake(where, Star, _key(each["loc"]), each) for each in error.errors()]
     if wrong:
         raise ConfigError("\n".join(wrong))
     return stars
@@ -154,23 +154,23 @@ def _key(place: tuple[Any, ...]) -> str:
     return ".".join(str(part) for part in place)
 
 
-def _told(where: str, kind: type[Settings], key: str, problem: Mapping[str, Any]) -> str:
+def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, Any]) -> str:
     """One mistake as one line."""
     match problem["type"]:
         case "union_tag_not_found":
-            said = f"step is missing; there are {', '.join(STEPS)}"
+            mistake = f"step is missing; there are {', '.join(STEPS)}"
         case "union_tag_invalid":
-            said = f"{problem['ctx']['tag']!r} is no step; there are {', '.join(STEPS)}"
+            mistake = f"{problem['ctx']['tag']!r} is no step; there are {', '.join(STEPS)}"
         case "extra_forbidden":
             allowed = [name for name in kind.model_fields if name != "step"]
             near = difflib.get_close_matches(key, allowed, 1)
             hint = f"; did you mean {near[0]}?" if near else ""
-            said = f"{key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
+            mistake = f"{key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
         case "missing":
-            said = f"{key}: is missing"
+            mistake = f"{key}: is missing"
         case _:
             given = problem.get("input")
             shown = f" (is {given!r})" if isinstance(given, str | int | float) else ""
             message = problem["msg"].replace("Input should be", "must be") + shown
-            said = f"{key}: {message}" if key else message
-    return f"{where}: {said}".replace("\n", " ")
+            mistake = f"{key}: {message}" if key else message
+    return f"{where}: {mistake}".replace("\n", " ")

@@ -1,23 +1,21 @@
-"""Runs steps: check, run, wait until done, stop what failed, try again; every attempt is told and recorded."""
+"""Runs steps: check, run, wait until done, stop what failed, try again; all attempts are recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
 import msgspec
 
-from fitctl.config import Rig
 from fitctl.logging.records import SequenceAttempt
-from fitctl.messages.commands import Hold, SequenceStatus
+from fitctl.messages.commands import Hold
 from fitctl.messages.modes import Mode
 from fitctl.sequences.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
-from fitctl.sequences.links import Link
-from fitctl.sequences.stars import judge, star_results, steps_of
-from fitctl.sequences.steps import Sequence, Standby, Stars, Step
+from fitctl.sequences.stars import evaluate, star_results, steps_of
+from fitctl.sequences.steps import Standby, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 
 _RETRY_S = 1.0  # between attempts
@@ -32,32 +30,14 @@ class TimedOut(StepFailed):
 
 
 class Runner:
-    """Runs the steps of one sequence, one at a time, on one link.
+    """Runs the steps of one sequence, one at a time, by its contact with the supervisor."""
 
-    Parameters
-    ----------
-    link : Link
-    rig : Rig
-    name : str
-    steps : int
-        How many there will be.
-    on_status : callable
-        Hears of every change: a new attempt, a pause, an end.
-    """
-
-    def __init__(
-        self,
-        link: Link,
-        rig: Rig,
-        name: str,
-        steps: int,
-        on_status: Callable[[SequenceStatus], None] = lambda _status: None,
-    ) -> None:
+    def __init__(self, contact: Contact) -> None:
         self.attempts: list[SequenceAttempt] = []
         self.calibrations: list[Calibration] = []
-        self.contact = Contact(link, rig, name, steps, on_status)
-        self._link = link
-        self._rig = rig
+        self.contact = contact
+        self._link = contact.link
+        self._rig = contact.rig
         self._loops: set[str] = set()
         self._star = ""  # of a list, that the step is for
 
@@ -100,16 +80,16 @@ class Runner:
             except SequenceError:
                 if step.on_failure == "stop":
                     raise
-        self._tell(step.step, loop_name, number, 1, "")
+        self._report(step.step, loop_name, number, 1, "")
         try:
-            result = judge(step, star_results(self.attempts[first:]))
+            result = evaluate(step, star_results(self.attempts[first:]))
         except StepFailed as failure:
-            record = self._note("failed", str(failure), {}, began_s)
+            record = self._record("failed", str(failure), {}, began_s)
             msg = f"step {number} ({step.step}) failed: {failure}"
             raise SequenceError(msg, record) from None
-        return self._note("done", result.message, result.figures, began_s)
+        return self._record("done", result.message, result.figures, began_s)
 
-    def _tell(self, step: str, loop_name: str, number: int, attempt: int, star: str) -> None:
+    def _report(self, step: str, loop_name: str, number: int, attempt: int, star: str) -> None:
         self._star = star
         self.contact.report(
             state="running", step_number=number, step=step, loop=loop_name, attempt=attempt,
@@ -118,7 +98,7 @@ class Runner:
 
     def _try(self, step: Step, loop_name: str, number: int, star: str = "") -> SequenceAttempt:
         for attempt in range(1, step.attempts + 1):
-            self._tell(step.step, loop_name, number, attempt, star)
+            self._report(step.step, loop_name, number, attempt, star)
             record = self._attempt(step, loop_name)
             if record.outcome == "done":
                 return record
@@ -135,7 +115,7 @@ class Runner:
         began_s = self._link.now_s()
         view: View | None = None
         try:
-            view = self.contact.look(loop_name)
+            view = self.contact.view_of(loop_name)
             self._wait_while_paused(view)
             self._wait_for_mode(step, behaviour, view)
             result = self._work(step, behaviour, view)
@@ -143,22 +123,22 @@ class Runner:
             if view is not None:
                 behaviour.stop(step, view)
             outcome: Outcome = "timed out" if isinstance(failure, TimedOut) else "failed"
-            return self._note(outcome, str(failure), {}, began_s)
+            return self._record(outcome, str(failure), {}, began_s)
         except (Stopped, KeyboardInterrupt) as stopped:
             hold = not isinstance(stopped, Stopped) or stopped.hold
             with suppress(ConnectionError):
                 if view is not None and hold:
                     behaviour.stop(step, view)
-                self._note("stopped", str(stopped) or "interrupted", {}, began_s)
+                self._record("stopped", str(stopped) or "interrupted", {}, began_s)
             raise
         if result.calibration is not None:
             self.calibrations.append(result.calibration)
-        return self._note("done", result.message, result.figures, began_s)
+        return self._record("done", result.message, result.figures, began_s)
 
     def _work(self, step: Step, behaviour: Behaviour, view: View) -> Result:
         limit_s = behaviour.own_s(step, self._rig, view.loop_name) + step.timeout_s
         view.began_s, view.paused_s = self._link.now_s(), 0.0
-        view.looks.clear()
+        view.measurements.clear()
         view.errors.clear()
         behaviour.run(step, view)
         while True:
@@ -170,7 +150,7 @@ class Runner:
                 result = behaviour.done(step, view)
                 if result is not None:
                     return result
-            if view.gone_s > limit_s:
+            if view.elapsed_s > limit_s:
                 msg = f"not done within {limit_s:g} s; loop {view.loop_name} is in {view.mode.name}"
                 raise TimedOut(msg)
 
@@ -182,8 +162,8 @@ class Runner:
             if view.mode not in _ON_THE_WAY:
                 raise StepFailed(msg)
             if view.now_s - begun_s > step.timeout_s:
-                told = f"{msg}, still after {step.timeout_s:g} s"
-                raise TimedOut(told)
+                late = f"{msg}, still after {step.timeout_s:g} s"
+                raise TimedOut(late)
             self.contact.next(view)
 
     def _wait_while_paused(self, view: View) -> None:
@@ -192,12 +172,12 @@ class Runner:
         self.contact.show_pause(paused=False)
 
     def _rest(self, loop_name: str) -> None:
-        view = self.contact.look(loop_name)
+        view = self.contact.view_of(loop_name)
         end_s = view.now_s + _RETRY_S
         while view.now_s < end_s:
             self.contact.next(view)
 
-    def _note(
+    def _record(
         self, outcome: Outcome, message: str, figures: Figures, began_s: float
     ) -> SequenceAttempt:
         now_s = self._link.now_s()
@@ -246,21 +226,7 @@ def _ending(runner: Runner) -> Iterator[None]:
 
 
 def run_steps(runner: Runner, steps: Iterable[Step]) -> list[SequenceAttempt]:
-    """Begin, run these steps, end; gives and raises what :func:`run_sequence` does."""
-    runner.contact.begin()
-    with _ending(runner):
-        for step in steps:
-            runner.run(step)
-    return runner.attempts
-
-
-def run_sequence(
-    link: Link,
-    rig: Rig,
-    sequence: Sequence,
-    on_status: Callable[[SequenceStatus], None] = lambda _status: None,
-) -> list[SequenceAttempt]:
-    """Run a whole sequence; the records of all attempts.
+    """Begin, run these steps, end; the records of all attempts.
 
     Raises
     ------
@@ -269,5 +235,8 @@ def run_sequence(
     ConnectionError
         If the supervisor does not answer or falls silent.
     """
-    runner = Runner(link, rig, sequence.name, len(sequence.steps), on_status)
-    return run_steps(runner, sequence.steps)
+    runner.contact.begin()
+    with _ending(runner):
+        for step in steps:
+            runner.run(step)
+    return runner.attempts

@@ -60,7 +60,7 @@ def star_results(attempts: Iterable[SequenceAttempt]) -> list[StarResult]:
     return list(results.values())
 
 
-def judge(step: steps.Stars, results: list[StarResult]) -> Result:
+def evaluate(step: steps.Stars, results: list[StarResult]) -> Result:
     """What came of the list.
 
     Raises
@@ -70,13 +70,13 @@ def judge(step: steps.Stars, results: list[StarResult]) -> Result:
     """
     skipped = [result.name for result in results if result.why_not]
     held = len(results) - len(skipped)
-    said = f"{held} of {len(results)} stars held"
+    message = f"{held} of {len(results)} stars held"
     if skipped:
-        said += f"; skipped {', '.join(skipped)}"
+        message += f"; skipped {', '.join(skipped)}"
     if held < step.least_held:
-        msg = f"{said}; least_held is {step.least_held}"
+        msg = f"{message}; least_held is {step.least_held}"
         raise StepFailed(msg)
-    return Result({"stars": float(len(results)), "held": float(held)}, said)
+    return Result({"stars": float(len(results)), "held": float(held)}, message)
 
 
 def _check(step: steps.Stars, rig: Rig, loop_name: str) -> list[str]:

@@ -29,8 +29,10 @@ LargestOffset = Annotated[
     Positive | None,
     Field(description="no search goes farther; without it, the radius does not grow"),
 ]
-SettleS = Annotated[NonNegative, Field(le=600, description="before, not judged")]
+SettleS = Annotated[NonNegative, Field(le=600, description="before, does not count")]
 DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
+DwellS = Annotated[DurationS, Field(description="at each place")]
+SteadyAfterS = Annotated[NonNegative, Field(description="of a dwell: from then on its RMS counts")]
 OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
 RmsLimitPx = Annotated[
     Positive | None,
@@ -94,10 +96,10 @@ class Acquire(Step):
 
 
 class Hold(Step):
-    """Hold the star for a time and judge each axis against the requirement."""
+    """Hold the star for a time and compare the RMS of each axis with the requirement."""
 
     step: Literal["hold"] = "hold"
-    duration_s: Annotated[DurationS, Field(description="how long is judged")]
+    duration_s: Annotated[DurationS, Field(description="for how long the RMS counts")]
     settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     timeout_s: TimeoutS = 60.0
@@ -114,7 +116,7 @@ class Star(Settings):
 
 
 class Stars(Step):
-    """A list of stars, one after the other: acquire each where it is expected, hold it and judge it."""
+    """A list of stars, one after the other: acquire each where it is expected, and hold it as `hold` does."""
 
     step: Literal["stars"] = "stars"
     stars: Annotated[
@@ -129,7 +131,9 @@ class Stars(Step):
     file: Annotated[
         str, Field(description="TOML, YAML or CSV with the stars, beside the sequence's own file")
     ] = ""
-    duration_s: Annotated[DurationS, Field(description="how long each is judged")] = 30.0
+    duration_s: Annotated[DurationS, Field(description="for how long the RMS of each counts")] = (
+        30.0
+    )
     settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     search_radius_sky_arcsec: SearchRadius = None
@@ -158,10 +162,8 @@ class Moving(Step):
 class Visiting(Moving):
     """The common part of steps that lead the star to one place after another."""
 
-    dwell_s: Annotated[DurationS, Field(description="at each place")] = 20.0
-    steady_after_s: Annotated[
-        NonNegative, Field(description="of a dwell: from then on its RMS counts")
-    ] = 10.0
+    dwell_s: DwellS = 20.0
+    steady_after_s: SteadyAfterS = 10.0
     rms_limit_px: RmsLimitPx = None
 
 
@@ -187,10 +189,8 @@ class Raster(Visiting):
     columns: Annotated[Count, Field(le=21, description="in azimuth")] = 3
     rows: Annotated[Count, Field(le=21, description="in elevation")] = 3
     spacing_px: Annotated[Positive, Field(description="between neighbours")] = 1.0
-    dwell_s: Annotated[DurationS, Field(description="at each place")] = 12.0
-    steady_after_s: Annotated[
-        NonNegative, Field(description="of a dwell: from then on its RMS counts")
-    ] = 8.0
+    dwell_s: DwellS = 12.0
+    steady_after_s: SteadyAfterS = 8.0
 
 
 class Controller(Step):

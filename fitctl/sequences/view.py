@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -33,46 +34,49 @@ class Squares:
 
     Attributes
     ----------
-    frames, seen : int
-        All that were taken, and those with a star.
+    frames, with_star : int
+        All, and those with a star.
     sum_px2 : array, shape (2,)
         Of the squares of these errors az, el.
     """
 
     frames: int = 0
-    seen: int = 0
+    with_star: int = 0
     sum_px2: Floats = field(default_factory=lambda: np.zeros(2))
 
     def add(self, errors_px: Floats) -> None:
-        """Take errors, shape (n, 2), NaN without a star."""
-        seen = errors_px[np.isfinite(errors_px).all(axis=1)]
+        """Add errors, shape (n, 2), NaN without a star."""
+        with_star = errors_px[np.isfinite(errors_px).all(axis=1)]
         self.frames += len(errors_px)
-        self.seen += len(seen)
-        self.sum_px2 += np.sum(seen**2, axis=0)
+        self.with_star += len(with_star)
+        self.sum_px2 += np.sum(with_star**2, axis=0)
 
     @property
     def rms_px(self) -> Floats:
         """Root of their mean, shape (2,); of one frame at the least."""
-        return np.asarray(np.sqrt(self.sum_px2 / self.seen))
+        return np.asarray(np.sqrt(self.sum_px2 / self.with_star))
 
 
 class StepFailed(Exception):
     """The attempt has failed; another may succeed."""
 
 
-class Look(NamedTuple):
-    """What a frame's tick showed of the star; NaN where it was not seen."""
+class Measurement(NamedTuple):
+    """What a frame's tick showed of the star, and where the stages were then; NaN without a star."""
 
-    time_s: float
+    mid_exposure_s: float
     star_az_px: float
     star_el_px: float
     error_az_px: float
     error_el_px: float
-    motor_az_rad: float
-    motor_el_rad: float
-    mirror_az_rad: float
-    mirror_el_rad: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+    fsm_az_rad: float
+    fsm_el_rad: float
     star_flux_dn: float
+
+
+_fields_of = attrgetter(*Measurement._fields)  # of a tick
 
 
 @dataclass
@@ -85,7 +89,7 @@ class View:
         When the loop was ready for it, by the supervisor's time.
     paused_s : float
         Spent in pauses since.
-    looks : list of Look
+    measurements : list of Measurement
         Of every frame since, but not of those in a pause.
     marks : list of float
         For the step's own use: times of what it did.
@@ -98,7 +102,7 @@ class View:
     attempt : int
         Which one it is, from 1.
     fresh_s : float
-        Telemetry from before tells nothing about the last command.
+        Telemetry from before shows nothing of the last command.
     """
 
     link: Link
@@ -109,7 +113,7 @@ class View:
     attempt: int = 1
     paused_s: float = 0.0
     fresh_s: float = 0.0
-    looks: list[Look] = field(default_factory=list)
+    measurements: list[Measurement] = field(default_factory=list)
     marks: list[float] = field(default_factory=list)
     frames: list[FrameRecord] = field(default_factory=list)
     squares: Squares = field(default_factory=Squares)
@@ -136,7 +140,7 @@ class View:
         return self.telemetry.time_s
 
     @property
-    def gone_s(self) -> float:
+    def elapsed_s(self) -> float:
         """Since the attempt began, without pauses."""
         return self.now_s - self.began_s - self.paused_s
 
@@ -165,7 +169,7 @@ class View:
             msg = f"{type(command).__name__.lower()} was refused: {reply.text}"
             raise StepFailed(msg)
 
-    def insist_on(self, *modes: Mode) -> None:
+    def require_mode(self, *modes: Mode) -> None:
         """Refuse to go on in another mode.
 
         Raises
@@ -177,13 +181,13 @@ class View:
             msg = f"loop {self.loop_name} went to {self.mode.name}: {self.why}"
             raise StepFailed(msg)
 
-    def take(self, telemetry: Telemetry, *, paused: bool) -> None:
-        """Take the next message."""
+    def update(self, telemetry: Telemetry, *, paused: bool) -> None:
+        """Go on to the next message."""
         if paused:
             self.paused_s += telemetry.time_s - self.telemetry.time_s
         else:
-            ticks = [tick for tick in telemetry.ticks if self._is_mine(tick)]
-            self.looks += [_look(tick) for tick in ticks]
+            ticks = filter(self._is_mine, telemetry.ticks)
+            self.measurements += [Measurement(*_fields_of(tick)) for tick in ticks]
         self.errors += [
             event.message
             for event in telemetry.events
@@ -202,21 +206,6 @@ class View:
         return self.mode in TRACKING
 
 
-def _look(tick: Tick) -> Look:
-    return Look(
-        tick.mid_exposure_s,
-        tick.star_az_px,
-        tick.star_el_px,
-        tick.error_az_px,
-        tick.error_el_px,
-        tick.siderostat_az_rad,
-        tick.siderostat_el_rad,
-        tick.fsm_az_rad,
-        tick.fsm_el_rad,
-        tick.star_flux_dn,
-    )
-
-
-def columns(looks: list[Look]) -> Floats:
+def columns(measurements: list[Measurement]) -> Floats:
     """Looks as an array, shape (n, 10)."""
-    return np.array(looks, dtype=np.float64).reshape(-1, len(Look._fields))
+    return np.array(measurements, dtype=np.float64).reshape(-1, len(Measurement._fields))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fitctl.clock import VirtualClock
 from fitctl.config import Rig
+from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import AnyRecord, ModeChange, Tick
 from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
@@ -86,7 +87,9 @@ class Simulation:
         self.mode_changes: list[ModeChange] = []
         self._also = record
         self.devices = Devices(self.camera, loops)
-        self.supervisor = Supervisor(rig, self.devices, self.clock, InlineExecutor(), self._take)
+        self.supervisor = Supervisor(
+            rig, self.devices, self.clock, InlineExecutor(), self._take, design_for
+        )
         self.camera.on_servo_period = [
             (work.period_s, work.period) for work in self.supervisor.periodic
         ]

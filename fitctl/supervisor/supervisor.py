@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.pair import Designer
 from fitctl.drivers.interface import DeviceError, Devices, Frame, LoopDevices
 from fitctl.logging.records import (
     CAMERA,
@@ -43,7 +43,7 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import Mode, Trigger, usable_commands
+from fitctl.messages.modes import TRACKING, Mode, Trigger, usable_commands
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.supervisor.camera_watch import CameraWatch
@@ -63,7 +63,7 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
-MakeLoop = Callable[[str, Rig, LoopDevices, Journal], StellarLoop]
+MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], StellarLoop]
 
 
 class Posted(NamedTuple):
@@ -87,8 +87,10 @@ class Supervisor:
         Runs device work; must run one piece at a time.
     record : callable
         Takes every record (log and consoles); must not block.
+    design : Designer
+        Makes the design of a loop, at the start and for `SetController`.
     make_loop : callable
-        Makes a loop of its name, the rig, its devices and the journal.
+        Makes a loop of its name, the rig, its devices, the journal and `design`.
     """
 
     def __init__(
@@ -98,12 +100,13 @@ class Supervisor:
         clock: Clock,
         executor: Executor,
         record: Callable[[AnyRecord], None],
+        design: Designer,
         make_loop: MakeLoop = stellar_loop,
     ) -> None:
         self.rig = rig
         journal = Journal(clock, record)
         self.loops = {
-            name: make_loop(name, rig, devices.loops[name], journal) for name in rig.loops
+            name: make_loop(name, rig, devices.loops[name], journal, design) for name in rig.loops
         }
         self.servos = {name: loop.servo for name, loop in self.loops.items()}
         self.sequences = SequenceBoard(journal)
@@ -112,6 +115,7 @@ class Supervisor:
         self._executor = executor
         self._journal = journal
         self._record = record
+        self._design = design
         self._commands: deque[Posted] = deque()
         self._left: deque[AnyRecord] = deque()
         self._quantities: deque[QuantityReading] = deque()
@@ -221,6 +225,11 @@ class Supervisor:
         now_s = self._clock.now_s()
         self._record(command_record(Stop(), Reply(accepted=True, text=reason), "fitctl", "", now_s))
 
+    @property
+    def pointing(self) -> bool:
+        """A loop has a star or looks for one."""
+        return any(loop.mode in TRACKING for loop in self.loops.values())
+
     def at_rest(self) -> bool:
         """Every stage that can still be commanded is where it may be left without power."""
         return all(loop.at_rest() for loop in self.loops.values())
@@ -324,7 +333,7 @@ class Supervisor:
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
         for name in names:
             # A design takes longer than a tick.
-            future = self._executor.submit(design_for, self.rig, name, command.name)
+            future = self._executor.submit(self._design, self.rig, name, command.name)
             self._designs.append(Job(future, partial(self._designed, name, command.name)))
         self._finish_jobs()
         return Reply(accepted=True, text="designing; an event tells when it is at work")

@@ -47,8 +47,8 @@ class AlarmBook:
         self.alarms: dict[str, Alarm] = {}
         self._rang_s = -BELL_EVERY_S
 
-    def judge(self, state: ConsoleState) -> bool:
-        """Take what is wrong now; true when the bell should ring."""
+    def update(self, state: ConsoleState) -> bool:
+        """Add what is wrong now, end what is over; true when the bell should ring."""
         newly = False
         wrong = {alarm.key: alarm for alarm in _wrong_now(state)}
         for key, alarm in wrong.items():
@@ -76,7 +76,7 @@ class AlarmBook:
         return rings
 
     @property
-    def unseen(self) -> bool:
+    def unacknowledged(self) -> bool:
         """There are alarms that were not acknowledged."""
         return any(not alarm.acknowledged for alarm in self.alarms.values())
 
@@ -91,7 +91,7 @@ class AlarmBook:
         return sorted(self.alarms.values(), key=lambda a: (a.acknowledged, not a.error, -a.since_s))
 
     def acknowledge(self) -> None:
-        """The operator has seen all of them; what is over goes."""
+        """Acknowledge all of them; what is over goes."""
         for key, alarm in list(self.alarms.items()):
             alarm.acknowledged = True
             if alarm.over_s is not None:
@@ -114,7 +114,7 @@ def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
         yield _no_data(state)
     if newest is None:
         return
-    told = {trip.reason for loop in newest.loops for trip in loop.interlocks}
+    reported = {trip.reason for loop in newest.loops for trip in loop.interlocks}
     for loop in newest.loops:
         yield from (_interlock(loop, trip) for trip in loop.interlocks)
         change = loop.last_change
@@ -122,24 +122,23 @@ def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
             loop.mode == "SAFE"
             and change
             and change.trigger == "FAULT"
-            and change.reason not in told
+            and change.reason not in reported
         ):
-            told.add(change.reason)
+            reported.add(change.reason)
             yield _fault(loop, change)
     changed_s = max((loop.since_s for loop in newest.loops), default=0.0)
     for device in newest.devices:
-        # What was told of a device before the last change of mode is of the past.
-        if device.state == "fault" and device.detail not in told and device.time_s >= changed_s:
+        # What a device reported before the last change of mode is of the past.
+        if device.state == "fault" and device.detail not in reported and device.time_s >= changed_s:
             yield _device(newest, device)
     yield from _log(newest)
 
 
 def _no_data(state: ConsoleState) -> Alarm:
-    seen = state.newest is not None
     return Alarm(
         "no data",
         True,
-        f"NO DATA for {state.silent_s:.0f} s" + ("; what you see is old" if seen else ""),
+        f"NO DATA for {state.silent_s:.0f} s" + ("; what you see is old" if state.newest else ""),
         state.received_s,
         "the console goes on trying to connect",
         "is the supervisor running? STOP may not reach it: be ready to cut the power",

@@ -11,14 +11,17 @@ from typing import Any, ClassVar, cast
 import msgspec
 from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
-from textual.message import Message
 from textual.screen import Screen
 
+from fitctl.config import CONTROLLERS
+from fitctl.messages.client import Client
 from fitctl.messages.command_table import ROWS, command_of
 from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
     Reply,
+    Reset,
+    SetController,
     Shutdown,
     Status,
     Stop,
@@ -30,9 +33,8 @@ from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
 from fitctl.tui.graphics import Graphics, PictureSender
 from fitctl.tui.jobs import Job
-from fitctl.tui.link import Link
 from fitctl.tui.pace import Pace
-from fitctl.tui.palette import ControllerProvider, PlaceProvider, ResetProvider
+from fitctl.tui.palette import PlaceProvider
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.views.devices import DevicesView
 from fitctl.tui.views.help import HelpView
@@ -48,38 +50,12 @@ BEAT_S = 0.1
 KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 
 
-class Received(Message):
-    """Telemetry came."""
-
-    def __init__(self, telemetry: Telemetry) -> None:
-        super().__init__()
-        self.telemetry = telemetry
-
-
-class Unreadable(Message):
-    """Something came that is not telemetry as this console knows it."""
-
-    def __init__(self, problem: str) -> None:
-        super().__init__()
-        self.problem = problem
-
-
-class Answered(Message):
-    """A command was answered, or it was not: then `reply` is None and `problem` says why."""
-
-    def __init__(self, command: AnyCommand, reply: Reply | None, problem: str = "") -> None:
-        super().__init__()
-        self.command = command
-        self.reply = reply
-        self.problem = problem
-
-
 class ConsoleApp(App[None]):
     """The operator console.
 
     Parameters
     ----------
-    link : Link
+    link : Client
         The connection to the supervisor; closed at the end.
     quit_shuts_down : bool
         Quitting ends the instrument too (which the caller does); only the help says so here.
@@ -101,7 +77,7 @@ class ConsoleApp(App[None]):
     CSS_PATH = Path(__file__).with_name("console.tcss")
     TITLE = "fitctl"
     ENABLE_COMMAND_PALETTE = True
-    COMMANDS = App.COMMANDS | {PlaceProvider, ControllerProvider, ResetProvider}
+    COMMANDS = App.COMMANDS | {PlaceProvider}
     MODES: ClassVar[dict[str, str | Callable[[], Screen[Any]]]] = {
         "operate": OperateView,
         "devices": DevicesView,
@@ -127,7 +103,7 @@ class ConsoleApp(App[None]):
 
     def __init__(
         self,
-        link: Link,
+        link: Client,
         *,
         quit_shuts_down: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -154,9 +130,10 @@ class ConsoleApp(App[None]):
         self._wire = Wire(
             link,
             clock,
-            lambda telemetry: self.post_message(Received(telemetry)),
-            lambda problem: self.post_message(Unreadable(problem)),
-            lambda *answer: self.post_message(Answered(*answer)),
+            # From the wire's threads to the console's own.
+            partial(self.call_later, self._accept),
+            partial(self.call_later, self._notify_unreadable),
+            partial(self.call_later, self._handle_reply),
         )
 
     def _write_to_terminal(self, sequence: str) -> None:
@@ -175,21 +152,21 @@ class ConsoleApp(App[None]):
 
     # ------------------------------------------------------------ telemetry
 
-    def on_received(self, message: Received) -> None:
+    def _accept(self, telemetry: Telemetry) -> None:
         """Remember; draw at once only what must not wait."""
-        self._wire.taken()
+        self._wire.processed()
         before, was_stale = self.state.mode, self.state.stale
         known = self.state.newest
-        self.state.accept(message.telemetry, self.clock())
-        if known is None or known.pid != message.telemetry.pid:
+        self.state.accept(telemetry, self.clock())
+        if known is None or known.pid != telemetry.pid:
             self._ask_for_events()
         if before != self.state.mode or was_stale:
             self.draw_all()
 
-    def on_unreadable(self, message: Unreadable) -> None:
-        """Say that telemetry comes but cannot be used."""
+    def _notify_unreadable(self, problem: str) -> None:
+        """Show that telemetry comes but cannot be used."""
         self.notify(
-            message.problem,
+            problem,
             title="✗ telemetry unreadable",
             severity="error",
             timeout=UNREADABLE_NOTICE_S,
@@ -213,7 +190,7 @@ class ConsoleApp(App[None]):
 
     def _draw(self, beat: int | None) -> None:
         self.state.now_s = self.clock()
-        if self.alarms.judge(self.state):
+        if self.alarms.update(self.state):
             self.bell()
         if self.view is not None:
             with self.batch_update():
@@ -221,20 +198,20 @@ class ConsoleApp(App[None]):
 
     # ------------------------------------------------------------ commands
 
-    def give(self, command: AnyCommand) -> None:
+    def send(self, command: AnyCommand) -> None:
         """Send a command for the shown loop; a stop goes to all loops."""
         loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
         self._wire.send(msgspec.structs.replace(command, loop=loop))
 
     def _keep(self) -> None:
         """Keep the instrument; hear what was missed."""
-        self.give(Status())
+        self.send(Status())
         if self.state.events_missing:
             self._ask_for_events()
 
     def _ask_for_events(self) -> None:
         self.state.events_missing = False
-        self.give(RecentEvents())
+        self.send(RecentEvents())
 
     def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
         """Do something once the operator has said yes."""
@@ -245,24 +222,23 @@ class ConsoleApp(App[None]):
 
         self.push_screen(Confirm(title, question), answered)
 
-    def on_answered(self, message: Answered) -> None:
-        """Say what became of a command, where that is not plain to see."""
-        name = type(message.command).__name__
+    def _handle_reply(self, command: AnyCommand, reply: Reply | None, problem: str) -> None:
+        """Show what became of a command, where that is not plain to see; without a reply, the problem."""
+        name = type(command).__name__
         if name == "Status":
             return  # which only keeps the instrument; a lost link is in the header
         if name == "RecentEvents":
-            self._recall(message.reply)
+            self._recall(reply)
             return
-        if message.reply is None:
-            text = message.problem
+        if reply is None:
             if name == "Stop":
-                text += "\nThe instrument may still move. Press STOP again, or cut its power."
+                problem += "\nThe instrument may still move. Press STOP again, or cut its power."
             self.notify(
-                text, title=f"✗ {name} not confirmed", severity="error", timeout=20, markup=False
+                problem, title=f"✗ {name} not confirmed", severity="error", timeout=20, markup=False
             )
-        elif not message.reply.accepted:
+        elif not reply.accepted:
             self.notify(
-                message.reply.text or "no reason given",
+                reply.text or "no reason given",
                 title=f"▲ {name} refused",
                 severity="warning",
                 timeout=8,
@@ -271,7 +247,7 @@ class ConsoleApp(App[None]):
         elif name == "Stop":
             self.notify("all loops go to SAFE", title="■ STOP confirmed", timeout=3)
         elif name == "TakeOver":
-            self.notify(message.reply.text, title="Taken over", timeout=5, markup=False)
+            self.notify(reply.text, title="Taken over", timeout=5, markup=False)
 
     def _recall(self, reply: Reply | None) -> None:
         if reply is None or not reply.accepted:
@@ -283,11 +259,11 @@ class ConsoleApp(App[None]):
     def action_command(self, name: str) -> None:
         """Give the command of a key, at once or after its question."""
         command = BY_NAME[name]
-        give = partial(self.give, command_of(command.word, (), ""))
+        send = partial(self.send, command_of(command.word, (), ""))
         if command.question and name in self.state.usable_commands:
-            self.ask(command.label, command.question, give)
+            self.ask(command.label, command.question, send)
         else:
-            give()
+            send()
 
     # ------------------------------------------------------------ screens and dialogs
 
@@ -302,7 +278,7 @@ class ConsoleApp(App[None]):
         self.draw_all()
 
     def action_window(self) -> None:
-        """Take the next window of RMS and traces."""
+        """Show the next window of RMS and traces."""
         self.state.next_window()
         self.draw_all()
 
@@ -332,7 +308,14 @@ class ConsoleApp(App[None]):
                 command.label, command.help, partial(self.action_command, command.name)
             )
         take_over = ROWS[TakeOver]
-        yield SystemCommand("Take over", take_over.help, partial(self.give, TakeOver()))
+        yield SystemCommand("Take over", take_over.help, partial(self.send, TakeOver()))
+        for name in CONTROLLERS:
+            set_controller = partial(self.send, SetController(name=name))
+            about = "In VERNIER the mirror goes on where it is"
+            yield SystemCommand(f"controller {name}", about, set_controller)
+        for trip in self.state.loop.state.interlocks if self.state.loop else ():
+            reset = partial(self.send, Reset(name=trip.name))
+            yield SystemCommand(f"reset {trip.name}", trip.reason, reset)
         for view in VIEWS:
             yield SystemCommand(
                 f"Screen: {view.label}", view.help, partial(self.action_view, view.name)
@@ -348,7 +331,7 @@ class ConsoleApp(App[None]):
             lambda: self.ask(
                 "Shut down",
                 "End the supervisor? All loops go to SAFE and OFF, for every console.",
-                partial(self.give, Shutdown()),
+                partial(self.send, Shutdown()),
             ),
         )
         yield SystemCommand(

@@ -83,8 +83,8 @@ def _sequence(state: ConsoleState, _alarms: AlarmBook) -> bool:
     return bool(state.newest and state.newest.running_sequence)
 
 
-def _unseen(_state: ConsoleState, alarms: AlarmBook) -> bool:
-    return alarms.unseen
+def _unacknowledged(_state: ConsoleState, alarms: AlarmBook) -> bool:
+    return alarms.unacknowledged
 
 
 def _loud(_state: ConsoleState, alarms: AlarmBook) -> bool:
@@ -93,7 +93,9 @@ def _loud(_state: ConsoleState, alarms: AlarmBook) -> bool:
 
 # In the footer these come before a screen's own keys.
 ALARM_KEYS = (
-    Key("k", "k", "Acknowledge", "app.acknowledge", "you have seen the alarms", "", _unseen),
+    Key(
+        "k", "k", "Acknowledge", "app.acknowledge", "you have seen the alarms", "", _unacknowledged
+    ),
     Key("u", "u", "Silence", "app.silence", "no bell for these alarms", "", _loud),
     Key(
         "v",
@@ -102,7 +104,7 @@ ALARM_KEYS = (
         "app.alarms",
         "alarms in full: what, since when, what to do",
         "",
-        _unseen,
+        _unacknowledged,
     ),
 )
 KEYS = (
@@ -119,7 +121,7 @@ KEYS = (
     Key("n", "n", "Reset", "screen.reset", "let the chosen interlock go", "devices"),
     Key("w", "w", "Window", "app.window", "over 10, 60 or 1 s", "loop"),
     Key("up,down", "↑↓", "Choose", "", "choose a sequence or a parameter", "sequences"),
-    Key("tab", "tab", "Other list", "screen.other", "sequences or parameters", "sequences"),
+    Key("tab", "tab", "Other list", "app.focus_next", "sequences or parameters", "sequences"),
     Key("enter", "enter", "Edit", "screen.edit", "change the chosen parameter", "sequences"),
     Key("d", "d", "Dry run", "screen.dry_run", "the whole of it on the virtual clock", "sequences"),
     Key("g", "g", "Go", "screen.go", "run it on the instrument", "sequences"),

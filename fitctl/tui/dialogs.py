@@ -14,7 +14,7 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
 from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.look import DIM, INK, ORANGE, RED, SKY, WHITE, Line, wall
+from fitctl.tui.look import DIM, INK, ORANGE, RED, SKY, Line, wall
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.events import event_lines
 
@@ -22,6 +22,7 @@ from fitctl.tui.widgets.events import event_lines
 class Reader(ModalScreen[None]):
     """A text to scroll through; any of its closing keys goes back."""
 
+    HINT = "esc closes · s stops"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,q,question_mark,e,v,enter", "dismiss", "Close", show=False),
     ]
@@ -35,13 +36,14 @@ class Reader(ModalScreen[None]):
         """One scrolling text in a frame."""
         with VerticalScroll() as sheet:
             sheet.border_title = self._title
-            sheet.border_subtitle = "esc closes · s stops"
-            yield Static(self._content)
+            sheet.border_subtitle = self.HINT
+            yield Static(self._content, id="text")
 
 
-class Alarms(ModalScreen[None]):
+class Alarms(Reader):
     """Every alarm in full; acknowledges and silences."""
 
+    HINT = "k acknowledges · u silences · esc closes · s stops"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,q,v,enter", "dismiss", "Close", show=False),
         Binding("k", "acknowledge", "Acknowledge", show=False),
@@ -49,33 +51,26 @@ class Alarms(ModalScreen[None]):
     ]
 
     def __init__(self, state: ConsoleState, book: AlarmBook) -> None:
-        super().__init__()
+        super().__init__("Alarms", alarms_text(state, book))
         self._state = state
         self._book = book
 
-    def compose(self) -> ComposeResult:
-        """The list in a frame."""
-        with VerticalScroll() as sheet:
-            sheet.border_title = "Alarms"
-            sheet.border_subtitle = "k acknowledges · u silences · esc closes · s stops"
-            yield Static(alarms_text(self._state, self._book), id="alarms")
-
     def on_mount(self) -> None:
         """Keep up with what happens meanwhile."""
-        self.set_interval(0.5, self._tell)
+        self.set_interval(0.5, self._show)
 
-    def _tell(self) -> None:
-        self.query_one("#alarms", Static).update(alarms_text(self._state, self._book))
+    def _show(self) -> None:
+        self.query_one("#text", Static).update(alarms_text(self._state, self._book))
 
     def action_acknowledge(self) -> None:
-        """All of them are seen."""
+        """Acknowledge all of them."""
         self._book.acknowledge()
-        self._tell()
+        self._show()
 
     def action_silence(self) -> None:
         """No bell for these."""
         self._book.silence()
-        self._tell()
+        self._show()
 
 
 class Confirm(ModalScreen[bool]):
@@ -108,7 +103,7 @@ class Ask(ModalScreen[str | None]):
 
     Parameters
     ----------
-    title, told : str
+    title, prompt : str
         What it is about.
     value : str
         To begin with.
@@ -121,11 +116,11 @@ class Ask(ModalScreen[str | None]):
     ]
 
     def __init__(
-        self, title: str, told: str, value: str, refused: Callable[[str], str] = lambda _: ""
+        self, title: str, prompt: str, value: str, refused: Callable[[str], str] = lambda _: ""
     ) -> None:
         super().__init__()
         self._title = title
-        self._told = told
+        self._prompt = prompt
         self._value = value
         self._refused = refused
 
@@ -134,12 +129,12 @@ class Ask(ModalScreen[str | None]):
         with Vertical(classes="sheet") as sheet:
             sheet.border_title = self._title
             sheet.border_subtitle = "enter takes it · esc leaves · ^s stops"
-            yield Static(Text(self._told, DIM))
+            yield Static(Text(self._prompt, DIM))
             yield Input(self._value, id="value")
             yield Static("", id="refused")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Take it, or say why not."""
+        """Accept it, or say why not."""
         why_not = self._refused(event.value)
         if why_not:
             self.query_one("#refused", Static).update(Text(f"✗ {why_not}", RED))
@@ -161,29 +156,24 @@ def alarms_text(state: ConsoleState, book: AlarmBook) -> Text:
     """Every alarm: what, since when, what was done, what to do."""
     if not book.alarms:
         return Text("all is well: no alarm", DIM)
-    told = Text()
+    text = Text()
     for alarm in book.in_order:
         colour = RED if alarm.error else ORANGE
-        told.append(f"{'✗' if alarm.error else '▲'} {alarm.what}\n", f"bold {colour}")
+        text.append(f"{'✗' if alarm.error else '▲'} {alarm.what}\n", f"bold {colour}")
         since = wall(state.wall_s(alarm.since_s))
         over = f", over {wall(state.wall_s(alarm.over_s))}" if alarm.over_s else ""
-        seen = "acknowledged" if alarm.acknowledged else "not acknowledged"
+        known = "acknowledged" if alarm.acknowledged else "not acknowledged"
         bell = ", silenced" if alarm.silenced else ""
         for name, words, ink in (
-            ("since", f"{since}{over}; {seen}{bell}", INK),
+            ("since", f"{since}{over}; {known}{bell}", INK),
             ("done", alarm.did, INK),
             ("to do", alarm.todo, SKY),
         ):
-            told.append(f"  {name:<6}", DIM)
-            told.append(f"{words}\n", ink)
-    return told
+            text.append(f"  {name:<6}", DIM)
+            text.append(f"{words}\n", ink)
+    return text
 
 
 def as_text(line: Line) -> Text:
     """A drawn line for Rich."""
     return Text.assemble(*((segment.text, segment.style or "") for segment in line))
-
-
-def heading(words: str) -> Text:
-    """A section's title."""
-    return Text(words, f"bold {WHITE}")

@@ -47,12 +47,12 @@ def graphics_of(wanted: Graphics, environment: Mapping[str, str]) -> Graphics:
 
 
 def cell_size_px(terminal: int) -> tuple[int, int] | None:
-    """Width and height of a character cell; None where the terminal does not tell."""
+    """Width and height of a character cell; None where the terminal does not report it."""
     try:
-        told = fcntl.ioctl(terminal, termios.TIOCGWINSZ, bytes(8))
+        size = fcntl.ioctl(terminal, termios.TIOCGWINSZ, bytes(8))
     except OSError:
         return None
-    rows, columns, width_px, height_px = struct.unpack("4H", told)
+    rows, columns, width_px, height_px = struct.unpack("4H", size)
     if not (rows and columns and width_px >= columns and height_px >= rows):
         return None
     return width_px // columns, height_px // rows

@@ -25,7 +25,7 @@ class Job:
     """
 
     def __init__(self, arguments: Sequence[str], *, outlives: bool = False) -> None:
-        self.told = " ".join(["fitctl", *arguments])
+        self.command_line = " ".join(["fitctl", *arguments])
         self.outlives = outlives
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  # closed by end()
         self._process = subprocess.Popen(

@@ -16,7 +16,7 @@ class Stage(NamedTuple):
     """What can be moved, in which modes, and the steps to choose from, the finest first."""
 
     name: str
-    told: str
+    description: str
     modes: frozenset[str]
     unit: str
     steps: tuple[float, ...]
@@ -52,7 +52,7 @@ class JogPad:
         return stage.steps[self.step_numbers[STAGES.index(stage)]]
 
     def next_stage(self) -> None:
-        """Take the other stage."""
+        """Choose the other stage."""
         self.number += 1
         self.begin_anew()
 
@@ -61,7 +61,7 @@ class JogPad:
         self.pressed_s = -math.inf
 
     def change_step(self, stage: Stage, by: int) -> None:
-        """Take a coarser or finer step."""
+        """Choose a coarser or finer step."""
         number = STAGES.index(stage)
         self.step_numbers[number] = max(
             0, min(len(stage.steps) - 1, self.step_numbers[number] + by)

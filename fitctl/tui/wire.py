@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import msgspec
 
+from fitctl.messages.client import Client
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.telemetry import Telemetry
-from fitctl.tui.link import Link
 
 RECEIVE_TIMEOUT_S = 0.2
 EXIT_WAIT_S = 2.5
@@ -27,21 +27,22 @@ class Wire:
 
     Parameters
     ----------
-    link : Link
-        Closed at the end.
+    link : Client
+        Called by the reader's thread, and by a thread for each command, so that a stop never waits for the
+        reply to an earlier command. Closed at the end.
     clock : callable
         Monotonic time in s.
     on_telemetry : callable
-        Takes each message, and calls :meth:`taken` when it is done with it.
+        Gets each message, and calls :meth:`processed` when it is done with it.
     on_unreadable : callable
-        Takes why something that came cannot be used.
+        Gets why something that came cannot be used.
     on_answer : callable
-        Takes a command, its reply, and, if there is none, why.
+        Gets a command, its reply, and, if there is none, why.
     """
 
     def __init__(
         self,
-        link: Link,
+        link: Client,
         clock: Callable[[], float],
         on_telemetry: Callable[[Telemetry], object],
         on_unreadable: Callable[[str], object],
@@ -61,7 +62,7 @@ class Wire:
         """Begin to read."""
         self._reader.start()
 
-    def taken(self) -> None:
+    def processed(self) -> None:
         """One message of telemetry is no longer on its way."""
         self._room.release()
 

@@ -5,7 +5,7 @@ import re
 import pytest
 from documents import between
 
-from fitctl.commands.fault import kinds
+from fitctl.commands.shared.fault_kinds import kinds
 
 from .catalogue import GROUPS
 from .configuration import WRONG

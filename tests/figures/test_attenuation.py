@@ -12,10 +12,10 @@ from fitctl.figures.attenuation import (
     mean_spectra,
     rebuilt,
     spectra,
-    tick_columns,
 )
 from fitctl.figures.rigs import with_controller
 from fitctl.identify.errors import IdentifyError
+from fitctl.identify.record import tick_columns
 from fitctl.logging.reading import tick_arrays
 from fitctl.logging.writer import LogWriter
 from fitctl.model.plant import Plant
@@ -90,7 +90,7 @@ def test_a_running_loop_attenuates_as_its_design_says(rig, held):
 
 def test_a_log_tells_the_same_as_the_ticks_in_hand(rig, held, tmp_path):
     path = tmp_path / "held.mcap"
-    info = run_info(rig, "simulated", now_s=0.0)
+    info = run_info(rig, "simulated", now_s=0.0, designs={})
     with LogWriter(path, rig.logging) as log:
         log.write(info, info.wall_minus_monotonic_s)
         for tick in held.ticks:

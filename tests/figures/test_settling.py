@@ -2,10 +2,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from fitctl.figures.settling import decayed_s, settling, smoothed
+from fitctl.figures.settling import decayed_s, settling
 
 TIME_S = np.arange(0.0, 20.0, 0.02)
 
@@ -51,12 +49,3 @@ def test_a_mirror_relieved_exponentially_is_back_at_a_third_after_ln_3():
     value = np.where(TIME_S < 2.0, 0.0, np.exp(-after(2.0) / 4.0))
 
     assert decayed_s(TIME_S, value, 2.0, 1 / 3) == pytest.approx(4.0 * math.log(3), abs=0.03)
-
-
-@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=50), st.integers(1, 9))
-def test_smoothing_keeps_length_and_range(values, samples):
-    out = smoothed(np.array(values), samples)
-
-    assert len(out) == len(values)
-    assert out.min() >= min(values) - 1e-6
-    assert out.max() <= max(values) + 1e-6

@@ -8,6 +8,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import given
 from hypothesis import strategies as st
 from log_samples import RUN_INFO, filled, one_of_each
+from logged_simulation import designs_of
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
@@ -132,7 +133,7 @@ def test_a_dark_frame_in_a_log_is_as_its_file_was_or_refused_where_it_is_damaged
 
 def test_the_design_that_a_log_carries_can_be_used_again(tmp_path):
     rig = load_rig(default_rig_path())
-    metadata = run_metadata(run_info(rig, "", now_s=0.0))
+    metadata = run_metadata(run_info(rig, "", now_s=0.0, designs=designs_of(rig)))
     path = tmp_path / "of-the-log.json"
     path.write_text(metadata["designs"]["right"])
     again, first = design_for(rig, "right", str(path)), design_for(rig, "right")

@@ -52,7 +52,7 @@ def run_and_kill(folder, after_s, pace):
     folder.mkdir()
     endpoint = f"ipc://{folder}/records"
     recorder = start_recorder(endpoint, folder / "logs", SHIPPED)
-    samples = str(Path(__file__).parent)
+    samples = str(Path(__file__).parents[1])
     feeder = subprocess.Popen([sys.executable, "-c", FEEDER, endpoint, samples, *pace])
     try:
         (path,) = wait_until(lambda: begun(folder / "logs"), timeout_s=30)

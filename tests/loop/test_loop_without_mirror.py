@@ -3,6 +3,7 @@
 import math
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import DeviceHealth, DevicesOpened, LoopTiming, Tick
 from fitctl.loop.loop import Loop
@@ -46,13 +47,13 @@ def test_it_is_opened_ticked_stopped_and_turned_off():
     amplifiers = with_mirror.devices.loops["right"].amplifiers
     devices = Devices(with_mirror.camera, {"right": LoopDevices(amplifiers)})
 
-    def make_loop(name, rig, devices, journal):
+    def make_loop(name, rig, devices, journal, _design):
         servo = SiderostatServo(name, rig.loops[name], devices.amplifiers, journal.clock, 0.02)
         return Watcher(name, rig, SiderostatStage(rig, name, servo), journal)
 
     records, replies = [], []
     supervisor = Supervisor(
-        rig, devices, with_mirror.clock, InlineExecutor(), records.append, make_loop
+        rig, devices, with_mirror.clock, InlineExecutor(), records.append, design_for, make_loop
     )
     with_mirror.camera.on_servo_period = [
         (work.period_s, work.period) for work in supervisor.periodic

@@ -63,25 +63,14 @@ def run_kernel(package):
 
 
 @pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
-def test_a_constant_that_changes_in_any_room_is_compiled_in_anew(package):
+def test_machine_code_is_kept_until_a_constant_in_any_imported_module_changes(package):
     assert run_kernel(package) == (6.0, 0)
+    (package / "tui" / "look.py").write_text("COLOUR = 1\n")  # which no kernel imports
     assert run_kernel(package) == (6.0, 1)
 
     (package / "loop" / "trial_gain.py").write_text("GAIN = 5.0\n")
 
     assert run_kernel(package) == (10.0, 0)
-
-
-@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
-def test_a_file_that_no_kernel_imports_leaves_the_machine_code_valid(package):
-    run_kernel(package)
-
-    (package / "tui" / "look.py").write_text("COLOUR = 1\n")
-    (package / "simulation" / "__init__.py").write_text('"""A room."""\n')  # a parent: imported
-
-    assert run_kernel(package) == (6.0, 0)
-    (package / "tui" / "look.py").write_text("COLOUR = 2\n")
-    assert run_kernel(package) == (6.0, 1)
 
 
 def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():

@@ -3,12 +3,9 @@
 import json
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "logging"))
 from log_samples import RUN_INFO, SETTINGS, frame, one_of_each, tick, write_log
 
 from fitctl.logging.copying import cut, merge, recover

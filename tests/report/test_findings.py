@@ -16,7 +16,7 @@ from fitctl.report.stages import stacks
 def test_the_residual_is_that_of_the_ticks(held, findings):
     simulation, _ = held
     loop = findings.loops["right"]
-    rows = loop.judged.rows
+    rows = loop.selection.rows
     errors = np.array([tick.error_az_px for tick in simulation.ticks])[rows]
 
     assert loop.verdict.word == "met"
@@ -47,7 +47,7 @@ def test_the_piston_is_what_the_plant_s_mirror_had(held, findings):
 
     assert loop.stacks is not None
     assert np.ptp(loop.stacks.piston_m[shown]) == pytest.approx(np.ptp(true_m), rel=0.15, abs=2e-9)
-    assert loop.stages.piston_rms_m == loop.stacks.piston_m[loop.judged.rows].std()
+    assert loop.stages.piston_rms_m == loop.stacks.piston_m[loop.selection.rows].std()
 
 
 def test_without_identified_hysteresis_a_mock_s_own_is_taken_and_told(rig, findings):
@@ -83,7 +83,7 @@ def test_what_was_lost_late_and_when_is_counted(findings):
 
     assert findings.gathered.lost == 3
     assert loop.counts["frames"] == np.count_nonzero(loop.ticks["number"] >= 0)
-    assert loop.mode_s["VERNIER"] == pytest.approx(loop.judged.vernier_s, abs=0.1)
+    assert loop.mode_s["VERNIER"] == pytest.approx(loop.selection.vernier_s, abs=0.1)
     assert loop.timing["age_median_s"] == pytest.approx(0.035, abs=1e-4)
 
 
@@ -101,7 +101,7 @@ def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
 
     assert [one.controller for one in found] == ["eq20", "minimum-variance"]
     assert all(one.predicted is not None for one in found)
-    assert found[1].judged_s == pytest.approx(12.0, abs=1.0)
+    assert found[1].evaluated_s == pytest.approx(12.0, abs=1.0)
 
 
 def test_a_disturbance_that_cannot_be_designed_for_leaves_the_measurement(held, rig):

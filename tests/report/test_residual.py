@@ -21,20 +21,20 @@ def motion(rng, duration_s, correlated_s):
 
 
 def trials(make, runs):
-    """How many of some records were told an interval, and how many of those intervals hold an RMS of 1."""
+    """How many of some records have an interval, and how many of those intervals hold an RMS of 1."""
     rng = np.random.default_rng(5)
-    told = [found for _ in range(runs) if (found := rms_estimate(make(rng))).known]
-    return len(told), sum(found.low_px <= 1.0 <= found.high_px for found in told)
+    known = [found for _ in range(runs) if (found := rms_estimate(make(rng))).known]
+    return len(known), sum(found.low_px <= 1.0 <= found.high_px for found in known)
 
 
 @pytest.mark.parametrize(
     ("duration_s", "correlated_s"), [(30.0, 0.1), (30.0, 0.5), (60.0, 0.5), (300.0, 2.0)]
 )
 def test_the_interval_holds_the_truth_as_often_as_it_says(duration_s, correlated_s):
-    told, held = trials(lambda rng: motion(rng, duration_s, correlated_s), 300)
+    known, held = trials(lambda rng: motion(rng, duration_s, correlated_s), 300)
 
-    assert told > 0.95 * 300
-    assert held > 0.92 * told
+    assert known > 0.95 * 300
+    assert held > 0.92 * known
 
 
 @pytest.mark.slow
@@ -42,14 +42,15 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(duration_s, correlated
 @pytest.mark.parametrize("correlated_s", [0.1, 0.5, 2.0, 5.0, 10.0])
 def test_of_any_records_few_are_told_a_wrong_interval(duration_s, correlated_s):
     """The table of docs/measurements.md; -s prints its cells."""
-    told, held = trials(lambda rng: motion(rng, duration_s, correlated_s), RUNS)
+    known, held = trials(lambda rng: motion(rng, duration_s, correlated_s), RUNS)
 
     print(
-        f"{duration_s:g} s, {correlated_s:g} s: {held / told:.0%} of {told / RUNS:.0%}", flush=True
+        f"{duration_s:g} s, {correlated_s:g} s: {held / known:.0%} of {known / RUNS:.0%}",
+        flush=True,
     )
-    assert told - held < 0.1 * RUNS
+    assert known - held < 0.1 * RUNS
     if duration_s >= 50 * correlated_s:
-        assert told > 0.95 * RUNS
+        assert known > 0.95 * RUNS
 
 
 OTHER = {
@@ -64,16 +65,16 @@ OTHER = {
 
 @pytest.mark.parametrize("kind", OTHER)
 def test_it_does_so_for_other_motions_too(kind):
-    told, held = trials(OTHER[kind], 200)
+    known, held = trials(OTHER[kind], 200)
 
-    assert told > 190
-    assert held > 0.9 * told
+    assert known > 190
+    assert held > 0.9 * known
 
 
 def test_a_record_hardly_longer_than_its_motion_is_too_short_to_judge():
-    told, _ = trials(lambda rng: motion(rng, 30.0, 5.0), 200)
+    known, _ = trials(lambda rng: motion(rng, 30.0, 5.0), 200)
 
-    assert told < 0.4 * 200
+    assert known < 0.4 * 200
 
 
 def test_frames_that_resemble_their_neighbours_tell_less():
@@ -118,7 +119,7 @@ GOOD, BAD, BETWEEN = (
 
 
 @pytest.mark.parametrize(
-    ("az", "el", "judged_s", "star_fraction", "word", "why"),
+    ("az", "el", "evaluated_s", "star_fraction", "word", "why"),
     [
         (GOOD, GOOD, 60.0, 1.0, "met", "both axes"),
         (GOOD, BAD, 60.0, 1.0, "not met", "the whole interval of el is above it"),
@@ -129,8 +130,8 @@ GOOD, BAD, BETWEEN = (
         (UNKNOWN, UNKNOWN, 0.0, math.nan, "not known", "no time in VERNIER"),
     ],
 )
-def test_the_verdict_needs_data_that_say_so(az, el, judged_s, star_fraction, word, why):
-    found = verdict({"az": az, "el": el}, 0.1, judged_s, star_fraction)
+def test_the_verdict_needs_data_that_say_so(az, el, evaluated_s, star_fraction, word, why):
+    found = verdict({"az": az, "el": el}, 0.1, evaluated_s, star_fraction)
 
     assert found.word == word
     assert why in found.why

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from logged_simulation import designs_of
 from mcap.writer import Writer
 from report_samples import record
 
@@ -45,7 +46,7 @@ def test_a_run_of_several_files_is_one_and_what_two_have_counts_once(halves, hel
 
 def test_a_folder_is_its_newest_run(halves, rig):
     other = halves / "older.mcap"
-    info = run_info(rig, "simulated", now_s=-5000.0)
+    info = run_info(rig, "simulated", now_s=-5000.0, designs=designs_of(rig))
     with LogWriter(other, rig.logging) as log:
         log.write(info, 1000.0)
         log.write(Event(time_s=1.0, severity="info", source="x", message="y"), 1000.0)
@@ -63,13 +64,13 @@ def test_a_log_that_was_cut_off_is_judged_as_far_as_it_goes(held, tmp_path):
     found = find(find_run([path]))
 
     assert not found.run.logs[0].finished
-    assert 5 < found.loops["right"].judged.judged_s < 40
+    assert 5 < found.loops["right"].selection.evaluated_s < 40
 
 
 def test_a_log_without_ticks_is_not_known(rig, tmp_path):
     path = tmp_path / "off.mcap"
     with LogWriter(path, rig.logging) as log:
-        info = run_info(rig, "simulated", now_s=0.0)
+        info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
         log.write(info, info.wall_minus_monotonic_s)
         log.write(Event(time_s=1.0, severity="error", source="camera", message="gone"), 1.8e9)
 
@@ -111,7 +112,7 @@ def test_two_loops_are_judged_each_by_itself(rig, tmp_path):
 def test_every_recorder_counts_its_own_losses(rig, tmp_path):
     path = tmp_path / "lost.mcap"
     with LogWriter(path, rig.logging) as log:
-        info = run_info(rig, "simulated", now_s=0.0)
+        info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
         log.write(info, info.wall_minus_monotonic_s)
         for second, lost in enumerate([0, 2, 2, 0, 5]):
             status = RecorderStatus(

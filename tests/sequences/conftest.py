@@ -2,12 +2,12 @@
 
 import msgspec
 import pytest
+from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import SequenceReport
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import sequence_from_document
-from fitctl.sequences.runner import run_sequence
 from fitctl.sequences.view import SequenceError
 
 # A star in the middle of the field is found at once.

@@ -4,7 +4,6 @@ import asyncio
 import inspect
 import math
 import threading
-from typing import get_args, get_type_hints
 
 import pytest
 
@@ -294,14 +293,48 @@ def test_every_step_is_a_method_with_its_keys_and_defaults(name):
     method = getattr(StepMethods, name)
     parameters = dict(inspect.signature(method).parameters)
     del parameters["self"]
-    limits = get_type_hints(get_args(get_type_hints(method)["limits"])[0])
-    del parameters["limits"]
 
-    assert set(parameters) | set(limits) == set(fields)
+    assert set(parameters) == set(fields)
     for key, parameter in parameters.items():
         required = parameter.default is inspect.Parameter.empty
         assert required == fields[key].is_required()
         assert required or parameter.default == fields[key].default
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [
+        ("hold", ["duration_s"]),
+        ("stars", ["stars"]),
+        ("target", ["offset_az_px", "offset_el_px"]),
+        ("jog", ["jog_px"]),
+        ("raster", ["columns", "rows", "spacing_px"]),
+        ("controller", ["name"]),
+        ("experiment", ["what"]),
+        ("chirp", ["channel"]),
+        ("dark", ["frames"]),
+        ("wait", ["duration_s"]),
+    ],
+)
+def test_what_a_step_is_about_may_be_given_without_its_name(name, keys):
+    parameters = list(inspect.signature(getattr(StepMethods, name)).parameters.values())
+
+    assert [parameter.name for parameter in parameters[1 : len(keys) + 1]] == keys
+    assert all(
+        parameter.kind == parameter.POSITIONAL_OR_KEYWORD
+        for parameter in parameters[1 : len(keys) + 1]
+    )
+
+
+@pytest.mark.parametrize("values", [(5.0, 5.0, 0.1, 1.0), (5.0,)], ids=["too many", "twice"])
+def test_a_key_is_given_once_by_name_or_in_its_order(values):
+    with Instrument(NEAR, simulate=True) as instrument:
+        with pytest.raises(TypeError, match="in the order duration_s, settle_s, rms_limit_px"):
+            instrument.hold(*values, duration_s=5.0)
+        with pytest.raises(ConfigError, match="hold: duratoin_s: unknown key; did you mean"):
+            instrument.hold(duratoin_s=5.0)
+        with pytest.raises(ConfigError, match="hold: duration_s: is missing"):
+            instrument.hold()
 
 
 def test_a_figure_that_could_not_be_had_is_not_a_number(monkeypatch, tmp_path):

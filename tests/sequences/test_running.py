@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import Acquire, Hold, SequenceControl, Stop
@@ -11,7 +12,6 @@ from fitctl.sequences import pointing, view
 from fitctl.sequences.files import find_sequence, shipped_sequences
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import load_sequence
-from fitctl.sequences.runner import run_sequence
 
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
@@ -183,9 +183,9 @@ def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
 def test_a_long_hold_remembers_no_more_frames_than_a_message_brings(tried, monkeypatch):
     remembered = []
 
-    def columns(looks):
-        remembered.append(len(looks))
-        return view.columns(looks)
+    def columns(measurements):
+        remembered.append(len(measurements))
+        return view.columns(measurements)
 
     monkeypatch.setattr(pointing, "columns", columns)
     run = tried()

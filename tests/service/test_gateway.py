@@ -121,11 +121,11 @@ def test_telemetry_is_passed_on_as_it_is(served):
 def test_who_sends_too_much_is_turned_back_before_the_supervisor_but_for_stops(served, monkeypatch):
     served.stop_gateway()
     served.start_gateway(VirtualClock())
-    reached, take = [], served.service._intake.take
+    reached, accept = [], served.service._intake.accept
     monkeypatch.setattr(
         served.service._intake,
-        "take",
-        lambda name, *rest: reached.append(name) or take(name, *rest),
+        "accept",
+        lambda name, *rest: reached.append(name) or accept(name, *rest),
     )
     anna = served.person("anna")
 
@@ -160,8 +160,8 @@ def test_clients_come_back_to_a_new_gateway_and_a_key_revoked_meanwhile_does_not
 def test_a_report_of_keys_takes_the_instrument_from_nobody_else(served, say):
     anna = AllowedKey(name="anna", role="commander", public="x" * 40)
     assert served.client.send(TakeOver()).accepted
-    say(msgspec.msgpack.encode(Report(keys=[anna], told=[("info", "one key")])))
-    say(msgspec.msgpack.encode(Report(keys=[], told=[])))
+    say(msgspec.msgpack.encode(Report(keys=[anna], events=[("info", "one key")])))
+    say(msgspec.msgpack.encode(Report(keys=[], events=[])))
 
     until(lambda: "the key anna was revoked or changed" in served.events())
     assert "one key" in served.events()

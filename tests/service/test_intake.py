@@ -44,7 +44,7 @@ def test_a_stop_is_taken_even_when_it_is_one_too_many(intake):
 
 @given(st.binary(max_size=100))
 def test_whatever_comes_is_taken_or_told_why_not(payload):
-    taken = Intake(commands_per_s=10.0).take("anna", payload, 0.0)
+    taken = Intake(commands_per_s=10.0).accept("anna", payload, 0.0)
 
     assert isinstance(taken, Accepted) or (isinstance(taken, Reply) and not taken.accepted)
 

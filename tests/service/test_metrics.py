@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from fitctl.config import ConfigError
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.service.metrics import HOST, InstrumentCollector, serve_metrics
-from tests.tui.fake import WALL_MINUS_MONOTONIC_S, FakeSupervisor
+from tests.fake_supervisor import WALL_MINUS_MONOTONIC_S, FakeSupervisor
 
 
 class Line:

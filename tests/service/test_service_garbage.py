@@ -70,9 +70,11 @@ def test_any_bytes_on_the_wire_leave_it_well(served, streams, keyed):
 
 def test_a_flood_of_commands_is_held_back_and_a_stop_comes_through(served, monkeypatch):
     """More than it takes: what is too much waits with its sender, and hinders nobody else."""
-    door, taken = served.service._local, []
-    take = door.take
-    monkeypatch.setattr(door, "take", lambda messages: taken.append(take(messages)) or taken[-1])
+    door, received = served.service._local, []
+    receive = door.receive
+    monkeypatch.setattr(
+        door, "receive", lambda messages: received.append(receive(messages)) or received[-1]
+    )
     begun_s = time.monotonic()
     with zmq.Context() as context, context.socket(zmq.DEALER) as flood:
         flood.setsockopt(zmq.LINGER, 0)
@@ -86,5 +88,5 @@ def test_a_flood_of_commands_is_held_back_and_a_stop_comes_through(served, monke
         assert served.client.send(Stop()).accepted
         assert served.client.send(Status()).text == "right SAFE"
     lasted_s = time.monotonic() - begun_s
-    assert sum(map(len, taken)) <= 8 * (lasted_s / 0.005 + 2)
+    assert sum(map(len, received)) <= 8 * (lasted_s / 0.005 + 2)
     assert sum("no commands" in told for told in served.events()) <= 10

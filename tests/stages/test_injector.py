@@ -34,12 +34,15 @@ class RecordingDac:
         self.held = threading.Event()
         self.held.set()
 
-    def write_v(self, volts):
+    def send_v(self, volts):
+        self._sent_v = volts
+
+    def confirm(self):
         self.writing.set()
         assert self.held.wait(10)
         if self.fails:
             raise self.fails
-        self.written_v.append(volts)
+        self.written_v.append(self._sent_v)
 
 
 @pytest.fixture
@@ -79,11 +82,11 @@ def test_what_was_written_is_given_once_with_its_times(injector, clock, dac):
     injector.start([STEP], clock.now_s())
     periods(injector, clock, 3)
 
-    injections = injector.take_written()
+    injections = injector.drain_written()
 
     assert [one.time_s for one in injections] == pytest.approx([0.0, PERIOD_S, 2 * PERIOD_S])
     assert [list(one.stack_v) for one in injections] == [list(volts) for volts in dac.written_v]
-    assert injector.take_written() == []
+    assert injector.drain_written() == []
 
 
 def test_the_stacks_stay_within_the_range_of_the_d_a(injector, clock, dac):
@@ -109,7 +112,7 @@ def test_a_failure_ends_the_experiment_and_is_kept(injector, clock, dac):
 
     assert str(injector.fault) == "the D/A is gone"
     assert dac.written_v == []
-    assert injector.take_written() == []
+    assert injector.drain_written() == []
 
 
 def test_the_next_experiment_begins_without_what_an_earlier_one_left(injector, clock, dac):
@@ -123,7 +126,7 @@ def test_the_next_experiment_begins_without_what_an_earlier_one_left(injector, c
     assert injector.fault is None
     periods(injector, clock, 1)
 
-    (only,) = injector.take_written()
+    (only,) = injector.drain_written()
     assert only.stack_v[0] == FULL_SCALE_V
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.widgets.spectrum import Spectrum
-from tests.tui.fake import START_S, FakeSupervisor
+from tests.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 
 MESSAGES = 420
@@ -52,7 +52,7 @@ class FakeJob:
 
     def __init__(self, arguments, *, outlives=False):
         self.arguments = list(arguments)
-        self.told = " ".join(["fitctl", *arguments])
+        self.command_line = " ".join(["fitctl", *arguments])
         self.outlives = outlives
         self.status = 0
         self.ended = False

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, settle
 
 Scenario = Callable[[FixedApp, Pilot], Awaitable[None]]

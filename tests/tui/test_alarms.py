@@ -8,7 +8,7 @@ from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
 from fitctl.tui.dialogs import alarms_text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
-from tests.tui.fake import START_S, FakeSupervisor
+from tests.fake_supervisor import START_S, FakeSupervisor
 
 FAULT = (
     "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error; "
@@ -34,7 +34,7 @@ class Watch:
         for message in self.supervisor.messages(count):
             self.state.accept(message, message.time_s)
             self.state.now_s = message.time_s
-            self.bells += self.book.judge(self.state)
+            self.bells += self.book.update(self.state)
         return self.book.in_order
 
     def row(self, columns=200):
@@ -111,7 +111,7 @@ def test_what_a_device_told_before_the_recovery_is_no_new_alarm():
         for loop in message.loops
     ]
     watch.state.accept(msgspec.structs.replace(message, loops=loops), message.time_s)
-    watch.book.judge(watch.state)
+    watch.book.update(watch.state)
     assert watch.book.in_order == []
 
 
@@ -137,7 +137,7 @@ def test_silence_of_the_supervisor_is_an_alarm_that_ends_with_it():
     watch = Watch(FakeSupervisor())
     watch.hear()
     watch.state.now_s += 7.0
-    watch.book.judge(watch.state)
+    watch.book.update(watch.state)
     (alarm,) = watch.book.in_order
     assert alarm.what == "NO DATA for 7 s; what you see is old"
     assert "STOP may not reach it" in alarm.todo

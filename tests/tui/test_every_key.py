@@ -4,6 +4,7 @@ import asyncio
 from typing import Any, NamedTuple
 
 import pytest
+from textual.screen import Screen
 
 from fitctl.messages.commands import (
     Acquire,
@@ -24,14 +25,14 @@ from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS
 from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader
 from fitctl.tui.jog import JogPad
 from fitctl.tui.state import WINDOWS
-from fitctl.tui.views.listing import ListingView
 from fitctl.tui.views.operate import OperateView
+from fitctl.tui.widgets.choice import Choice
 from fitctl.tui.widgets.focalplane import FocalPlane
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs
 
 SCREENS = [ConsoleApp.MODES[view.name] for view in VIEWS]
-BOUND = (ConsoleApp, ListingView, *SCREENS, Reader, Alarms, Confirm, Ask)
+BOUND = (ConsoleApp, Choice, *SCREENS, Reader, Alarms, Confirm, Ask)
 LOG = "fit-mock_20261132T031500Z.mcap"
 STAR = {"hand": "aim", "cursor_px": (24.0, 19.5)}
 CLOSED = {"dialog": ""}
@@ -126,16 +127,15 @@ OPERATE = lines(
 )
 LISTS = [
     *lines(
-        ListingView,
+        Choice,
         [
             ("down", "2", {"chosen": 1}),
             ("up", "2 down down", {"chosen": 1}),
             ("pagedown", "2 tab", {"chosen": 7}),
             ("pageup", "2 tab pagedown", {"chosen": 0}),
-            ("tab", "2", {"list": "readings"}),
-            ("shift+tab", "2", {"list": "readings"}),
         ],
     ),
+    *lines(Screen, [(key, "2", {"list": "readings"}) for key in ("tab", "shift+tab")]),
     *lines(
         ConsoleApp.MODES["devices"],
         [
@@ -220,7 +220,7 @@ class KeyApp(FixedApp):
             "dialog": type(self.screen).__name__ if self.screen.is_modal else "",
             "loop": self.state.shown,
             "window_s": self.state.window.rms_s,
-            "unseen": self.alarms.unseen,
+            "unseen": self.alarms.unacknowledged,
             "loud": self.alarms.loud,
             "kept": len(list(self.log_folder.glob("*.keep"))),
             "started": [
@@ -229,9 +229,8 @@ class KeyApp(FixedApp):
                 if job.arguments[0] != "design" and job.arguments[:2] != ["sequence", "list"]
             ],
         }
-        if isinstance(view, ListingView):
-            (active,) = (choice for choice in view.choices() if choice.active)
-            seen |= {"list": active.id, "chosen": active.chosen}
+        if isinstance(view.focused, Choice):
+            seen |= {"list": view.focused.id, "chosen": view.focused.chosen}
         if isinstance(view, OperateView):
             plane, stage = view.query_one(FocalPlane), view.pad.stage(self.state.mode)
             seen |= {
@@ -248,10 +247,9 @@ class KeyApp(FixedApp):
         """As it was at the start: no dialog, no choice, Operate."""
         while self.screen.is_modal:
             await self.pop_screen()
-        if isinstance(self.view, ListingView):
-            for choice in self.view.choices():
-                choice.chosen = 0
-            self.view._activate(self.view.choices()[0])
+        for choice in reversed(self.view.query(Choice)):
+            choice.chosen = 0
+            choice.focus()
         if not isinstance(self.view, OperateView):
             self.action_view("operate")
             await pilot.pause()
@@ -304,7 +302,12 @@ def keys_bound(owner):
 def test_every_key_has_its_row():
     tried = {(row.on, row.key) for _, rows in PARTS.values() for row in rows}
     bound = {(owner, key) for owner in BOUND for key in keys_bound(owner)}
-    assert tried == bound | {(ConsoleApp, ConsoleApp.COMMAND_PALETTE_BINDING)}
+    textual = {
+        (ConsoleApp, ConsoleApp.COMMAND_PALETTE_BINDING),
+        (Screen, "tab"),
+        (Screen, "shift+tab"),
+    }
+    assert tried == bound | textual
 
 
 def test_every_key_that_is_told_to_people_is_bound():
@@ -315,5 +318,6 @@ def test_every_key_that_is_told_to_people_is_bound():
     for row in KEYS:
         if row.view:
             screen = ConsoleApp.MODES[row.view]
-            own = {key for owner in BOUND if issubclass(screen, owner) for key in keys_bound(owner)}
+            owners = {owner for owner in BOUND if issubclass(screen, owner)} | {Choice}
+            own = {key for owner in owners for key in keys_bound(owner)}
             assert set(row.keys.split(",")) <= own, row

@@ -12,7 +12,7 @@ from fitctl.tui.widgets.loglist import LogList
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.readings import Readings
 from fitctl.tui.widgets.sequencing import Parameters, SequenceList
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FakeJob, make_logs, settle
 from tests.tui.live import notifications
 from tests.tui.piloted import pressed, run, sent
@@ -45,7 +45,7 @@ def test_a_click_chooses_a_row_and_its_list():
         await pilot.click(Readings, offset=(5, 4))
         await settle(app, pilot)
         readings = app.view.query_one(Readings)
-        assert readings.active
+        assert readings.has_focus
         assert readings.now().name == "following_error"
 
     run(scenario)

@@ -27,8 +27,8 @@ from fitctl.tui.widgets.spectrum import Spectrum
 from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces
+from tests.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.drawn import plain, shown
-from tests.tui.fake import START_S, FakeSupervisor
 
 
 def header(state):
@@ -36,17 +36,17 @@ def header(state):
 
 
 def keys(state):
-    return Keys(state, "operate", judged(state))
+    return Keys(state, "operate", updated_book(state))
 
 
-def judged(state):
+def updated_book(state):
     book = AlarmBook()
-    book.judge(state)
+    book.update(state)
     return book
 
 
 def alarm_bar(state):
-    return AlarmBar(state, judged(state))
+    return AlarmBar(state, updated_book(state))
 
 
 def hand(state):
@@ -219,7 +219,7 @@ def test_at_80_columns_an_alarms_keys_follow_stop_and_the_commands(mode):
     supervisor = FakeSupervisor(mode)
     supervisor.records_lost = 3
     state = shown(supervisor)
-    book = judged(state)
+    book = updated_book(state)
     footer = Keys(state, "operate", book)
     line = plain(footer.draw(80, 1))[0]
     commands = [row.label for row in OPERATOR_COMMANDS if row.name in state.usable_commands]
@@ -291,6 +291,7 @@ def test_readings_are_told_in_the_units_of_their_names(quantity, value, told):
 
 def test_a_list_scrolls_to_what_is_chosen():
     readings = Readings(shown(FakeSupervisor()))
+    readings.set_reactive(Readings.has_focus, True)
     readings.draw(80, 4)
     for wanted in (6, 0, 7):
         readings.chosen = wanted

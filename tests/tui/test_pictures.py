@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_np
 
-from fitctl.commands.attending import console
+from fitctl.commands.operate.console import console
 from fitctl.tui.draw.frame import place
 from fitctl.tui.draw.overlays import OVERLAY_INKS, SHAPES, Overlay, cell_marks, paint
 from fitctl.tui.draw.pictures import KITTY_AWAY, SIXEL_INKS, kitty, sixel
@@ -19,7 +19,7 @@ from fitctl.tui.graphics import Graphics, PictureSender, cell_size_px, graphics_
 from fitctl.tui.look import SKY
 from fitctl.tui.widgets import focalplane
 from fitctl.tui.widgets.focalplane import FocalPlane
-from tests.tui.fake import FakeSupervisor
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, settle
 from tests.tui.piloted import run_app
 

@@ -11,13 +11,13 @@ import scipy.signal
 from fitctl.tui.draw.frame import place
 from fitctl.tui.draw.overlays import cell_marks, tick_overlays
 from fitctl.tui.widgets.focalplane import FocalPlane, spot_overlays
-from fitctl.tui.widgets.margins import Judged, Margins
+from fitctl.tui.widgets.margins import DesignInUse, Margins
 from fitctl.tui.widgets.spectrum import spectra_of
 from fitctl.tui.widgets.stages import Stages, working_point
 from fitctl.tui.widgets.timing import Breakdown
 from fitctl.tui.widgets.traces import Traces, axis_limit_px, trace_lines
+from tests.fake_supervisor import FakeSupervisor
 from tests.tui.drawn import changed_tick, plain, shown
-from tests.tui.fake import FakeSupervisor
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_the_spectrum_is_of_the_ticks_since_the_star_was_missed():
 
 def test_margins_are_judged_against_what_is_usual():
     margins = Margins(shown(FakeSupervisor(), 400), "", lambda _loop: "")
-    at_work = Judged("right", "minimum-variance")
+    at_work = DesignInUse("right", "minimum-variance")
     told = {
         "stable": True,
         "crossover_hz": 3.9,
@@ -216,12 +216,12 @@ def test_margins_are_judged_against_what_is_usual():
         "attenuation_1hz": 6.1,
         "residual_px": 0.0131,
     }
-    margins.told(at_work, json.dumps(told), 0)
+    margins.show_result(at_work, json.dumps(told), 0)
     lines = plain(margins.draw(60, 12))
     assert next(line for line in lines if "phase" in line).endswith("▲")
     assert next(line for line in lines if "gain" in line).endswith("✓")
     assert any("0.0131 px, by linear theory" in line for line in lines)
-    margins.told(at_work, "design: no such loop", 2)
+    margins.show_result(at_work, "design: no such loop", 2)
     assert "✗ design: no such loop" in "\n".join(plain(margins.draw(60, 12)))
 
 

@@ -7,7 +7,7 @@ from pytest_textual_snapshot import SVGImageExtension
 from textual.pilot import Pilot
 
 from fitctl.tui.commands import VIEWS
-from tests.tui.fake import MODE_NUMBERS, FakeSupervisor
+from tests.fake_supervisor import MODE_NUMBERS, FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs, settle
 
 SIZES = [(80, 24), (120, 40), (200, 60)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import json
 import math
 import textwrap
@@ -16,31 +15,13 @@ from pydantic import ValidationError
 
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Basis, basis_of
+from fitctl.controllers.design.document import FORMAT, MATRICES, design_json
 from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
 
-FORMAT = "fitctl design 1"
-_MATRICES = ("a", "b", "c", "d")
 _MOST_BYTES = 1_000_000  # a hundred times a design's
 # Matrices are written with all their digits; made again on another machine they differ by rounding, and
 # by what a Riccati solution makes of that.
 _ROUNDING = 1e-6
-
-
-def design_json(design: Design) -> str:
-    """A design with everything needed to make it again, as its file has it."""
-    document = {
-        "format": FORMAT,
-        "fitctl": importlib.metadata.version("fitctl"),
-        "name": design.name,
-        "period_s": design.period_s,
-        "delay_s": design.delay_s,
-        "inputs": list(INPUTS),
-        "outputs": list(OUTPUTS),
-        "hysteresis_inverse": design.hysteresis_inverse,
-        "parameters": design.parameters,
-        **{name: getattr(design, name).tolist() for name in _MATRICES},
-    }
-    return json.dumps(document, indent=1) + "\n"
 
 
 def save_design(design: Design, path: Path) -> None:
@@ -112,7 +93,7 @@ def design_of(
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         hint = "use a file that this fitctl saved"
         raise _refusal(path, "parameters", f"those of {name}", repr(error), hint) from None
-    for key in _MATRICES:
+    for key in MATRICES:
         if not _follows(document.get(key), getattr(again, key)):
             hint = "the file was changed, or made by another fitctl; design it again"
             expected = "the matrix that follows from its parameters"

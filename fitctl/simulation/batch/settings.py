@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fitctl.config import Rig
 from fitctl.controllers.centroid import StarSensor
+from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.mirror import Mirror
 from fitctl.controllers.position_servo import position_servo
 from fitctl.controllers.spiral import plan_spiral
@@ -63,7 +64,7 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     target_px = np.array([loop.target_px.az, loop.target_px.el])
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
     servo = position_servo(loop.siderostat, camera.period_s)
-    pointing = Pointing(rig, loop_name, target_px)
+    pointing = Pointing(rig, loop_name, target_px, design_for(rig, loop_name))
     pair = pointing.pair
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     block_steps = BLOCK_NODES * len(constants.air.weights)

@@ -115,8 +115,8 @@ def envelope(
     bottom = np.full(width, -1)
     np.minimum.at(top, column[good], row)
     np.maximum.at(bottom, column[good], row)
-    seen = bottom >= 0
-    joined = seen[1:] & seen[:-1]
+    filled = bottom >= 0
+    joined = filled[1:] & filled[:-1]
     # A step between neighbouring columns is drawn as part of the later one.
     reach_up = np.where(joined, np.minimum(top[1:], bottom[:-1]), top[1:])
     reach_down = np.where(joined, np.maximum(bottom[1:], top[:-1]), bottom[1:])

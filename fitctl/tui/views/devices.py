@@ -13,12 +13,12 @@ from fitctl.messages.commands import Reset
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Reader
 from fitctl.tui.look import DIM, INK
-from fitctl.tui.views.listing import ListingView
+from fitctl.tui.views.view import View
 from fitctl.tui.widgets.readings import DeviceList, Readings, device_lines, reading_lines
 from fitctl.tui.widgets.stages import Stages
 
 
-class DevicesView(ListingView):
+class DevicesView(View):
     """Devices above, readings below, the stages beside them where there is room."""
 
     view_name = "devices"
@@ -37,23 +37,23 @@ class DevicesView(ListingView):
         devices, readings = self.query_one(DeviceList), self.query_one(Readings)
         loop, row = self.state.loop, readings.now()
         known = devices.devices()
-        if devices.active and known:
+        if devices.has_focus and known:
             device = known[min(devices.chosen, len(known) - 1)]
             self.app.push_screen(Reader(device.device, _table(device_lines(devices, device))))
-        elif readings.active and loop is not None and row is not None:
+        elif readings.has_focus and loop is not None and row is not None:
             self.app.push_screen(Reader(row.name, _table(reading_lines(loop, row))))
 
     def action_reset(self) -> None:
         """Let the chosen interlock go."""
         row = self.query_one(Readings).now()
-        if row is None or not self.query_one(Readings).active:
+        if row is None or not self.query_one(Readings).has_focus:
             self.notify("choose an interlock first: tab, then up and down", timeout=3)
         else:
-            self.console.give(Reset(name=row.name))
+            self.console.send(Reset(name=row.name))
 
 
 def _table(lines: list[tuple[str, str]]) -> Table:
     table = Table.grid(padding=(0, 2))
-    for name, told in lines:
-        table.add_row(Text(name, DIM), Text(told, INK))
+    for name, content in lines:
+        table.add_row(Text(name, DIM), Text(content, INK))
     return table

@@ -10,7 +10,7 @@ from textual.binding import BindingType
 from fitctl.logging.errors import LogError
 from fitctl.logging.folder import keep
 from fitctl.tui.commands import keys_of
-from fitctl.tui.views.listing import ListingView
+from fitctl.tui.views.view import View
 from fitctl.tui.widgets.loglist import LogList
 from fitctl.tui.widgets.printed import Printed
 
@@ -23,7 +23,7 @@ TOOLS = {
 HINT = "Choose a log. enter says what it holds, f verifies it, m keeps it, t reports on it, y replays it."
 
 
-class LogsView(ListingView):
+class LogsView(View):
     """The list, and what the last command printed. Nothing here deletes."""
 
     view_name = "logs"

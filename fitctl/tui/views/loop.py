@@ -11,7 +11,7 @@ from fitctl.messages.telemetry import LoopState
 from fitctl.tui.commands import keys_of
 from fitctl.tui.jobs import Job
 from fitctl.tui.views.view import View
-from fitctl.tui.widgets.margins import Judged, Margins, judged
+from fitctl.tui.widgets.margins import DesignInUse, Margins, design_in_use
 from fitctl.tui.widgets.spectrum import Spectrum
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 
@@ -31,7 +31,7 @@ class LoopScreen(View):
     def __init__(self) -> None:
         super().__init__()
         self._job: Job | None = None
-        self._asked = Judged("", "")
+        self._asked = DesignInUse("", "")
 
     def parts(self) -> ComposeResult:
         """Four panels."""
@@ -41,16 +41,16 @@ class LoopScreen(View):
         yield Margins(self.state, "Design", self._why_unknown)
 
     def before_drawing(self) -> None:
-        """Have the design at work judged by `fitctl design`, once for each design."""
+        """Have `fitctl design` evaluate the design in use, once for each design."""
         loop, job = self.state.loop, self._job
         if job is not None and job.status is not None:
-            self.query_one(Margins).told(self._asked, job.text(), job.status)
+            self.query_one(Margins).show_result(self._asked, job.text(), job.status)
             job.end()
             self._job = None
         rig_arguments = self.console.rig_arguments
         if loop is None or rig_arguments is None or self._job is not None:
             return
-        wanted = judged(loop.state)
+        wanted = design_in_use(loop.state)
         if wanted != self._asked and wanted.design and not self._why_unknown(loop.state):
             self._asked = wanted
             options = ["--json", "--loop", wanted.loop, *rig_arguments]

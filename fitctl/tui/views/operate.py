@@ -23,7 +23,7 @@ AIM_STEP_PX = 0.5
 MODES_WITH_STAR = {"COARSE", "VERNIER"}
 _AIM_KEYS = [
     Key("", "↑↓←→", "Move", "", ""),
-    Key("enter", "enter", "Set target", "screen.take", ""),
+    Key("enter", "enter", "Set target", "screen.set_target", ""),
     Key("i", "i", "Look here", "screen.look", ""),
     Key("escape", "esc", "Leave", "screen.leave", ""),
 ]
@@ -50,7 +50,7 @@ class OperateView(View):
         Binding("right_square_bracket", "step(1)", show=False),
         Binding("tab", "next_stage", show=False),
         Binding("0", "zero", show=False),
-        Binding("enter", "take", show=False),
+        Binding("enter", "set_target", show=False),
         Binding("escape", "leave", show=False),
     ]
 
@@ -79,17 +79,17 @@ class OperateView(View):
         return {"": [], "aim": _AIM_KEYS, "jog": _JOG_KEYS}[self.hand]
 
     def before_drawing(self) -> None:
-        """A mode in which nothing can be moved takes the hand away."""
+        """A mode in which nothing can be moved ends it."""
         mode = self.state.mode
         idle = {"aim": mode not in MODES_WITH_STAR, "jog": self.pad.stage(mode) is None}
         if idle.get(self.hand):
-            self._take_hand("")
+            self._set_hand("")
 
     @property
     def _plane(self) -> FocalPlane:
         return self.query_one(FocalPlane)
 
-    def _take_hand(self, hand: Literal["", "aim", "jog"]) -> None:
+    def _set_hand(self, hand: Literal["", "aim", "jog"]) -> None:
         self.hand = hand
         if hand != "aim":
             self._plane.cursor_px = None
@@ -108,8 +108,8 @@ class OperateView(View):
         """Put the window where the cursor is; without one, put a cursor."""
         cursor = self._plane.cursor_px
         if self.hand == "aim" and cursor is not None:
-            self.console.give(Look(az_px=round(cursor[0], 3), el_px=round(cursor[1], 3)))
-            self._take_hand("")
+            self.console.send(Look(az_px=round(cursor[0], 3), el_px=round(cursor[1], 3)))
+            self._set_hand("")
         else:
             self.action_aim()
 
@@ -126,27 +126,27 @@ class OperateView(View):
             az_px = min(max(az_px, 0.0), frame.width_px - 1.0)
             el_px = min(max(el_px, 0.0), frame.height_px - 1.0)
         self._plane.cursor_px = (az_px, el_px)
-        self._take_hand("aim")
+        self._set_hand("aim")
 
-    def action_take(self) -> None:
+    def action_set_target(self) -> None:
         """Move the target to the cursor."""
         cursor = self._plane.cursor_px
         if self.hand == "aim" and cursor is not None:
-            self.console.give(SetTarget(az_px=round(cursor[0], 3), el_px=round(cursor[1], 3)))
-            self._take_hand("")
+            self.console.send(SetTarget(az_px=round(cursor[0], 3), el_px=round(cursor[1], 3)))
+            self._set_hand("")
 
     # ------------------------------------------------------------ jog
 
     def action_jog(self) -> None:
         """Let the arrow keys move a stage, or no more."""
         if self.hand == "jog":
-            self._take_hand("")
+            self._set_hand("")
         elif self.pad.stage(self.state.mode) is None:
             self.notify(
                 "stages are moved by hand in STANDBY, targets while a star is held", timeout=4
             )
         else:
-            self._take_hand("jog")
+            self._set_hand("jog")
 
     def action_nudge(self, right: int, up: int) -> None:
         """An arrow key: the cursor, or a stage; without either, nothing moves."""
@@ -156,7 +156,7 @@ class OperateView(View):
         elif self.hand == "jog" and loop is not None and not self.state.stale:
             command = self.pad.press(loop, right, up, self.console.clock())
             if command is not None:
-                self.console.give(command)
+                self.console.send(command)
 
     def action_step(self, by: int) -> None:
         """A finer or a coarser step."""
@@ -175,24 +175,25 @@ class OperateView(View):
         """The mirror back to its bias."""
         if self.hand == "jog" and self.state.mode == "STANDBY":
             self.pad.begin_anew()
-            self.console.give(SetBiasOffset(az_urad=0.0, el_urad=0.0))
+            self.console.send(SetBiasOffset(az_urad=0.0, el_urad=0.0))
 
     def action_leave(self) -> None:
         """The arrow keys move nothing any more."""
-        self._take_hand("")
+        self._set_hand("")
 
     # ------------------------------------------------------------ picture
 
     def action_colours(self) -> None:
         """The next colour map."""
         self._plane.next_colours()
-        self._told(f"Focal plane · {self._plane.colours} · {self._plane.stretch}")
+        self._show_choice()
 
     def action_stretch(self) -> None:
         """The next stretch."""
         self._plane.next_stretch()
-        self._told(f"Focal plane · {self._plane.colours} · {self._plane.stretch}")
+        self._show_choice()
 
-    def _told(self, title: str) -> None:
-        self._plane.border_title = title
+    def _show_choice(self) -> None:
+        plane = self._plane
+        plane.border_title = f"Focal plane · {plane.colours} · {plane.stretch}"
         self.console.draw_all()

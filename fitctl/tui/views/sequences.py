@@ -16,7 +16,7 @@ from fitctl.messages.commands import SequenceControl
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Ask
 from fitctl.tui.jobs import Job
-from fitctl.tui.views.listing import ListingView
+from fitctl.tui.views.view import View
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
 
@@ -30,7 +30,7 @@ NEEDS_RIG = (
 )
 
 
-class SequencesView(ListingView):
+class SequencesView(View):
     """Sequences at the left, parameters at the right, progress and what was printed below.
 
     Everything that is run is `fitctl sequence` as a process of its own, which goes on when the console
@@ -68,14 +68,14 @@ class SequencesView(ListingView):
         self._folder.cleanup()
 
     def before_drawing(self) -> None:
-        """Take the list of sequences once it has come."""
+        """Show the list of sequences once it has come."""
         job = self._list
         if job is None or job.status is None:
             return
         self._list = None
         printed = self.query_one(Printed)
         if job.status == 0:
-            self._take(json.loads(job.text()))
+            self._add(json.loads(job.text()))
             job.end()
         elif printed.moving is None:
             printed.show(job)  # it says why
@@ -83,7 +83,7 @@ class SequencesView(ListingView):
             self.notify(job.text(), severity="error", timeout=8, markup=False)
             job.end()
 
-    def _take(self, documents: list[dict[str, Any]]) -> None:
+    def _add(self, documents: list[dict[str, Any]]) -> None:
         sequences = self.query_one(SequenceList)
         known = [d for d in sequences.documents if d["file"] not in {n["file"] for n in documents}]
         sequences.documents = [*known, *documents]
@@ -98,21 +98,21 @@ class SequencesView(ListingView):
         document = self._chosen()
         if document is None:
             return
-        if parameter is None or not self.query_one(Parameters).active:
+        if parameter is None or not self.query_one(Parameters).has_focus:
             self.notify("choose a parameter first: tab, then up and down", timeout=3)
             return
         step = document["steps"][parameter.step]
 
-        def take(value: str | None) -> None:
+        def accept(value: str | None) -> None:
             if value is not None:
                 step[parameter.key] = parsed(value)
                 sequences.edited.add(document["file"])
                 self._start("check")
 
-        told = (
+        prompt = (
             f"step {parameter.step + 1}, {step['step']}: {parameter.key} (is {parameter.value!r})"
         )
-        self.app.push_screen(Ask(document["name"], told, str(parameter.value)), take)
+        self.app.push_screen(Ask(document["name"], prompt, str(parameter.value)), accept)
 
     def action_dry_run(self) -> None:
         """Rehearse the chosen sequence on the virtual clock."""
@@ -133,28 +133,28 @@ class SequencesView(ListingView):
         """Pause what is under way, or let it go on."""
         status = self.state.newest.running_sequence if self.state.newest else None
         paused = status is not None and "pause" in {status.wanted, status.state.removesuffix("d")}
-        self.console.give(SequenceControl(action="resume" if paused else "pause"))
+        self.console.send(SequenceControl(action="resume" if paused else "pause"))
 
     def action_end(self) -> None:
         """End what is under way; its stages are held."""
-        self.console.give(SequenceControl(action="stop"))
+        self.console.send(SequenceControl(action="stop"))
 
     def action_file(self) -> None:
         """Read a file of the operator's own."""
 
-        def take(name: str | None) -> None:
+        def accept(name: str | None) -> None:
             if name and self._list is None:
                 self._list = self.console.start_job(["sequence", "list", "--json", name])
 
         def refused(name: str) -> str:
             return "" if Path(name).is_file() else f"{name}: no such file"
 
-        self.app.push_screen(Ask("Open", "a sequence file (TOML or YAML)", "", refused), take)
+        self.app.push_screen(Ask("Open", "a sequence file (TOML or YAML)", "", refused), accept)
 
     # ------------------------------------------------------------ children
 
     def _chosen(self) -> dict[str, Any] | None:
-        """The chosen sequence; if nothing can be done with one, the operator is told why."""
+        """The chosen sequence; if nothing can be done with one, a notice shows why."""
         document = self.query_one(SequenceList).document
         if self.console.rig_arguments is None:
             self.notify(NEEDS_RIG, severity="warning", timeout=8, markup=False)

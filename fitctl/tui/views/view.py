@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import ClassVar, cast
 
 from textual.app import ComposeResult
 from textual.containers import Container
@@ -11,14 +11,12 @@ from textual.events import Resize
 from textual.screen import Screen
 
 from fitctl.tui.commands import Key
+from fitctl.tui.console import Console
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.header import WIDE_FROM_COLUMNS, Header
 from fitctl.tui.widgets.keys import Keys
 from fitctl.tui.widgets.panel import Panel
-
-if TYPE_CHECKING:
-    from fitctl.tui.app import ConsoleApp
 
 TALL_FROM_ROWS = 36
 
@@ -35,9 +33,9 @@ class View(Screen[None]):
     view_name: ClassVar[str]
 
     @property
-    def console(self) -> ConsoleApp:
+    def console(self) -> Console:
         """The console that this is a screen of."""
-        return cast("ConsoleApp", self.app)
+        return cast("Console", self.app)
 
     @property
     def state(self) -> ConsoleState:
@@ -61,11 +59,11 @@ class View(Screen[None]):
         return []
 
     def on_mount(self) -> None:
-        """Take the layout that fits."""
+        """Choose the layout that fits."""
         self._arrange(self.app.size.width, self.app.size.height)
 
     def on_resize(self, event: Resize) -> None:
-        """Take the layout that fits now."""
+        """Choose the layout that fits now."""
         self._arrange(event.size.width, event.size.height)
 
     def _arrange(self, columns: int, rows: int) -> None:
@@ -86,6 +84,10 @@ class View(Screen[None]):
         for panel in panels:
             if panel.display and (beat is None or beat % panel.every == 0):
                 panel.redraw()
+
+    def on_choice_changed(self) -> None:
+        """Draw what depends on a list's choice."""
+        self.call_after_refresh(self.console.draw_all)
 
     def before_drawing(self) -> None:
         """What must be done at each beat."""

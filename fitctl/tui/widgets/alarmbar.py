@@ -63,7 +63,7 @@ class AlarmBar(Panel):
             keys += [text(f" +{more}", INK, bold=True)]
         if first:
             keys += clickable([text(" v", SKY, bold=True), text(" all", DIM)], "app.alarms")
-            if self._book.unseen:
+            if self._book.unacknowledged:
                 keys += clickable(
                     [text(" k", SKY, bold=True), text(" seen", DIM)], "app.acknowledge"
                 )
@@ -74,10 +74,10 @@ class AlarmBar(Panel):
         else:
             head = [text(f" {sign} {since} ", PAPER, on=ground, bold=True)]
             ink, back = WHITE, None
-        body = self._told(alarm, room - width(head) - 1, ink)
+        body = self._body(alarm, room - width(head) - 1, ink)
         return [*pad([*head, text(" ", ink, on=back), *body], room), *keys]
 
-    def _told(self, alarm: Alarm, columns: int, ink: str) -> Line:
+    def _body(self, alarm: Alarm, columns: int, ink: str) -> Line:
         over = f" (over {wall(self.state.wall_s(alarm.over_s))})" if alarm.over_s else ""
         did = f" — {alarm.did}" if columns >= DID_FROM_COLUMNS else ""
         todo = f" ▸ {alarm.todo}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import ClassVar
 
+from textual.binding import Binding, BindingType
 from textual.events import Click, MouseScrollDown, MouseScrollUp
 from textual.message import Message
 
@@ -15,30 +16,29 @@ from fitctl.tui.widgets.panel import Panel
 BAR = "▌"
 
 
-class Choice(Panel):
-    """Rows of which one is chosen; those that do not fit are scrolled to.
+class Choice(Panel, can_focus=True):
+    """Rows of which one is chosen; the arrow keys move in the list that has the focus.
 
     Attributes
     ----------
     chosen : int
         Number of the row.
-    active : bool
-        The arrow keys are for this list.
     """
 
     every: ClassVar[int] = 5
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("up", "move(-1)", show=False),
+        Binding("down", "move(1)", show=False),
+        Binding("pageup", "move(-10)", show=False),
+        Binding("pagedown", "move(10)", show=False),
+    ]
 
     class Changed(Message):
-        """Another row was chosen, or a click says that this list is to be active."""
-
-        def __init__(self, choice: Choice) -> None:
-            super().__init__()
-            self.choice = choice
+        """Another row was chosen, or another list has the focus."""
 
     def __init__(self, state: ConsoleState, title: str = "") -> None:
         super().__init__(state, title)
         self.chosen = 0
-        self.active = True
         self._top = 0
         self._heads = 0
         self._count = 0
@@ -60,19 +60,23 @@ class Choice(Panel):
         self.chosen = max(0, min(self.chosen, len(lines) - 1))
         lowest = max(0, len(lines) - room)
         self._top = min(max(self._top, self.chosen - room + 1, 0), self.chosen, lowest)
-        seen = [
-            [text(BAR if number == self.chosen and self.active else " ", SKY, bold=True), *line]
+        shown = [
+            [text(BAR if number == self.chosen and self.has_focus else " ", SKY, bold=True), *line]
             for number, line in enumerate(lines[self._top : self._top + room], start=self._top)
         ]
-        return [*([text(" "), *line] for line in heads), *seen]
+        return [*([text(" "), *line] for line in heads), *shown]
 
-    def move(self, by: int) -> None:
+    def action_move(self, by: int) -> None:
         """Choose another row, as far as there is one."""
         chosen = max(0, min(self.chosen + by, self._count - 1))
         if chosen != self.chosen:
             self.chosen = chosen
             self.redraw()
-            self.post_message(self.Changed(self))
+            self.post_message(self.Changed())
+
+    def on_focus(self) -> None:
+        """Show it."""
+        self.post_message(self.Changed())
 
     def on_click(self, event: Click) -> None:
         """Choose the row under the mouse."""
@@ -80,12 +84,14 @@ class Choice(Panel):
         if 0 <= number < self._count:
             self.chosen = number
             self.redraw()
-        self.post_message(self.Changed(self))
+            self.post_message(self.Changed())
 
     def on_mouse_scroll_down(self, _event: MouseScrollDown) -> None:
         """Go down."""
-        self.move(1)
+        self.focus()
+        self.action_move(1)
 
     def on_mouse_scroll_up(self, _event: MouseScrollUp) -> None:
         """Go up."""
-        self.move(-1)
+        self.focus()
+        self.action_move(-1)

@@ -34,7 +34,7 @@ class Hand(Panel):
             [
                 text(f" JOG {stage.name} ", PAPER, on=YELLOW, bold=True),
                 text(f"  ±{step:g} {stage.unit}", INK, bold=True),
-                text(f"  {stage.told}", DIM),
+                text(f"  {stage.description}", DIM),
             ],
             [text("at    ", DIM), text(_place(loop, stage.name), INK)],
             steps,

@@ -49,9 +49,9 @@ class Devices(Panel):
             spare = rows - len(devices)
             lines: list[Line] = []
             for device in devices:
-                told = _device(device, names, columns, 1 + spare)
-                spare -= len(told) - 1
-                lines += told
+                own = _device(device, names, columns, 1 + spare)
+                spare -= len(own) - 1
+                lines += own
             return lines
         ill = [device for device in devices if device.state != "ok"]
         others = tuple(f"{name} " for name in self.state.loops if name != self.state.shown)
@@ -157,15 +157,14 @@ def _table(timing: LoopTiming, unsent: int) -> list[Line]:
         ("frame age", timing.frame_age_median_s, timing.frame_age_worst_s),
         ("servo late", timing.servo_late_median_s, timing.servo_late_worst_s),
     )
-    lines: list[Line] = [[text(f"{'ms':<12}{'median':>8}{'worst':>8}", DIM)]]
-    for name, median_s, worst_s in rows:
-        lines.append(
-            [
-                text(f"{name:<12}", DIM),
-                text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK),
-            ]
-        )
-    return [*lines, _counts(timing, unsent)]
+    return [
+        [text(f"{'ms':<12}{'median':>8}{'worst':>8}", DIM)],
+        *(
+            [text(f"{name:<12}", DIM), text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK)]
+            for name, median_s, worst_s in rows
+        ),
+        _counts(timing, unsent),
+    ]
 
 
 def _counts(timing: LoopTiming, unsent: int) -> Line:

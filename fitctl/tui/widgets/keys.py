@@ -66,5 +66,5 @@ class Keys(Panel):
             for key in (HELP, *ALARM_KEYS, *own, *keys_of(""))
             if key.matters(self.state, self._alarms)
         ]
-        told = [(key.shown, key.label, key.action) for key in now]
-        return dict.fromkeys([*told, *commands, *rest])
+        first = [(key.shown, key.label, key.action) for key in now]
+        return dict.fromkeys([*first, *commands, *rest])

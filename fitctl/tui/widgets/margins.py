@@ -19,20 +19,20 @@ LEAST_GAIN_DB = 6.0
 MOST_SENSITIVITY = 2.0
 
 
-class Judged(NamedTuple):
+class DesignInUse(NamedTuple):
     """A loop, and the name or the file of the design that it works with."""
 
     loop: str
     design: str
 
 
-def judged(loop: LoopState) -> Judged:
-    """What is at work."""
-    return Judged(loop.name, loop.controller_file or loop.controller)
+def design_in_use(loop: LoopState) -> DesignInUse:
+    """The design that a loop works with."""
+    return DesignInUse(loop.name, loop.controller_file or loop.controller)
 
 
 class Margins(Panel):
-    """What `fitctl design` says of the design at work; :meth:`told` hands it in.
+    """The figures that `fitctl design` prints of the design in use; :meth:`show_result` passes them in.
 
     The limits beside the margins are the usual ones of textbooks (30 deg, 6 dB, 2).
 
@@ -49,13 +49,13 @@ class Margins(Panel):
     ) -> None:
         super().__init__(state, title)
         self._why_unknown = why_unknown
-        self._judged = Judged("", "")
+        self._evaluated = DesignInUse("", "")
         self._figures: dict[str, Any] | None = None
         self._problem = ""
 
-    def told(self, what: Judged, output: str, status: int) -> None:
-        """Take what the command printed."""
-        self._judged = what
+    def show_result(self, design: DesignInUse, output: str, status: int) -> None:
+        """Show what the command printed of a design."""
+        self._evaluated = design
         self._figures, self._problem = None, ""
         if status == 0:
             self._figures = json.loads(output.strip().splitlines()[-1])
@@ -76,7 +76,7 @@ class Margins(Panel):
                 *lines,
                 *([text(line, DIM)] for line in textwrap.wrap(unknown, max(10, columns))),
             ]
-        if self._judged != judged(loop.state):
+        if self._evaluated != design_in_use(loop.state):
             return [*lines, [text("its margins are being worked out", DIM)]]
         figures = self._figures
         if figures is None:
@@ -94,9 +94,9 @@ class Margins(Panel):
         return [
             *lines,
             _figure("crossover", figures["crossover_hz"], "Hz"),
-            _judged("phase margin", figures["phase_margin_deg"], "°", least=LEAST_PHASE_DEG),
-            _judged("gain margin", figures["gain_margin_db"], "dB", least=LEAST_GAIN_DB),
-            _judged("sensitivity", figures["peak_sensitivity"], "at most", most=MOST_SENSITIVITY),
+            _within("phase margin", figures["phase_margin_deg"], "°", least=LEAST_PHASE_DEG),
+            _within("gain margin", figures["gain_margin_db"], "dB", least=LEAST_GAIN_DB),
+            _within("sensitivity", figures["peak_sensitivity"], "at most", most=MOST_SENSITIVITY),
             [text(f"{'attenuates':<14}", DIM), text(shorten(attenuation, columns - 14), INK)],
             _figure("should leave", figures["residual_px"], "px, by linear theory", ".4f"),
             _figure("measured", measured_px, "px, the worse axis", ".4f"),
@@ -111,7 +111,7 @@ def _figure(name: str, value: float, unit: str, form: str = ".2f") -> Line:
     ]
 
 
-def _judged(
+def _within(
     name: str, value: float, unit: str, least: float = -math.inf, most: float = math.inf
 ) -> Line:
     limit = f"≥ {least:g}" if math.isfinite(least) else f"≤ {most:g}"

@@ -39,7 +39,7 @@ class Printed(Panel):
         """Run another fitctl command in place of the one before, unless that moves the stages still."""
         moving = self.moving
         if moving is not None:
-            self.notify(f"still at work: {moving.told}", severity="warning", timeout=4)
+            self.notify(f"still at work: {moving.command_line}", severity="warning", timeout=4)
         else:
             self.show(start_job(arguments, outlives=outlives))
 
@@ -61,11 +61,11 @@ class Printed(Panel):
         job = self.job
         if job is None:
             return [[text(line, DIM)] for line in textwrap.wrap(self._hint, max(10, columns))]
-        sign, colour, told = _how_it_went(job.status)
+        sign, colour, state = _how_it_went(job.status)
         head = [
             text(f"{sign} ", colour, bold=True),
-            text(shorten(job.told, columns - len(told) - 4), INK, bold=True),
-            text(f"  {told}", colour),
+            text(shorten(job.command_line, columns - len(state) - 4), INK, bold=True),
+            text(f"  {state}", colour),
         ]
         lines = [
             piece

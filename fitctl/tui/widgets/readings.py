@@ -29,7 +29,7 @@ from fitctl.tui.state import LoopView
 from fitctl.tui.widgets.choice import Choice
 
 NAME_COLUMNS = 21
-# How a device's link is judged: a quantity, its unit as people write it, and what it is in it.
+# What a device's link is measured by: a quantity, its unit as people write it, and what it is in it.
 LINKS = {
     "camera": ("frame_late_s", "frame late", 1e3, "ms"),
     "siderostat": ("amplifier_round_trip_periods", "round trip", 100.0, "% of period"),
@@ -70,9 +70,9 @@ class DeviceList(Choice):
             text(f"{device.state:<7}", look.colour),
             text(f"{self.link_of(device):<29}", INK),
         ]
-        told = device.detail if device.state == "fault" else f"{device.identity}  {device.detail}"
+        report = device.detail if device.state == "fault" else f"{device.identity}  {device.detail}"
         rest = columns - width(line)
-        return [*line, text(shorten(f"{told}  {device.endpoint}", rest), DIM)]
+        return [*line, text(shorten(f"{report}  {device.endpoint}", rest), DIM)]
 
     def link_of(self, device: DeviceHealth) -> str:
         """How quick its link is, in words; empty where nothing says so."""

@@ -69,11 +69,11 @@ def _map(
 def _notes(loop: LoopView, limits: LoopLimits, here: np.ndarray, field_arcsec: float) -> list[Line]:
     tick = loop.tick
     progress = tick.search_progress if tick else math.nan
-    seen = tick is not None and tick.star_visible
+    found = tick is not None and tick.star_visible
     return [
         [text("searched ", DIM), text(f"{number(100 * progress, '.0f')} %", INK, bold=True)],
         [text("at ", DIM), text(f"{number(here[0], '+.0f')}″ {number(here[1], '+.0f')}″", INK)],
-        [text("● a star is seen" if seen else "○ no star yet", GREEN if seen else YELLOW)],
+        [text("● a star is seen" if found else "○ no star yet", GREEN if found else YELLOW)],
         [],
         [text("─ ", YELLOW), text("way so far", DIM)],
         [text("▯ ", GREEN), text(f"field, {field_arcsec:.0f}″", DIM)],

@@ -108,7 +108,7 @@ class Progress(Panel):
         part = status.step_number / max(1, status.steps)
         again = f", attempt {status.attempt}" if status.attempt > 1 else ""
         last = status.last_attempt
-        told = "" if last is None else f"{last.step}: {last.outcome} {last.message}"
+        outcome = "" if last is None else f"{last.step}: {last.outcome} {last.message}"
         head = f"{_SIGNS[status.state]} {status.name} {status.state}{asked}"
         return [
             [
@@ -117,5 +117,5 @@ class Progress(Panel):
                 text(f"{status.step}{again}  ", SKY),
                 *bar(part, max(4, min(30, columns - len(head) - 32)), SKY),
             ],
-            [text(shorten(status.message or told, columns), DIM)],
+            [text(shorten(status.message or outcome, columns), DIM)],
         ]

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from textual.strip import Strip
 
 from fitctl.logging.records import Tick
 from fitctl.tui.draw import braille
@@ -21,6 +22,7 @@ from fitctl.tui.look import (
     YELLOW,
     Line,
     bar,
+    in_columns,
     number,
     pad,
     text,
@@ -50,14 +52,9 @@ class Stages(Panel):
         picture = diamond_lines(tick, side, trail)
         left = width(picture[0]) + 1
         above = (rows - len(picture)) // 2
-        picture = [*([] for _ in range(above)), *picture]
-        picture += [[] for _ in range(rows - len(picture))]
-        numbers = _numbers(loop, tick, columns - left, rows)
+        numbers = _numbers(loop, tick, columns - left, rows)[:rows]
         numbers += [[] for _ in range(rows - len(numbers))]
-        return [
-            [*pad(drawn, left), *beside]
-            for drawn, beside in zip(picture, numbers[:rows], strict=True)
-        ]
+        return in_columns([*([] for _ in range(above)), *picture], left, numbers)
 
 
 def working_point(tick: Tick) -> tuple[float, float]:
@@ -87,26 +84,9 @@ def diamond_lines(tick: Tick, rows: int, trail: NDArray[np.float64]) -> list[Lin
     way = braille.empty(rows, columns)
     braille.scatter(way, (trail[:, 0] + 1) / 2, (trail[:, 1] + 1) / 2)
     lines = braille.layered([(braille.diamond(rows, columns), DIM), (way, SKY)])
-    at = pad(lines[y], columns)
-    before, after = _cut(at, x)
-    lines[y] = [*before, text(sign, colour, bold=True), *after]
+    line = Strip(pad(lines[y], columns))
+    lines[y] = [*line.crop(0, x), text(sign, colour, bold=True), *line.crop(x + 1)]
     return lines
-
-
-def _cut(line: Line, column: int) -> tuple[Line, Line]:
-    """What is left and what is right of one column."""
-    before: Line = []
-    after: Line = []
-    at = 0
-    for segment in line:
-        cut = min(max(column - at, 0), len(segment.text))
-        skipped = 1 if at <= column < at + len(segment.text) else 0
-        if cut:
-            before.append(type(segment)(segment.text[:cut], segment.style))
-        if segment.text[cut + skipped :]:
-            after.append(type(segment)(segment.text[cut + skipped :], segment.style))
-        at += len(segment.text)
-    return before, after
 
 
 def _numbers(loop: LoopView, tick: Tick, columns: int, rows: int) -> list[Line]:
@@ -163,12 +143,12 @@ def _siderostat(loop: LoopView, tick: Tick, columns: int) -> Line:
         (wide, sign, "″"),
     )
     room = columns - NAME_COLUMNS
-    values, mark, told = next((form for form in forms if len("".join(form)) <= room), forms[-1])
+    values, mark, rest = next((form for form in forms if len("".join(form)) <= room), forms[-1])
     return [
         text("sider".ljust(NAME_COLUMNS), DIM),
         text(values, ORANGE if high else INK, bold=high),
         text(mark, ORANGE if high else DIM, bold=high),
-        text(told, DIM),
+        text(rest, DIM),
     ]
 
 

@@ -103,7 +103,7 @@ class Breakdown(Panel):
         )
         longest_s = float(np.median(compute_s))
         lines: list[Line] = [[text(f"{'ms':<8}{'median':>8}{'99 %':>8}{'worst':>8}", DIM)]]
-        for name, values_s, colour, told in parts:
+        for name, values_s, colour, meaning in parts:
             middle, late, worst = 1e3 * np.percentile(values_s, [50, 99, 100])
             line = [
                 text(f"{name:<8}", colour if colour != FAINT else DIM, bold=True),
@@ -114,5 +114,5 @@ class Breakdown(Panel):
             room = columns - 60
             if room >= 6 and name != "frame":
                 line += [*bar(share, room, colour), text("  ")]
-            lines.append([*line, text(told, DIM)])
+            lines.append([*line, text(meaning, DIM)])
         return lines[:rows]

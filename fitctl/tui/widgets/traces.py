@@ -65,7 +65,7 @@ class Traces(Panel):
             now_px = float(errors[-1, index]) if len(errors) else math.nan
             heading = [text(f"{name} ", colour, bold=True)]
             heading.append(text(f"{number(now_px, '+.3f')} px", INK, bold=True))
-            right = _rms_told(rms_px, rms, window, loop, columns - width(heading) - 1)
+            right = _rms_line(rms_px, rms, window, loop, columns - width(heading) - 1)
             if not time_axis and width(heading) + len(span) + width(right) < columns:
                 heading.append(text(span, DIM))
             lines.append(spread(heading, right, columns))
@@ -139,7 +139,7 @@ def _axis_labels(rows: int, limit_px: float, requirement_px: float) -> list[Segm
     return labels
 
 
-def _rms_told(rms_px: float, rms: Rms, window: Window, loop: LoopView, room: int) -> Line:
+def _rms_line(rms_px: float, rms: Rms, window: Window, loop: LoopView, room: int) -> Line:
     """The RMS of one axis: in px, as a part of the requirement, and on the sky."""
     if math.isnan(rms_px):
         return [text("no star, no RMS", DIM)]

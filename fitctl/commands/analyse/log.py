@@ -1,0 +1,210 @@
+"""`fitctl log`: what is in a log, whether it is whole, and other files made from it."""
+
+from __future__ import annotations
+
+import time
+from enum import StrEnum
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.log_time import time_ns
+from fitctl.commands.shared.printing import to_json
+from fitctl.config import ConfigError
+from fitctl.logging import copying, exporting, folder, verifying
+from fitctl.logging.reading import LogInfo, log_info
+
+app = typer.Typer(
+    help="Look into logs, mend them, make other files from them.", no_args_is_help=True
+)
+
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")]
+LogsArgument = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP files.")]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FILE", help="The new log; else beside LOG, its name says how."),
+]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="An existing file of that name may go.")
+]
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic", metavar="TOPIC", help="Only this, such as '/fit/right/*'; may be repeated."
+    ),
+]
+
+
+class Format(StrEnum):
+    """What can be exported, by the file's ending."""
+
+    csv = "csv"
+    parquet = "parquet"
+    npz = "npz"
+
+
+@app.command()
+def info(
+    log: LogArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="All of it, also the rig file.")] = False,
+) -> None:
+    """Say what a log holds."""
+    found, kept, recording = log_info(log), folder.is_kept(log), folder.in_use(log)
+    if as_json:
+        typer.echo(to_json(_info_document(found, kept=kept, recording=recording)))
+        return
+    unfinished = "being recorded" if recording else "cut off; `fitctl log recover` mends it"
+    state = "finished" if found.finished else unfinished
+    typer.echo(f"{found.path}: {state}{'; kept' if kept else ''}")
+    if found.counts:
+        start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(found.start_s))
+        typer.echo(f"from {start}, {found.duration_s:.1f} s")
+    else:
+        typer.echo("without any record")
+    width = max(map(len, found.counts), default=0)
+    for topic, count in sorted(found.counts.items()):
+        typer.echo(f"  {topic:<{width}}  {count}")
+
+
+def _info_document(found: LogInfo, *, kept: bool, recording: bool) -> dict[str, object]:
+    span = {"start_s": found.start_s, "end_s": found.end_s} if found.counts else {}
+    return {
+        "path": str(found.path),
+        "bytes": found.path.stat().st_size,
+        "finished": found.finished,
+        "recording": recording,
+        "kept": kept,
+        **span,
+        "counts": found.counts,
+        "metadata": found.metadata,
+    }
+
+
+@app.command()
+def verify(logs: LogsArgument) -> None:
+    """Read logs from end to end: checksums, index, order, every message. Exit status 1 if one is not whole."""
+    problems = 0
+    for log in logs:
+        verdict = verifying.verify(log)
+        problems += len(verdict.problems)
+        typer.echo(
+            f"{log}: {'not whole' if verdict.problems else 'whole'}; {verdict.records} records, "
+            f"{verdict.lost} lost on the way, {verdict.frames_missing} frames missing"
+        )
+        for problem in verdict.problems:
+            typer.echo(f"  {problem}")
+    raise typer.Exit(FAILED if problems else 0)
+
+
+@app.command()
+def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+    """Make a whole log from one that was cut off or damaged. LOG itself stays as it is."""
+    if folder.in_use(log):
+        msg = f"{log}: is being recorded just now; there is nothing to mend"
+        raise ConfigError(msg)
+    if not verifying.verify(log).problems:
+        typer.echo(f"{log}: is whole; there is nothing to mend")
+        return
+    target = out or log.with_name(f"{log.stem}_recovered.mcap")
+    saved = copying.recover(log, target, overwrite=overwrite)
+    lost = f"{saved.damaged_chunks} damaged chunks passed over, " if saved.damaged_chunks else ""
+    typer.echo(
+        f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
+    )
+
+
+@app.command()
+def cut(
+    log: LogArgument,
+    from_: Annotated[
+        str, typer.Option("--from", metavar="TIME", help="Seconds after LOG's start, or UTC.")
+    ] = "0",
+    to: Annotated[
+        str | None,
+        typer.Option("--to", metavar="TIME", help="The same; what is at it is not copied."),
+    ] = None,
+    topic: TopicOption = None,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Copy a span of time, some topics, or both. UTC times look like 2026-11-21T09:18:30.5."""
+    found = log_info(log)
+    from_ns = time_ns("--from", from_, found)
+    to_ns = 2**63 if to is None else time_ns("--to", to, found)
+    if to_ns <= from_ns:
+        msg = (
+            f"cut: --to {to} is not after --from {from_}; choose a later --to, or an earlier --from"
+        )
+        raise ConfigError(msg)
+    target = out or log.with_name(f"{log.stem}_cut.mcap")
+    topics = _topics(found, topic)
+    records = copying.cut(
+        log, target, from_ns=from_ns, to_ns=to_ns, topics=topics, overwrite=overwrite
+    )
+    typer.echo(f"{target}: {records} of {sum(found.counts.values())} records")
+
+
+@app.command()
+def merge(
+    logs: LogsArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The new log.")],
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Join logs by time, such as those of one night, or what a crash tore in two."""
+    records, doubles = copying.merge(logs, out, overwrite=overwrite)
+    also = f"; {doubles} were in two logs" if doubles else ""
+    typer.echo(f"{out}: {records} records of {len(logs)} logs{also}")
+
+
+@app.command()
+def export(
+    log: LogArgument,
+    format_: Annotated[Format, typer.Option("--format", help="CSV has no frames.")],
+    topic: TopicOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder; else beside LOG, with its name."),
+    ] = None,
+) -> None:
+    """Write each topic as a table, with units in the names of the columns."""
+    target = out or log.with_name(f"{log.stem}_{format_}")
+    files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
+    for file, rows in sorted(files.items()):
+        typer.echo(f"{file}: {rows} rows")
+    if not files:
+        msg = f"export: {log} has nothing to write as {format_}; frames need npz or parquet"
+        raise ConfigError(msg)
+
+
+@app.command()
+def keep(
+    logs: LogsArgument,
+    undo: Annotated[bool, typer.Option("--undo", help="No longer keep them.")] = False,
+) -> None:
+    """Mark logs, so that the recorder never deletes them; the mark is an empty file LOG.keep beside each."""
+    for log in logs:
+        folder.keep(log, kept=not undo)
+        typer.echo(f"{log}: {'no longer kept' if undo else 'kept'}")
+
+
+def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:
+    """The log's topics that are asked for; all without patterns.
+
+    Raises
+    ------
+    ConfigError
+        If a pattern is of no topic.
+    """
+    for pattern in patterns or ():
+        if not any(fnmatchcase(topic, pattern) for topic in found.counts):
+            there = ", ".join(sorted(found.counts)) or "none"
+            msg = f"--topic {pattern}: {found.path} has no such topic; there are {there}"
+            raise ConfigError(msg)
+    return [
+        topic
+        for topic in sorted(found.counts)
+        if not patterns or any(fnmatchcase(topic, pattern) for pattern in patterns)
+    ]

@@ -1,0 +1,83 @@
+"""`fitctl plot`: fields of a log at a glance."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.log_time import time_ns
+from fitctl.config import ConfigError
+from fitctl.logging.reading import log_info
+from fitctl.report.quick import Series, as_figure, as_text, read_series
+
+_PICTURES = {".png", ".svg", ".pdf"}
+
+
+def plot(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")],
+    what: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="TOPIC...",
+            help="/fit/right/tick.error_az_px, a topic, or a field; * is anything.",
+        ),
+    ],
+    from_: Annotated[
+        str, typer.Option("--from", metavar="TIME", help="Seconds after LOG's start, or UTC.")
+    ] = "0",
+    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same.")] = None,
+    window: Annotated[
+        bool, typer.Option("--window", help="In a window, not in the terminal.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="As a picture: PNG, SVG or PDF.")
+    ] = None,
+) -> None:
+    """Draw fields of a log in the terminal, one panel for each unit."""
+    if out is not None and out.suffix.lower() not in _PICTURES:
+        msg = f"plot: --out {out}: expected a name that ends in {', '.join(sorted(_PICTURES))}"
+        raise ConfigError(msg)
+    found = log_info(log)
+    from_ns = time_ns("--from", from_, found) if found.counts else 0
+    to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
+    series = read_series(log, what, from_ns, to_ns)
+    if not any(len(one.time_s) for one in series):
+        msg = f"plot: {log} has nothing of that between --from {from_} and --to {to or 'its end'}"
+        raise ConfigError(msg)
+    if out is not None:
+        _save(log, series, out)
+    elif window:
+        _show(log, series)
+    else:
+        typer.echo(as_text(log, series, colours=sys.stdout.isatty()))
+
+
+def _save(log: Path, series: Sequence[Series], out: Path) -> None:
+    try:
+        as_figure(log, series).savefig(out)
+    except OSError as error:
+        msg = f"plot: --out {out}: cannot be written: {error.strerror or error}; name another file"
+        raise ConfigError(msg) from None
+    typer.echo(f"written: {out}")
+
+
+def _show(log: Path, series: Sequence[Series]) -> None:
+    from matplotlib import pyplot
+
+    manager = pyplot.figure().canvas.manager
+    if manager is None or manager.canvas.required_interactive_framework is None:
+        typer.echo(
+            "plot: no window can be opened: matplotlib finds no display, or no toolkit such as python3-tk; "
+            "leave --window away, or name a picture with --out",
+            err=True,
+        )
+        raise typer.Exit(FAILED)
+    figure = as_figure(log, series)
+    manager.canvas.figure = figure
+    figure.set_canvas(manager.canvas)
+    pyplot.show()

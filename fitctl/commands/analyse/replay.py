@@ -1,0 +1,184 @@
+"""`fitctl replay`: a log through today's code, and where it decides otherwise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import ControllerOption, JsonOption, SetOption
+from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.rig import controller_overrides
+from fitctl.config import ConfigError, Rig, load_rig, rig_from_json
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.document import design_json
+from fitctl.logging.reading import LogInfo
+from fitctl.replay.files import dark_of_today, logged_files
+from fitctl.replay.log import read_steps, whole_run
+from fitctl.replay.replay import replay as replay_steps
+from fitctl.replay.result import LoopReplay, ReplayResult
+
+_ROWS = {
+    "star_px": ("star's place", "px"),
+    "mirror_rad": ("mirror", "rad"),
+    "stacks_v": ("D/A voltages", "V"),
+    "siderostat_setpoint_rad": ("siderostat set-point", "rad"),
+}
+_OPEN_LOOP = (
+    "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
+    "on from where\nthe log sent them; modes and the controllers' own state go on from today's"
+)
+_OLD_DARK = "an older fitctl recorded it, and kept only the dark frame's name"
+_NAME_IT = "name the one of then with --set camera.dark_file=FILE"
+
+
+def replay(
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="All files of one run, from its first on."),
+    ],
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", metavar="FILE", help="Rig file; without it, the one in the log."),
+    ] = None,
+    overrides: SetOption = None,
+    controller: ControllerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Feed a log's frames through today's code, and show where it decides otherwise.
+
+    Exit status 0 if every mode and every command is the same to the last bit, 1 if not, 2 if the log
+    cannot be replayed. A changed command changes no frames.
+    """
+    with whole_run(logs) as info, logged_files(info) as files:
+        settings = _rig(info, files, rig, overrides or [], controller)
+        dark_file = dark_of_today(info, settings)
+        if dark_file is not None and not Path(dark_file).exists():
+            msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
+            raise ConfigError(msg)
+        result = _replayed(info, settings)
+    named = ", ".join(map(str, logs))
+    if dark_file is not None:
+        today = f"{dark_file} was read as it is today; if it was measured anew since, {_NAME_IT}"
+        typer.echo(f"{named}: {_OLD_DARK}; {today}", err=True)
+    if as_json:
+        typer.echo(to_json(_document(named, info, settings, result)))
+    else:
+        for line in _lines(named, info, settings, result):
+            typer.echo(line)
+    raise typer.Exit(0 if result.same else FAILED)
+
+
+def _replayed(info: LogInfo, rig: Rig) -> ReplayResult:
+    """The replay, with its progress."""
+    with progress_line("replaying", info.duration_s) as progress:
+        result = replay_steps(rig, read_steps(info, list(rig.loops)), on_tick=progress)
+        progress(info.duration_s)
+    return result
+
+
+def _rig(
+    info: LogInfo,
+    files: Sequence[str],
+    path: Path | None,
+    overrides: Sequence[str],
+    controller: str | None,
+) -> Rig:
+    """The log's rig or the one of a file, with values replaced; its loops and frames must be the log's."""
+    in_log = info.metadata.get("rig", {}).get("json")
+    if in_log is None:
+        msg = f"{info.path}: has no rig file in it; name a log that fitctl recorded"
+        raise ConfigError(msg)
+    origin = f"the rig in {info.path}"
+
+    def read(changes: Sequence[str]) -> Rig:
+        return (
+            load_rig(path, changes) if path else rig_from_json(in_log, origin, [*files, *changes])
+        )
+
+    rig = read(overrides)
+    if controller is not None:
+        rig = read([*overrides, *controller_overrides(rig.loops, controller)])
+    then = json.loads(in_log)
+    needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
+    given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)
+    if given != needed:
+        msg = (
+            f"replay: loops, camera.width_px and camera.height_px must be those of the log, {needed}, are "
+            f"{given}; replace other values, or none"
+        )
+        raise ConfigError(msg)
+    return rig
+
+
+def _from_start_s(info: LogInfo, time_s: float) -> float:
+    """Seconds after the log's first record, as `fitctl log cut` takes them, of a monotonic time."""
+    return time_s + float(info.metadata["clock"]["wall_minus_monotonic_s"]) - info.start_s
+
+
+def _document(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> dict[str, Any]:
+    loops = {}
+    for name, loop in result.loops.items():
+        loops[name] = document = asdict(loop)
+        for difference in document["differences"].values():
+            difference["first_s"] = _from_start_s(info, difference["first_s"])
+        document["mode"]["first_s"] = _from_start_s(info, loop.mode.first_s)
+    span_s = result.end_s - result.start_s
+    return {
+        "log": named,
+        "rig": rig.name,
+        "same": result.same,
+        "span_s": span_s,
+        "speed_x": span_s / result.wall_s,
+        "records_lost": result.records_lost,
+        "refused": result.refused,
+        "loops": loops,
+    }
+
+
+def _lines(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> Iterator[str]:
+    span_s = result.end_s - result.start_s
+    yield f"{named}: {span_s:.1f} s of rig {rig.name}, replayed at {span_s / result.wall_s:.0f}x real time"
+    for name, loop in result.loops.items():
+        yield from _loop_lines(info, name, loop)
+    yield from (f"accepted then, refused today: {text}" for text in result.refused)
+    if result.records_lost:
+        yield f"{result.records_lost} records were lost on the way to the log; what follows them may differ"
+    if result.same:
+        yield "the same, to the last bit"
+        return
+    yield from _other_designs(info, rig)
+    yield _OPEN_LOOP
+
+
+def _loop_lines(info: LogInfo, name: str, loop: LoopReplay) -> Iterator[str]:
+    yield f"loop {name}: {loop.ticks} ticks"
+    if loop.frames_missing:
+        yield (
+            f"  {loop.frames_missing} frames are not in the log; their ticks were replayed without, "
+            "so what follows may differ"
+        )
+    yield f"  {'differs':<22}{'ticks':>8}{'first at':>12}{'worst':>16}{'rms':>16}"
+    mode = loop.mode
+    first = f"{_from_start_s(info, mode.first_s):>10.2f} s   {mode.then} then, {mode.now} now"
+    yield f"  {'mode':<22}{mode.ticks:>8}" + (first if mode.ticks else "")
+    for what, (title, unit) in _ROWS.items():
+        found = loop.differences[what]
+        first = f"{_from_start_s(info, found.first_s):>10.2f} s"
+        sizes = "".join(f"{f'{value:.3g} {unit}':>16}" for value in (found.worst, found.rms))
+        yield f"  {title:<22}{found.ticks:>8}" + (first + sizes if found.ticks else "")
+
+
+def _other_designs(info: LogInfo, rig: Rig) -> Iterator[str]:
+    """Where the controller to begin with is not that of the log."""
+    for name, text in info.metadata.get("designs", {}).items():
+        then, now = json.loads(text), json.loads(design_json(design_for(rig, name)))
+        if then["name"] != now["name"]:
+            yield f"loop {name} begins with controller {now['name']}, in the log with {then['name']}"
+        elif any(then[matrix] != now[matrix] for matrix in ("a", "b", "c", "d")):
+            yield f"loop {name}: today's design of {now['name']} is not the log's"

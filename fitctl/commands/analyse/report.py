@@ -1,0 +1,89 @@
+"""`fitctl report`: a log, as a page."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.rig import rig_of
+from fitctl.config import ConfigError
+from fitctl.report.compare import make_comparison
+from fitctl.report.findings import Findings, find
+from fitctl.report.make import make_report
+from fitctl.report.page import SIGNS
+from fitctl.report.pdf import PdfError, print_pdf
+from fitctl.report.run import find_run
+from fitctl.report.tables import interval, number
+
+MOST_NIGHTS = 6
+
+
+def report(
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Files of one run, or a folder: its newest run."),
+    ],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Each LOG is a night of its own; side by side.")
+    ] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="As PDF too; needs Chromium or Chrome.")
+    ] = False,
+    show: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for everything; else beside the first LOG."),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Judge by this rig file, not by the one in the log."),
+    ] = None,
+) -> None:
+    """Say on one page whether a night was good: verdict, plots, losses, configuration.
+
+    One HTML file that needs nothing from elsewhere, every plot as PNG and SVG, all figures as JSON.
+    """
+    settings = None if rig is None else rig_of(rig, None)
+    if compare and not 2 <= len(logs) <= MOST_NIGHTS:
+        msg = f"report: --compare takes 2 to {MOST_NIGHTS} logs or folders, got {len(logs)}"
+        raise ConfigError(msg)
+    runs = [find_run([log], settings) for log in logs] if compare else [find_run(logs, settings)]
+    nights = [find(run) for run in runs]
+    name = "comparison" if compare else f"{runs[0].name}_report"
+    first = runs[0].logs[0].path
+    folder = out or first.with_name(name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        page = make_comparison(nights, folder) if compare else make_report(nights[0], folder)
+    except OSError as error:
+        msg = f"report: {folder}: cannot be written: {error.strerror or error}; name another folder with --out"
+        raise ConfigError(msg) from None
+    for night in nights:
+        _print_verdict(night)
+    typer.echo(f"written: {page}")
+    if pdf:
+        try:
+            print_pdf(page, page.with_suffix(".pdf"))
+        except PdfError as error:
+            typer.echo(f"report: {error}", err=True)
+            raise typer.Exit(FAILED) from None
+        typer.echo(f"written: {page.with_suffix('.pdf')}")
+    if show and not webbrowser.open(page.resolve().as_uri()):
+        typer.echo(f"report: no browser could be opened; open {page} yourself", err=True)
+        raise typer.Exit(FAILED)
+
+
+def _print_verdict(night: Findings) -> None:
+    for loop in night.loops.values():
+        typer.echo(
+            f"{night.run.name}, loop {loop.name}: {SIGNS[loop.verdict.word]} requirement of "
+            f"{loop.requirement_px:g} px {loop.verdict.word}: {loop.verdict.why}"
+        )
+        for axis, found in loop.residual.items():
+            typer.echo(
+                f"  {axis} {number(found.rms_px, '.4f', 'px RMS')}, 95 % interval {interval(found)}"
+            )

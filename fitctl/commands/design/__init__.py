@@ -1,0 +1,1 @@
+"""Commands that identify a rig, design its controllers and simulate it."""

@@ -1,0 +1,63 @@
+"""`fitctl figures`: the paper's figures and the table of performance, made from this system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
+from fitctl.commands.shared.plant import require_plant
+from fitctl.commands.shared.printing import progress_line
+from fitctl.commands.shared.rig import require_loop, rig_of
+from fitctl.config import ConfigError
+from fitctl.figures.make import FULL, QUICK, make
+from fitctl.identify.errors import IdentifyError
+
+
+def figures(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for everything; made if missing.")
+    ],
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    loop: LoopOption = "right",
+    seed: SeedOption = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few and short runs: to see how it looks.")
+    ] = False,
+) -> None:
+    """Make the paper's figures from this system, and measure what every controller shows.
+
+    Figs. 3, 5, 6, 7, 9, 11 and 12 as PNG and SVG, with captions and beside the paper's numbers in
+    figures.md; residuals, attenuation, steps and piston in performance.md; both as JSON too.
+    """
+    settings = rig_of(rig, overrides)
+    require_plant(settings)
+    require_loop("figures", settings, loop)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"figures: --out {out}: cannot be made a folder: {error.strerror}; name one you may write in"
+        raise ConfigError(msg) from None
+    amount = QUICK if quick else FULL
+    try:
+        with progress_line("figures") as progress:
+            plates, rows = make(settings, loop, seed, out, amount, progress)
+    except OSError as error:
+        msg = f"figures: --out {out}: cannot be written: {error}; make room or name another folder"
+        raise ConfigError(msg) from None
+    except (IdentifyError, RuntimeError) as error:
+        typer.echo(f"figures: {error}", err=True)
+        raise typer.Exit(FAILED) from None
+    for plate in plates:
+        typer.echo(plate.title)
+    for row in rows:
+        nominal = row.nominal
+        typer.echo(
+            f"{row.controller:<17} {nominal.rms_px:.4f} px RMS, {nominal.ratio_to_bound:.3f} of the bound; "
+            f"{row.attenuation:.1f}x at 1 Hz"
+        )
+    typer.echo(f"written: {out / 'figures.md'}, {out / 'performance.md'}, and JSON beside each")

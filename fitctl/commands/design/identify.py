@@ -1,0 +1,196 @@
+"""`fitctl identify`: an experiment (on a rig, mocks, the virtual clock) or a log, and what it gives."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+
+from fitctl import demo as demos
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
+from fitctl.commands.shared.printing import progress_line
+from fitctl.commands.shared.rig import require_loop, rig_of
+from fitctl.commands.shared.supervisor import client_of
+from fitctl.config import ConfigError, Rig, default_rig_path
+from fitctl.identify.errors import IdentifyError
+from fitctl.identify.experiments import (
+    EXPERIMENTS,
+    Finding,
+    Identification,
+    response_on_mock_bench,
+)
+from fitctl.identify.fragments import fragment_text
+from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
+from fitctl.logging.copying import merge
+from fitctl.messages.modes import Mode
+from fitctl.processes import ended_by_signals, interrupt
+
+_PLOT_SUFFIXES = (".png", ".svg")
+_MOCK_VERNIER_S = 60.0
+_MOCK_SETTLE_S = 5.0
+_BENCH_ONLY = (
+    "the response is measured on a bench of its own, with a position-sensing detector: give its "
+    "record with --log FILE (NPZ or CSV), or --mock for the mock bench"
+)
+
+
+class Source(NamedTuple):
+    """Where the records come from; without any of these, from the rig's running supervisor."""
+
+    log: Path | None
+    simulate: bool
+    mock: bool
+    seed: int
+
+
+def identify(
+    what: Annotated[str, typer.Argument(help="hysteresis, backlash, response, airpath or delay.")],
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    loop: LoopOption = "right",
+    log: Annotated[
+        Path | None, typer.Option(help="Learn from this log (or bench file) of an earlier run.")
+    ] = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulate", help="Experiment on the virtual clock, in seconds.")
+    ] = False,
+    mock: Annotated[
+        bool, typer.Option("--mock", help="Start the rig's mock devices and experiment on them.")
+    ] = False,
+    seed: SeedOption = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="The rig fragment; by default RIG-LOOP-WHAT.toml.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="The plot; by default beside the fragment, as PNG.")
+    ] = None,
+) -> None:
+    """Measure what a rig truly is, and write it as a fragment that its rig file includes.
+
+    Without --log, --simulate or --mock the rig's running supervisor does the experiment: the loop must
+    hold a star in VERNIER. The stages move open loop meanwhile; a stop ends it at once.
+    """
+    if what not in EXPERIMENTS:
+        msg = f"identify: {what} cannot be identified; there are {', '.join(EXPERIMENTS)}"
+        raise ConfigError(msg)
+    if (log is not None) + simulated + mock > 1:
+        msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
+        raise ConfigError(msg)
+    settings = rig_of(rig, overrides)
+    require_loop("identify", settings, loop)
+    source = Source(log, simulated, mock, seed)
+    stem = f"{settings.name}-{loop}-{what}"
+    fragment_path = out or Path(f"{stem}.toml")
+    _require_output(fragment_path)
+    plot_path = plot or fragment_path.with_suffix(".png")
+    if plot_path.suffix not in _PLOT_SUFFIXES:
+        msg = f"identify: {plot_path}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
+        raise ConfigError(msg)
+    _require_output(plot_path)
+    try:
+        with ended_by_signals(interrupt), progress_line(f"identify {what}") as progress:
+            finding = _finding(
+                settings, rig or default_rig_path(), overrides or [], what, loop, source, progress
+            )
+        # The plot first: it shows why, where there is nothing to write for the rig.
+        _write(plot_path, lambda: finding.plot(plot_path))
+        text = fragment_text(
+            f"fitctl identify {what}", settings, finding.lines(), finding.fragment()
+        )
+    except (IdentifyError, ConnectionError, demos.DemoError) as error:
+        typer.echo(f"identify {what}: {error}", err=True)
+        raise typer.Exit(FAILED) from None
+    _write(fragment_path, lambda: fragment_path.write_text(text, encoding="utf-8"))
+    for line in finding.lines():
+        typer.echo(line)
+    typer.echo(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
+
+
+def _require_output(path: Path) -> None:
+    """Refuse, before minutes of an experiment, what could not be written after them."""
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        msg = f"identify: {path}: nothing can be written there; name another with --out or --plot"
+        raise ConfigError(msg)
+
+
+def _write(path: Path, write: Callable[[], object]) -> None:
+    try:
+        write()
+    except OSError as error:
+        msg = f"identify: {path}: cannot be written: {error}; name another with --out or --plot"
+        raise ConfigError(msg) from None
+
+
+def _finding(
+    rig: Rig,
+    rig_path: Path,
+    overrides: Sequence[str],
+    what: str,
+    loop_name: str,
+    source: Source,
+    progress: Progress,
+) -> Finding:
+    experiment = EXPERIMENTS[what]
+    if source.log is not None:
+        return experiment.from_log(rig, loop_name, source.log)
+    if experiment.plan is None or experiment.from_records is None:
+        if not (source.simulate or source.mock):
+            raise IdentifyError(_BENCH_ONLY)
+        rig.mock_parts()
+        return response_on_mock_bench(rig, loop_name, source.seed, _by_axis(progress))
+    drives = experiment.plan(rig, loop_name)
+    if source.simulate:
+        rig.mock_parts()
+        records = on_simulation(rig, loop_name, what, drives, source.seed, progress)
+        return experiment.from_records(rig, loop_name, records)
+    if source.mock:
+        rig.mock_parts()
+        with demos.instrument(rig_path, overrides, source.seed) as running:
+            _hold_a_star(running, loop_name)
+            paths = on_rig(running.client, rig, loop_name, what, drives, progress)
+            return _from_logs(experiment, rig, loop_name, paths)
+    client = client_of(rig)
+    try:
+        require_vernier(client, loop_name)
+        paths = on_rig(client, rig, loop_name, what, drives, progress)
+    finally:
+        client.close()
+    return _from_logs(experiment, rig, loop_name, paths)
+
+
+def _from_logs(experiment: Identification, rig: Rig, loop_name: str, paths: list[Path]) -> Finding:
+    """From all logs that were written meanwhile: another may have begun within the experiment."""
+    if len(paths) == 1:
+        return experiment.from_log(rig, loop_name, paths[0])
+    with tempfile.TemporaryDirectory(prefix="fitctl-identify-") as folder:
+        whole = Path(folder) / "whole.mcap"
+        merge(paths, whole)
+        return experiment.from_log(rig, loop_name, whole)
+
+
+def _by_axis(progress: Progress) -> Callable[[str], None]:
+    """Progress by halves."""
+    done = itertools.count()
+    return lambda _axis: progress(next(done) / 2)
+
+
+def _hold_a_star(running: demos.Instrument, loop_name: str) -> None:
+    demos.acquire(running)
+    deadline_s = time.monotonic() + _MOCK_VERNIER_S
+    since_s = None
+    while since_s is None or time.monotonic() < since_s + _MOCK_SETTLE_S:
+        running.check()
+        telemetry = running.client.receive(0.5)
+        modes = {} if telemetry is None else {loop.name: loop.mode for loop in telemetry.loops}
+        if since_s is None and modes.get(loop_name) == Mode.VERNIER.name:
+            since_s = time.monotonic()
+        if since_s is None and time.monotonic() > deadline_s:
+            msg = f"the mock star was not held within {_MOCK_VERNIER_S:g} s; modes {modes}"
+            raise IdentifyError(msg)

@@ -1,0 +1,173 @@
+"""`fitctl simulate`: the instrument without wires, once or many times."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import (
+    ControllerOption,
+    JsonOption,
+    RigOption,
+    SeedOption,
+    SetOption,
+)
+from fitctl.commands.shared.plant import require_plant
+from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.rig import rig_of, with_controller
+from fitctl.config import Rig
+from fitctl.processes import ended_by_signals, interrupt
+from fitctl.simulation.campaign import (
+    PERCENTILES,
+    CampaignError,
+    LoopSummary,
+    Statistics,
+    dask_executor,
+    local_executor,
+    run_campaign,
+    summarize,
+)
+from fitctl.simulation.simulation import simulate as simulate_rig
+from fitctl.simulation.statistics import SimulationResult
+
+
+def simulate(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    controller: ControllerOption = None,
+    seed: SeedOption = 0,
+    duration: Annotated[
+        float, typer.Option(min=1.0, max=1e6, help="Seconds of virtual time.")
+    ] = 120.0,
+    runs: Annotated[
+        int, typer.Option(min=1, help="How many, with seeds from --seed on, on every core.")
+    ] = 1,
+    scheduler: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:port.")
+    ] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Acquire and hold on the virtual clock: same supervisor and plant, no wires, much faster.
+
+    With --runs, means, percentiles and the worst seeds of many runs; each is the run that its seed
+    gives alone.
+    """
+    settings = rig_of(rig, with_controller(rig, overrides, controller))
+    require_plant(settings)
+    if runs == 1 and not scheduler:
+        status = _simulate_once(settings, seed, duration, as_json=as_json)
+    else:
+        seeds = range(seed, seed + runs)
+        status = _simulate_many(settings, seeds, duration, scheduler, as_json=as_json)
+    raise typer.Exit(status)
+
+
+def _simulate_once(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
+    """Simulate and print the result; returns the exit status."""
+    with progress_line("simulating") as progress:
+        results = simulate_rig(rig, seed, duration_s, on_progress=progress)
+        progress(1.0)
+    plain = {name: result._asdict() for name, result in results.items()}
+    if as_json:
+        typer.echo(to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
+    else:
+        for name, result in results.items():
+            typer.echo(_result_text(name, result))
+    return 0 if all(not math.isnan(result.vernier_s) for result in results.values()) else FAILED
+
+
+def _result_text(name: str, result: SimulationResult) -> str:
+    rms, measured = result.rms_px, result.measured_rms_px
+    return (
+        f"loop {name}: star found after {result.acquired_s:.1f} s, vernier after "
+        f"{result.vernier_s:.1f} s\n"
+        f"  true residual RMS  az {rms['az']:.4f} px, el {rms['el']:.4f} px"
+        f" over {result.judged_s:.0f} s\n"
+        f"  measured RMS       az {measured['az']:.4f} px, el {measured['el']:.4f} px\n"
+        f"  piston RMS         {result.piston_rms_m * 1e9:.1f} nm\n"
+        f"  speed              {result.speed_x:.0f}x real time"
+    )
+
+
+def _simulate_many(
+    rig: Rig, seeds: Sequence[int], duration_s: float, scheduler: str, *, as_json: bool
+) -> int:
+    """Simulate every seed, here or on a Dask cluster, and print what they say together."""
+    started = time.perf_counter()
+    refusal: str | None = None
+
+    def on_refusal(reason: str) -> None:
+        nonlocal refusal
+        refusal = reason
+        typer.echo(
+            f"The batch simulator cannot run this rig: {reason}.\n"
+            "Each run is simulated tick by tick, about a hundred times slower.",
+            err=True,
+        )
+
+    try:
+        with (
+            ended_by_signals(interrupt),  # its workers would outlive it
+            dask_executor(scheduler) if scheduler else local_executor() as (executor, workers),
+            progress_line(f"{len(seeds)} runs", len(seeds)) as progress,
+        ):
+            results = run_campaign(rig, seeds, duration_s, executor, workers, progress, on_refusal)
+    except CampaignError as error:
+        typer.echo(str(error), err=True)
+        return FAILED
+    wall_s = time.perf_counter() - started
+    summaries = summarize(results)
+    speed_x = len(seeds) * duration_s / wall_s
+    if as_json:
+        head = {
+            "duration_s": duration_s,
+            "workers": workers,
+            "wall_s": wall_s,
+            "speed_x": speed_x,
+            "batch_refusal": refusal,
+        }
+        typer.echo(to_json(head | {"loops": summaries}))
+    else:
+        for name, summary in summaries.items():
+            typer.echo(_summary_text(name, summary))
+        typer.echo(f"{speed_x:.0f}x real time on {workers} workers, {wall_s:.1f} s in all")
+    return 0 if all(summary.held == summary.runs for summary in summaries.values()) else FAILED
+
+
+def _summary_text(name: str, summary: LoopSummary) -> str:
+    head = "".join(f"{f'{p}%':>10}" for p in PERCENTILES)
+    rows = [
+        ("true RMS az, px", summary.rms_px["az"], 4, 1.0),
+        ("true RMS el, px", summary.rms_px["el"], 4, 1.0),
+        ("worst axis, px", summary.rms_px["worst_axis"], 4, 1.0),
+        ("measured az, px", summary.measured_rms_px["az"], 4, 1.0),
+        ("measured el, px", summary.measured_rms_px["el"], 4, 1.0),
+        ("piston RMS, nm", summary.piston_rms_m, 1, 1e9),
+        ("star found, s", summary.acquired_s, 1, 1.0),
+        ("vernier, s", summary.vernier_s, 1, 1.0),
+    ]
+    worst = ", ".join(
+        f"{run.seed} (not judged)"
+        if math.isnan(run.rms_px)
+        else f"{run.seed} ({run.rms_px:.4f} px)"
+        for run in summary.worst_seeds
+    )
+    return "\n".join(
+        [
+            f"loop {name}: {summary.held} of {summary.runs} runs held their star, "
+            f"{summary.judged} for long enough to be judged",
+            f"  {'':18}{'mean':>10}{head}{'worst':>10}",
+            *(_row(title, figure, digits, scale) for title, figure, digits, scale in rows),
+            f"  worst seeds       {worst}",
+        ]
+    )
+
+
+def _row(title: str, figure: Statistics, digits: int, scale: float) -> str:
+    values = [figure.mean, *figure.percentiles.values(), figure.worst]
+    return f"  {title:18}" + "".join(f"{value * scale:10.{digits}f}" for value in values)

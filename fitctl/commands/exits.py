@@ -1,7 +1,0 @@
-"""Exit statuses that more than one command has; those of one command are beside it."""
-
-from __future__ import annotations
-
-FAILED = 1
-UNUSABLE = 2
-INTERRUPTED = 130

@@ -1,0 +1,1 @@
+"""Commands that operate a rig: the supervisor, and what attaches to it."""

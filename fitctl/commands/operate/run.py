@@ -1,0 +1,28 @@
+"""`fitctl run`: the supervisor."""
+
+from __future__ import annotations
+
+from fitctl.commands.shared.options import ControllerOption, ParentOption, RigOption, SetOption
+from fitctl.commands.shared.rig import rig_of, with_controller
+from fitctl.config import default_rig_path
+from fitctl.daemon.run import run_supervisor
+from fitctl.processes import end_with_parent, rig_arguments
+from fitctl.stages.realtime import bound_memory
+
+
+def run(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    controller: ControllerOption = None,
+    parent_pid: ParentOption = None,
+) -> None:
+    """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
+    bound_memory()
+    overrides = with_controller(rig, overrides, controller)
+    settings = rig_of(rig, overrides)
+    end_with_parent(parent_pid)
+    run_supervisor(
+        settings,
+        rig_arguments(rig or default_rig_path(), overrides),
+        lambda folder: print(f"supervising {settings.name}; sockets in {folder}", flush=True),
+    )

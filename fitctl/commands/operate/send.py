@@ -1,0 +1,45 @@
+"""`fitctl send`: one command to a supervisor, and its reply."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from fitctl.commands.shared import completion
+from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
+from fitctl.commands.shared.rig import require_loop, rig_of
+from fitctl.commands.shared.supervisor import connect, send_and_print
+from fitctl.messages.command_table import WORDS, command_of
+
+
+class SendCommand(TyperCommand):
+    """Its help ends with every command, from the table that they are made from."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Add them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(row.usage, row.help) for row in WORDS.values()])
+
+
+# -1 is a value, not an option.
+SETTINGS = {"cls": SendCommand, "context_settings": {"ignore_unknown_options": True}}
+
+
+def send(
+    command: Annotated[str, typer.Argument(help="One of those below.")],
+    values: Annotated[list[str] | None, typer.Argument(help="What it needs.")] = None,
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    remote: RemoteOption = None,
+    loop: Annotated[
+        str,
+        typer.Option(help="One loop by name; without it, all.", autocompletion=completion.loops),
+    ] = "",
+) -> None:
+    """Give one command to the running supervisor of a rig."""
+    wanted = command_of(command, values or [], loop)
+    if remote is None and loop:
+        require_loop("send", rig_of(rig, overrides), loop)
+    raise typer.Exit(send_and_print(connect(rig, overrides, remote), wanted, "send"))

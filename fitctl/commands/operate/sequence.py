@@ -1,0 +1,224 @@
+"""`fitctl sequence`: run a sequence on the rig, check or rehearse it without one, steer the one that runs.
+
+What only some of its commands need is imported within them: scipy must not delay `fitctl sequence stop`.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from fitctl.commands.shared import completion
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import (
+    JsonOption,
+    RemoteOption,
+    RigOption,
+    SeedOption,
+    SetOption,
+)
+from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.supervisor import client_of, connect, send_and_print
+from fitctl.config import Rig
+from fitctl.messages.commands import SequenceControl
+from fitctl.processes import ended_by_signals, interrupt
+from fitctl.sequences.files import find_sequence, shipped_sequences
+
+if TYPE_CHECKING:
+    from fitctl.logging.records import SequenceAttempt
+    from fitctl.messages.commands import SequenceStatus
+    from fitctl.sequences.links import Link
+    from fitctl.sequences.steps import Sequence
+
+app = typer.Typer(
+    help="Run, check and steer sequences of acquisition and experiment steps.",
+    no_args_is_help=True,
+)
+
+SequenceArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="A TOML or YAML file, or the name of a shipped sequence.",
+        autocompletion=completion.sequences,
+    ),
+]
+StepSetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the rig file, or of the sequence: steps.2.duration_s=60, or "
+        "steps.hold.duration_s=60 for every hold; may be repeated.",
+    ),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER",
+        help="Where calibrations are written: fragments for the rig file's include list.",
+    ),
+]
+
+
+def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Rig, Sequence]:
+    from fitctl.sequences.reading import load_sequence
+
+    of_steps = [text for text in overrides or () if text.startswith("steps.")]
+    settings = rig_of(rig, [text for text in overrides or () if text not in of_steps])
+    return settings, load_sequence(find_sequence(file), settings, of_steps)
+
+
+@app.command("list")
+def list_(
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="[FILE...]", help="These, not the shipped ones.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Every step with every key, as JSON.")
+    ] = False,
+) -> None:
+    """Print the shipped sequences."""
+    from fitctl.sequences.reading import read_sequence
+
+    listed = {path: read_sequence(path) for path in files or shipped_sequences()}
+    if as_json:
+        documents = [
+            {"file": str(path), **sequence.model_dump(exclude_none=True)}
+            for path, sequence in listed.items()
+        ]
+        typer.echo(to_json(documents))
+        return
+    width = max(len(sequence.name) for sequence in listed.values())
+    for sequence in listed.values():
+        typer.echo(f"{sequence.name:<{width}}  {sequence.description}")
+
+
+@app.command()
+def check(file: SequenceArgument, rig: RigOption = None, overrides: StepSetOption = None) -> None:
+    """Say what is wrong with a sequence for a rig, without the instrument."""
+    settings, sequence = _load(file, rig, overrides)
+    typer.echo(f"{file}: well; {len(sequence.steps)} steps for rig {settings.name}")
+
+
+@app.command("dry-run")
+def dry_run(
+    file: SequenceArgument,
+    rig: RigOption = None,
+    overrides: StepSetOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+    out: OutOption = None,
+) -> None:
+    """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave.
+
+    What it measures of the simulated rig is written only where --out says.
+    """
+    from fitctl.sequences.links import SimulatedLink
+
+    settings, sequence = _load(file, rig, overrides)
+    settings.mock_parts()
+    begun = time.perf_counter()
+    link = SimulatedLink(settings, seed)
+    status = _run(settings, sequence, link, out, as_json=as_json)
+    if not as_json:
+        typer.echo(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")
+    raise typer.Exit(status)
+
+
+@app.command()
+def run(
+    file: SequenceArgument,
+    rig: RigOption = None,
+    overrides: StepSetOption = None,
+    remote: RemoteOption = None,
+    as_json: JsonOption = False,
+    out: OutOption = Path(),
+) -> None:
+    """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
+    settings, sequence = _load(file, rig, overrides)
+    client = client_of(settings, remote)
+    try:
+        status = _run(settings, sequence, client, out, as_json=as_json)
+    finally:
+        client.close()
+    raise typer.Exit(status)
+
+
+@app.command()
+def pause(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
+    """Pause the sequence that is running: after its step, or at once within hold and wait."""
+    _steer("pause", rig, overrides, remote)
+
+
+@app.command()
+def resume(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
+    """Let a paused sequence go on."""
+    _steer("resume", rig, overrides, remote)
+
+
+@app.command()
+def stop(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
+    """End the sequence that is running; its stages are held. For SAFE, see `fitctl send stop`."""
+    _steer("stop", rig, overrides, remote)
+
+
+def _steer(
+    action: Literal["pause", "resume", "stop"],
+    rig: Path | None,
+    overrides: list[str] | None,
+    remote: Path | None,
+) -> None:
+    client = connect(rig, overrides, remote)
+    raise typer.Exit(send_and_print(client, SequenceControl(action=action), "sequence"))
+
+
+def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json: bool) -> int:
+    """Run, show progress, print what every attempt gave, write calibrations; returns the exit status."""
+    from fitctl.commands.operate.sequence_text import as_json_text, attempts_text, where
+    from fitctl.sequences.calibration import CALIBRATING, require_folder, write_calibration
+    from fitctl.sequences.contact import Contact
+    from fitctl.sequences.runner import Runner, run_steps
+    from fitctl.sequences.view import SequenceError
+
+    if out is not None and any(step.step in CALIBRATING for step in sequence.steps):
+        require_folder(out)
+    attempts: list[SequenceAttempt] = []
+    failure = "interrupted"
+    try:
+        with (
+            ended_by_signals(interrupt),
+            progress_line(sequence.name, len(sequence.steps)) as progress,
+        ):
+
+            def show(status: SequenceStatus) -> None:
+                newest = status.last_attempt
+                if newest is not None and newest not in attempts[-1:]:
+                    attempts.append(newest)
+                done = {each.step_number for each in attempts if each.outcome == "done"}
+                steps_done = len(done - {status.step_number}) + (status.state == "done")
+                progress(steps_done, where(status))
+
+            runner = Runner(Contact(link, rig, sequence.name, len(sequence.steps), show))
+            run_steps(runner, sequence.steps)
+            failure = ""
+    except (SequenceError, ConnectionError) as error:
+        failure = str(error)
+    finally:
+        if as_json:
+            typer.echo(as_json_text(sequence.name, failure, attempts))
+        elif attempts:
+            typer.echo(attempts_text(attempts))
+    if out is not None:
+        for calibration in runner.calibrations:
+            path = write_calibration(calibration, rig, out)
+            typer.echo(f"written: {path} (name it in the rig file's include list)", err=as_json)
+    if failure:
+        typer.echo(f"sequence {sequence.name}: {failure}", err=True)
+        return FAILED
+    return 0

@@ -1,0 +1,122 @@
+"""`fitctl status`: one look at a running instrument, for people and for scripts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import typer
+
+from fitctl.commands.shared.exits import NO_SUPERVISOR
+from fitctl.commands.shared.options import JsonOption, RemoteOption, RigOption, SetOption
+from fitctl.commands.shared.printing import to_json, utc
+from fitctl.commands.shared.supervisor import connect
+from fitctl.messages.client import REPLY_TIMEOUT_S, Client
+from fitctl.messages.commands import Status
+from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.troubles import troubles
+
+NOT_WELL = 1
+_STREAMS = ("frame", "events", "mode_changes")  # `fitctl watch` and the log have them
+
+
+def status(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    remote: RemoteOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say how the running instrument of a rig is.
+
+    Exit status 0 if all is well, 1 if something is not, 3 if no supervisor answers.
+    """
+    client = connect(rig, overrides, remote)
+    try:
+        telemetry = newest_telemetry(client)
+    except ConnectionError as error:
+        typer.echo(f"status: {error}", err=True)
+        raise typer.Exit(NO_SUPERVISOR) from None
+    finally:
+        client.close()
+    found = troubles(telemetry)
+    if as_json:
+        typer.echo(to_json(status_document(telemetry, found)))
+    else:
+        typer.echo("\n".join(status_lines(telemetry, found)))
+    raise typer.Exit(NOT_WELL if found else 0)
+
+
+def newest_telemetry(client: Client) -> Telemetry:
+    """One message.
+
+    Raises
+    ------
+    ConnectionError
+        If nobody answers, or no telemetry comes.
+    """
+    client.send(Status())  # who is not there is told sooner, and by name
+    telemetry = client.receive(REPLY_TIMEOUT_S)
+    if telemetry is None:
+        msg = f"the supervisor answers, but sends no telemetry ({REPLY_TIMEOUT_S:g} s); see its output"
+        raise ConnectionError(msg)
+    return telemetry
+
+
+def status_document(telemetry: Telemetry, found: list[str]) -> dict[str, Any]:
+    """One telemetry message as plain values, and `found` troubles: no streams, each loop's newest tick."""
+    plain = msgspec.to_builtins(telemetry)
+    for stream in _STREAMS:
+        del plain[stream]
+    plain["ticks"] = list({tick["loop"]: tick for tick in plain["ticks"]}.values())
+    for loop in plain["loops"]:
+        loop["since"] = utc(telemetry, loop["since_s"])
+    verdict = {"well": not found, "troubles": found, "time": utc(telemetry, telemetry.time_s)}
+    return verdict | plain
+
+
+def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
+    """The same for people."""
+    lines = [f"{telemetry.rig_name}: {'not well' if found else 'well'}"]
+    lines += [f"  ! {trouble}" for trouble in found]
+    for loop in telemetry.loops:
+        for_s = duration(telemetry.time_s - loop.since_s)
+        lines.append(_line(loop.name, f"{loop.mode} for {for_s}, controller {loop.controller}"))
+    for device in telemetry.devices:
+        known = f" ({device.identity})" if device.identity else ""
+        text = f"{device.state}{known} at {device.endpoint}, {device.detail}"
+        lines.append(_line(device.device, text))
+    for timing in telemetry.timing:
+        text = (
+            f"{timing.ticks} ticks, {timing.late_ticks} late, computed in "
+            f"{timing.compute_worst_s * 1e3:.1f} ms at worst, {timing.stalls} stalls of the machine"
+        )
+        lines.append(_line(f"{timing.loop} last second", text))
+    if telemetry.recorder is not None:
+        text = f"{telemetry.recorder.path}, {telemetry.recorder.records} records"
+        lines.append(_line("log", f"{text}, {telemetry.records_lost} lost"))
+    unsent = ", ".join(f"{count} {name}" for name, count in telemetry.losses.unsent.items())
+    lines.append(_line("unsent", unsent.replace("_", " ")))
+    running = telemetry.running_sequence
+    if running is not None:
+        text = f"{running.name} {running.state}, step {running.step_number} of {running.steps}"
+        lines.append(_line("sequence", f"{text} ({running.step})"))
+    lines.append(_line("commander", telemetry.commander or "nobody"))
+    lines.append(_line("supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"))
+    return lines
+
+
+def _line(what: str, text: str) -> str:
+    return f"  {what:<17}  {text}"
+
+
+def duration(seconds: float) -> str:
+    """A time span for people: its two largest units."""
+    whole = int(max(0.0, seconds))
+    parts = [
+        (whole // 86400, "d"),
+        (whole // 3600 % 24, "h"),
+        (whole // 60 % 60, "min"),
+        (whole % 60, "s"),
+    ]
+    first = next((n for n, (count, _) in enumerate(parts) if count), len(parts) - 1)
+    return " ".join(f"{count} {unit}" for count, unit in parts[first : first + 2])

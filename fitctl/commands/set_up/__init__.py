@@ -1,0 +1,1 @@
+"""Commands that set up a rig: its file, its devices, its keys."""

@@ -1,0 +1,18 @@
+"""`fitctl check`: a rig file, validated."""
+
+from __future__ import annotations
+
+import typer
+
+from fitctl.commands.shared.options import RigOption, SetOption
+from fitctl.commands.shared.plant import check_plant
+from fitctl.commands.shared.rig import rig_of
+from fitctl.config import default_rig_path
+
+
+def check(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Read a rig file and say whether it is well."""
+    settings = rig_of(rig, overrides)
+    check_plant(settings)
+    loops = ", ".join(settings.loops)
+    typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")

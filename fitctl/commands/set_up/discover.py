@@ -1,0 +1,70 @@
+"""`fitctl discover`: cameras, serial ports and CAN interfaces of this machine."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from typing import Annotated
+
+import can
+import typer
+from serial.tools import list_ports
+
+from fitctl.commands.shared.options import JsonOption
+from fitctl.commands.shared.printing import to_json
+from fitctl.drivers.gige.discovery import discover as discover_cameras
+from fitctl.drivers.interface import DeviceUnreachable
+
+
+def discover(
+    broadcast: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where cameras are asked to say who they are.")
+    ] = "255.255.255.255",
+    wait_s: Annotated[
+        float, typer.Option("--wait", min=0.01, max=60.0, help="For their answers, seconds.")
+    ] = 1.0,
+    as_json: JsonOption = False,
+) -> None:
+    """List cameras, serial ports and CAN interfaces. Cameras are asked by a broadcast."""
+    found = {
+        "cameras": _cameras(broadcast, wait_s),
+        "serial_ports": _serial_ports(),
+        "can_interfaces": _can_interfaces(),
+    }
+    if as_json:
+        typer.echo(to_json(found))
+        return
+    for title, entries in found.items():
+        typer.echo(title.replace("_", " ") + ("" if entries else ": none"))
+        for entry in entries:
+            typer.echo("  " + "  ".join(str(value) for value in entry.values() if value))
+
+
+def _cameras(broadcast: str, wait_s: float) -> list[dict[str, str]]:
+    try:
+        cameras = discover_cameras(broadcast, wait_s)
+    except DeviceUnreachable as error:
+        typer.echo(f"cameras: {error}", err=True)
+        return []
+    return [
+        {"address": one.address, "mac": one.mac, "name": one.user_name, **asdict(one.identity)}
+        for one in cameras
+    ]
+
+
+def _serial_ports() -> list[dict[str, str]]:
+    return [
+        {"port": port.device, "description": port.description, "hardware": port.hwid}
+        for port in sorted(list_ports.comports())
+    ]
+
+
+def _can_interfaces() -> list[dict[str, str]]:
+    """Buses of the system and adapters by their makers' drivers; serial ports stand by themselves."""
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # of makers' drivers that are not installed
+    known = can.detect_available_configs()
+    return [
+        {"interface": str(one["interface"]), "channel": str(one["channel"])}
+        for one in known
+        if one["interface"] not in {"serial", "virtual", "udp_multicast"}
+    ]

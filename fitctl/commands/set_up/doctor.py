@@ -1,0 +1,125 @@
+"""`fitctl doctor`: which of a rig's devices answer, and whether they are as the rig file says."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.printing import to_json
+from fitctl.commands.shared.rig import rig_of
+from fitctl.config import Rig
+from fitctl.drivers.bal_analog.driver import probe_bal_analog
+from fitctl.drivers.cia402.configure import probe_drive
+from fitctl.drivers.ensemble.driver import probe_ensemble
+from fitctl.drivers.gige.probe import probe_camera
+from fitctl.drivers.interface import DeviceError, DeviceIdentity, DeviceTimeout, DeviceUnreachable
+from fitctl.drivers.mdt693.driver import probe_mdt693
+from fitctl.drivers.modbus_dac.probe import probe_dac
+from fitctl.drivers.probe import Probe
+
+_WIDEST = 118
+PROBES: dict[str, Callable[[Any], Probe]] = {
+    "gige": probe_camera,
+    "aravis": probe_camera,
+    "cia402": probe_drive,
+    "ensemble": probe_ensemble,
+    "bal_analog": probe_bal_analog,
+    "modbus_dac": probe_dac,
+    "mdt693": probe_mdt693,
+}
+
+
+class Finding(NamedTuple):
+    """What became of asking one device.
+
+    Attributes
+    ----------
+    device : str
+    driver : str
+    found : bool
+        Something answered.
+    identity : DeviceIdentity or None
+    round_trip_ms : float or None
+    disagreements : list of str
+        Empty where all is as the rig file says.
+    """
+
+    device: str
+    driver: str
+    found: bool
+    identity: DeviceIdentity | None
+    round_trip_ms: float | None
+    disagreements: list[str]
+
+
+def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+    """Ask every device of the rig who it is; nothing is set, nothing moves.
+
+    Exit status 1 if one is missing or is not as the rig file says.
+    """
+    raise typer.Exit(ask_devices(rig_of(rig, overrides), as_json=as_json))
+
+
+def ask_devices(rig: Rig, *, as_json: bool) -> int:
+    """Ask every device of a rig, print what they answer; returns the exit status."""
+    logging.disable()  # libraries print on stderr what is in the table
+    parts = list(_parts(rig))
+    with ThreadPoolExecutor(len(parts)) as pool:
+        findings = list(pool.map(lambda part: examine(*part), parts))
+    if as_json:
+        typer.echo(to_json({"rig": rig.name, "devices": [_plain(one) for one in findings]}))
+    else:
+        _print(rig, findings)
+    return FAILED if any(finding.disagreements for finding in findings) else 0
+
+
+def examine(device: str, driver: str, settings: Any) -> Finding:
+    """Ask one device; `settings` is what its driver takes from the rig file."""
+    try:
+        probe = PROBES[driver](settings)
+    except DeviceError as error:
+        found = not isinstance(error, (DeviceUnreachable, DeviceTimeout))
+        return Finding(device, driver, found, None, None, [str(error)])
+    round_trip_ms = 1e3 * probe.round_trip_s
+    return Finding(device, driver, True, probe.identity, round_trip_ms, list(probe.disagreements))
+
+
+def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:
+    yield "camera", rig.camera.device.driver, rig.camera
+    for name, loop in rig.loops.items():
+        yield f"{name} siderostat", loop.siderostat.device.driver, loop.siderostat
+        yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
+        yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    identity = None if finding.identity is None else asdict(finding.identity)
+    return finding._asdict() | {"identity": identity}
+
+
+def _print(rig: Rig, findings: list[Finding]) -> None:
+    table = Table(title=f"Devices of {rig.name}", title_justify="left", show_lines=True)
+    for heading in ("device", "found", "identity", "firmware", "round trip", "disagrees"):
+        table.add_column(heading, justify="right" if heading == "round trip" else "left")
+    for finding in findings:
+        who = finding.identity
+        table.add_row(
+            f"{finding.device}\n({finding.driver})",
+            "yes" if finding.found else "no",
+            "" if who is None else "\n".join(filter(None, (who.maker, who.model, who.serial))),
+            "" if who is None else who.firmware,
+            "" if finding.round_trip_ms is None else f"{finding.round_trip_ms:.2f} ms",
+            "\n".join(finding.disagreements),
+        )
+    width = min(shutil.get_terminal_size((_WIDEST, 24)).columns, _WIDEST)
+    Console(width=width, highlight=False).print(table)

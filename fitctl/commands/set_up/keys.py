@@ -1,0 +1,65 @@
+"""`fitctl keys`: who may reach a rig from other machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.options import RigOption, SetOption
+from fitctl.commands.shared.rig import rig_of
+from fitctl.messages.keys import allowed_keys, new_key, revoke_key
+
+app = typer.Typer(
+    help="Keys with which others reach the rig from other machines: to command it, or to watch.",
+    no_args_is_help=True,
+)
+
+NameArgument = Annotated[str, typer.Argument(help="Whose it is: a-z, 0-9, - and _.")]
+
+
+@app.command()
+def new(
+    name: NameArgument,
+    viewer: Annotated[bool, typer.Option("--viewer", help="May watch and not command.")] = False,
+    host: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            help="How they reach this machine; without it, service.tcp_address.",
+        ),
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The key file; by default NAME.key.toml.")
+    ] = None,
+    rig: RigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Allow somebody in, and write the key file that they need: whoever has it is them."""
+    settings = rig_of(rig, overrides)
+    path = out or Path(f"{name}.key.toml")
+    key = new_key(settings, name, "viewer" if viewer else "commander", host, path)
+    typer.echo(
+        f"{path}: {key.role} {key.name} of rig {key.rig} at {key.host}; hand it over in secret"
+    )
+    if not settings.service.tcp_address:
+        typer.echo("the rig listens to nobody yet: set service.tcp_address and start it anew")
+
+
+@app.command("list")
+def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Print whose keys are allowed, and what each may do."""
+    keys, problems = allowed_keys(rig_of(rig, overrides))
+    for key in keys.values():
+        typer.echo(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
+    for problem in problems:
+        typer.echo(problem, err=True)
+    raise typer.Exit(1 if problems else 0)
+
+
+@app.command()
+def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Let a key in no more; a running supervisor drops its holder at once."""
+    revoke_key(rig_of(rig, overrides), name)
+    typer.echo(f"{name} is let in no more")

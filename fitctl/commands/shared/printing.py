@@ -1,0 +1,44 @@
+"""What commands print: results for programs, progress for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Protocol
+
+import msgspec
+
+if TYPE_CHECKING:
+    from fitctl.messages.telemetry import Telemetry
+
+
+class ShowProgress(Protocol):
+    """Show how much is done, and what is being done where that changes."""
+
+    def __call__(self, done: float, text: str | None = None) -> None:
+        """Show it."""
+
+
+def to_json(result: Any) -> str:
+    """One line; what was not reached is null."""
+    return msgspec.json.encode(result).decode()
+
+
+@contextmanager
+def progress_line(text: str, total: float = 1.0) -> Iterator[ShowProgress]:
+    """A progress line on standard error, so that results alone are on standard output."""
+    # Not at the top: most commands print and show no progress, and rich takes as long as numpy.
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(text, total=total)
+        yield lambda done, text=None: progress.update(task, completed=done, description=text)
+
+
+def utc(telemetry: Telemetry, time_s: float) -> str:
+    """A time of the supervisor's clock as ISO 8601."""
+    wall_s = time_s + telemetry.wall_minus_monotonic_s
+    return datetime.fromtimestamp(wall_s, UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,47 @@
+"""The rig that a command is for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+
+
+def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
+    """The rig that the options name.
+
+    Raises
+    ------
+    ConfigError
+        If its file cannot be used.
+    """
+    return load_rig(path or default_rig_path(), overrides or ())
+
+
+def with_controller(
+    path: Path | None, overrides: list[str] | None, controller: str | None
+) -> list[str]:
+    """The overrides, and with them one that gives every loop the named controller, if any."""
+    if controller is None:
+        return overrides or []
+    loops = rig_of(path, overrides).loops
+    return [*(overrides or []), *controller_overrides(loops, controller)]
+
+
+def controller_overrides(loops: Iterable[str], controller: str) -> list[str]:
+    """Overrides that give loops a controller to begin with."""
+    return [f"loops.{name}.vernier.controller={controller}" for name in loops]
+
+
+def require_loop(command: str, rig: Rig, loop: str) -> None:
+    """Reject a loop that the rig has not.
+
+    Raises
+    ------
+    ConfigError
+        If so.
+    """
+    if loop not in rig.loops:
+        msg = f"{command}: --loop {loop!r}: rig {rig.name} has {', '.join(rig.loops)}"
+        raise ConfigError(msg)

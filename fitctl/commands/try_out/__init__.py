@@ -1,0 +1,1 @@
+"""Commands to try fitctl without hardware: the demo, mock devices, their faults."""

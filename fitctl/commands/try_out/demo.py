@@ -1,0 +1,143 @@
+"""`fitctl demo`: the whole instrument on mock devices, with a console or with a summary at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fitctl import demo as demos
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import (
+    ControllerOption,
+    JsonOption,
+    RigOption,
+    SeedOption,
+    SetOption,
+)
+from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.rig import rig_of, with_controller
+from fitctl.commands.shared.terminal import has_terminal
+from fitctl.config import Rig, default_rig_path
+from fitctl.messages.telemetry import Telemetry
+from fitctl.processes import (
+    end_process,
+    ended_by_signals,
+    interrupt,
+    rig_arguments,
+    show_process,
+)
+
+_CONSOLE_END_S = 3.0
+
+
+def demo(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    seed: SeedOption = 0,
+    duration: Annotated[
+        float, typer.Option(min=1.0, help="Seconds to run without a console.")
+    ] = 60.0,
+    headless: Annotated[
+        bool, typer.Option("--headless", help="No console, also on a terminal.")
+    ] = False,
+    as_json: JsonOption = False,
+    controller: ControllerOption = None,
+) -> None:
+    """Run the whole instrument on mock devices: see a star acquired and held.
+
+    On a terminal the console comes up. Without one, or with --headless, the same runs for a while and
+    a summary is printed at the end.
+    """
+    overrides = with_controller(rig, overrides, controller)
+    settings = rig_of(rig, overrides)
+    settings.mock_parts()
+    path = rig or default_rig_path()
+    console = not (headless or as_json) and has_terminal()
+    with ended_by_signals(interrupt):
+        try:
+            with demos.instrument(path, overrides, seed) as running:
+                if console:
+                    status = _demo_with_console(path, overrides, running)
+                else:
+                    status = _demo_headless(settings, running, duration, as_json=as_json)
+        except (demos.DemoError, ConnectionError) as error:
+            typer.echo(f"demo: {error}", err=True)
+            status = FAILED
+    raise typer.Exit(status)
+
+
+def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.Instrument) -> int:
+    thread = demos.acquire_in_background(running)
+    # A process of its own: when its terminal goes away it may hang, and must not hang us with it.
+    console = show_process(
+        [
+            "console",
+            *rig_arguments(rig_path, [*overrides, f"service.folder={running.sockets}"]),
+            "--quitting-ends-instrument",
+        ]
+    )
+    try:
+        console.wait()
+    finally:
+        end_process(console, _CONSOLE_END_S)
+    thread.join(timeout=5.0)
+    newest = demos.newest_telemetry(running.sockets)
+    if newest is not None and newest.recorder is not None:
+        typer.echo(f"log: {newest.recorder.path}")
+    return 0 if console.returncode == 0 else FAILED
+
+
+def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as_json: bool) -> int:
+    demos.acquire(running)
+    with progress_line("starting", duration_s) as progress:
+        course = demos.watch(
+            running,
+            duration_s,
+            lambda gone_s, telemetry: progress(gone_s, _progress_text(telemetry)),
+        )
+    results = {name: demos.summary(rig, running, course, name) for name in rig.loops}
+    if as_json:
+        # One loop: its summary. Several: one for each, by name.
+        typer.echo(to_json(next(iter(results.values())) if len(results) == 1 else results))
+    else:
+        for name, result in results.items():
+            typer.echo(_summary_text(name, result))
+    held = all(result["judged_s"] > 0 for result in results.values())
+    return 0 if held else FAILED
+
+
+def _progress_text(telemetry: Telemetry) -> str:
+    parts = []
+    for loop in telemetry.loops:
+        ticks = [t for t in telemetry.ticks if t.loop == loop.name and t.star_visible]
+        error = (
+            f" az {ticks[-1].error_az_px:+.3f} el {ticks[-1].error_el_px:+.3f} px" if ticks else ""
+        )
+        parts.append(f"{loop.name} {loop.mode:<11}{error:<28}")
+    return "; ".join(parts)
+
+
+def _summary_text(name: str, result: dict[str, Any]) -> str:
+    rms, measured, arcsec = result["rms_px"], result["measured_rms_px"], result["rms_arcsec"]
+    lines = [
+        f"loop {name}",
+        f"  star found after     {result['acquired_s']:8.1f} s",
+        f"  vernier after        {result['vernier_s']:8.1f} s",
+        f"  true residual RMS    az {rms['az']:.4f} px, el {rms['el']:.4f} px"
+        f" (az {arcsec['az']:.3f}, el {arcsec['el']:.3f} arcsec on the sky)"
+        f" over the last {result['judged_s']:.0f} s",
+        f"  measured RMS         az {measured['az']:.4f} px, el {measured['el']:.4f} px",
+        f"  frames               {result['frames']} ({result['frames_lost']} lost),"
+        f" {result['late_ticks']} late ticks, {result['records_lost']} records lost",
+        f"  log                  {result['log']}",
+    ]
+    if result["machine_stalls"]:
+        lines.insert(
+            -1,
+            f"  this machine stalled {result['machine_stalls']} times,"
+            f" {result['worst_stall_s'] * 1e3:.0f} ms at worst",
+        )
+    return "\n".join(lines)

@@ -1,0 +1,110 @@
+"""`fitctl fault`: make something go wrong with running mock devices."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from fitctl.commands.shared import completion
+from fitctl.commands.shared.fault_kinds import kinds
+from fitctl.commands.shared.options import RigOption, SetOption
+from fitctl.commands.shared.rig import rig_of
+from fitctl.config import ConfigError, Rig
+from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
+
+app = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
+
+DeviceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.",
+        autocompletion=completion.devices,
+    ),
+]
+PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has parts.")]
+
+
+@app.command("set")
+def set_(
+    device: DeviceArgument,
+    kind: Annotated[
+        str,
+        typer.Argument(help="`fitctl fault kinds` lists them.", autocompletion=completion.faults),
+    ],
+    value: Annotated[float | None, typer.Argument(help="In the kind's unit.")] = None,
+    part: PartOption = "",
+    for_s: Annotated[
+        float | None, typer.Option("--for", metavar="SECONDS", help="Without it, until cleared.")
+    ] = None,
+    probability: Annotated[float, typer.Option(help="That it hits, each time.")] = 1.0,
+    rig: RigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Begin a fault."""
+    wanted = SetFault(device, kind, part, value, for_s, probability)
+    _change(rig_of(rig, overrides), wanted)
+
+
+@app.command("clear")
+def clear(
+    device: Annotated[
+        str, typer.Argument(help="Without it, all devices.", autocompletion=completion.devices)
+    ] = "",
+    kind: Annotated[str, typer.Argument(help="Without it, all kinds.")] = "",
+    part: PartOption = "",
+    rig: RigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """End faults."""
+    _change(rig_of(rig, overrides), ClearFaults(device, kind, part))
+
+
+@app.command("now")
+def now(rig: RigOption = None, overrides: SetOption = None) -> None:
+    """Print what is wrong now."""
+    _change(rig_of(rig, overrides), ListFaults())
+
+
+@app.command("kinds")
+def kinds_() -> None:
+    """Print what can go wrong with each device."""
+    for device, table in kinds().items():
+        typer.echo(device)
+        for name, kind in table.items():
+            value = f" [{kind.value:g} {kind.unit}]" if kind.unit else ""
+            parts = f" ({', '.join(kind.parts)})" if kind.parts else ""
+            typer.echo(f"  {name:<18} {kind.text}{value}{parts}")
+
+
+def _change(rig: Rig, question: SetFault | ClearFaults | ListFaults) -> None:
+    """Change or list faults of the running mocks, and print those that remain.
+
+    Raises
+    ------
+    ConfigError
+        If no mocks answer, or they have no such fault.
+    """
+    _, mocks = rig.mock_parts()
+    if not mocks.bench_port:
+        msg = "fault: mocks.bench_port is 0; give the port that the mocks printed: --set mocks.bench_port=PORT"
+        raise ConfigError(msg)
+    try:
+        now = ask_bench(mocks.bench_port, question, FaultsNow)
+    except ConnectionError as error:
+        msg = f"fault: {error}; start fitctl mocks, or give its port: --set mocks.bench_port=PORT"
+        raise ConfigError(msg) from None
+    if now.error:
+        msg = f"fault: {now.error}"
+        raise ConfigError(msg)
+    typer.echo("\n".join(map(_line, now.active)) or "all is well")
+
+
+def _line(fault: dict[str, Any]) -> str:
+    words = [fault["device"], fault["kind"]]
+    words += [str(fault[key]) for key in ("part", "value") if fault[key] not in {"", None}]
+    if fault["for_s"] is not None:
+        words.append(f"for {fault['for_s']:g} s")
+    if fault["probability"] != 1:
+        words.append(f"probability {fault['probability']:g}")
+    return " ".join(words)

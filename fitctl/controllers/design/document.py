@@ -1,0 +1,63 @@
+"""A design as JSON, with everything needed to make it again: in files, in logs, between processes."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+
+import numpy as np
+
+from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
+
+FORMAT = "fitctl design 1"
+MATRICES = ("a", "b", "c", "d")
+
+
+def design_json(design: Design) -> str:
+    """A design with everything needed to make it again, as its file has it."""
+    document = {
+        "format": FORMAT,
+        "fitctl": importlib.metadata.version("fitctl"),
+        "name": design.name,
+        "period_s": design.period_s,
+        "delay_s": design.delay_s,
+        "inputs": list(INPUTS),
+        "outputs": list(OUTPUTS),
+        "hysteresis_inverse": design.hysteresis_inverse,
+        "parameters": design.parameters,
+        **{name: getattr(design, name).tolist() for name in MATRICES},
+    }
+    return json.dumps(document, indent=1) + "\n"
+
+
+def design_from_json(text: str) -> Design:
+    """The design that :func:`design_json` wrote, bit for bit; for text of this process's own making.
+
+    Nothing is compared with a rig: for files there is :func:`fitctl.controllers.design.files.load_design`.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If the text is not one of :func:`design_json`.
+    """
+    document = json.loads(text)
+    # A law without states has matrices of no rows, whose columns JSON does not keep.
+    states = len(document["a"])
+    shapes = {
+        "a": (states, states),
+        "b": (states, len(INPUTS)),
+        "c": (len(OUTPUTS), states),
+        "d": (len(OUTPUTS), len(INPUTS)),
+    }
+    a, b, c, d = (np.array(document[name], dtype=float).reshape(shapes[name]) for name in MATRICES)
+    return Design(
+        document["name"],
+        document["period_s"],
+        document["delay_s"],
+        a,
+        b,
+        c,
+        d,
+        document["hysteresis_inverse"],
+        document["parameters"],
+    )

@@ -1,0 +1,46 @@
+"""Pages made from templates, for people, and their JSON, for programs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+
+def write_page(path: Path, package: str, template: str, **values: Any) -> None:
+    """Write a package's template, filled in; HTML is escaped, Markdown is not.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+    pages = Environment(
+        loader=PackageLoader(package),
+        autoescape=select_autoescape(["html.j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    pages.filters["number"] = number
+    path.write_text(pages.get_template(template).render(values), encoding="utf-8")
+
+
+def number(value: float | None, form: str, unknown: str = "") -> str:
+    """A number as a format has it, or what stands for one that is not known."""
+    return unknown if value is None or math.isnan(value) else f"{value:{form}}"
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write JSON; what is not a number becomes null.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")

@@ -1,0 +1,111 @@
+"""The frames of a loop from which its residual is computed, and the pieces that are whole."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.identify.record import axis_pair
+from fitctl.logging.reading import Columns
+from fitctl.messages.modes import Mode
+from fitctl.simulation.statistics import SETTLE_S
+
+TARGET_SETTLE_S = 2.0
+LONGEST_GAP_S = 0.5
+"""Frames missing for longer end a piece; shorter gaps are bridged, linearly, for spectra alone."""
+_TARGET_MOVES = 0.5  # requirements a second: slower is no motion
+
+
+class Selection(NamedTuple):
+    """The part of a run that is evaluated for a loop.
+
+    Attributes
+    ----------
+    pieces : list of array of int
+        Rows of ticks with a frame and a star, piece by piece, nothing longer than `LONGEST_GAP_S`
+        missing within one.
+    vernier_s : float
+        All time in VERNIER.
+    evaluated_s : float
+        Of it, what counts.
+    star_fraction : float
+        Part of the frames that count in which the star was measured; nan without any.
+    """
+
+    pieces: list[NDArray[np.intp]]
+    vernier_s: float
+    evaluated_s: float
+    star_fraction: float
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """Of all pieces."""
+        return np.concatenate([np.empty(0, np.intp), *self.pieces])
+
+
+def select_frames(ticks: Columns, period_s: float, requirement_px: float) -> Selection:
+    """Choose the frames: VERNIER, from `SETTLE_S` after it began and `TARGET_SETTLE_S` after the target moved.
+
+    Parameters
+    ----------
+    ticks : dict of str to array, shape (ticks,)
+        As :class:`fitctl.report.gather.Gathered` has them.
+    period_s : float
+        Of frames.
+    requirement_px : float
+        The target moves if it would pass half of this in a second.
+    """
+    rows = np.flatnonzero((ticks["mode_number"] == Mode.VERNIER) & (ticks["number"] >= 0))
+    if len(rows) == 0:
+        return Selection([], 0.0, 0.0, float("nan"))
+    time_s = ticks["time_s"][rows]
+    # A stretch ends where another mode came between, or nothing for long.
+    begins = np.ones(len(rows), bool)
+    left = np.cumsum(ticks["mode_number"] != Mode.VERNIER)[rows]
+    begins[1:] = (np.diff(left) > 0) | (np.diff(time_s) > LONGEST_GAP_S)
+    since_s = time_s - last_marked(time_s, begins)
+    still_s = time_s - last_marked(time_s, _moves(ticks, rows, begins, requirement_px) | begins)
+    counts = (since_s >= SETTLE_S) & (still_s >= TARGET_SETTLE_S)
+    with_star = rows[counts & ticks["star_visible"][rows]]
+    exposed_s = ticks["mid_exposure_s"][with_star]
+    apart = (np.diff(exposed_s) > LONGEST_GAP_S) | (
+        np.diff(np.cumsum(begins)[np.searchsorted(rows, with_star)]) > 0
+    )
+    pieces = np.split(with_star, np.flatnonzero(apart) + 1) if len(with_star) else []
+    return Selection(
+        pieces=[piece for piece in pieces if len(piece) > 1],
+        vernier_s=len(rows) * period_s,
+        evaluated_s=int(np.count_nonzero(counts)) * period_s,
+        star_fraction=len(with_star) / max(1, int(np.count_nonzero(counts)))
+        if counts.any()
+        else float("nan"),
+    )
+
+
+def last_marked(values: NDArray[Any], marked: NDArray[np.bool_]) -> NDArray[Any]:
+    """At each place, the value where it was marked last; the first counts as marked."""
+    index = np.where(marked, np.arange(len(values)), 0)
+    return values[np.maximum.accumulate(index)]
+
+
+def _moves(
+    ticks: Columns, rows: NDArray[np.intp], begins: NDArray[np.bool_], requirement_px: float
+) -> NDArray[np.bool_]:
+    """Whether the target is on its way, at each of some rows."""
+    target_px = axis_pair(ticks, "target_{}_px")[rows]
+    step_px = np.abs(np.diff(target_px, axis=0, prepend=target_px[:1])).max(axis=1)
+    step_s = np.diff(ticks["time_s"][rows], prepend=ticks["time_s"][rows[0]] - 1.0)
+    return (step_px > _TARGET_MOVES * requirement_px * np.maximum(step_s, 1e-6)) & ~begins
+
+
+def regular(
+    time_s: NDArray[np.float64], values: NDArray[np.floating], period_s: float
+) -> NDArray[np.float64]:
+    """Values, shape (frames, n), once a period: what is missing is bridged by straight lines."""
+    frames = 1 + round((time_s[-1] - time_s[0]) / period_s)
+    if frames == len(time_s):
+        return np.asarray(values, dtype=float)
+    grid_s = np.linspace(time_s[0], time_s[-1], frames)
+    return np.column_stack([np.interp(grid_s, time_s, column) for column in values.T])

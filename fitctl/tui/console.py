@@ -1,0 +1,36 @@
+"""What a screen or the command palette may ask of the console."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from fitctl.messages.commands import AnyCommand
+from fitctl.tui.alarms import AlarmBook
+from fitctl.tui.graphics import PictureSender
+from fitctl.tui.jobs import Job
+from fitctl.tui.state import ConsoleState
+
+
+class Console(Protocol):
+    """The console without its screens; :class:`fitctl.tui.app.ConsoleApp` describes the attributes."""
+
+    state: ConsoleState
+    alarms: AlarmBook
+    pictures: PictureSender | None
+    clock: Callable[[], float]
+    quit_shuts_down: bool
+    rig_arguments: Sequence[str] | None
+    remote_arguments: list[str]
+    log_folder: Path | None
+    start_job: Callable[..., Job]
+
+    def send(self, command: AnyCommand) -> None:
+        """Send a command for the shown loop."""
+
+    def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
+        """Do something once the operator has said yes."""
+
+    def draw_all(self) -> None:
+        """Bring everything on the screen up to date now."""

@@ -1,0 +1,110 @@
+"""`fitctl identify` as a stranger meets it: what is wrong is said before anything moves."""
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from fitctl.cli import main
+from fitctl.commands.design import identify as commands
+from fitctl.daemon.run import run_info
+from fitctl.identify import run as runs
+from fitctl.identify.experiments import EXPERIMENTS
+from fitctl.identify.run import on_simulation
+from fitctl.logging.writer import LogWriter
+from fitctl.messages.commands import Experiment, Hold, Reply
+from fitctl.model.drives import Drive
+
+WALL_S = 1_795_000_000.0
+
+
+@pytest.fixture
+def identify(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["identify", *map(str, arguments)])
+        return end.value.code or 0, capsys.readouterr().err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--plot", "a.xyz"], "a.xyz"),
+        (["--out", "nowhere/a.toml"], "nowhere/a.toml"),
+        (["--plot", "nowhere/a.png"], "nowhere/a.png"),
+        (["--out", "."], "nothing can be written"),
+        (["--mock"], "exclude each other"),
+        (["--log", "a.mcap"], "exclude each other"),
+        (["--loop", "left"], "left"),
+    ],
+)
+def test_what_could_not_end_well_is_not_begun(identify, monkeypatch, tmp_path, arguments, said):
+    monkeypatch.setattr(commands, "on_simulation", lambda *_: pytest.fail("it was begun"))
+    status, err = identify("delay", "--simulate", *arguments)
+    assert status == 2
+    assert said in err
+    assert len(err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp_path):
+    """Each log has a part of the voltages and of the frames; the analysis gets all of them."""
+    drives = EXPERIMENTS["delay"].plan(rig, "right")
+    records = on_simulation(rig, "right", "delay", drives, 1, lambda _: None)
+    middle = len(records) // 2
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for path, part in zip(paths, (records[:middle], records[middle:]), strict=True):
+        with LogWriter(path, rig.logging) as log:
+            log.write(run_info(rig, "", 0.0, designs={}), WALL_S)
+            for record in part:
+                log.write(record, WALL_S + record.time_s)
+
+    found = commands._from_logs(EXPERIMENTS["delay"], rig, "right", paths)
+
+    whole = EXPERIMENTS["delay"].from_records(rig, "right", records)
+    assert found.fragment() == whole.fragment()
+
+
+def test_the_logs_of_an_experiment_are_those_that_were_written_meanwhile(rig, monkeypatch):
+    monkeypatch.setattr(runs, "_FLUSH_SLACK_S", 0.0)
+    moments = [("EXPERIMENT", "a"), ("EXPERIMENT", "b"), ("COARSE", "b"), ("COARSE", "c")]
+
+    class Rigged:
+        began_s = time.monotonic()
+
+        def send(self, _command):
+            return Reply(accepted=True)
+
+        def receive(self, _timeout_s):
+            mode, log = moments.pop(0) if len(moments) > 1 else moments[0]
+            if mode == "COARSE":  # not one from before the experiment
+                time.sleep(max(0.0, self.began_s + 1.1 - time.monotonic()))
+            loop = SimpleNamespace(name="right", mode=mode, last_change=None)
+            return SimpleNamespace(loops=[loop], recorder=SimpleNamespace(path=f"{log}.mcap"))
+
+    drive = Drive(channel="fsm_az", shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=9.0)
+    found = runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
+    assert found == [Path("a.mcap"), Path("b.mcap"), Path("c.mcap")]
+
+
+def test_ctrl_c_ends_the_experiment_on_the_rig(rig):
+    given = []
+
+    class Rigged:
+        def send(self, command):
+            given.append(command)
+            return Reply(accepted=True)
+
+        def receive(self, _timeout_s):
+            raise KeyboardInterrupt
+
+    drive = Drive(channel="fsm_az", shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=9.0)
+    with pytest.raises(KeyboardInterrupt):
+        runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
+    assert [type(command) for command in given] == [Experiment, Hold]
+    assert given[1].loop == "right"

@@ -1,0 +1,161 @@
+"""`fitctl report` and `fitctl plot` as a stranger meets them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from report_samples import record
+
+from fitctl.cli import main
+from fitctl.report.pdf import BROWSERS, PdfError, print_pdf
+
+BROWSER = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+
+
+@pytest.fixture(scope="module")
+def log(rig, tmp_path_factory):
+    path = tmp_path_factory.mktemp("logs") / "night.mcap"
+
+    def course(simulation):
+        simulation.acquire()
+        simulation.run(12.0)
+
+    record(rig, path, course)
+    return path
+
+
+@pytest.fixture(scope="module")
+def off(rig, tmp_path_factory):
+    """Nothing ever moved: quick to draw."""
+    path = tmp_path_factory.mktemp("off") / "night.mcap"
+    record(rig, path, lambda simulation: simulation.run(0.5))
+    return path
+
+
+@pytest.fixture
+def fitctl(capsys):
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(list(map(str, arguments)))
+        printed = capsys.readouterr()
+        return end.value.code, printed.out, printed.err
+
+    return run
+
+
+def test_a_report_stands_beside_its_log_and_is_opened_in_the_browser(off, fitctl, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or True)
+
+    status, out, err = fitctl("report", off, "--open")
+
+    folder = off.with_name("night_report")
+    assert (status, err) == (0, "")
+    assert "night, loop right: ? requirement of 0.1 px not known" in out
+    assert f"written: {folder / 'report.html'}" in out
+    assert {path.name for path in folder.iterdir()} >= {"report.html", "report.json"}
+    assert opened == [(folder / "report.html").as_uri()]
+
+
+def test_nights_side_by_side_and_a_line_that_says_what_a_pdf_needs(
+    off, fitctl, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+
+    status, out, err = fitctl("report", "--compare", off, off, "--pdf", "--out", tmp_path / "both")
+
+    assert status == 1
+    assert out.count("loop right") == 2
+    assert len(json.loads((tmp_path / "both" / "report.json").read_text())["nights"]) == 2
+    assert (tmp_path / "both" / "report.html").exists()
+    assert "needs Chromium or Chrome" in err
+    assert err.count("\n") == 1
+
+
+def browser(folder, script):
+    program = folder / BROWSERS[0]
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        ("echo no display >&2; exit 3", "ended with 3 and said: no display"),
+        ("exit 0", "ended with 0 and said: nothing"),
+        ("exec /bin/sleep 60", "did not end within 0.5 s"),
+    ],
+)
+def test_a_browser_that_fails_is_told(script, told, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("fitctl.report.pdf._LIMIT_S", 0.5)
+    browser(tmp_path, script)
+
+    with pytest.raises(PdfError, match=told):
+        print_pdf(tmp_path / "report.html", tmp_path / "report.pdf")
+
+
+@pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+def test_a_browser_that_is_there_prints_the_page(tmp_path):
+    page = tmp_path / "report.html"
+    page.write_text("<!doctype html><title>t</title><p>A night.")
+
+    print_pdf(page, tmp_path / "report.pdf")
+
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["report", "missing.mcap"], "missing.mcap: cannot be opened"),
+        (["report", "."], "holds no log of fitctl"),
+        (["report", "--compare", "LOG"], "--compare takes 2 to"),
+        (["report", "LOG", "--rig", "missing.toml"], "missing.toml"),
+        (["report", "LOG", "--out", "file/below"], "cannot be written"),
+        (["report", "file"], "is not an MCAP log"),
+        (["report"], "Missing argument"),
+        (["plot", "LOG", "colour"], "has no colour"),
+        (["plot", "LOG", "/fit/right/tick"], "too many to look at"),
+        (["plot", "LOG", "star_flux_dn", "--from", "noon"], "--from noon: expected seconds"),
+        (["plot", "LOG", "star_flux_dn", "--from", "500"], "has nothing of that between"),
+        (["plot", "LOG", "star_flux_dn", "--out", "a.docx"], "expected a name that ends in"),
+        (["plot", "missing.mcap", "x"], "cannot be opened"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_2(arguments, told, log, fitctl, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("text")
+
+    status, out, err = fitctl(*(log if word == "LOG" else word for word in arguments))
+
+    assert status == 2, err
+    assert out == ""
+    assert told in err
+    assert err.count("\n") == 1
+
+
+def test_a_plot_in_the_terminal_and_as_a_picture(log, fitctl, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    picture = tmp_path / "error.svg"
+
+    shown = fitctl("plot", log, "error_*_px", "--from", 5, "--to", 10)
+    written = fitctl("plot", log, "error_*_px", "--out", picture)
+
+    assert shown[0] == written[0] == 0
+    assert "error_az_px" in shown[1]
+    assert "\x1b" not in shown[1]  # nobody at a terminal reads this
+    assert picture.read_text().count("<svg") == 1
+
+
+def test_without_a_display_a_window_is_refused_with_what_to_do(log, fitctl, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    import matplotlib
+
+    matplotlib.use("agg")
+
+    status, _, err = fitctl("plot", log, "star_flux_dn", "--window")
+
+    assert status == 1
+    assert "no window can be opened" in err

@@ -1,0 +1,221 @@
+"""`fitctl status` and `fitctl watch`: what they make of telemetry."""
+
+import itertools
+import json
+import math
+
+import msgspec
+import pytest
+
+from fitctl.commands.operate import watch
+from fitctl.commands.operate.status import duration, status_document, status_lines
+from fitctl.commands.shared.printing import to_json, utc
+from fitctl.logging.records import Event
+from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
+from tests.fake_supervisor import FakeSupervisor
+
+TRIPPED = TrippedInterlock(
+    name="flux_low", since_s=999.0, action="warn", reset="itself", reason="0.7; check the shutter"
+)
+
+
+def told(supervisor=None, **changes):
+    """A message, with some of its fields replaced."""
+    return msgspec.structs.replace((supervisor or FakeSupervisor()).message(), **changes)
+
+
+def told_of_losses(count):
+    supervisor = FakeSupervisor()
+    supervisor.records_lost = count
+    return supervisor.message()
+
+
+# ---------------------------------------------------------------- what is not well
+
+
+def test_an_instrument_that_holds_its_star_is_well():
+    assert troubles(told()) == []
+
+
+def test_an_instrument_that_is_off_is_well():
+    assert troubles(told(FakeSupervisor("OFF"))) == []
+
+
+@pytest.mark.parametrize(
+    ("trouble", "expected"),
+    [
+        (lambda: told(FakeSupervisor("SAFE")), "right is SAFE: "),
+        (lambda: told(recorder=None), "nothing is recorded"),
+        (lambda: told_of_losses(3), "3 records are missing"),
+        (lambda: told(time_s=told().time_s + 1.1 * RECORDER_SILENT_S), "said nothing for 11 s"),
+    ],
+    ids=["safe", "no recorder", "losses", "silent recorder"],
+)
+def test_what_is_not_well_is_one_line_each(trouble, expected):
+    (line,) = troubles(trouble())
+
+    assert expected in line
+
+
+def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():
+    supervisor = FakeSupervisor()
+    supervisor.interlocks = [TRIPPED]
+    message = told(supervisor)
+    camera = msgspec.structs.replace(message.devices[0], state="fault", detail="no frame came")
+    found = troubles(msgspec.structs.replace(message, devices=[camera, *message.devices[1:]]))
+
+    assert found == [
+        "right interlock flux_low: 0.7; check the shutter",
+        f"{camera.device} at {camera.endpoint}: no frame came",
+    ]
+
+
+# ---------------------------------------------------------------- status
+
+
+def test_the_document_has_all_of_a_message_but_its_streams():
+    message = told()
+    document = json.loads(msgspec.json.encode(status_document(message, [])))
+
+    streams = {"frame", "events", "mode_changes"}
+    assert document.keys() == {"well", "troubles", "time"} | (
+        set(message.__struct_fields__) - streams
+    )
+    assert document["well"]
+    assert document["loops"][0]["mode"] == "VERNIER"
+    assert document["loops"][0]["since"] == utc(message, message.loops[0].since_s)
+    assert [tick["number"] for tick in document["ticks"]] == [message.ticks[-1].number]
+
+
+def test_people_read_the_verdict_first_then_loops_devices_and_log():
+    message = told_of_losses(3)
+    first, second, *rest = status_lines(message, troubles(message))
+
+    assert first == "fit-mock: not well"
+    assert second.strip() == "! 3 records are missing from the log of this run"
+    text = "\n".join(rest)
+    assert "VERNIER for 2 min 13 s, controller minimum-variance" in text
+    assert "0 ticks, 0 events, 0 mode changes, 0 replies" in text
+    for device in message.devices:
+        assert device.endpoint in text
+    assert message.recorder.path in text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (-1, "0 s"),
+        (59.9, "59 s"),
+        (3599, "59 min 59 s"),
+        (7260, "2 h 1 min"),
+        (90000, "1 d 1 h"),
+    ],
+)
+def test_time_spans_read_in_their_two_largest_units(seconds, text):
+    assert duration(seconds) == text
+
+
+# ---------------------------------------------------------------- watch
+
+
+def watched(monkeypatch, arrivals, duration_s=None, silent_s=0.0):
+    """The entries of some messages; an arrival of None is silence, and `silent_s` goes by."""
+    now_s = [0.0]
+    monkeypatch.setattr(watch.time, "monotonic", lambda: now_s[0])
+    coming = iter(arrivals)
+
+    def receive(_timeout_s):
+        message = next(coming)
+        now_s[0] += silent_s if message is None else 0.05
+        if isinstance(message, Exception):
+            raise message
+        return message
+
+    made = watch.entries(receive, duration_s)
+    try:
+        yield from made
+    except RuntimeError:  # the arrivals are over
+        return
+
+
+def test_a_second_has_the_rms_of_its_own_ticks(monkeypatch):
+    messages = FakeSupervisor(error_px=0.05).messages(45)
+    found = list(watched(monkeypatch, messages))
+
+    seconds = [entry for entry in found if isinstance(entry, watch.Second)]
+    assert len(seconds) == 2
+    last_s = messages[0].time_s + 1.0
+    of_first = [tick for message in messages for tick in message.ticks if tick.time_s <= last_s]
+    rms_px = math.sqrt(sum(tick.error_el_px**2 for tick in of_first) / len(of_first))
+    (loop,) = seconds[0].loops
+    assert loop.rms_el_px == pytest.approx(rms_px)
+    assert loop.ticks == len(of_first)
+
+
+def test_events_come_at_once_and_in_order(monkeypatch):
+    message = FakeSupervisor().message()
+    found = list(watched(monkeypatch, [message]))
+
+    assert [entry.message for entry in found] == [event.message for event in message.events]
+
+
+def test_silence_is_said_once_a_second_with_what_to_do(monkeypatch):
+    found = list(watched(monkeypatch, [None] * 12, silent_s=0.25))
+
+    assert len(found) == 3
+    assert all("fitctl run" in entry.message for entry in found)
+
+
+def test_what_cannot_be_read_is_said_in_the_place_of_silence(monkeypatch):
+    unreadable = [ConnectionError("of another version")] * 25
+    found = list(watched(monkeypatch, unreadable))
+
+    assert found
+    assert {entry.message for entry in found} == {"of another version"}
+
+
+def test_it_ends_after_its_time(monkeypatch):
+    forever = itertools.cycle(FakeSupervisor().messages(3))
+    found = list(watched(monkeypatch, forever, duration_s=2.0))
+
+    assert found
+
+
+def test_a_supervisor_whose_clock_begins_anew_is_followed(monkeypatch):
+    late = [
+        msgspec.structs.replace(each, time_s=each.time_s + 1e5)
+        for each in FakeSupervisor().messages(5)
+    ]
+    found = list(watched(monkeypatch, [*late, *FakeSupervisor().messages(45)]))
+
+    assert sum(isinstance(entry, watch.Second) for entry in found) == 2
+
+
+@pytest.mark.parametrize("mode", ["OFF", "ACQUISITION", "VERNIER"])
+def test_a_line_of_text_says_what_the_mode_needs(monkeypatch, mode):
+    supervisor = FakeSupervisor(mode)
+    supervisor.interlocks = [TRIPPED]
+    (second,) = (
+        each
+        for each in watched(monkeypatch, supervisor.messages(23))
+        if isinstance(each, watch.Second)
+    )
+    line = watch._text(second)
+
+    assert f"right {mode}" in line
+    assert "tripped: flux_low" in line
+    assert ("searched" in line) == (mode == "ACQUISITION")
+    assert ("RMS az" in line) == (mode == "VERNIER")
+    assert "nan" not in line
+
+
+def test_each_line_of_json_says_what_it_is_of(monkeypatch):
+    message = told(events=[Event(time_s=1000.0, severity="error", source="x", message="y")])
+    lines = [
+        json.loads(to_json(entry))
+        for entry in watched(monkeypatch, [message, *FakeSupervisor().messages(25)])
+    ]
+
+    assert {line["kind"] for line in lines} == {"event", "second"}
+    assert lines[0]["severity"] == "error"
