@@ -231,7 +231,7 @@ def _truth(rig: Rig, running: Instrument, name: str, start_s: float, end_s: floa
         return Residual(math.nan, math.nan, 0)
     target = rig.loops[name].target_px
     return ask_bench(
-        running.bench_port, ResidualQuestion(name, start_s, end_s, target.az, target.el)
+        running.bench_port, ResidualQuestion(name, start_s, end_s, target.az, target.el), Residual
     )
 
 

@@ -20,11 +20,11 @@ from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.cia402.link import BulkSlcanBus, CanLink
 from fitctl.drivers.cia402.node import Node
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceError
 from fitctl.mocks.cia402.dictionary import SdoServer
 from fitctl.mocks.cia402.drive import Cia402DriveMock
-from fitctl.mocks.cia402.slcan import _Client
-from fitctl.mocks.cia402.slcan_frames import CanFrame, decode_frame, encode_frame
+from fitctl.mocks.cia402.slcan import CanFrame, _Client, decode_frame, encode_frame
 
 _RIG_SIDEROSTAT = load_rig(default_rig_path()).loops["right"].siderostat
 _DEVICE = _RIG_SIDEROSTAT.device.model_copy(update={"response_timeout_s": 0.001})
@@ -59,6 +59,9 @@ class _Transport:
 
     def get_write_buffer_size(self) -> int:
         return 0
+
+    def is_closing(self) -> bool:
+        return False
 
     def write(self, data: bytes) -> None:
         self.sent += data
@@ -141,7 +144,7 @@ def serve_sdo(data: bytes) -> None:
 class _Scripted:
     """A link whose far end says these frames, whatever it is told."""
 
-    endpoint = "nowhere"
+    endpoint = Endpoint("drive", "nowhere")
 
     def __init__(self, data: bytes) -> None:
         self._frames = _frames(data, _FROM_DRIVE)
@@ -179,7 +182,7 @@ def exchange(data: bytes) -> None:
     node = Node(_Scripted(data), _DEVICE)
     node.nmt_state = protocol.NmtState.OPERATIONAL
     node.handlers |= {0x181: amplifiers._on_positions, 0x281: amplifiers._on_statuswords}
-    amplifiers._node = node
+    amplifiers._link = node
     amplifiers._status_s = node._heard_s
     for _ in range(1 + len(data) // 8):
         try:
@@ -199,12 +202,12 @@ def hear_line(data: bytes) -> None:
         bus = object.__new__(BulkSlcanBus)
         bus._buffer = bytearray()
         bus._queue = queue.SimpleQueue()
-        bus._held = None
+        bus._batch = None
         bus._is_shutdown = True
         bus._can_protocol = CanProtocol.CAN_20
         bus._descriptor = ours.fileno()
         link = object.__new__(CanLink)
-        link.endpoint = "nowhere"
+        link.endpoint = Endpoint("drive", "nowhere")
         link._bus = bus
         for _ in range(len(data) + 2):
             try:

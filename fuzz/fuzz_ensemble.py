@@ -15,7 +15,7 @@ from fitctl.drivers.ensemble.protocol import (
 )
 from fitctl.mocks.ensemble.axis import Axis
 from fitctl.mocks.ensemble.commands import Interpreter
-from fitctl.mocks.ensemble.line import LineSplitter
+from fitctl.mocks.ensemble.controller import LineSplitter
 
 _PARAMETERS = {
     Parameter.COUNTS_PER_UNIT: 4000.0,

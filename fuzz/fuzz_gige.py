@@ -14,14 +14,16 @@ from functools import cache
 import numpy as np
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol as p
-from fitctl.drivers.gige.description import unpacked
 from fitctl.drivers.gige.discovery import decode_found
+from fitctl.drivers.gige.features import unpacked
 from fitctl.drivers.gige.stream import FrameAssembler
 from fitctl.drivers.interface import DeviceError
 from fitctl.mocks.gige.camera import GigeCameraMock
 
 SIZE_PX = 20
+ENDPOINT = Endpoint("camera", "fuzz")
 CLIENTS = (("127.0.0.1", 40001), ("127.0.0.1", 40002))
 
 
@@ -45,14 +47,14 @@ def answers(data: bytes) -> None:
 def description(data: bytes) -> None:
     """The GenICam description as the camera keeps it, zipped or not."""
     with contextlib.suppress(DeviceError):
-        unpacked(data, "fuzz")
+        unpacked(data, ENDPOINT)
 
 
 def stream(data: bytes) -> None:
     """What the driver makes of GVSP: each frame that comes out is whole, and numbers ascend."""
     asked: list[p.Resend] = []
     assembler = FrameAssembler(
-        SIZE_PX, SIZE_PX, p.PIXEL_FORMATS["Mono16"], 576, "fuzz", asked.append
+        SIZE_PX, SIZE_PX, p.PIXEL_FORMATS["Mono16"], 576, ENDPOINT, asked.append
     )
     number = 0
     for packet in packets(data):

@@ -15,7 +15,7 @@ from benchmarks.soak.consoles import Console
 from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.demo import Instrument
 from fitctl.messages.commands import Off, Stop
-from fitctl.mocks.bench import ClearFaults, SetFault, ask_faults
+from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench
 from fitctl.mocks.faults import WIRE_FAULTS
 
 _LOOP = "right"
@@ -76,10 +76,10 @@ def _device_fault(
         part=chance.choice(parts) if parts else "",
         probability=chance.choice(_PROBABILITIES) if kind in WIRE_FAULTS else 1.0,
     )
-    answer = ask_faults(port, fault)
+    answer = ask_bench(port, fault, FaultsNow)
     if answer.error:
         raise ValueError(answer.error)
-    return lambda: ask_faults(port, ClearFaults()) and None
+    return lambda: ask_bench(port, ClearFaults(), FaultsNow) and None
 
 
 # ---------------------------------------------------------------- processes

@@ -1,10 +1,16 @@
-"""What the siderostat's amplifiers have in common where they are no more than velocity commands and angles."""
+"""What the siderostat's amplifiers have in common, whatever they are connected by."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator, Sequence
+from typing import Generic, Protocol, TypeVar
 
-from fitctl.drivers.interface import AzEl
+from fitctl.config import Siderostat
+from fitctl.config.base import Settings
+from fitctl.drivers.endpoint import Endpoint
+from fitctl.drivers.interface import AzEl, DeviceError, DeviceFault, DeviceUnreachable
 
 DEVICE = "siderostat amplifiers"
 """What errors call the device."""
@@ -15,24 +21,111 @@ SLACK = 1.5
 _MARGIN_RAD = 0.05
 
 
-def held(velocity_rad_s: AzEl, limit_rad_s: float) -> AzEl:
-    """Both velocities, held within the motors' limit.
+class _Closable(Protocol):
+    def close(self) -> None: ...
 
-    Raises
-    ------
-    ValueError
-        A velocity is not finite.
+
+_Link = TypeVar("_Link", bound=_Closable)
+_Settings = TypeVar("_Settings", bound=Settings)
+
+
+class LinkedAmplifiers(Generic[_Link, _Settings]):
+    """Both axes' amplifiers on one link, which is None while they are closed.
+
+    Parameters
+    ----------
+    siderostat : Siderostat
+        Limits and device settings of the rig.
+    endpoint : str
+        Their address in errors.
     """
-    az_rad_s, el_rad_s = velocity_rad_s
-    if not (math.isfinite(az_rad_s) and math.isfinite(el_rad_s)):
-        msg = f"velocities must be finite numbers of rad/s, not {velocity_rad_s}"
-        raise ValueError(msg)
-    return (
-        max(-limit_rad_s, min(limit_rad_s, az_rad_s)),
-        max(-limit_rad_s, min(limit_rad_s, el_rad_s)),
-    )
 
+    def __init__(self, siderostat: Siderostat[_Settings], endpoint: str) -> None:
+        self._device = siderostat.device
+        self._endpoint = Endpoint(DEVICE, endpoint)
+        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
+        self._link: _Link | None = None
 
-def reach_rad(velocity_limit_rad_s: float, since_s: float) -> float:
-    """What a motor can have turned at most in a time: a reading beyond it is a false one."""
-    return _MARGIN_RAD + SLACK * velocity_limit_rad_s * since_s
+    def disable(self) -> None:
+        """Take power from both axes."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Disable if possible and disconnect; safe to call twice and after a failure."""
+        if self._link is None:
+            return
+        try:
+            with contextlib.suppress(DeviceError):
+                self._shut_down()
+        finally:
+            self._drop()
+
+    def _shut_down(self) -> None:
+        self.disable()
+
+    def _drop(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    @contextlib.contextmanager
+    def _connected(self, link: _Link) -> Iterator[_Link]:
+        """Set a new link up inside; after a failure it is closed."""
+        self._link = link
+        try:
+            yield link
+        except BaseException:
+            self._drop()
+            raise
+
+    @contextlib.contextmanager
+    def _disabled_on_failure(self) -> Iterator[None]:
+        """Power the axes inside; after a failure neither has power."""
+        try:
+            yield
+        except DeviceError:
+            with contextlib.suppress(DeviceError):
+                self.disable()
+            raise
+
+    def _opened(self) -> _Link:
+        if self._link is None:
+            raise self._endpoint.error(
+                DeviceUnreachable, "an open connection", "a closed one", "open it first"
+            )
+        return self._link
+
+    def _limited(self, velocity_rad_s: AzEl) -> AzEl:
+        """Both velocities within the motors' limit. Raises ValueError if one is not finite."""
+        az_rad_s, el_rad_s = velocity_rad_s
+        if not (math.isfinite(az_rad_s) and math.isfinite(el_rad_s)):
+            msg = f"velocities must be finite numbers of rad/s, not {velocity_rad_s}"
+            raise ValueError(msg)
+        limit_rad_s = self._velocity_limit_rad_s
+        return (
+            max(-limit_rad_s, min(limit_rad_s, az_rad_s)),
+            max(-limit_rad_s, min(limit_rad_s, el_rad_s)),
+        )
+
+    def _check_turned(
+        self,
+        before: Sequence[float],
+        now: Sequence[float],
+        since_s: float,
+        *,
+        rad_per_count: float | None = None,
+    ) -> None:
+        """Raise DeviceFault if a motor cannot have turned so far in that time.
+
+        Angles are in rad, or in encoder counts if `rad_per_count` is given.
+        """
+        unit, digits = ("rad", 2) if rad_per_count is None else ("counts", 0)
+        most = (_MARGIN_RAD + SLACK * self._velocity_limit_rad_s * since_s) / (rad_per_count or 1.0)
+        for name, earlier, later in zip(AXES, before, now, strict=True):
+            if abs(later - earlier) > most:
+                raise self._endpoint.error(
+                    DeviceFault,
+                    f"{name} to turn at most {most:.{digits}f} {unit} in {since_s:.3f} s",
+                    f"{later - earlier:.{digits}f}",
+                    "check the encoder, its cable and its counter, then recover",
+                )

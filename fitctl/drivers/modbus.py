@@ -23,11 +23,12 @@ _CRC_BYTES = 2
 
 
 class Message(NamedTuple):
-    """One answer, taken out of its TCP frame."""
+    """One message without its TCP frame; `protocol` is 0 for Modbus."""
 
     transaction: int
     unit: int
     pdu: bytes
+    protocol: int = 0
 
 
 def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
@@ -35,18 +36,18 @@ def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
     return _HEADER.pack(transaction, 0, 1 + len(pdu), unit) + pdu
 
 
-def take_message(pending: bytearray) -> Message | None:
+def pop_message(pending: bytearray) -> Message | None:
     """Remove the first whole TCP message from `pending`; None while there is none.
 
     Raises
     ------
     ValueError
-        If `pending` does not begin with a Modbus header.
+        If no message can be that long, so that nobody knows where the next one begins.
     """
     if len(pending) < _HEADER.size:
         return None
     transaction, protocol, length, unit = _HEADER.unpack_from(pending)
-    if protocol != 0 or not 2 <= length <= 1 + PDU_BYTES_MAX:
+    if not 2 <= length <= 1 + PDU_BYTES_MAX:
         msg = f"protocol {protocol}, length {length}"
         raise ValueError(msg)
     end = _HEADER.size - 1 + length
@@ -54,7 +55,7 @@ def take_message(pending: bytearray) -> Message | None:
         return None
     pdu = bytes(pending[_HEADER.size : end])
     del pending[:end]
-    return Message(transaction, unit, pdu)
+    return Message(transaction, unit, pdu, protocol)
 
 
 def _crc_of_byte(crc: int) -> int:

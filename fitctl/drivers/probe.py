@@ -1,4 +1,4 @@
-"""What `fitctl doctor` learns of a device by asking only."""
+"""What `fitctl doctor` reads from a device without setting anything."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fitctl.drivers.interface import DeviceIdentity
 
 
 class Probe(NamedTuple):
-    """What a device said that was only asked: nothing was set, nothing moved.
+    """What a device reports; nothing was set, nothing moved.
 
     Attributes
     ----------
@@ -19,7 +19,7 @@ class Probe(NamedTuple):
     round_trip_s : float
         Median of a few questions.
     disagreements : tuple of str
-        What is not as the rig file says, and what to do about it; one line each.
+        What differs from the rig file, and what to do about it; one line each.
     """
 
     identity: DeviceIdentity

@@ -111,7 +111,7 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> Prun
     settings : Logging
         How much may stay (``retain_bytes``) and how long (``retain_days``, since the last write).
     now : datetime
-        Against which ages are judged.
+        Against which ages are computed.
 
     Returns
     -------

@@ -11,7 +11,7 @@ queue to recorder  one message a record: an :class:`Envelope` as msgpack
 recorder to queue  one msgpack integer: -1 "I am new", else "all up to this sequence is written"
 =================  ========================================================================
 
-The queue speaks only to the recorder that said -1 last. That one is first sent the run's
+The queue sends only to the recorder that sent -1 last. That one is first sent the run's
 :class:`RunInfo` again, if its predecessor had it already, under the sequence last confirmed: so it knows
 the run and sees every record that is missing after that as a gap.
 """
@@ -85,7 +85,7 @@ class RecordQueue:
 
     @property
     def heard(self) -> bool:
-        """A recorder has said that it is there."""
+        """A recorder has connected."""
         return self._recorder is not None
 
     @property
@@ -166,7 +166,7 @@ class RecordQueue:
             self._pass_on(_encode(Envelope(RECORD_VERSION, self._confirmed, self._run_info)))
 
     def _forget(self, most: int) -> None:
-        """Let go of confirmed records."""
+        """Drop confirmed records."""
         for _ in range(most):
             if not self._kept or self._kept[0][0] > self._confirmed:
                 return
@@ -190,7 +190,7 @@ class RecordQueue:
         except zmq.ZMQError as error:
             if error.errno != zmq.EHOSTUNREACH:
                 raise
-            self._recorder = None  # it died; the next one says so itself
+            self._recorder = None  # it died; the next one announces itself
             return False
         return True
 
@@ -227,7 +227,7 @@ class RecordReceiver:
         return self._socket.recv()
 
     def confirm(self, sequence: int) -> None:
-        """Tell the queue that everything up to `sequence` is in the file."""
+        """Confirm that everything up to `sequence` is in the file."""
         self._answer(sequence)
 
     def close(self) -> None:
@@ -235,5 +235,5 @@ class RecordReceiver:
         self._context.destroy(linger=500)
 
     def _answer(self, number: int) -> None:
-        with contextlib.suppress(zmq.Again):  # no supervisor: nobody to tell
+        with contextlib.suppress(zmq.Again):  # there is no supervisor
             self._socket.send(_encode(number), zmq.NOBLOCK)

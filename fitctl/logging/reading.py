@@ -182,7 +182,7 @@ def tick_arrays(path: Path, loop: str) -> Columns:
 
 
 class _Block:
-    """Messages of one topic, field by field; the file says which fields, it may be older than we are."""
+    """Messages of one topic, field by field, with the fields of the file, which may be older than this code."""
 
     def __init__(
         self, message: google.protobuf.message.Message, chosen: Collection[str] | None
@@ -194,7 +194,7 @@ class _Block:
         ]
         kinds = dict.fromkeys(HEADER, _COLUMNS[FieldDescriptor.CPPTYPE_INT64])
         for field in fields:
-            # Text and bytes are told apart by their type alone.
+            # Only the type distinguishes text from bytes.
             is_bytes = field.type == FieldDescriptor.TYPE_BYTES
             kinds[field.name] = ("", np.object_) if is_bytes else _COLUMNS[field.cpp_type]
         self._dtypes = {name: dtype for name, (_, dtype) in kinds.items()}

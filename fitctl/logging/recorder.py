@@ -1,4 +1,4 @@
-"""The recorder process: receives every record, writes the log, says how it goes.
+"""The recorder process: receives every record, writes the log, reports its status.
 
 It shares nothing with the supervisor but the queue's socket, because flushing a chunk may take as long
 as a whole frame period.
@@ -123,7 +123,7 @@ class _Recording:
         """Receive and write one record, then whatever is due; False when none came in time."""
         data = self._receiver.receive(timeout_s)
         if data is not None:
-            self._take(data)
+            self._receive(data)
         now_s = time.monotonic()
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + STATUS_PERIOD_S
@@ -136,7 +136,7 @@ class _Recording:
         return data is not None
 
     def confirm(self) -> None:
-        """Tell the queue what is in the file."""
+        """Confirm to the queue what is in the file."""
         if self._last_sequence is not None and self._unconfirmed:
             self._receiver.confirm(self._last_sequence)
         self._unconfirmed = 0
@@ -144,17 +144,17 @@ class _Recording:
     def report(self) -> None:
         """Write a status record, and before it what was lost, not understood or deleted since the last."""
         now_s = time.monotonic()
-        for severity, message in self._log.take_notes():
-            self._say(severity, message)
+        for severity, message in self._log.pop_notes():
+            self._write_event(severity, message)
         if self._lost > self._lost_reported:
-            self._say(
+            self._write_event(
                 "warning",
                 f"{self._lost - self._lost_reported} records were lost on their way to the log "
                 f"({self._lost} in all); the disk or the machine is too slow",
             )
             self._lost_reported = self._lost
         if self._malformed > self._malformed_reported:
-            self._say(
+            self._write_event(
                 "error",
                 f"{self._malformed - self._malformed_reported} messages were no records "
                 f"({self._malformed} in all); the last: {self._malformed_why}",
@@ -173,16 +173,16 @@ class _Recording:
 
     def warn_of_cut_end(self) -> None:
         """Write a warning that the log may end before the queue does."""
-        self._say(
+        self._write_event(
             "warning",
             f"records still came when the {DRAIN_S:g} s to drain the queue were over; "
             "some may be missing at the end of this log",
         )
 
-    def _take(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         self._unconfirmed += 1
         try:
-            envelope = _understood(data)
+            envelope = _envelope_of(data)
             self._count_gap(envelope.sequence)
             if isinstance(envelope.record, RunInfo):
                 self._wall_minus_monotonic_s = envelope.record.wall_minus_monotonic_s
@@ -201,14 +201,14 @@ class _Recording:
         self._log_time_s = max(self._log_time_s, now_s)  # the run's offset comes a little late
         self._log.write(record, self._log_time_s)
 
-    def _say(self, severity: Severity, message: str) -> None:
+    def _write_event(self, severity: Severity, message: str) -> None:
         event = Event(
             time_s=time.monotonic(), severity=severity, source="recorder", message=message
         )
         self._write(event)
 
 
-def _understood(data: bytes) -> Envelope:
+def _envelope_of(data: bytes) -> Envelope:
     """Decode an envelope of this version.
 
     Raises

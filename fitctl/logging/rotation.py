@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 
 from fitctl.config import Logging
 from fitctl.logging.folder import new_log_path, prune
@@ -85,7 +84,7 @@ class RotatingLog:
         if self._run_info is not None:
             self._writer.write(self._run_info, time.time())
 
-    def take_notes(self) -> list[tuple[Severity, str]]:
+    def pop_notes(self) -> list[tuple[Severity, str]]:
         """What somebody should read of files deleted, once."""
         notes, self._notes = self._notes, []
         return notes
@@ -97,12 +96,7 @@ class RotatingLog:
     def __enter__(self) -> RotatingLog:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _begin(self) -> None:

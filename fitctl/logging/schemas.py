@@ -138,7 +138,7 @@ def dark_npy_of(metadata: Mapping[str, Mapping[str, str]]) -> bytes | None:
 def message_class(record_type: type[msgspec.Struct], pool: DescriptorPool) -> type[Message]:
     """Build the protobuf message ``fitctl.<name>`` of a struct, field by field, into `pool`.
 
-    A field that may be None becomes optional, so that None is told from zero.
+    A field that may be None becomes optional, so that None differs from zero.
 
     Raises
     ------

@@ -78,7 +78,9 @@ def verify(path: Path) -> Verdict:
                     frames_missing += max(0, entry.sequence - last_frame - 1)
                 last_frame = entry.sequence
                 if len(message.data) != message.step * message.height:
-                    problems.append(f"frame {entry.sequence}: its data is not as large as it says")
+                    problems.append(
+                        f"frame {entry.sequence}: the size of its data does not match its header"
+                    )
         if finished and not in_order == counts == Counter(log_info(path).counts):
             problems.append(f"its index is not of its contents; {MEND}")
     except LogError as error:

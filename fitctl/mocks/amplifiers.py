@@ -1,9 +1,8 @@
-"""Which mock stands where a loop's amplifiers do: one table from driver name to mock."""
+"""Which mock stands where a loop's amplifiers do."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from fitctl.config import LoopMocks, Siderostat
 from fitctl.mocks.bal_analog.station import BalAnalogMockStation
@@ -27,55 +26,27 @@ class AmplifierMock(Protocol):
         ...
 
 
-class _Kind(NamedTuple):
-    make: Callable[[Siderostat[Any], LoopMocks, Motors], AmplifierMock]
-    endpoints: Callable[[Any], Mapping[str, Any]]
-
-
 def amplifier_mock(siderostat: Siderostat[Any], mocks: LoopMocks, motors: Motors) -> AmplifierMock:
-    """The mock that speaks what the rig's driver speaks."""
-    return _KINDS[siderostat.device.driver].make(siderostat, mocks, motors)
+    """The mock that speaks what the rig's driver speaks; the rig file has its settings, if it needs any."""
+    match siderostat.device.driver:
+        case "ensemble" if mocks.ensemble is not None:
+            return EnsembleControllerMock(siderostat, mocks.ensemble, motors)
+        case "bal_analog" if mocks.bal_analog is not None:
+            return BalAnalogMockStation(siderostat, mocks.bal_analog, motors)
+        case _:
+            return Cia402DriveMock(siderostat, motors, port=mocks.slcan_port)
 
 
 def endpoint_keys(driver: str, loop: str, listening: Any) -> dict[str, Any]:
     """Where a started mock listens, by the rig file's keys."""
-    endpoints = _KINDS[driver].endpoints(listening)
-    return {key.format(loop=loop): value for key, value in endpoints.items()}
-
-
-def _ensemble(
-    siderostat: Siderostat[Any], mocks: LoopMocks, motors: Motors
-) -> EnsembleControllerMock:
-    assert mocks.ensemble is not None  # noqa: S101 - the rig file is refused otherwise
-    return EnsembleControllerMock(siderostat, mocks.ensemble, motors)
-
-
-def _bal_analog(
-    siderostat: Siderostat[Any], mocks: LoopMocks, motors: Motors
-) -> BalAnalogMockStation:
-    assert mocks.bal_analog is not None  # noqa: S101 - likewise
-    return BalAnalogMockStation(siderostat, mocks.bal_analog, motors)
-
-
-_KINDS = {
-    "cia402": _Kind(
-        lambda siderostat, mocks, motors: Cia402DriveMock(
-            siderostat, motors, port=mocks.slcan_port
-        ),
-        lambda port: {"loops.{loop}.siderostat.device.channel": f"socket://127.0.0.1:{port}"},
-    ),
-    "ensemble": _Kind(
-        _ensemble,
-        lambda ends: {
-            "loops.{loop}.siderostat.device.port": f"socket://127.0.0.1:{ends.tcp_port}",
-            "mocks.loops.{loop}.ensemble_pty": ends.pty_path,
-        },
-    ),
-    "bal_analog": _Kind(
-        _bal_analog,
-        lambda port: {
-            "loops.{loop}.siderostat.device.host": "127.0.0.1",
-            "loops.{loop}.siderostat.device.port": port,
-        },
-    ),
-}
+    device = f"loops.{loop}.siderostat.device"
+    match driver:
+        case "ensemble":
+            return {
+                f"{device}.port": f"socket://127.0.0.1:{listening.tcp_port}",
+                f"mocks.loops.{loop}.ensemble_pty": listening.pty_path,
+            }
+        case "bal_analog":
+            return {f"{device}.host": "127.0.0.1", f"{device}.port": listening}
+        case _:
+            return {f"{device}.channel": f"socket://127.0.0.1:{listening}"}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -91,6 +91,7 @@ class FaultsNow(msgspec.Struct, frozen=True):
 
 
 _AnyQuestion = ResidualQuestion | StagesQuestion | SetFault | ClearFaults | ListFaults
+_Answer = TypeVar("_Answer", Residual, StagesNow, FaultsNow)
 
 
 class FaultTable:
@@ -236,40 +237,14 @@ class Bench:
         return Residual(float(az), float(el), len(track_px))
 
 
-def ask_bench(port: int, question: ResidualQuestion) -> Residual:
-    """Ask a running bench where the star was.
+def ask_bench(port: int, question: _AnyQuestion, answer: type[_Answer]) -> _Answer:
+    """Send a question to a running bench and return its answer, which is an `answer`.
 
     Raises
     ------
     ConnectionError
         If none answers within five seconds.
     """
-    return msgspec.msgpack.decode(_ask(port, question), type=Residual)
-
-
-def ask_stages(port: int, question: StagesQuestion) -> StagesNow:
-    """Ask a running bench where the stages are.
-
-    Raises
-    ------
-    ConnectionError
-        If none answers within five seconds.
-    """
-    return msgspec.msgpack.decode(_ask(port, question), type=StagesNow)
-
-
-def ask_faults(port: int, question: SetFault | ClearFaults | ListFaults) -> FaultsNow:
-    """Have a running bench begin or end faults, or list them.
-
-    Raises
-    ------
-    ConnectionError
-        If none answers within five seconds.
-    """
-    return msgspec.msgpack.decode(_ask(port, question), type=FaultsNow)
-
-
-def _ask(port: int, question: _AnyQuestion) -> bytes:
     context = zmq.Context()
     try:
         with context.socket(zmq.REQ) as socket:
@@ -279,6 +254,6 @@ def _ask(port: int, question: _AnyQuestion) -> bytes:
             if not socket.poll(_TIMEOUT_MS):
                 msg = f"the mock testbed's bench does not answer at 127.0.0.1:{port}"
                 raise ConnectionError(msg)
-            return socket.recv()
+            return msgspec.msgpack.decode(socket.recv(), type=answer)
     finally:
         context.term()

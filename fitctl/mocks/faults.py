@@ -48,7 +48,7 @@ WIRE_FAULTS = {
 
 
 class UnknownFault(ValueError):
-    """There is no such fault here; the text says which there are."""
+    """There is no such fault here; the text lists those that exist."""
 
 
 class Faults:
@@ -101,7 +101,7 @@ class Faults:
         if lasts_s is not None:
             loop = asyncio.get_running_loop()
             self._ends[key] = loop.call_later(lasts_s, self._end, key)
-        self._tell(fault.kind)
+        self._notify(fault.kind)
 
     def clear(self, kind: str = "", part: str = "") -> None:
         """End the faults of a kind, or of one part of it; without a kind all of them."""
@@ -110,7 +110,7 @@ class Faults:
                 self._end(key)
 
     def close(self) -> None:
-        """Forget all of it, and tell nobody: the device is being taken down."""
+        """End all faults without notifying anyone: the device is being stopped."""
         self._watchers.clear()
         self.clear()
 
@@ -142,14 +142,14 @@ class Faults:
     def _end(self, key: tuple[str, str]) -> None:
         self._stop_timer(key)
         del self._active[key]
-        self._tell(key[0])
+        self._notify(key[0])
 
     def _stop_timer(self, key: tuple[str, str]) -> None:
         timer = self._ends.pop(key, None)
         if timer is not None:
             timer.cancel()
 
-    def _tell(self, kind: str) -> None:
+    def _notify(self, kind: str) -> None:
         for watcher in self._watchers:
             watcher(kind)
 

@@ -27,7 +27,7 @@ class Motors(Protocol):
         ...
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
-        """Drive the motors at these velocities; to be said again and again."""
+        """Drive the motors at these velocities; must be repeated."""
         ...
 
     def set_enabled(self, axis: int, enabled: bool) -> None:
@@ -60,7 +60,7 @@ class FaultyMotors:
         self._motors = motors
         self._faults = faults
         self._zero_rad: Sequence[float] = (0.0, 0.0)
-        faults.on_change(self._take_fault)
+        faults.on_change(self._fault_changed)
 
     def position_counts(self) -> tuple[int, int]:
         """What both encoders say: counts, however many bits they take."""
@@ -83,6 +83,6 @@ class FaultyMotors:
         turned = math.floor((angle_rad - self._zero_rad[axis]) * self.counts_per_rad + 0.5)
         return turned + round(self._faults.value("encoder_jump", AXES[axis]) or 0.0)
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         if kind == "reboot" and self._faults.value("reboot") is None:
             self._zero_rad = tuple(self._motors.position_rad())

@@ -27,7 +27,7 @@ class Pty(asyncio.ReadTransport):
     Parameters
     ----------
     baud_rate : int or None
-        At which the far end is set, until a client sets another. None, or one that a pty cannot tell:
+        At which the far end is set, until a client sets another. None, or one that a pty does not know:
         every client is at ours.
 
     Attributes
@@ -70,7 +70,7 @@ class Pty(asyncio.ReadTransport):
 
     def resume_reading(self) -> None:
         """Read again."""
-        asyncio.get_running_loop().add_reader(self._ours, self._take)
+        asyncio.get_running_loop().add_reader(self._ours, self._read)
 
     def close(self) -> None:
         """Close both ends."""
@@ -78,6 +78,6 @@ class Pty(asyncio.ReadTransport):
         os.close(self._ours)
         os.close(self._theirs)
 
-    def _take(self) -> None:
+    def _read(self) -> None:
         with suppress(BlockingIOError):
             self._received(os.read(self._ours, _READ_BYTES))

@@ -35,18 +35,22 @@ class Watchdog:
     """Calls `expired` once when it was fed, and then not again for its timeout.
 
     Feeding is a store and a clock reading, whatever the rate; the timer moves only when it fires.
+
+    Attributes
+    ----------
+    timeout_s : float
     """
 
     def __init__(self, expired: Callable[[], None], timeout_s: float = 0.0) -> None:
         self._expired = expired
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
         self._fed_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
     def set_timeout(self, timeout_s: float) -> None:
         """Wait for the first feeding, with this timeout; 0 switches off."""
         self.stop()
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
 
     def stop(self) -> None:
         """Wait for the first feeding again."""
@@ -58,14 +62,14 @@ class Watchdog:
         """Put off the end; the first feeding arms."""
         loop = asyncio.get_running_loop()
         self._fed_s = loop.time()
-        if self._timer is None and self._timeout_s > 0:
-            self._timer = loop.call_later(self._timeout_s, self._look)
+        if self._timer is None and self.timeout_s > 0:
+            self._timer = loop.call_later(self.timeout_s, self._check)
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         loop = asyncio.get_running_loop()
-        left_s = self._fed_s + self._timeout_s - loop.time()
+        left_s = self._fed_s + self.timeout_s - loop.time()
         if left_s > 0:
-            self._timer = loop.call_later(left_s, self._look)
+            self._timer = loop.call_later(left_s, self._check)
         else:
             self._timer = None
             self._expired()

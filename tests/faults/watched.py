@@ -12,7 +12,14 @@ from fitctl.config import load_rig
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Acquire, Experiment, Hold, Off, Recover, Standby, Status, Stop
 from fitctl.messages.keys import new_key
-from fitctl.mocks.bench import ClearFaults, SetFault, StagesQuestion, ask_faults, ask_stages
+from fitctl.mocks.bench import (
+    ClearFaults,
+    FaultsNow,
+    SetFault,
+    StagesNow,
+    StagesQuestion,
+    ask_bench,
+)
 from fitctl.model.drives import Drive
 
 from .console import Console
@@ -98,7 +105,7 @@ class WatchedRig(Rig):
 
     def place(self):
         """Where the stages truly are."""
-        stages = ask_stages(self.endpoints["mocks.bench_port"], StagesQuestion("right"))
+        stages = ask_bench(self.endpoints["mocks.bench_port"], StagesQuestion("right"), StagesNow)
         return Place(time.monotonic(), stages.motor_rad, stages.stack_v)
 
     def start_supervisor(self):
@@ -113,7 +120,7 @@ class WatchedRig(Rig):
         self.bench_answers = True
 
     def tell(self, question):
-        answer = ask_faults(self.endpoints["mocks.bench_port"], question)
+        answer = ask_bench(self.endpoints["mocks.bench_port"], question, FaultsNow)
         assert not answer.error, answer.error
 
     def mode(self):

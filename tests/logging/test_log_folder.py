@@ -174,8 +174,8 @@ def test_a_new_recording_clears_away_and_says_so_in_the_log(tmp_path):
     old = aged(tmp_path, name_of(1), 400, 10)
     with RotatingLog(SETTINGS, "bench", tmp_path) as log:
         assert not old.exists()
-        assert log.take_notes() == [("info", f"{old}: deleted, its time was over")]
-        assert log.take_notes() == []
+        assert log.pop_notes() == [("info", f"{old}: deleted, its time was over")]
+        assert log.pop_notes() == []
 
 
 def test_recording_goes_on_where_nothing_can_be_deleted(tmp_path, monkeypatch):
@@ -186,7 +186,7 @@ def test_recording_goes_on_where_nothing_can_be_deleted(tmp_path, monkeypatch):
 
     monkeypatch.setattr("fitctl.logging.folder.Path.unlink", refuse)
     with RotatingLog(SETTINGS, "bench", tmp_path) as log:
-        ((severity, text),) = log.take_notes()
+        ((severity, text),) = log.pop_notes()
         log.write(tick(1), WALL_S)
     assert severity == "warning"
     assert f"{old}: is due for deletion, but cannot be deleted" in text
@@ -218,7 +218,7 @@ def test_recording_goes_on_where_something_else_has_an_old_logs_name(tmp_path):
     os.utime(folder, (0, 0))
     with RotatingLog(SETTINGS, "bench", tmp_path) as log:
         log.write(tick(1), WALL_S)
-        assert log.take_notes() == [
+        assert log.pop_notes() == [
             (
                 "warning",
                 f"{folder}: cannot be opened: Is a directory; a log is a file that may be read",

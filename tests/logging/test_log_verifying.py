@@ -73,7 +73,7 @@ def test_a_frame_that_is_not_as_large_as_it_says_and_a_time_that_goes_back_are_n
     problems = verify(writer.path).problems
     assert problems == (
         "record 2 (/fit/camera/frame): its log time goes back",
-        "frame 9: its data is not as large as it says",
+        "frame 9: the size of its data does not match its header",
     )
 
 

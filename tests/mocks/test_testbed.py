@@ -13,7 +13,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.modbus_dac.driver import ModbusDac
-from fitctl.mocks.bench import ResidualQuestion, StagesQuestion, ask_bench, ask_stages
+from fitctl.mocks.bench import Residual, ResidualQuestion, StagesNow, StagesQuestion, ask_bench
 from fitctl.mocks.testbed import Testbed as MockTestbed
 from fitctl.model.hysteresis import stack_gains
 from fitctl.model.optics import scales
@@ -150,7 +150,9 @@ def test_the_bench_knows_where_the_star_truly_is(running):
     wait.wait(0.5)
     port = running.endpoints["mocks.bench_port"]
 
-    residual = ask_bench(port, ResidualQuestion("right", since_s, since_s + 0.3, 24.0, 18.5))
+    residual = ask_bench(
+        port, ResidualQuestion("right", since_s, since_s + 0.3, 24.0, 18.5), Residual
+    )
 
     assert residual.az_rms_px == pytest.approx(0.0, abs=1e-6)
     assert residual.el_rms_px == pytest.approx(1.0, abs=1e-6)
@@ -165,21 +167,26 @@ def test_the_bench_knows_where_the_stages_truly_are(running):
     dac.confirm()
     dac.close()
 
-    stages = ask_stages(port, StagesQuestion("right"))
+    stages = ask_bench(port, StagesQuestion("right"), StagesNow)
 
     assert stages.stack_v == pytest.approx([6.0, 5.0, 4.0], abs=1e-3)
     assert stages.motor_rad == [0.0, 0.0]
-    assert "no loop is named left" in ask_stages(port, StagesQuestion("left")).error
+    assert "no loop is named left" in ask_bench(port, StagesQuestion("left"), StagesNow).error
 
 
 def test_the_bench_answers_nonsense_with_an_error(running):
     port = running.endpoints["mocks.bench_port"]
 
-    assert "no loop is named left" in ask_bench(port, ResidualQuestion("left", 0, 1, 0, 0)).error
-    assert ask_bench(port, ResidualQuestion("right", 5.0, 1.0, 0, 0)).samples == 0
-    assert ask_bench(port, ResidualQuestion("right", 1e300, 1e301, 0, 0)).samples == 0
-    assert ask_bench(port, ResidualQuestion("right", float("nan"), 1.0, 0, 0)).error
-    assert math.isnan(ask_bench(port, ResidualQuestion("right", 5.0, 1.0, 0, 0)).az_rms_px)
+    assert (
+        "no loop is named left"
+        in ask_bench(port, ResidualQuestion("left", 0, 1, 0, 0), Residual).error
+    )
+    assert ask_bench(port, ResidualQuestion("right", 5.0, 1.0, 0, 0), Residual).samples == 0
+    assert ask_bench(port, ResidualQuestion("right", 1e300, 1e301, 0, 0), Residual).samples == 0
+    assert ask_bench(port, ResidualQuestion("right", float("nan"), 1.0, 0, 0), Residual).error
+    assert math.isnan(
+        ask_bench(port, ResidualQuestion("right", 5.0, 1.0, 0, 0), Residual).az_rms_px
+    )
 
 
 def test_every_device_listens_on_loopback_only(running):

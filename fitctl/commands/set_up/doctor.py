@@ -18,12 +18,12 @@ from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import Rig
-from fitctl.drivers.bal_analog.probe import probe_bal_analog
-from fitctl.drivers.cia402.probe import probe_drive
-from fitctl.drivers.ensemble.probe import probe_ensemble
+from fitctl.drivers.bal_analog.driver import probe_bal_analog
+from fitctl.drivers.cia402.configure import probe_drive
+from fitctl.drivers.ensemble.driver import probe_ensemble
 from fitctl.drivers.gige.probe import probe_camera
 from fitctl.drivers.interface import DeviceError, DeviceIdentity, DeviceTimeout, DeviceUnreachable
-from fitctl.drivers.mdt693.probe import probe_mdt693
+from fitctl.drivers.mdt693.driver import probe_mdt693
 from fitctl.drivers.modbus_dac.probe import probe_dac
 from fitctl.drivers.probe import Probe
 

@@ -11,7 +11,7 @@ from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.commands.shared.options import RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError, Rig
-from fitctl.mocks.bench import ClearFaults, ListFaults, SetFault, ask_faults
+from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
 app = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
 
@@ -90,7 +90,7 @@ def _change(rig: Rig, question: SetFault | ClearFaults | ListFaults) -> None:
         msg = "fault: mocks.bench_port is 0; give the port that the mocks printed: --set mocks.bench_port=PORT"
         raise ConfigError(msg)
     try:
-        now = ask_faults(mocks.bench_port, question)
+        now = ask_bench(mocks.bench_port, question, FaultsNow)
     except ConnectionError as error:
         msg = f"fault: {error}; start fitctl mocks, or give its port: --set mocks.bench_port=PORT"
         raise ConfigError(msg) from None

@@ -2,7 +2,7 @@
 
 One transaction of function 23 a servo period writes both commands and the enable lines, and reads both
 encoder counters and the fault lines. The counters have 16 bits: the driver counts on across their wrap,
-and says so where it has been blind for longer than they are unambiguous.
+and fails where it has not read them for longer than they are unambiguous.
 
 The amplifiers themselves watch nobody: the station's output watchdog must take commands and enable lines
 away when we are gone.
@@ -10,19 +10,20 @@ away when we are gone.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections import deque
+from contextlib import closing
 
 from fitctl.config import BalAnalogDevice, Siderostat
-from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, held, reach_rad
+from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, LinkedAmplifiers
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
     EXCEPTIONS,
     decode_registers,
     encode_exchange,
+    encode_read,
     lines,
     signed,
     unwrap,
@@ -31,24 +32,23 @@ from fitctl.drivers.bal_analog.protocol import (
 )
 from fitctl.drivers.interface import (
     AzEl,
-    DeviceError,
     DeviceFault,
     DeviceIdentity,
     DeviceRefused,
     DeviceTimeout,
-    DeviceUnreachable,
     ServoReading,
 )
-from fitctl.drivers.modbus import EXCEPTION_FLAG, Message
+from fitctl.drivers.modbus import EXCEPTION_FLAG, READ_HOLDING_REGISTERS, Message
+from fitctl.drivers.probe import Probe, round_trip_s
 
 _STILL = (0.0, 0.0)
 _MOST_OUTSTANDING = 100
 
 
-class BalAnalogAmplifiers:
+class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
     """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
 
-    An axis has no line that says that it is enabled: it counts as enabled while it is told to be and
+    No line reports that an axis is enabled: it counts as enabled while its enable line is up and it
     reports no fault.
 
     Parameters
@@ -58,18 +58,16 @@ class BalAnalogAmplifiers:
     """
 
     def __init__(self, siderostat: Siderostat[BalAnalogDevice]) -> None:
-        self._device = siderostat.device
+        super().__init__(siderostat, siderostat.device.endpoint)
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
-        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         most_rad_s = SLACK * siderostat.velocity_limit_rad_s
         self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / most_rad_s
-        self._link: ModbusLink | None = None
         self._enable = False
         self._counts: tuple[int, int] | None = None
-        self._asked_s = -math.inf
+        self._counted_s = -math.inf
         self._answered_s = 0.0
-        self._asked: deque[tuple[int, float]] = deque(maxlen=_MOST_OUTSTANDING)
+        self._outstanding: deque[tuple[int, float]] = deque(maxlen=_MOST_OUTSTANDING)
 
     def open(self) -> DeviceIdentity:
         """Connect, disable both amplifiers and read their encoders.
@@ -83,15 +81,11 @@ class BalAnalogAmplifiers:
         """
         self.close()
         self._enable = False
-        self._asked.clear()
-        self._asked_s = -math.inf
-        self._link = ModbusLink(self._device)
-        try:
-            identity = self._link.identify()
+        self._outstanding.clear()
+        self._counted_s = -math.inf
+        with self._connected(ModbusLink(self._device)) as link:
+            identity = link.identify()
             self._settle()
-        except BaseException:
-            self._drop()
-            raise
         return identity
 
     def enable(self) -> None:
@@ -103,15 +97,11 @@ class BalAnalogAmplifiers:
             An axis is in fault; then neither has power.
         """
         self._enable = True
-        try:
+        with self._disabled_on_failure():
             self._settle()
             reading = self._settle()  # the first answers were on their way when the lines changed
             if reading.fault:
                 raise self._fault("both axes enabled", reading.fault)
-        except DeviceError:
-            with contextlib.suppress(DeviceError):
-                self.disable()
-            raise
 
     def disable(self) -> None:
         """Command zero velocity and take the enable lines away; a latched fault stays."""
@@ -150,39 +140,26 @@ class BalAnalogAmplifiers:
         DeviceRefused, DeviceProtocolError
             The station refuses, or what comes is no answer.
         DeviceFault
-            A counter says what no motor can do.
+            A counter reports a motion that no motor can make.
         ValueError
             A velocity is not finite.
         """
         link = self._opened()
         sent_s = self._request(link, velocity_rad_s)
         newest: ServoReading | None = None
-        while self._asked:
+        while self._outstanding:
             message = link.receive(sent_s + self._period_s)
             if message is None:
                 break
-            newest = self._take(message) or newest
+            newest = self._reading_of(message) or newest
         if newest is None and sent_s - self._answered_s > self._device.response_timeout_s:
             raise self._silent()
         return newest
 
-    def close(self) -> None:
-        """Disable if possible and disconnect; safe to call twice and after a failure."""
-        if self._link is None:
-            return
-        with contextlib.suppress(DeviceError):
-            self.disable()
-        self._drop()
-
-    def _drop(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
-
     # ------------------------------------------------------------ requests
     def _request(self, link: ModbusLink, velocity_rad_s: AzEl) -> float:
         """Send one transaction, velocities within the motors' limit; returns when."""
-        wanted_rad_s = held(velocity_rad_s, self._velocity_limit_rad_s)
+        wanted_rad_s = self._limited(velocity_rad_s)
         device = self._device
         scale = device.velocity_rad_s_per_v
         az, el = (
@@ -194,29 +171,31 @@ class BalAnalogAmplifiers:
             device.first_input_register, device.first_output_register, [az, el, enable]
         )
         sent_s = time.monotonic()
-        if not self._asked:
+        if not self._outstanding:
             self._answered_s = sent_s
-        self._asked.append((link.send(pdu), sent_s))
+        self._outstanding.append((link.send(pdu), sent_s))
         return sent_s
 
     def _settle(self) -> ServoReading:
-        """Stand still until the station has answered a request that says so."""
+        """Command zero velocity and wait for the answer to that very request."""
         link = self._opened()
         sent_s = self._request(link, _STILL)
-        number = self._asked[-1][0]
+        number = self._outstanding[-1][0]
         while (message := link.receive(sent_s + self._device.response_timeout_s)) is not None:
-            reading = self._take(message)
+            reading = self._reading_of(message)
             if reading is not None and message.transaction == number:
                 return reading
         raise self._silent()
 
     # ------------------------------------------------------------ answers
-    def _take(self, message: Message) -> ServoReading | None:
-        """What an answer says; None where it answers nothing that was asked."""
-        sent_s = next((sent for number, sent in self._asked if number == message.transaction), None)
+    def _reading_of(self, message: Message) -> ServoReading | None:
+        """The reading in an answer; None if it answers no outstanding request."""
+        sent_s = next(
+            (sent for number, sent in self._outstanding if number == message.transaction), None
+        )
         if sent_s is None:
             return None
-        while self._asked.popleft()[0] != message.transaction:
+        while self._outstanding.popleft()[0] != message.transaction:
             pass
         now_s = self._answered_s = time.monotonic()
         self._check_unit_and_exception(message)
@@ -225,7 +204,7 @@ class BalAnalogAmplifiers:
         except ValueError as error:
             raise self._opened().nonsense("three registers", str(error)) from None
         self._counts = self._count((az, el), now_s)
-        self._asked_s = sent_s
+        self._counted_s = sent_s
         az_counts, el_counts = self._counts
         fault = "; ".join(
             f"{name}: fault line"
@@ -245,9 +224,8 @@ class BalAnalogAmplifiers:
             raise self._opened().nonsense(f"unit {self._device.device_id}", got)
         if len(message.pdu) == 2 and message.pdu[0] & EXCEPTION_FLAG:
             code = message.pdu[1]
-            raise DeviceRefused(
-                DEVICE,
-                self._device.endpoint,
+            raise self._endpoint.error(
+                DeviceRefused,
                 "function 23 to be carried out",
                 f"exception {code:02X}, {EXCEPTIONS.get(code, 'see the station manual')}",
                 "check device_id, first_output_register and first_input_register",
@@ -255,7 +233,7 @@ class BalAnalogAmplifiers:
 
     def _count(self, counters: tuple[int, int], now_s: float) -> tuple[int, int]:
         """Both counters, counted on across their wrap."""
-        since_s = now_s - self._asked_s
+        since_s = now_s - self._counted_s
         near = self._counts
         if near is None:
             return signed(counters[0]), signed(counters[1])
@@ -267,30 +245,13 @@ class BalAnalogAmplifiers:
                 f"a reading within {self._blind_s:.2f} s, for the counters not to wrap unseen"
             )
             raise self._timeout(expected, f"one after {since_s:.2f} s")
-        most_counts = reach_rad(self._velocity_limit_rad_s, since_s) / self._rad_per_count
-        for name, before, now in zip(AXES, near, (az, el), strict=True):
-            if abs(now - before) > most_counts:
-                raise DeviceFault(
-                    DEVICE,
-                    self._device.endpoint,
-                    f"{name} to turn at most {most_counts:.0f} counts in {since_s:.3f} s",
-                    f"{now - before}",
-                    "check the encoder, its cable and its counter, then recover",
-                )
+        self._check_turned(near, (az, el), since_s, rad_per_count=self._rad_per_count)
         return az, el
 
     # ------------------------------------------------------------ errors
-    def _opened(self) -> ModbusLink:
-        if self._link is None:
-            expected = "an open connection"
-            raise DeviceUnreachable(
-                DEVICE, self._device.endpoint, expected, "none", "open it again"
-            )
-        return self._link
-
     def _fault(self, expected: str, got: str) -> DeviceFault:
         hint = "look at the amplifier's lamps, remove the cause, then recover"
-        return DeviceFault(DEVICE, self._device.endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceFault, expected, got, hint)
 
     def _silent(self) -> DeviceTimeout:
         return self._timeout(f"an answer within {self._device.response_timeout_s:g} s", "none")
@@ -299,4 +260,37 @@ class BalAnalogAmplifiers:
         hint = (
             "check the I/O station's power and load, and siderostat.device.device_id; then recover"
         )
-        return DeviceTimeout(DEVICE, self._device.endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceTimeout, expected, got, hint)
+
+
+def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
+    """Who a station is, and whether an amplifier behind it is in fault.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or has no such registers.
+    """
+    device = siderostat.device
+    with closing(ModbusLink(device)) as link:
+        identity = link.identify()
+        read = encode_read(device.first_input_register)
+        answer = link.ask(read)
+        if not answer:
+            expected = f"an answer within {device.response_timeout_s:g} s"
+            hint = "check siderostat.device.device_id"
+            raise DeviceTimeout(DEVICE, device.endpoint, expected, "none", hint)
+        try:
+            _, _, faults = decode_registers(answer, READ_HOLDING_REGISTERS)
+        except ValueError as error:
+            hint = "check siderostat.device.first_input_register"
+            raise DeviceRefused(
+                DEVICE, device.endpoint, "three registers", str(error), hint
+            ) from None
+        question_s = round_trip_s(lambda: link.ask(read))
+    disagreements = tuple(
+        f"{name}'s fault line is up: look at the amplifier's lamps and remove the cause"
+        for name, is_up in zip(AXES, lines(faults, device.fault_level), strict=True)
+        if is_up
+    )
+    return Probe(identity, question_s, disagreements)

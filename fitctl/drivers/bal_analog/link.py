@@ -1,4 +1,4 @@
-"""The Modbus/TCP connection to the I/O station: requests out, answers in, told apart by their number.
+"""The Modbus/TCP connection to the I/O station: requests out, answers in, matched by their number.
 
 A servo goes on after one period, and takes a late answer when it comes.
 """
@@ -11,13 +11,14 @@ import time
 
 from fitctl.config import BalAnalogDevice
 from fitctl.drivers.amplifiers import DEVICE
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
 from fitctl.drivers.modbus import (
     Message,
     decode_identity,
     encode_identify,
     frame,
-    take_message,
+    pop_message,
 )
 
 _MESSAGE_BYTES_MAX = 260
@@ -38,6 +39,7 @@ class ModbusLink:
 
     def __init__(self, device: BalAnalogDevice) -> None:
         self._device = device
+        self._endpoint = Endpoint(DEVICE, device.endpoint)
         self._pending = bytearray()
         self._transaction = 0
         try:
@@ -45,9 +47,8 @@ class ModbusLink:
                 (device.host, device.port), device.response_timeout_s
             )
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all
-            raise DeviceUnreachable(
-                DEVICE,
-                device.endpoint,
+            raise self._endpoint.error(
+                DeviceUnreachable,
                 "a Modbus I/O station",
                 str(error),
                 "check its power and cable, and siderostat.device.host and .port",
@@ -77,10 +78,12 @@ class ModbusLink:
         """
         while True:
             try:
-                message = take_message(self._pending)
+                message = pop_message(self._pending)
             except ValueError as error:
                 raise self.nonsense("a Modbus header", str(error)) from None
             if message is not None:
+                if message.protocol != 0:
+                    raise self.nonsense("a Modbus header", f"protocol {message.protocol}")
                 return message
             try:
                 left_s = max(0.0, deadline_s - time.monotonic())
@@ -125,13 +128,12 @@ class ModbusLink:
         """The error for an answer that cannot be; the link is closed."""
         self.close()
         hint = "check that siderostat.device.host and .port lead to the I/O station, then recover"
-        return DeviceProtocolError(DEVICE, self._device.endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceProtocolError, expected, got, hint)
 
     def _broken(self, got: str) -> DeviceUnreachable:
         self.close()
-        return DeviceUnreachable(
-            DEVICE,
-            self._device.endpoint,
+        return self._endpoint.error(
+            DeviceUnreachable,
             "a connection",
             f"a broken one ({got})",
             "check the I/O station's power and cable, then recover",

@@ -1,12 +1,20 @@
-"""What the drive is checked for and set to before it is started: identity, modes, units, PDOs, heartbeat."""
+"""What the drive is checked for and set to before it is started: identity, modes, units, PDOs, heartbeat.
+
+`probe_drive` checks without setting anything.
+"""
 
 from __future__ import annotations
 
-from fitctl.config import Cia402Device
+from contextlib import closing
+
+from fitctl.config import Cia402Device, Siderostat
+from fitctl.drivers.amplifiers import AXES
 from fitctl.drivers.cia402 import protocol
+from fitctl.drivers.cia402.link import CanLink
 from fitctl.drivers.cia402.node import Node
 from fitctl.drivers.cia402.protocol import NmtCommand
 from fitctl.drivers.interface import DeviceIdentity, DeviceMismatch, DeviceRefused
+from fitctl.drivers.probe import Probe, round_trip_s
 
 _PREFERRED_MODES = (protocol.CYCLIC_SYNCHRONOUS_VELOCITY, protocol.PROFILE_VELOCITY)
 
@@ -34,7 +42,7 @@ def configure(node: Node, device: Cia402Device, position_limit_counts: int) -> D
         raise _mismatch(node, "device profile 402 in object 1000", str(profile))
     identity = drive_identity(node)
     node.guard(on=False)
-    for name, offset in zip(protocol.AXES, (0, protocol.AXIS_OFFSET), strict=True):
+    for name, offset in zip(AXES, (0, protocol.AXIS_OFFSET), strict=True):
         _configure_axis(node, name, offset)
         _watch_over_link(node, offset)
         if position_limit_counts:
@@ -45,6 +53,32 @@ def configure(node: Node, device: Cia402Device, position_limit_counts: int) -> D
     heartbeat_ms = round(device.drive_heartbeat_s * 1e3)
     node.write(protocol.HEARTBEAT_PRODUCER, 0, "H", heartbeat_ms)
     return identity
+
+
+def probe_drive(siderostat: Siderostat) -> Probe:
+    """Who a drive is, and whether its axes are fit to be servoed.
+
+    Raises
+    ------
+    DeviceError
+        If there is no adapter, or no CiA 402 drive behind it.
+    """
+    device = siderostat.device
+    with closing(Node(CanLink(device), device)) as node:
+        identity = drive_identity(node)
+        question_s = round_trip_s(lambda: node.read(protocol.DEVICE_TYPE, 0, "I"))
+        disagreements = []
+        for name, offset in zip(AXES, (0, protocol.AXIS_OFFSET), strict=True):
+            if not velocity_modes(node, offset):
+                disagreements.append(
+                    f"{name} has no velocity mode (6502): set the drive up for one"
+                )
+            code = node.read(protocol.ERROR_CODE + offset, 0, "H")
+            if code:
+                disagreements.append(
+                    f"{name} reports {protocol.error_text(code)}: remove its cause; fitctl clears it at standby"
+                )
+    return Probe(identity, question_s, tuple(disagreements))
 
 
 def drive_identity(node: Node) -> DeviceIdentity:
@@ -122,4 +156,4 @@ def _configure_pdo(
 
 def _mismatch(node: Node, expected: str, got: str) -> DeviceMismatch:
     hint = "check siderostat.device.node_id, and the drive's model and firmware"
-    return DeviceMismatch(protocol.DEVICE, node.endpoint, expected, got, hint)
+    return node.endpoint.error(DeviceMismatch, expected, got, hint)

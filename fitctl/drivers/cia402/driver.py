@@ -8,30 +8,32 @@ change and ten times a second. While the amplifiers are enabled the drive watche
 
 from __future__ import annotations
 
-import contextlib
 import math
 import struct
 import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from fitctl.config import Siderostat
+from fitctl.config import Cia402Device, Siderostat
+from fitctl.drivers.amplifiers import AXES, LinkedAmplifiers
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.positions import Encoders
 from fitctl.drivers.cia402.protocol import NmtCommand, State
 from fitctl.drivers.interface import (
     AzEl,
-    DeviceError,
     DeviceFault,
     DeviceIdentity,
     DeviceProtocolError,
     DeviceTimeout,
-    DeviceUnreachable,
     ServoReading,
 )
 
 if TYPE_CHECKING:
     from fitctl.drivers.cia402.node import Node
+
+    _Base = LinkedAmplifiers[Node, Cia402Device]
+else:
+    _Base = LinkedAmplifiers
 
 _POLL_S = 0.001
 _STATUS_LIMIT_S = 5 * protocol.STATUS_EVERY_MS / 1e3
@@ -60,7 +62,7 @@ _DISABLED = frozenset({State.NOT_READY, State.SWITCH_ON_DISABLED, State.FAULT})
 _NOT_FAULT = frozenset(State) - protocol.FAULT_STATES
 
 
-class Cia402Amplifiers:
+class Cia402Amplifiers(_Base):
     """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
 
     Parameters
@@ -69,11 +71,11 @@ class Cia402Amplifiers:
         Encoder, servo rate and device settings of the rig.
     """
 
-    def __init__(self, siderostat: Siderostat) -> None:
-        self._device = siderostat.device
+    def __init__(self, siderostat: Siderostat[Cia402Device]) -> None:
+        device = siderostat.device
+        super().__init__(siderostat, f"{device.interface} {device.channel}, node {device.node_id}")
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
-        self._node: Node | None = None
         self._rpdo_id = protocol.RPDO1_BASE + self._device.node_id
         self._position_limit_counts = int(self._device.position_limit_rad / self._rad_per_count)
         self._encoders = Encoders(siderostat.velocity_limit_rad_s / self._rad_per_count)
@@ -101,22 +103,16 @@ class Cia402Amplifiers:
         self.close()
         self._encoders.restart()
         self._behind = 0
-        link = CanLink(self._device)
-        try:
-            self._node = Node(link, self._device)
-            identity = configure(self._node, self._device, self._position_limit_counts)
-            self._node.handlers |= {
+        with self._connected(Node(CanLink(self._device), self._device)) as node:
+            identity = configure(node, self._device, self._position_limit_counts)
+            node.handlers |= {
                 protocol.TPDO1_BASE + self._device.node_id: self._on_positions,
                 protocol.TPDO2_BASE + self._device.node_id: self._on_statuswords,
             }
-            self._node.start()
+            node.start()
             for axis in range(2):
                 self._state(axis)
             self._status_s = time.monotonic()
-        except BaseException:
-            self._node = None
-            link.close()
-            raise
         return identity
 
     def enable(self) -> None:
@@ -129,14 +125,10 @@ class Cia402Amplifiers:
         """
         node = self._opened()
         node.guard(on=True)
-        try:
+        with self._disabled_on_failure():
             self._stand_still()
             for axis in range(2):
                 self._walk(axis, _TOWARDS_ENABLED, _ENABLED, refused=protocol.FAULT_STATES)
-        except DeviceError:
-            with contextlib.suppress(DeviceError):
-                self.disable()
-            raise
 
     def disable(self) -> None:
         """Command zero velocity, then take current from both motors; a latched fault stays.
@@ -242,19 +234,10 @@ class Cia402Amplifiers:
             fault=self._fault_text(node.error_code),
         )
 
-    def close(self) -> None:
-        """Disable if possible and disconnect; safe to call twice and after a failure."""
-        node = self._node
-        if node is None:
-            return
-        try:
-            self.disable()
-            node.command(NmtCommand.PRE_OPERATIONAL)
-        except DeviceError:
-            pass  # nothing answers, or it answers wrongly: the drive's own watch on us stops it
-        finally:
-            self._node = None
-            node.link.close()
+    def _shut_down(self) -> None:
+        # Where nothing answers, or it answers wrongly, the drive's own watch on us stops it.
+        self.disable()
+        self._opened().command(NmtCommand.PRE_OPERATIONAL)
 
     # ------------------------------------------------------------ one axis
     def _state(self, axis: int) -> State | None:
@@ -304,7 +287,7 @@ class Cia402Amplifiers:
         return sync_s
 
     def _find_lost(self) -> None:
-        """Once behind for long, tell a TPDO that was lost from a slow link.
+        """Once behind for long, distinguish a lost TPDO from a slow link.
 
         On both the oldest SYNC stays unanswered. By the time that the drive answers a request it has
         long sent its TPDOs of earlier SYNCs: those that have not come before the answer never will. It
@@ -317,7 +300,7 @@ class Cia402Amplifiers:
             self._encoders.give_up()
 
     def _on_positions(self, data: bytes) -> None:
-        self._encoders.take(_PAIR.unpack(self._sized(data, _PAIR.size, "both positions")))
+        self._encoders.add(_PAIR.unpack(self._sized(data, _PAIR.size, "both positions")))
 
     def _on_statuswords(self, data: bytes) -> None:
         sized = self._sized(data, _STATUS_PAIR.size, "both statuswords")
@@ -327,9 +310,8 @@ class Cia402Amplifiers:
     def _check_status(self) -> None:
         silent_s = time.monotonic() - self._status_s
         if silent_s > _STATUS_LIMIT_S:
-            raise DeviceTimeout(
-                protocol.DEVICE,
-                self._endpoint,
+            raise self._endpoint.error(
+                DeviceTimeout,
                 f"the TPDO with the statuswords within {_STATUS_LIMIT_S:g} s",
                 f"none for {silent_s:.2f} s",
                 "another CANopen master changed it; recover",
@@ -337,48 +319,28 @@ class Cia402Amplifiers:
 
     def _check_encoders(self) -> None:
         if self._encoders.jumped:
-            raise DeviceFault(
-                protocol.DEVICE,
-                self._endpoint,
+            raise self._endpoint.error(
+                DeviceFault,
                 "encoders that move as their motors can",
                 self._encoders.jumped,
                 "look at the encoder and its cable, recover, and acquire again",
             )
 
     # ------------------------------------------------------------ errors
-    def _opened(self) -> Node:
-        if self._node is None:
-            raise DeviceUnreachable(
-                protocol.DEVICE,
-                self._endpoint,
-                "an open connection",
-                "a closed one",
-                "open it first",
-            )
-        return self._node
-
-    @property
-    def _endpoint(self) -> str:
-        device = self._device
-        return f"{device.interface} {device.channel}, node {device.node_id}"
-
     def _sized(self, data: bytes, size: int, what: str) -> bytes:
         if len(data) != size:
             expected = f"a TPDO of {size} bytes with {what}"
             hint = "another CANopen master changed the mapping; recover"
-            raise DeviceProtocolError(
-                protocol.DEVICE, self._endpoint, expected, f"{len(data)}", hint
-            )
+            raise self._endpoint.error(DeviceProtocolError, expected, f"{len(data)}", hint)
         return data
 
     def _axis_fault(self, axis: int, goals: frozenset[State]) -> DeviceFault:
         statusword = self._statuswords[axis]
         code = self._read(axis, protocol.ERROR_CODE, "H")
         wanted = " or ".join(sorted(state.name.lower().replace("_", " ") for state in goals))
-        return DeviceFault(
-            protocol.DEVICE,
-            self._endpoint,
-            f"{protocol.AXES[axis]} in state {wanted}",
+        return self._endpoint.error(
+            DeviceFault,
+            f"{AXES[axis]} in state {wanted}",
             f"{protocol.state_name(statusword)} (statusword 0x{statusword:04X}), "
             f"{protocol.error_text(code)}",
             "remove the cause, then recover",
@@ -387,7 +349,7 @@ class Cia402Amplifiers:
     def _fault_text(self, error_code: int) -> str:
         texts = [
             f"{name}: {protocol.state_name(word)} (statusword 0x{word:04X})"
-            for name, word in zip(protocol.AXES, self._statuswords, strict=True)
+            for name, word in zip(AXES, self._statuswords, strict=True)
             if protocol.state_of(word) in protocol.FAULT_STATES
         ]
         if error_code:

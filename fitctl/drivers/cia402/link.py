@@ -18,7 +18,8 @@ import can
 from can.interfaces.slcan import slcanBus
 
 from fitctl.config import Cia402Device
-from fitctl.drivers.cia402.protocol import DEVICE
+from fitctl.drivers.amplifiers import DEVICE
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 
 _SEND_TIMEOUT_S = 0.1
@@ -37,7 +38,7 @@ class BulkSlcanBus(slcanBus):
     _BITRATES = {**slcanBus._BITRATES, 800000: "S7"}  # noqa: RUF012 (overrides python-can's)
 
     def __init__(self, channel: str, bitrate: int) -> None:
-        self._held: bytearray | None = None
+        self._batch: bytearray | None = None
         super().__init__(channel, bitrate=bitrate, sleep_after_open=0)
         self._descriptor = self.fileno()
         if channel.startswith("socket://"):
@@ -47,20 +48,20 @@ class BulkSlcanBus(slcanBus):
 
     def send_together(self, messages: Sequence[can.Message]) -> None:
         """Send frames that belong together by one write: a write costs more than all the rest."""
-        self._held = bytearray()
+        self._batch = bytearray()
         try:
             for message in messages:
                 self.send(message, _SEND_TIMEOUT_S)
         finally:
-            held, self._held = self._held, None
+            batch, self._batch = self._batch, None
         with can.exceptions.error_check("Could not write to the adapter"):
-            self.serialPortOrig.write(held)
+            self.serialPortOrig.write(batch)
 
     def _write(self, string: str) -> None:
-        if self._held is None:
+        if self._batch is None:
             super()._write(string)
         else:
-            self._held += string.encode("ascii") + self.LINE_TERMINATOR
+            self._batch += string.encode("ascii") + self.LINE_TERMINATOR
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame; python-can's own waits by the wall clock, which may be set back."""
@@ -69,8 +70,8 @@ class BulkSlcanBus(slcanBus):
     def _read(self, timeout: float | None) -> str | None:
         """The next line that is a frame, or None when none came in time.
 
-        Bytes that are waiting are looked at once even if `timeout` is 0. What else an adapter says is
-        passed over: a frame that it refuses (BEL) shows as an answer of the drive that does not come.
+        Waiting bytes are read once even if `timeout` is 0. Everything else that an adapter sends is
+        ignored: a frame that it refuses (BEL) shows as an answer of the drive that does not come.
 
         Raises
         ------
@@ -142,7 +143,8 @@ class CanLink:
     """
 
     def __init__(self, device: Cia402Device) -> None:
-        self.endpoint = f"{device.interface} {device.channel}, node {device.node_id}"
+        address = f"{device.interface} {device.channel}, node {device.node_id}"
+        self.endpoint = Endpoint(DEVICE, address)
         try:
             self._bus: can.BusABC = (
                 BulkSlcanBus(device.channel, device.bitrate)
@@ -155,9 +157,8 @@ class CanLink:
                 )
             )
         except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
-            raise DeviceUnreachable(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceUnreachable,
                 "an open CAN bus",
                 str(error) or type(error).__name__,
                 "check that the adapter is on, and siderostat.device in the rig file",
@@ -187,8 +188,8 @@ class CanLink:
             except (can.CanError, OSError) as error:
                 self._broken("frames", error)
             except (ValueError, IndexError) as error:
-                raise DeviceProtocolError(
-                    DEVICE, self.endpoint, "CAN frames", str(error), "check the adapter"
+                raise self.endpoint.error(
+                    DeviceProtocolError, "CAN frames", str(error), "check the adapter"
                 ) from error
             if message is None:
                 return None
@@ -208,4 +209,4 @@ class CanLink:
     def _broken(self, expected: str, error: Exception) -> NoReturn:
         hint = "check the adapter and its cable, then recover"
         got = str(error) or type(error).__name__
-        raise DeviceUnreachable(DEVICE, self.endpoint, expected, got, hint) from error
+        raise self.endpoint.error(DeviceUnreachable, expected, got, hint) from error

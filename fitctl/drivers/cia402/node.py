@@ -14,7 +14,7 @@ from collections.abc import Callable
 from fitctl.config import Cia402Device
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.link import CanLink
-from fitctl.drivers.cia402.protocol import DEVICE, NmtCommand, NmtState
+from fitctl.drivers.cia402.protocol import NmtCommand, NmtState
 from fitctl.drivers.interface import (
     DeviceFault,
     DeviceProtocolError,
@@ -40,9 +40,9 @@ class Node:
     Attributes
     ----------
     handlers : dict
-        Who takes the data of which identifier; PDOs are added by their owner.
+        The handler of each identifier's data; the owner of a PDO adds its own.
     error_code : int
-        Of the newest emergency message; 0 once the node says that the error is gone.
+        Of the newest emergency message; 0 once the node reports that the error is gone.
     """
 
     def __init__(self, link: CanLink, device: Cia402Device) -> None:
@@ -62,9 +62,13 @@ class Node:
         self._beat_period_s = device.master_heartbeat_timeout_s / 3
         self._next_beat_s = 0.0
 
+    def close(self) -> None:
+        """Leave the bus; never raises."""
+        self.link.close()
+
     # ------------------------------------------------------------ frames
     def pump(self, timeout_s: float) -> bool:
-        """Take one frame from the bus and hand it to its handler; False when none came in time."""
+        """Receive one frame and pass it to its handler; False when none came in time."""
         frame = self.link.receive(timeout_s)
         if frame is None:
             return False
@@ -74,13 +78,13 @@ class Node:
         return True
 
     def drain(self) -> None:
-        """Take what has come in, without waiting: at most 100 frames, so that a flood does not hold us."""
+        """Receive what is waiting, at most 100 frames, so that a flood cannot block the caller."""
         for _ in range(_DRAIN_FRAMES):
             if not self.pump(0.0):
                 return
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        """Take frames, and keep our heartbeat going, until `done` or the time limit."""
+        """Receive frames and send our heartbeat until `done` or the time limit."""
         deadline_s = time.monotonic() + timeout_s
         while not done():
             left_s = deadline_s - time.monotonic()
@@ -110,7 +114,7 @@ class Node:
             self.link.send((protocol.HEARTBEAT_BASE + self._master_id, state))
 
     def check_alive(self) -> None:
-        """See that the drive's heartbeat goes on and says OPERATIONAL.
+        """Check that the drive's heartbeat continues and reports OPERATIONAL.
 
         Raises
         ------
@@ -122,17 +126,15 @@ class Node:
         silent_s = time.monotonic() - self._heard_s
         limit_s = _MISSED_HEARTBEATS * self._device.drive_heartbeat_s
         if silent_s > limit_s:
-            raise DeviceTimeout(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceTimeout,
                 f"the drive's heartbeat within {limit_s:g} s",
                 f"none for {silent_s:.2f} s",
                 "check the drive's power and its bus cable, then recover",
             )
         if self.nmt_state != NmtState.OPERATIONAL:
-            raise DeviceFault(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceFault,
                 "the drive in NMT state operational",
                 f"NMT state 0x{self.nmt_state or 0:02X}",
                 "it restarted, or another CANopen master commands it; recover",
@@ -143,7 +145,7 @@ class Node:
         self.link.send((protocol.NMT_ID, bytes([command, self._device.node_id])))
 
     def start(self) -> None:
-        """Start the node, and wait for a heartbeat that says so.
+        """Start the node, and wait for a heartbeat that reports it.
 
         Raises
         ------
@@ -155,9 +157,8 @@ class Node:
         self.command(NmtCommand.START)
         timeout_s = self._device.response_timeout_s + self._device.drive_heartbeat_s
         if not self.pump_until(lambda: self.nmt_state == NmtState.OPERATIONAL, timeout_s):
-            raise DeviceTimeout(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceTimeout,
                 f"a heartbeat in state operational within {timeout_s:g} s",
                 "none",
                 "check object 1017 and that no other master commands this drive",
@@ -170,7 +171,7 @@ class Node:
         size = struct.calcsize("<" + code)
         if len(data) < size:
             expected = f"{size} bytes of {index:04X}:{subindex:02X}"
-            raise DeviceProtocolError(DEVICE, self.endpoint, expected, f"{len(data)}")
+            raise self.endpoint.error(DeviceProtocolError, expected, f"{len(data)}")
         (value,) = struct.unpack_from("<" + code, data)
         return int(value)
 
@@ -220,7 +221,7 @@ class Node:
                 f"at most {limit} bytes of {what}" if size is None else f"{size} bytes of {what}"
             )
             got = f"{len(data)} bytes" + ("" if last else " and more")
-            raise DeviceProtocolError(DEVICE, self.endpoint, expected, got)
+            raise self.endpoint.error(DeviceProtocolError, expected, got)
         return data
 
     @property
@@ -247,9 +248,8 @@ class Node:
             timed_out = struct.pack("<I", protocol.AbortCode.TIMED_OUT)
             abort = bytes([protocol.SDO_ABORT]) + request[1:4] + timed_out
             self.link.send((can_id, abort))
-            raise DeviceTimeout(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceTimeout,
                 f"an answer to SDO {what} within {timeout_s:g} s",
                 "none",
                 "check the drive's power, bit rate and node id",
@@ -262,16 +262,15 @@ class Node:
     ) -> None:
         if len(answer) == 8 and answer[0] == protocol.SDO_ABORT:
             (code,) = struct.unpack_from("<I", answer, 4)
-            raise DeviceRefused(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceRefused,
                 f"SDO {what}",
                 protocol.abort_text(code),
                 "the drive does not take this setting; compare its manual with the rig file",
             )
         if len(answer) != 8 or answer[0] & mask != service:
-            raise DeviceProtocolError(
-                DEVICE, self.endpoint, f"an SDO answer to {what}", answer.hex(" ")
+            raise self.endpoint.error(
+                DeviceProtocolError, f"an SDO answer to {what}", answer.hex(" ")
             )
 
     # ------------------------------------------------------------ handlers
@@ -283,7 +282,7 @@ class Node:
         try:
             self.error_code, _ = protocol.decode_emcy(data)
         except ValueError as error:
-            raise DeviceProtocolError(DEVICE, self.endpoint, "an EMCY", str(error)) from error
+            raise self.endpoint.error(DeviceProtocolError, "an EMCY", str(error)) from error
 
     def _on_sdo(self, data: bytes) -> None:
         self._answer = data

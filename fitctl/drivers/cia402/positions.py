@@ -1,8 +1,8 @@
-"""What both encoders say, dated by the SYNC that latched it, unwrapped, and held against what motors can do.
+"""Both encoder counts, dated by the SYNC that latched it, unwrapped, and held against what motors can do.
 
 Each SYNC is answered by one TPDO, in order; counting both dates a late one. A counter is an int32 and
 wraps; the sum of its steps does not. A step larger than the motor can have made since the last reading is
-kept back: the next reading tells whether it was a false one or the encoder has jumped.
+kept back: the next reading shows whether it was false or the encoder has jumped.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import time
 from collections import deque
 from typing import NamedTuple
 
-from fitctl.drivers.cia402.protocol import AXES, wrap_int32
+from fitctl.drivers.amplifiers import AXES
+from fitctl.drivers.cia402.protocol import wrap_int32
 
 _SPEED_MARGIN = 1.25  # over the motor's velocity limit
 _MARGIN_COUNTS = 2  # two roundings
@@ -55,7 +56,7 @@ class Encoders:
         self.jumped = ""
 
     def trust(self) -> None:
-        """The jump is known, and the positions are taken as they are."""
+        """Accept the positions as they are after a jump."""
         self.jumped = ""
 
     @property
@@ -68,15 +69,15 @@ class Encoders:
         self._syncs_s.clear()
 
     def sync_sent(self, time_s: float) -> None:
-        """Take note of a SYNC, by the time just before it was sent.
+        """Record a SYNC, by the time just before it was sent.
 
         The drive latches its encoders at SYNC: not before that time, and as a rule hardly later. The
         time after sending can be long after it, on a machine that is busy.
         """
         self._syncs_s.append(time_s)
 
-    def take(self, raw: tuple[int, int]) -> None:
-        """Take the next answer; one that answers nothing is a copy, and passed over."""
+    def add(self, raw: tuple[int, int]) -> None:
+        """Add the next answer; one without an outstanding SYNC is a copy, and ignored."""
         if not self._syncs_s:
             return
         last = self._last

@@ -16,9 +16,6 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-DEVICE = "siderostat amplifiers"
-"""What errors call the device."""
-
 # ---------------------------------------------------------------- CAN identifiers (CiA 301)
 NMT_ID = 0x000
 SYNC_ID = 0x080
@@ -55,7 +52,7 @@ STATUS_EVERY_MS = 100
 
 
 class NmtCommand(IntEnum):
-    """What the NMT master tells a node."""
+    """Commands of the NMT master to a node."""
 
     START = 0x01
     STOP = 0x02
@@ -65,7 +62,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """What a heartbeat says; BOOT_UP is sent once."""
+    """The state in a heartbeat; BOOT_UP is sent once."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04
@@ -97,7 +94,6 @@ RPDO_MAPPING = 0x1600
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
 
-AXES = ("azimuth", "elevation")
 AXIS_OFFSET = 0x800
 """The second axis' objects stand this much higher."""
 

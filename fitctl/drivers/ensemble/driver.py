@@ -10,14 +10,14 @@ a controller without them is refused.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 
 from fitctl.config import EnsembleDevice, Siderostat
-from fitctl.drivers.amplifiers import AXES, DEVICE, held, reach_rad
+from fitctl.drivers.amplifiers import AXES, LinkedAmplifiers
 from fitctl.drivers.ensemble.link import EnsembleLink
 from fitctl.drivers.ensemble.protocol import (
     AxisStatus,
@@ -30,18 +30,17 @@ from fitctl.drivers.ensemble.protocol import (
 )
 from fitctl.drivers.interface import (
     AzEl,
-    DeviceError,
     DeviceFault,
     DeviceIdentity,
     DeviceMismatch,
-    DeviceUnreachable,
     ServoReading,
 )
+from fitctl.drivers.probe import Probe, round_trip_s
 
 _POLL_S = 0.005
 
 
-class EnsembleAmplifiers:
+class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
     """Both axes' amplifiers (:class:`fitctl.drivers.interface.ServoAmplifiers`).
 
     Parameters
@@ -51,11 +50,9 @@ class EnsembleAmplifiers:
     """
 
     def __init__(self, siderostat: Siderostat[EnsembleDevice]) -> None:
-        self._device = siderostat.device
-        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
+        super().__init__(siderostat, siderostat.device.port)
         self._acceleration_limit_rad_s2 = siderostat.acceleration_limit_rad_s2
         self._counts_per_rad = siderostat.encoder_counts_per_rev / (2 * math.pi)
-        self._link: EnsembleLink | None = None
         self._rad_per_unit = [1.0, 1.0]
         self._digits = [1, 1]
         self._sent: list[str] = ["", ""]
@@ -74,16 +71,12 @@ class EnsembleAmplifiers:
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
         self.close()
-        self._link = EnsembleLink(self._device)
-        try:
-            identity = self._link.probe()
+        with self._connected(EnsembleLink(self._device)) as link:
+            identity = link.probe()
             for axis in range(2):
                 self._set_up(axis)
             self._command("WAIT MODE NOWAIT")
             self._last = None
-        except BaseException:
-            self._drop()
-            raise
         return identity
 
     def enable(self) -> None:
@@ -95,16 +88,12 @@ class EnsembleAmplifiers:
             An axis is in fault or does not come up in time; then neither has power.
         """
         self._opened().last_words = tuple(f"ABORT {self._at(axis)}" for axis in range(2))
-        try:
+        with self._disabled_on_failure():
             for axis in range(2):
                 self._sent[axis] = ""
                 if self._opened().command(f"ENABLE {self._at(axis)}") is not Reply.DONE:
                     raise self._axis_fault(axis, "enabled", "the controller refuses")
                 self._wait(axis, "enabled", partial(self._is_enabled, axis))
-        except DeviceError:
-            with contextlib.suppress(DeviceError):
-                self.disable()
-            raise
 
     def disable(self) -> None:
         """Stop both axes, then take their power; a latched fault stays.
@@ -147,22 +136,22 @@ class EnsembleAmplifiers:
         DeviceUnreachable, DeviceTimeout, DeviceProtocolError
             The link broke, or is out of step. A fault of an axis does not raise: the reading has it.
         DeviceFault
-            An encoder says what no motor can do.
+            An encoder reports a motion that no motor can make.
         ValueError
             A velocity is not finite.
         """
-        velocity_rad_s = held(velocity_rad_s, self._velocity_limit_rad_s)
+        velocity_rad_s = self._limited(velocity_rad_s)
         self._opened()
         for axis in range(2):
             self._free_run(axis, velocity_rad_s[axis])
-        asked_s = time.monotonic()
+        requested_s = time.monotonic()
         az_rad, el_rad = self._position_rad(0), self._position_rad(1)
         read_s = time.monotonic()
-        self._look_after(*divmod(self._turn, 2))
+        self._poll_axis(*divmod(self._turn, 2))
         self._turn = (self._turn + 1) % 4
-        self._check_plausible(asked_s, read_s, (az_rad, el_rad))
+        self._check_plausible(requested_s, read_s, (az_rad, el_rad))
         return ServoReading(
-            time_s=(asked_s + read_s) / 2,
+            time_s=(requested_s + read_s) / 2,
             position_rad=(az_rad, el_rad),
             enabled=all(status & AxisStatus.ENABLED for status in self._status),
             fault="; ".join(
@@ -171,19 +160,6 @@ class EnsembleAmplifiers:
                 if faults
             ),
         )
-
-    def close(self) -> None:
-        """Disable if possible and disconnect; safe to call twice and after a failure."""
-        if self._link is None:
-            return
-        with contextlib.suppress(DeviceError):
-            self.disable()
-        self._drop()
-
-    def _drop(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
 
     # ------------------------------------------------------------ one axis
     def _set_up(self, axis: int) -> None:
@@ -210,7 +186,7 @@ class EnsembleAmplifiers:
         self._read_faults(axis)
 
     def _free_run(self, axis: int, velocity_rad_s: float) -> None:
-        """Say a velocity, unless it was the last one said too."""
+        """Command a velocity, unless it is the last one commanded."""
         units_s = f"{velocity_rad_s / self._rad_per_unit[axis]:.{self._digits[axis]}f}"
         if units_s == self._sent[axis] or not self._status[axis] & AxisStatus.ENABLED:
             return
@@ -222,7 +198,7 @@ class EnsembleAmplifiers:
             if not self._read_faults(axis) and self._is_enabled(axis):
                 raise link.refused(command, reply)
 
-    def _look_after(self, axis: int, what: int) -> None:
+    def _poll_axis(self, axis: int, what: int) -> None:
         """Read the status or the faults of an axis; both where it has just lost its power."""
         was_enabled = self._status[axis] & AxisStatus.ENABLED
         if what or (was_enabled and not self._is_enabled(axis)):
@@ -233,22 +209,11 @@ class EnsembleAmplifiers:
     def _position_rad(self, axis: int) -> float:
         return self._number(f"PFBKPROG({self._at(axis)})") * self._rad_per_unit[axis]
 
-    def _check_plausible(self, asked_s: float, read_s: float, position_rad: AzEl) -> None:
-        """An ASCII answer has no checksum and no number of its own: see that it can be this one."""
-        last, self._last = self._last, (asked_s, position_rad)
-        if last is None:
-            return
-        since_s, before_rad = read_s - last[0], last[1]
-        most_rad = reach_rad(self._velocity_limit_rad_s, since_s)
-        for name, before, now in zip(AXES, before_rad, position_rad, strict=True):
-            if abs(now - before) > most_rad:
-                raise DeviceFault(
-                    DEVICE,
-                    self._device.port,
-                    f"{name} to turn at most {most_rad:.2f} rad in {since_s:.3f} s",
-                    f"{now - before:.2f} rad",
-                    "check the encoder and its cable, then recover",
-                )
+    def _check_plausible(self, requested_s: float, read_s: float, position_rad: AzEl) -> None:
+        """An ASCII answer has neither checksum nor number: check that the motors can be there."""
+        last, self._last = self._last, (requested_s, position_rad)
+        if last is not None:
+            self._check_turned(last[1], position_rad, read_s - last[0])
 
     def _is_enabled(self, axis: int) -> bool:
         self._status[axis] = self._bits(f"AXISSTATUS({self._at(axis)})")
@@ -291,23 +256,42 @@ class EnsembleAmplifiers:
     def _bits(self, text: str) -> int:
         return self._opened().value(text, parse_bits)
 
-    def _opened(self) -> EnsembleLink:
-        if self._link is None:
-            expected = "an open connection"
-            raise DeviceUnreachable(DEVICE, self._device.port, expected, "none", "open it again")
-        return self._link
-
     def _mismatch(self, axis: int, expected: str, got: str) -> DeviceMismatch:
         hint = "set them in the controller with its maker's tool"
-        what = f"{AXES[axis]}: {expected}"
-        return DeviceMismatch(DEVICE, self._device.port, what, got, hint)
+        return self._endpoint.error(DeviceMismatch, f"{AXES[axis]}: {expected}", got, hint)
 
     def _axis_fault(self, axis: int, goal: str, got: str) -> DeviceFault:
         faults = fault_text(self._read_faults(axis))
-        return DeviceFault(
-            DEVICE,
-            self._device.port,
-            f"{AXES[axis]} {goal}",
-            f"{got}; {faults}" if faults else got,
-            "remove its cause, then recover",
-        )
+        got = f"{got}; {faults}" if faults else got
+        hint = "remove its cause, then recover"
+        return self._endpoint.error(DeviceFault, f"{AXES[axis]} {goal}", got, hint)
+
+
+def probe_ensemble(siderostat: Siderostat[EnsembleDevice]) -> Probe:
+    """Whether a controller has both axes, their software limits, and no fault.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or has no such axes.
+    """
+    device = siderostat.device
+    disagreements = []
+    with closing(EnsembleLink(device)) as link:
+        identity = link.probe()
+        for axis in device.axes:
+            low, high = (
+                link.value(f"GETPARM(@{axis}, {parameter.value})", parse_number)
+                for parameter in (Parameter.SOFTWARE_LIMIT_LOW, Parameter.SOFTWARE_LIMIT_HIGH)
+            )
+            if low >= high:
+                disagreements.append(
+                    f"axis @{axis} has no software limits: set SoftwareLimitLow and SoftwareLimitHigh"
+                )
+            faults = link.value(f"AXISFAULT(@{axis})", parse_bits)
+            if faults:
+                disagreements.append(
+                    f"axis @{axis} is in fault ({fault_text(faults)}): remove its cause"
+                )
+        question_s = round_trip_s(lambda: link.query(f"PFBKPROG(@{device.axes[0]})"))
+    return Probe(identity, question_s, tuple(disagreements))

@@ -11,6 +11,7 @@ import serial
 
 from fitctl.config import EnsembleDevice
 from fitctl.drivers.amplifiers import DEVICE
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, PROBE, Reply
 from fitctl.drivers.interface import (
     DeviceIdentity,
@@ -47,6 +48,7 @@ class EnsembleLink:
 
     def __init__(self, device: EnsembleDevice) -> None:
         self._device = device
+        self._endpoint = Endpoint(DEVICE, device.port)
         self.last_words: tuple[str, ...] = ()
         try:
             self._port = serial.serial_for_url(
@@ -57,9 +59,8 @@ class EnsembleLink:
                 exclusive=True,
             )
         except (OSError, ValueError) as error:
-            raise DeviceUnreachable(
-                DEVICE,
-                device.port,
+            raise self._endpoint.error(
+                DeviceUnreachable,
                 "an Ensemble controller",
                 str(error),
                 "check its power and cable, its Ethernet socket's set-up, and siderostat.device.port",
@@ -128,13 +129,13 @@ class EnsembleLink:
         """The error for a command that the controller has not done."""
         got = reply.name.lower().replace("_", " ")
         hint = "check siderostat.device.axes, and the controller's firmware"
-        return DeviceRefused(DEVICE, self._device.port, f"{text} to be done", got, hint)
+        return self._endpoint.error(DeviceRefused, f"{text} to be done", got, hint)
 
     def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
         """The error for an answer that cannot be; the link is closed."""
         self._give_up()
         hint = "check that nobody else uses this port of the controller, then recover"
-        return DeviceProtocolError(DEVICE, self._device.port, expected, got, hint)
+        return self._endpoint.error(DeviceProtocolError, expected, got, hint)
 
     def _send(self, text: str) -> float:
         """Send a command; returns the time by which its answer must be here."""
@@ -174,9 +175,8 @@ class EnsembleLink:
             if byte:
                 return byte
         self._give_up()
-        raise DeviceTimeout(
-            DEVICE,
-            self._device.port,
+        raise self._endpoint.error(
+            DeviceTimeout,
             f"an answer to {text} within {self._device.response_timeout_s:g} s",
             "none",
             "check the controller's power and its ASCII command set-up, then recover",
@@ -193,9 +193,8 @@ class EnsembleLink:
 
     def _broken(self, text: str, error: OSError) -> DeviceUnreachable:
         self.close()
-        return DeviceUnreachable(
-            DEVICE,
-            self._device.port,
+        return self._endpoint.error(
+            DeviceUnreachable,
             f"to send {text}",
             f"a broken connection ({error})",
             "check power and cable, and the timeout of the controller's socket; then recover",

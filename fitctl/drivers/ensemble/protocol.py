@@ -1,7 +1,7 @@
 """The Ensemble's ASCII interface as both sides see it: answers, status words, parameters, numbers.
 
-A command is a line. Its answer begins with one character that says what became of it; a value and a
-newline follow. Bits and characters as in Aerotech's C headers and in epics-motor/motorAerotech, which
+A command is a line. Its answer begins with one character that reports the result; a value and a newline
+follow. Bits and characters as in Aerotech's C headers and in epics-motor/motorAerotech, which
 was verified with firmware 4.01. Status words are printed as signed 32-bit integers.
 """
 
@@ -27,7 +27,7 @@ class Reply(Enum):
 
 
 class AxisStatus(IntFlag):
-    """What AXISSTATUS tells; the bits that are used here."""
+    """Bits of AXISSTATUS that are used here."""
 
     ENABLED = 1 << 0
     HOMED = 1 << 1
@@ -42,7 +42,7 @@ class AxisStatus(IntFlag):
 
 
 class AxisFault(IntFlag):
-    """What AXISFAULT tells."""
+    """Bits of AXISFAULT."""
 
     POSITION_ERROR = 1 << 0
     OVER_CURRENT = 1 << 1

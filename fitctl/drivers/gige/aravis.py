@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import Camera
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.features import (
     EXPOSURE_TOLERANCE,
@@ -53,7 +54,7 @@ class AravisCamera:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._endpoint = camera.device.endpoint
+        self._endpoint = Endpoint(DEVICE, camera.device.endpoint)
         self._expect = partial(expect, self._endpoint)
         self._mismatch = partial(mismatch, self._endpoint)
         self._aravis: Any = None
@@ -93,9 +94,8 @@ class AravisCamera:
                     firmware=self._device.get_device().get_string_feature_value("DeviceVersion"),
                 )
             if not self._device.get_device().is_controller():
-                raise DeviceRefused(
-                    DEVICE,
-                    self._endpoint,
+                raise self._endpoint.error(
+                    DeviceRefused,
                     "control of the camera",
                     "read access only",
                     "another program has it: end that, or wait for its heartbeat to lapse",
@@ -133,8 +133,8 @@ class AravisCamera:
         """
         heartbeat = self._opened()
         if self._stream is None:
-            raise DeviceMismatch(
-                DEVICE, self._endpoint, "a started stream", "none", "call start() first"
+            raise self._endpoint.error(
+                DeviceMismatch, "a started stream", "none", "call start() first"
             )
         deadline_s = time.monotonic() + timeout_s
         while True:
@@ -235,14 +235,14 @@ class AravisCamera:
         return Frame(self._number, middle_s, received_s, image)
 
     def _answers(self) -> bool:
-        """Whether it is worth while to tell it anything: Aravis would try for seconds."""
+        """Whether the camera still answers; if not, Aravis would retry for seconds."""
         lost = self._heartbeat is not None and self._heartbeat.error is not None
         return self._device is not None and not lost
 
     def _opened(self) -> Heartbeat:
         if self._device is None or self._heartbeat is None:
-            raise DeviceUnreachable(
-                DEVICE, self._endpoint, "an open camera", "a closed one", "open() it"
+            raise self._endpoint.error(
+                DeviceUnreachable, "an open camera", "a closed one", "open() it"
             )
         return self._heartbeat
 
@@ -257,9 +257,8 @@ class AravisCamera:
             kind = {codes.TIMEOUT: DeviceTimeout, codes.NOT_FOUND: DeviceUnreachable}.get(
                 error.code, DeviceMismatch
             )
-            raise kind(
-                DEVICE,
-                self._endpoint,
+            raise self._endpoint.error(
+                kind,
                 expected,
                 error.message,
                 "check power, cable and [camera] in the rig file",
@@ -272,7 +271,7 @@ class _Registers:
     def __init__(
         self,
         device: Any,
-        endpoint: str,
+        endpoint: Endpoint,
         translated: Callable[[str], contextlib.AbstractContextManager[None]],
     ) -> None:
         self.endpoint = endpoint
@@ -294,14 +293,13 @@ class _Registers:
         self.answered_s = time.monotonic()
 
 
-def _library(endpoint: str) -> Any:
+def _library(endpoint: Endpoint) -> Any:
     try:
         importlib.import_module("gi").require_version("Aravis", "0.8")
         return importlib.import_module("gi.repository.Aravis")
     except (ImportError, ValueError) as error:
-        raise DeviceUnreachable(
-            DEVICE,
-            endpoint,
+        raise endpoint.error(
+            DeviceUnreachable,
             "the library Aravis 0.8 and PyGObject",
             str(error),
             "install them (Debian: gir1.2-aravis-0.8 python3-gi) for the Python that runs fitctl, "

@@ -22,7 +22,7 @@ class FoundCamera(NamedTuple):
     Attributes
     ----------
     address : str
-        Its IPv4 address, as it says itself; not always one that this host can reach.
+        The IPv4 address that it reports; not always one that this host can reach.
     mac : str
     user_name : str
         What its owner has called it; may be empty.

@@ -8,6 +8,7 @@ import socket
 import time
 
 from fitctl.config import Camera
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.features import Features
 from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
@@ -118,8 +119,8 @@ class GigeCamera:
         channel, _features, heartbeat = self._opened()
         stream, assembler = self._stream, self._assembler
         if stream is None or assembler is None:
-            raise DeviceMismatch(
-                DEVICE, channel.endpoint, "a started stream", "none", "call start() first"
+            raise channel.endpoint.error(
+                DeviceMismatch, "a started stream", "none", "call start() first"
             )
         deadline_s = time.monotonic() + timeout_s
         view = memoryview(self._packet)
@@ -185,8 +186,8 @@ class GigeCamera:
 
     def _opened(self) -> tuple[ControlChannel, Features, Heartbeat]:
         if self._channel is None or self._features is None or self._heartbeat is None:
-            endpoint = self._camera.device.endpoint
-            raise DeviceUnreachable(DEVICE, endpoint, "an open camera", "a closed one", "open() it")
+            endpoint = Endpoint(DEVICE, self._camera.device.endpoint)
+            raise endpoint.error(DeviceUnreachable, "an open camera", "a closed one", "open() it")
         return self._channel, self._features, self._heartbeat
 
 
@@ -202,9 +203,8 @@ def _take_control(channel: ControlChannel, heartbeat_s: float) -> None:
     try:
         channel.write_register(Register.CONTROL_PRIVILEGE, protocol.CONTROL)
     except DeviceRefused as error:
-        raise DeviceRefused(
-            DEVICE,
-            channel.endpoint,
+        raise channel.endpoint.error(
+            DeviceRefused,
             "control of the camera",
             error.got,
             "another program has it: end that, or wait for its heartbeat to lapse",

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
+import zipfile
 from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
 from fitctl.config import Camera
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.description import download_xml
-from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
-from fitctl.drivers.interface import DeviceMismatch, DeviceRefused
+from fitctl.drivers.gige.gvcp import ControlChannel
+from fitctl.drivers.gige.protocol import MalformedPacketError, Register
+from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError, DeviceRefused
 
 RATE_TOLERANCE = 1e-3  # cameras round the frame rate to their own clock
 EXPOSURE_TOLERANCE = 1e-2  # and the exposure to rows or microseconds
@@ -96,7 +99,7 @@ class Features:
             raise self._mismatch("a GenICam description", str(error)) from error
 
     def configure(self, camera: Camera) -> float:
-        """Set what the rig file says and check that the camera took it.
+        """Apply the settings of the rig file and check that the camera has accepted them.
 
         Returns
         -------
@@ -245,14 +248,74 @@ class Features:
             raise self._mismatch(f"command {name}", str(error)) from error
 
 
-def expect(endpoint: str, name: str, wanted: float, actual: float, tolerance: float) -> None:
+_XML_BYTES_MAX = 16 << 20  # many times that of any known camera; 4 GiB would be read for hours
+_MEMORY_END = 1 << 32
+
+
+def download_xml(channel: ControlChannel) -> str:
+    """The description from the camera's memory, by its first URL or else its second.
+
+    Raises
+    ------
+    DeviceMismatch
+        If the camera keeps none in its memory, or an absurd one.
+    DeviceProtocolError
+        If it cannot be unpacked.
+    """
+    urls = []
+    for register in (Register.XML_URL_1, Register.XML_URL_2):
+        text = channel.read_text(protocol.TextRegister(register, protocol.XML_URL_BYTES))
+        urls.append(text)
+        try:
+            location = protocol.decode_xml_url(text)
+        except MalformedPacketError:
+            continue
+        if not 0 < location.length <= min(_XML_BYTES_MAX, _MEMORY_END - location.address):
+            continue
+        data = channel.read_memory(location.address, location.length)
+        return unpacked(data, channel.endpoint)
+    raise channel.endpoint.error(
+        DeviceMismatch,
+        "a GenICam description of 1 byte to 16 MiB in the camera's memory, Local:NAME;ADDRESS;LENGTH",
+        " and ".join(repr(url) for url in urls),
+        "fitctl cannot read a description kept elsewhere; update the camera's firmware",
+    )
+
+
+def unpacked(data: bytes, endpoint: Endpoint) -> str:
+    """The text of a description: most real cameras send a zip archive that holds the one file.
+
+    Raises
+    ------
+    DeviceProtocolError
+        If it is damaged or absurdly large.
+    """
+    try:
+        if data.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                first = archive.infolist()[0]
+                if first.file_size > _XML_BYTES_MAX:
+                    msg = f"{first.file_size} bytes once unpacked"
+                    raise ValueError(msg)
+                data = archive.read(first)
+        return data.rstrip(b"\0").decode("utf-8-sig")
+    except Exception as error:  # a damaged archive can raise any of a dozen kinds
+        raise endpoint.error(
+            DeviceProtocolError,
+            "a readable GenICam description",
+            f"{type(error).__name__}: {error}",
+            "update its firmware",
+        ) from error
+
+
+def expect(endpoint: Endpoint, name: str, wanted: float, actual: float, tolerance: float) -> None:
     """See that a camera has taken a number. Raises DeviceMismatch."""
     if abs(actual - wanted) > tolerance * abs(wanted):
         raise mismatch(endpoint, f"{name} = {wanted:g}", f"{actual:g}")
 
 
-def mismatch(endpoint: str, expected: str, got: str) -> DeviceMismatch:
-    """The error for a camera that is not what the rig file says."""
-    return DeviceMismatch(
-        DEVICE, endpoint, expected, got, "correct [camera] in the rig file to this camera"
+def mismatch(endpoint: Endpoint, expected: str, got: str) -> DeviceMismatch:
+    """The error for a camera that does not match the rig file."""
+    return endpoint.error(
+        DeviceMismatch, expected, got, "correct [camera] in the rig file to this camera"
     )

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Command, MalformedPacketError, Register
 from fitctl.drivers.interface import (
@@ -45,7 +46,7 @@ class ControlChannel:
     """
 
     def __init__(self, address: str, port: int, timeout_s: float) -> None:
-        self.endpoint = f"{address}:{port}"
+        self.endpoint = Endpoint(DEVICE, f"{address}:{port}")
         self.answered_s = time.monotonic()
         _check_address(address, self.endpoint)
         self._timeout_s = timeout_s
@@ -105,7 +106,7 @@ class ControlChannel:
         return text_of(self.read_memory(*register))
 
     def read_identity(self) -> DeviceIdentity:
-        """Read who the camera says it is."""
+        """Read the camera's maker, model, serial number and version."""
         return DeviceIdentity(
             maker=self.read_text(protocol.MAKER),
             model=self.read_text(protocol.MODEL),
@@ -147,9 +148,8 @@ class ControlChannel:
             answer = self._answer(command, payload)
         what = f"{command.name} 0x{payload[:4].hex().upper()}"
         if protocol.is_error(answer.status):
-            raise DeviceRefused(
-                DEVICE,
-                self.endpoint,
+            raise self.endpoint.error(
+                DeviceRefused,
                 f"{what} to succeed",
                 protocol.status_name(answer.status),
                 "the camera does not have this register or does not allow it now",
@@ -172,9 +172,8 @@ class ControlChannel:
             if answer is not None:
                 self.answered_s = time.monotonic()
                 return answer
-        raise DeviceTimeout(
-            DEVICE,
-            self.endpoint,
+        raise self.endpoint.error(
+            DeviceTimeout,
             f"an answer to {command.name} within {self._timeout_s:g} s",
             f"none to {ATTEMPTS} attempts",
             "check power, cable and camera.device.address in the rig file",
@@ -222,32 +221,30 @@ class ControlChannel:
         return next(self._counter) % 0xFFFF + 1
 
     def _unreachable(self, error: OSError) -> DeviceUnreachable:
-        return DeviceUnreachable(
-            DEVICE,
-            self.endpoint,
+        return self.endpoint.error(
+            DeviceUnreachable,
             "a GigE Vision camera",
             str(error),
             "check power, cable and camera.device in the rig file; for a mock rig, start the mocks",
         )
 
     def _protocol_error(self, expected: str, got: str) -> DeviceProtocolError:
-        return DeviceProtocolError(
-            DEVICE, self.endpoint, expected, got, "is this a GigE Vision camera?"
+        return self.endpoint.error(
+            DeviceProtocolError, expected, got, "is this a GigE Vision camera?"
         )
 
 
 def text_of(data: bytes) -> str:
-    """What a string register says."""
+    """The text in a string register."""
     return data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
 
 
-def _check_address(address: str, endpoint: str) -> None:
+def _check_address(address: str, endpoint: Endpoint) -> None:
     try:
         ipaddress.IPv4Address(address)
     except ValueError as error:
-        raise DeviceUnreachable(
-            DEVICE,
-            endpoint,
+        raise endpoint.error(
+            DeviceUnreachable,
             "an IPv4 address such as 192.168.1.10",
             repr(address),
             "correct camera.device.address in the rig file",

@@ -7,7 +7,6 @@ import threading
 import time
 
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import DEVICE
 from fitctl.drivers.gige.protocol import Register
 from fitctl.drivers.gige.ticks import CameraTime, Registers
 from fitctl.drivers.interface import DeviceError, DeviceTimeout, DeviceUnreachable
@@ -79,9 +78,8 @@ def _check_control(channel: Registers) -> None:
     """Read the privilege, which refreshes the heartbeat. Raises DeviceUnreachable if it is gone."""
     privilege = channel.read_register(Register.CONTROL_PRIVILEGE)
     if not privilege & (protocol.CONTROL | protocol.CONTROL_EXCLUSIVE):
-        raise DeviceUnreachable(
-            DEVICE,
-            channel.endpoint,
+        raise channel.endpoint.error(
+            DeviceUnreachable,
             "to keep control of the camera",
             "the camera took it away",
             "its heartbeat was not refreshed in time, or it restarted; open it again",

@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 import struct
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class MalformedPacketError(ValueError):
-    """Bytes that are not a packet of the protocol; ``str()`` says what is wrong with them."""
+    """Bytes that are not a packet of the protocol; ``str()`` describes the error."""
 
 
 # ---------------------------------------------------------------- GVCP
@@ -157,10 +157,7 @@ def encode_readmem(address: int, count: int) -> bytes:
 
 def decode_readmem(payload: bytes) -> tuple[int, int]:
     """Read the payload of READMEM: address, count. Raises MalformedPacketError."""
-    if len(payload) != _READMEM.size:
-        msg = f"READMEM with {len(payload)} bytes, not {_READMEM.size}"
-        raise MalformedPacketError(msg)
-    address, _reserved, count = _READMEM.unpack(payload)
+    address, _reserved, count = _unpacked(_READMEM, payload, "READMEM")
     return address, count
 
 
@@ -171,10 +168,7 @@ def encode_written(count: int) -> bytes:
 
 def decode_forceip(payload: bytes) -> tuple[bytes, bytes]:
     """Read the payload of FORCEIP: whom it is for, and its new address. Raises MalformedPacketError."""
-    if len(payload) != _FORCEIP.size:
-        msg = f"FORCEIP with {len(payload)} bytes, not {_FORCEIP.size}"
-        raise MalformedPacketError(msg)
-    mac, address = _FORCEIP.unpack(payload)
+    mac, address = _unpacked(_FORCEIP, payload, "FORCEIP")
     return mac, address
 
 
@@ -194,19 +188,20 @@ def encode_resend(request: Resend) -> bytes:
 
 def decode_resend(payload: bytes) -> Resend:
     """Read the payload of PACKETRESEND. Raises MalformedPacketError."""
-    if len(payload) != _RESEND.size:
-        msg = f"PACKETRESEND with {len(payload)} bytes, not {_RESEND.size}"
-        raise MalformedPacketError(msg)
-    channel, block_id, first, last = _RESEND.unpack(payload)
+    channel, block_id, first, last = _unpacked(_RESEND, payload, "PACKETRESEND")
     return Resend(channel, block_id, first & 0xFFFFFF, last & 0xFFFFFF)
 
 
 def decode_pending_s(payload: bytes) -> float:
     """How long a PENDING_ACK asks to wait. Raises MalformedPacketError."""
-    if len(payload) != _WRITTEN.size:
-        msg = f"PENDING_ACK with {len(payload)} bytes, not {_WRITTEN.size}"
+    return float(_unpacked(_WRITTEN, payload, "PENDING_ACK")[1]) / 1000
+
+
+def _unpacked(layout: struct.Struct, payload: bytes, what: str) -> tuple[Any, ...]:
+    if len(payload) != layout.size:
+        msg = f"{what} with {len(payload)} bytes, not {layout.size}"
         raise MalformedPacketError(msg)
-    return float(_WRITTEN.unpack(payload)[1]) / 1000
+    return layout.unpack(payload)
 
 
 # ---------------------------------------------------------------- bootstrap registers
@@ -336,7 +331,7 @@ class StreamHeader(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """What a frame's first packet says of it; the timestamp is the start of exposure."""
+    """Contents of a frame's first packet; the timestamp is the start of exposure."""
 
     timestamp_ticks: int
     pixel_format: int

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import DEVICE
 from fitctl.drivers.gige.protocol import (
     GVSP_HEADER,
     PACKET_ID_MASK,
@@ -51,7 +51,7 @@ class FrameAssembler:
     pixel_format : PixelFormat
     packet_size_bytes : int
         SCPS: one packet with all its headers.
-    endpoint : str
+    endpoint : Endpoint
         What errors call the camera's address.
     request_resend : callable
         Called with each run of missing packets.
@@ -71,7 +71,7 @@ class FrameAssembler:
         height_px: int,
         pixel_format: PixelFormat,
         packet_size_bytes: int,
-        endpoint: str,
+        endpoint: Endpoint,
         request_resend: Callable[[protocol.Resend], None],
     ) -> None:
         self.frames = 0
@@ -108,8 +108,8 @@ class FrameAssembler:
         kind = word >> 24
         packet_id = word & PACKET_ID_MASK
         if kind & protocol.EXTENDED_ID_FLAG:
-            raise DeviceProtocolError(
-                DEVICE, self._endpoint, "16-bit block ids", "64-bit ones", "switch them off"
+            raise self._endpoint.error(
+                DeviceProtocolError, "16-bit block ids", "64-bit ones", "switch them off"
             )
         if block_id == 0 or protocol.is_error(status):
             return None
@@ -187,16 +187,15 @@ class FrameAssembler:
         try:
             leader = protocol.decode_leader(payload)
         except MalformedPacketError as error:
-            raise DeviceProtocolError(
-                DEVICE, self._endpoint, "an image", str(error), "switch off chunk data and others"
+            raise self._endpoint.error(
+                DeviceProtocolError, "an image", str(error), "switch off chunk data and others"
             ) from error
         height_px, width_px = self._shape
         wanted = (self._format.code, width_px, height_px)
         got = (leader.pixel_format, leader.width_px, leader.height_px)
         if got != wanted:
-            raise DeviceMismatch(
-                DEVICE,
-                self._endpoint,
+            raise self._endpoint.error(
+                DeviceMismatch,
                 "pixel format 0x{:08X}, {} x {} px".format(*wanted),
                 "0x{:08X}, {} x {} px".format(*got),
                 "something else has changed the camera's settings; open it again",

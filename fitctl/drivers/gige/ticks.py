@@ -7,6 +7,7 @@ from collections import deque
 from typing import NamedTuple, Protocol
 
 from fitctl.config import Camera
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Register
 
@@ -21,13 +22,13 @@ class Registers(Protocol):
 
     Attributes
     ----------
-    endpoint : str
+    endpoint : Endpoint
         What errors call the camera's address.
     answered_s : float
         Host's monotonic time of its last answer.
     """
 
-    endpoint: str
+    endpoint: Endpoint
     answered_s: float
 
     def read_register(self, address: int) -> int:

@@ -7,7 +7,7 @@ import socket
 import time
 
 from fitctl.drivers.gige import protocol
-from fitctl.drivers.gige.gvcp import DEVICE, ControlChannel
+from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.gige.protocol import Register
 from fitctl.drivers.interface import DeviceMismatch, DeviceRefused
 
@@ -45,9 +45,8 @@ def set_packet_size(channel: ControlChannel, size_bytes: int) -> None:
     except DeviceRefused as error:
         got = error.got
     if got != f"{size_bytes} bytes":
-        raise DeviceMismatch(
-            DEVICE,
-            channel.endpoint,
+        raise channel.endpoint.error(
+            DeviceMismatch,
             f"packets of {size_bytes} bytes",
             got,
             "correct camera.device.packet_size_bytes in the rig file; a multiple of 4 is usual",
@@ -72,9 +71,8 @@ def check_path(channel: ControlChannel, size_bytes: int) -> None:
     channel.write_register(Register.STREAM_PORT, 0)
     set_packet_size(channel, size_bytes)
     if small_fits:
-        raise DeviceMismatch(
-            DEVICE,
-            channel.endpoint,
+        raise channel.endpoint.error(
+            DeviceMismatch,
             f"packets of {size_bytes} bytes to pass the network",
             f"packets of {_SMALLEST_BYTES} bytes only",
             "lower camera.device.packet_size_bytes in the rig file, or switch on jumbo frames all the way",
@@ -95,9 +93,8 @@ def set_packet_delay(channel: ControlChannel, delay_s: float, ticks_per_s: int) 
     except DeviceRefused as error:
         got = error.got
     if got and delay_s:
-        raise DeviceMismatch(
-            DEVICE,
-            channel.endpoint,
+        raise channel.endpoint.error(
+            DeviceMismatch,
             f"a delay of {delay_s:g} s between packets",
             got,
             "set camera.device.packet_delay_s = 0.0 in the rig file",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from typing import NoReturn
 
 import numpy as np
@@ -11,6 +12,7 @@ import serial
 from numpy.typing import NDArray
 
 from fitctl.config import Mdt693Device
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
@@ -35,8 +37,8 @@ from fitctl.drivers.mdt693.protocol import (
     parse_three_volts,
     parse_volts,
 )
+from fitctl.drivers.probe import Probe, round_trip_s
 
-_NAME = "piezo amplifier"
 _CHANNEL_NAMES = ("x", "y", "z")
 _POLL_S = 0.02  # how long one read waits; the time limits are counted above it
 # An answer without a prompt is complete after this silence. A slow command takes 0.15 s, a stall of
@@ -67,6 +69,7 @@ class Mdt693:
 
     def __init__(self, piezo: Mdt693Device) -> None:
         self._piezo = piezo
+        self._endpoint = Endpoint("piezo amplifier", piezo.port)
         self._port: serial.Serial | None = None
         self._commands: Commands = MODEL_B
         self._echoes: bool | None = None  # not known yet
@@ -93,9 +96,8 @@ class Mdt693:
                 exclusive=True,
             )
         except (OSError, ValueError) as error:
-            raise DeviceUnreachable(
-                _NAME,
-                self._piezo.port,
+            raise self._endpoint.error(
+                DeviceUnreachable,
                 "a serial port",
                 str(error),
                 "check its cable and power, who else has the port open, and piezo.port",
@@ -138,7 +140,7 @@ class Mdt693:
         return volts
 
     def ask_once(self) -> None:
-        """One question and its answer, unjudged: what a round trip takes.
+        """Send one query and read its answer without checking it, to time a round trip.
 
         Raises
         ------
@@ -185,16 +187,15 @@ class Mdt693:
             ("low", self._commands.system_low, 0.0),
             ("high", self._commands.system_high, self._piezo.limit_v),
         ):
-            if command and not self._ask(command).refused:  # not every firmware tells
+            if command and not self._ask(command).refused:  # not every firmware has them
                 (volts,) = self._volts(command, _one)
                 volts = min(volts, self._piezo.limit_v)  # beyond the switch it limits nothing
                 self._check_limit(f"the system's {bound} limit", volts, expected_v)
 
     def _check_limit(self, what: str, volts: float, expected_v: float) -> None:
         if abs(volts - expected_v) > _LIMIT_TOLERANCE_V:
-            raise DeviceMismatch(
-                _NAME,
-                self._piezo.port,
+            raise self._endpoint.error(
+                DeviceMismatch,
                 f"{what} at {expected_v:g} V",
                 f"{volts:g} V",
                 f"set {what} on the amplifier, or correct piezo.limit_v in the rig file "
@@ -213,9 +214,8 @@ class Mdt693:
         """Ask for a value and insist on one, in the dialect found at open."""
         answer = self._ask(command)
         if answer.refused:
-            raise DeviceRefused(
-                _NAME,
-                self._piezo.port,
+            raise self._endpoint.error(
+                DeviceRefused,
                 f"an answer to {command}",
                 "an error",
                 "check that this is an MDT693A or MDT693B and see its manual for this command",
@@ -234,7 +234,7 @@ class Mdt693:
         self._in_step = False
         self._send(command)
         data = self._collect(command)
-        # Without echo nothing in an answer tells to which question; so nothing may follow it.
+        # Without echo an answer does not name its question, so nothing may follow it.
         more = b"" if self._echoes else self._read(command)
         if not is_frame_only(command, more):
             self._nonsense(f"one answer to {command}", f"{(data + more)[:80]!r}")
@@ -290,38 +290,46 @@ class Mdt693:
 
     def _opened(self) -> serial.Serial:
         if self._port is None:
-            raise DeviceUnreachable(
-                _NAME, self._piezo.port, "an open port", "none", "open it again"
-            )
+            raise self._endpoint.error(DeviceUnreachable, "an open port", "none", "open it again")
         return self._port
 
     def _broken(self, expected: str, error: OSError) -> NoReturn:
         self.close()
-        raise DeviceUnreachable(
-            _NAME,
-            self._piezo.port,
+        raise self._endpoint.error(
+            DeviceUnreachable,
             expected,
             f"a broken link ({error})",
             "check its power and its cable, then recover",
         ) from error
 
     def _silence(self, expected: str) -> NoReturn:
-        raise DeviceTimeout(
-            _NAME,
-            self._piezo.port,
+        raise self._endpoint.error(
+            DeviceTimeout,
             f"{expected} within {self._piezo.response_timeout_s:g} s",
             "none",
             "check that it is switched on, that the port is the right one, and piezo.baud_rate",
         )
 
     def _nonsense(self, expected: str, got: str) -> NoReturn:
-        raise DeviceProtocolError(
-            _NAME,
-            self._piezo.port,
+        raise self._endpoint.error(
+            DeviceProtocolError,
             expected,
             got,
             "check piezo.baud_rate, and that no other program uses the port",
         )
+
+
+def probe_mdt693(piezo: Mdt693Device) -> Probe:
+    """Who an amplifier is; its limits are held against the rig file on the way.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or its limits are not the rig file's.
+    """
+    with closing(Mdt693(piezo)) as driver:
+        identity = driver.open()
+        return Probe(identity, round_trip_s(driver.ask_once))
 
 
 def _one(body: str) -> _Volts:

@@ -1,4 +1,4 @@
-"""What an MDT693A or MDT693B says on the wire, in every variant that public sources report.
+"""What an MDT693A or MDT693B sends, in every variant that public sources report.
 
 A command ends in CR. The answer is, where echo is on, the command itself, in lower case from some;
 then, from some, a ``*``; then the body; then CR and a prompt: ``>``, ``> `` or ``*``. The A has no prompt
@@ -23,7 +23,7 @@ REFUSED = "!"
 ACKNOWLEDGED = "*"
 
 LIMIT_SWITCH_V = (75, 100, 150)  # by position: 0, 1, 2
-LIMIT_MARGIN_V = 0.5  # the highest output is this much above what the switch says
+LIMIT_MARGIN_V = 0.5  # the highest output is this much above the switch position
 ANSWER_BYTES_MAX = 4096  # the longest real one is the help text of the B, below 3 kB
 BITS_PER_BYTE = 10  # 8N1: start bit, eight data bits, stop bit
 
@@ -75,7 +75,7 @@ class Answer:
     Attributes
     ----------
     body : str
-        What was said; lines are separated by CR.
+        The answer itself; lines are separated by CR.
     refused : bool
         The device does not know the command, or not with this value.
     echoed : bool
@@ -117,7 +117,7 @@ def is_frame_only(command: str, data: bytes) -> bool:
 
 
 def parse_answer(command: str, data: bytes) -> Answer:
-    """Take the frame off an answer.
+    """Remove the frame from an answer.
 
     Raises
     ------
@@ -204,7 +204,7 @@ def parse_identity(body: str) -> tuple[str, str]:
 
 
 def format_volts(volts: float, decimals: int) -> str:
-    """A measured voltage as the B tells it, such as ``[  24.8]``."""
+    """A measured voltage as the B sends it, such as ``[  24.8]``."""
     return f"[{volts:6.{decimals}f}]"
 
 
@@ -214,12 +214,12 @@ def format_three_volts(volts: Sequence[float], decimals: int) -> str:
 
 
 def format_volts_a(volts: float) -> str:
-    """A measured voltage as the A tells it: to 0.1 V, but ``[     1]`` for a whole number."""
+    """A measured voltage as the A sends it: to 0.1 V, but ``[     1]`` for a whole number."""
     return f"[{round(volts, 1):6g}]"
 
 
 def _without_echo(command: str, text: str) -> tuple[str, bool]:
-    """Take off LFs and the echo of the command; tell whether it was there."""
+    """Remove LFs and the echo of the command; returns whether there was an echo."""
     text = text.replace("\n", "")
     # What ends an answer may come after that answer has been taken as complete.
     echo = re.match(rf"[\0 >*]*{re.escape(command)}\r", text, re.IGNORECASE)

@@ -18,8 +18,8 @@ from fitctl.config import ModbusDacDevice
 from fitctl.drivers.modbus import (
     EXCEPTION_FLAG,
     frame,
+    pop_message,
     rtu_frame,
-    take_message,
     take_rtu_answer,
 )
 from fitctl.drivers.modbus_dac.protocol import rtu_silence_s
@@ -93,7 +93,9 @@ class TcpLink:
                 raise ConnectionResetError("closed by the station")
             self._pending += data
             try:
-                while (message := take_message(self._pending)) is not None:
+                while (message := pop_message(self._pending)) is not None:
+                    if message.protocol != 0:
+                        raise NonsenseError(f"protocol {message.protocol}")
                     if message.transaction == self._transaction:
                         if message.unit != self._unit:
                             raise NonsenseError(f"an answer of unit {message.unit}")

@@ -13,7 +13,7 @@ from fitctl.drivers.bal_analog.protocol import (
     word_of,
 )
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
-from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel
+from fitctl.mocks.modbus.pdu import DataModel
 from fitctl.mocks.modbus.tcp import ModbusTcpServer
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.timers import Periodic, Watchdog
@@ -27,7 +27,7 @@ FAULTS = (
         ),
     }
 )
-_HOLD_S = 0.005  # how often the motors are told again what the outputs hold
+_HOLD_S = 0.005  # how often the outputs are applied to the motors again
 _LINES = 2  # the register of both axes' lines
 _IDENTITY = (b"fitctl", b"mock analogue amplifiers", b"1.0")
 
@@ -48,7 +48,7 @@ class BalAnalogMockStation:
     - Currents, commutation, tachometers and the amplifier's own adjustments are not there: its velocity
       loop is the plant's first-order lag.
     - Analogue outputs settle at once, without noise.
-    - The mock's amplifiers have the velocity scale and line levels that the rig file says.
+    - The mock's amplifiers have the velocity scale and line levels of the rig file.
     - Any number of clients; real stations allow a few.
     - The motors stop while this process stands still.
 
@@ -89,17 +89,11 @@ class BalAnalogMockStation:
             for first in (device.first_output_register, device.first_input_register)
         )
         self._first_output, self._first_input = outputs.start, inputs.start
-        model = DataModel(
-            {HOLDING_REGISTERS: {*outputs, *inputs}}, self._read, self._write, _IDENTITY
-        )
+        model = DataModel({*outputs, *inputs}, self._read, self._write, _IDENTITY)
         self._server = ModbusTcpServer(
-            model,
-            self.faults,
-            unit=device.device_id,
-            unknown_unit="refuse",
-            port=settings.modbus_port,
+            model, self.faults, unit=device.device_id, unknown_unit="refuse"
         )
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     async def start(self) -> int:
         """Listen; returns the port.
@@ -109,7 +103,7 @@ class BalAnalogMockStation:
         OSError
             If the port is taken.
         """
-        port = await self._server.start()
+        port = await self._server.start(self._settings.modbus_port)
         self._hold.set_period(_HOLD_S)
         return port
 
@@ -123,12 +117,12 @@ class BalAnalogMockStation:
         await self._server.stop()
 
     # ------------------------------------------------------------ the station
-    def _read(self, table: str, address: int, count: int) -> list[int]:
+    def _read(self, address: int, count: int) -> list[int]:
         registers = dict(enumerate(self._inputs(), self._first_input))
         registers |= dict(enumerate(self._outputs, self._first_output))
         return [registers[place] for place in range(address, address + count)]
 
-    def _write(self, table: str, address: int, values: Sequence[int]) -> None:
+    def _write(self, address: int, values: Sequence[int]) -> None:
         for place, value in enumerate(values, address - self._first_output):
             if 0 <= place < REGISTERS:  # what is written to an input is lost
                 self._outputs[place] = value
@@ -142,7 +136,7 @@ class BalAnalogMockStation:
                 self._motors.position_counts(), self._settings.counters_at_start, strict=True
             )
         ]
-        self._judge()
+        self._update_latches()
         faults = word_of(self._latched[0], self._latched[1], self._device.fault_level)
         return [*(counter % COUNTER_MODULUS for counter in counters), faults]
 
@@ -151,19 +145,19 @@ class BalAnalogMockStation:
         self._apply()
 
     # ------------------------------------------------------------ the amplifiers
-    def _judge(self) -> None:
-        """Latch the faults that are so now, and let go of those that were reset."""
-        told = lines(self._outputs[_LINES], self._device.enabled_level)
+    def _update_latches(self) -> None:
+        """Latch the faults that are present, and clear those that were reset."""
+        requested = lines(self._outputs[_LINES], self._device.enabled_level)
         for axis, part in enumerate(AXES):
             is_so = self.faults.value("amplifier_fault", part) is not None
-            self._latched[axis] = is_so or (self._latched[axis] and told[axis])
+            self._latched[axis] = is_so or (self._latched[axis] and requested[axis])
 
     def _apply(self) -> None:
         """The amplifiers do what their lines say."""
-        self._judge()
-        told = lines(self._outputs[_LINES], self._device.enabled_level)
+        self._update_latches()
+        requested = lines(self._outputs[_LINES], self._device.enabled_level)
         for axis in range(len(AXES)):
-            enabled = told[axis] and not self._latched[axis]
+            enabled = requested[axis] and not self._latched[axis]
             if enabled != self.enabled[axis]:
                 self.enabled[axis] = enabled
                 self._motors.set_enabled(axis, enabled)
@@ -187,7 +181,7 @@ class BalAnalogMockStation:
         scale = device.velocity_rad_s_per_v
         return volts * (scale.az, scale.el)[axis]
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         if kind == "reboot":
             self._watchdog.stop()
             self._outputs = list(self._safe)

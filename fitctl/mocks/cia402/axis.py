@@ -88,7 +88,7 @@ class Axis:
     Attributes
     ----------
     demand_rad_s : float
-        What the motor is told.
+        Velocity command of the motor.
     limited : bool
         A software position limit holds the axis back.
     fault_persists : bool
@@ -145,7 +145,7 @@ class Axis:
         return word
 
     def control(self, controlword: int) -> None:
-        """Take a controlword: a fault reset is an edge, everything else a level."""
+        """Obey a controlword: a fault reset is an edge, everything else a level."""
         resets = controlword & ~self.controlword & protocol.CW_FAULT_RESET
         self.controlword = controlword
         if self.state is State.FAULT:

@@ -59,7 +59,7 @@ def constant(code: str, value: int | str) -> Entry:
 
 
 def find(dictionary: Dictionary, index: int, subindex: int) -> Entry:
-    """The object, or the abort that says what is missing."""
+    """The object, or the abort that names what is missing."""
     entry = dictionary.get((index, subindex))
     if entry is None:
         known = any(other == index for other, _ in dictionary)
@@ -148,7 +148,7 @@ class SdoServer:
     def _upload_segment(self, frame: protocol.SdoFrame, _request: bytes) -> bytes:
         if self._to_send is None:
             raise SdoAbortError(AbortCode.COMMAND_SPECIFIER)
-        toggle = self._take_toggle(frame)
+        toggle = self._check_toggle(frame)
         chunk, rest = self._to_send[:7], self._to_send[7:]
         self._to_send = rest or None
         return protocol.encode_segment(chunk, toggle, last=not rest)
@@ -173,7 +173,7 @@ class SdoServer:
     def _download_segment(self, frame: protocol.SdoFrame, request: bytes) -> bytes:
         if self._received is None:
             raise SdoAbortError(AbortCode.COMMAND_SPECIFIER)
-        toggle = self._take_toggle(frame)
+        toggle = self._check_toggle(frame)
         chunk, last = protocol.decode_segment(request)
         self._received += chunk
         if last:
@@ -183,7 +183,7 @@ class SdoServer:
             raise SdoAbortError(AbortCode.TOO_LONG)
         return protocol.encode_sdo(protocol.SDO_SEGMENT_DOWNLOADED | toggle, 0, 0)
 
-    def _take_toggle(self, frame: protocol.SdoFrame) -> int:
+    def _check_toggle(self, frame: protocol.SdoFrame) -> int:
         toggle = frame.command & protocol.SDO_TOGGLE
         if toggle != self._toggle:
             raise SdoAbortError(AbortCode.TOGGLE_BIT)

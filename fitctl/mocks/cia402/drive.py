@@ -19,15 +19,13 @@ from functools import partial
 
 from fitctl.config import Siderostat
 from fitctl.drivers.cia402 import protocol
-from fitctl.drivers.cia402.protocol import NmtCommand, NmtState
+from fitctl.drivers.cia402.protocol import NmtCommand, NmtState, wrap_int32
 from fitctl.mocks.cia402.axis import Axis, Command
 from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoServer, constant
 from fitctl.mocks.cia402.emergency import Emergencies
-from fitctl.mocks.cia402.encoders import Encoders
 from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
-from fitctl.mocks.cia402.slcan import SlcanAdapter
-from fitctl.mocks.cia402.slcan_frames import CanFrame
+from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.timers import Periodic, Watchdog
@@ -50,6 +48,42 @@ BOTH_VELOCITY_MODES = 1 << (protocol.PROFILE_VELOCITY - 1) | 1 << (
 )
 PDOS_EACH_WAY = 4
 _CONTROL_S = 0.002  # how often the axes' ramps go on also without SYNC
+
+
+class Encoders:
+    """What the drive has last read of its motors.
+
+    Parameters
+    ----------
+    motors : FaultyMotors
+
+    Attributes
+    ----------
+    counts : pair of int
+        Both counters as last sampled.
+    """
+
+    def __init__(self, motors: FaultyMotors) -> None:
+        self.counts = (0, 0)
+        self._motors = motors
+        self._earlier = self._later = (0.0, self.counts)
+
+    def sample(self) -> None:
+        """Read both."""
+        az_counts, el_counts = self._motors.position_counts()
+        self.counts = (wrap_int32(az_counts), wrap_int32(el_counts))
+
+    def latch(self, now_s: float) -> None:
+        """Keep the sample, and its time, for the velocity."""
+        self._earlier, self._later = self._later, (now_s, self.counts)
+
+    def velocity_rad_s(self, axis: int) -> float:
+        """Mean velocity between the last two samples that were latched."""
+        (earlier_s, earlier), (later_s, later) = self._earlier, self._later
+        if later_s <= earlier_s:
+            return 0.0
+        moved = wrap_int32(later[axis] - earlier[axis])
+        return moved / (later_s - earlier_s) / self._motors.counts_per_rad
 
 
 class Cia402DriveMock:
@@ -90,7 +124,7 @@ class Cia402DriveMock:
         self.nmt_state = NmtState.STOPPED
         self.axes = tuple(
             Axis(partial(self._motors.set_enabled, number), self._axis_changed)
-            for number in range(len(protocol.AXES))
+            for number in range(len(AXES))
         )
         self.heartbeat_ms = 0
         self.consumer = 0
@@ -109,7 +143,7 @@ class Cia402DriveMock:
         )
         self._events = tuple(Periodic(partial(self._send_pdo, tpdo)) for tpdo in self._tpdos)
         self._handlers: dict[int, Callable[[bytes], None]] = {}
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     async def start(self) -> int:
         """Power up: listen, boot, wait in PRE-OPERATIONAL. Returns the TCP port."""
@@ -226,7 +260,7 @@ class Cia402DriveMock:
             case NmtCommand.RESET_NODE:
                 self._power_off()
                 self._reset_communication()
-                self._look_for_causes()
+                self._update_causes()
             case NmtCommand.RESET_COMMUNICATION:
                 self._reset_communication()
 
@@ -248,7 +282,7 @@ class Cia402DriveMock:
 
     def _apply(self, rpdo: Pdo, data: bytes) -> None:
         if not rpdo.apply(data):
-            self._emergencies.tell(protocol.EMCY_PDO_TOO_SHORT, 0)
+            self._emergencies.report(protocol.EMCY_PDO_TOO_SHORT, 0)
 
     def _on_sync(self, _data: bytes) -> None:
         self._encoders.sample()
@@ -267,7 +301,7 @@ class Cia402DriveMock:
         self._adapter.send(tpdo.can_id, tpdo.message())
 
     def _send_events(self) -> None:
-        """The TPDOs that are sent on change, as far as they would tell something new."""
+        """The TPDOs that are sent on change, if their contents have changed."""
         if self.nmt_state is NmtState.OPERATIONAL:
             for tpdo in self._tpdos:
                 if tpdo.in_service and tpdo.on_event and tpdo.changed:
@@ -301,10 +335,10 @@ class Cia402DriveMock:
     # ------------------------------------------------------------ what happens
     def _axis_changed(self) -> None:
         self._command_motors()
-        self._emergencies.look()
+        self._emergencies.update()
         self._send_events()
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         self._adapter.severed = self.faults.value("link_loss") is not None
         without_power = self.faults.value("reboot") is not None
         if kind == "reboot":
@@ -312,16 +346,16 @@ class Cia402DriveMock:
             if not without_power:
                 self._reset_communication()
         if not without_power:
-            self._look_for_causes()
+            self._update_causes()
             self._command_motors()
 
-    def _look_for_causes(self) -> None:
+    def _update_causes(self) -> None:
         """A cause puts its axis in fault, and no reset helps before it is gone."""
         for number, (axis, part) in enumerate(zip(self.axes, AXES, strict=True)):
             cause = self._cause(part)
             axis.fault_persists = cause is not None
             if cause is not None and axis.fault(cause):
-                self._emergencies.tell(cause, number + 1)
+                self._emergencies.report(cause, number + 1)
 
     def _cause(self, part: str) -> int | None:
         """Error code of what is wrong with an axis now."""
@@ -332,7 +366,7 @@ class Cia402DriveMock:
         return protocol.ERROR_FOLLOWING if fails else None
 
     def _master_lost(self) -> None:
-        """The master's heartbeat is missing: each axis does what its object 6007 says."""
+        """The master's heartbeat is missing: each axis reacts as its object 6007 says."""
         for axis in self.axes:
             if axis.abort_option == protocol.ABORT_IS_FAULT:
                 axis.fault(protocol.EMCY_HEARTBEAT_LOST)
@@ -340,7 +374,7 @@ class Cia402DriveMock:
                 axis.command(Command.DISABLE_VOLTAGE)
             elif axis.abort_option == protocol.ABORT_IS_QUICK_STOP:
                 axis.command(Command.QUICK_STOP)
-        self._emergencies.tell(protocol.EMCY_HEARTBEAT_LOST, 0)
+        self._emergencies.report(protocol.EMCY_HEARTBEAT_LOST, 0)
 
     def _enter(self, state: NmtState) -> None:
         """Change the NMT state; leaving OPERATIONAL stops the motors, entering it sends event TPDOs."""

@@ -20,7 +20,7 @@ _COMMUNICATION_CODES = 0x81
 
 
 class Emergencies:
-    """What is wrong, told once when it begins and once when all of it is over.
+    """Errors, each reported once when it begins, and once more when all are over.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ class Emergencies:
             for number in range(HISTORY_ENTRIES)
         }
 
-    def tell(self, code: int, axis_number: int) -> None:
+    def report(self, code: int, axis_number: int) -> None:
         """Report an error; `axis_number` is 1 or 2, or 0 for the whole drive."""
         self._history.appendleft(axis_number << 16 | code)
         self._send(protocol.encode_emcy(code, self._register(), bytes([axis_number])))
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Report that all is well again, if it is so since just now."""
         in_error = any(axis.error_code for axis in self._axes)
         if self._in_error and not in_error:

@@ -75,7 +75,7 @@ def axis_objects(
     statusword, position_counts, velocity_rad_s : callable
         What the drive measures or derives.
     changed : callable
-        Called after a write that changes what the motor is told.
+        Called after a write that changes the motor's command.
     """
 
     def set_mode(mode: int) -> None:

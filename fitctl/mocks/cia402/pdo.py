@@ -109,7 +109,7 @@ class Pdo:
         return not self.cob_id & protocol.PDO_NO_RTR
 
     def due(self) -> bool:
-        """Take note of a SYNC; True if this TPDO is sent at this one."""
+        """Count a SYNC; True if this TPDO is sent at this one."""
         if self.transmission == protocol.ACYCLIC_SYNC:
             return self.changed
         if self.transmission == protocol.RTR_AT_SYNC:
@@ -122,7 +122,7 @@ class Pdo:
 
     @property
     def changed(self) -> bool:
-        """It would tell something else than the last time."""
+        """Its contents differ from the last ones sent."""
         return self.pack() != self._last
 
     def message(self) -> bytes:

@@ -12,12 +12,12 @@ Invented constants: version and serial number; what a client may leave unread (`
 from __future__ import annotations
 
 import asyncio
-import socket
+import re
 from collections.abc import Callable
-from typing import cast
+from typing import NamedTuple, cast
 
-from fitctl.mocks.cia402.slcan_frames import CanFrame, decode_frame, encode_frame
-from fitctl.mocks.faults import Faults, Wire
+from fitctl.mocks.faults import Faults
+from fitctl.mocks.tcp import Link, TcpServer
 
 OK = b"\r"
 BELL = b"\a"
@@ -41,10 +41,74 @@ UNREAD_LIMIT_BYTES = 65536
 _STAMP_MS = 60000
 
 
-class _Client(asyncio.Protocol):
+_FRAME = re.compile(
+    rb"(?:[tr]([0-7][0-9A-Fa-f]{2})|[TR]([01][0-9A-Fa-f]{7}))([0-8])((?:[0-9A-Fa-f]{2})*)"
+)
+
+
+class CanFrame(NamedTuple):
+    """One classic CAN frame.
+
+    Attributes
+    ----------
+    can_id : int
+        11 bits, or 29 if `extended`.
+    data : bytes
+        Up to eight; empty in a remote frame.
+    extended : bool
+        29-bit identifier.
+    remote_length : int or None
+        None for a data frame; the length asked for by a remote frame.
+    """
+
+    can_id: int
+    data: bytes
+    extended: bool = False
+    remote_length: int | None = None
+
+
+def encode_frame(frame: CanFrame, stamp: bytes = b"") -> bytes:
+    """A frame as a line, CR included; `stamp` is the time of its receipt where that is wanted."""
+    can_id = b"%08X" % frame.can_id if frame.extended else b"%03X" % frame.can_id
+    if frame.remote_length is not None:
+        kind = b"R" if frame.extended else b"r"
+        return b"%b%b%d%b\r" % (kind, can_id, frame.remote_length, stamp)
+    kind = b"T" if frame.extended else b"t"
+    digits = frame.data.hex().upper().encode()
+    return b"%b%b%d%b%b\r" % (kind, can_id, len(frame.data), digits, stamp)
+
+
+def decode_frame(line: bytes) -> CanFrame:
+    """A line, without its CR, as a frame.
+
+    Raises
+    ------
+    ValueError
+        If it is not exactly one frame: wrong digits, or data that do not fit the length.
+    """
+    match = _FRAME.fullmatch(line)
+    if match is None:
+        msg = f"not an SLCAN frame: {line!r}"
+        raise ValueError(msg)
+    standard, extended, length_digit, digits = match.groups()
+    length = int(length_digit)
+    remote = line[:1] in {b"r", b"R"}
+    if len(digits) != (0 if remote else 2 * length):
+        msg = f"length {length} does not fit the data of {line!r}"
+        raise ValueError(msg)
+    return CanFrame(
+        int(extended or standard, 16),
+        bytes.fromhex(digits.decode()),
+        extended is not None,
+        length if remote else None,
+    )
+
+
+class _Client(Link):
     """One TCP connection: an adapter of its own on the shared bus."""
 
     def __init__(self, adapter: SlcanAdapter) -> None:
+        super().__init__(adapter)
         self._adapter = adapter
         self._unfinished = b""
         self._answers = bytearray()
@@ -53,8 +117,6 @@ class _Client(asyncio.Protocol):
         self._stamps = False
         self._listens_only = False
         self._flags = 0
-        self._wire = Wire(adapter.faults, self._out)
-        self.transport: asyncio.Transport | None = None
         self.is_open = False
 
     @property
@@ -63,20 +125,8 @@ class _Client(asyncio.Protocol):
         return self.is_open and self._bitrate == self._adapter.bitrate
 
     # ------------------------------------------------------------ the connection
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast("asyncio.Transport", transport)
-        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._adapter.clients.add(self)
-        if self._adapter.faults.away:
-            self.transport.abort()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.transport = None
-        self._wire.close()
-        self._adapter.clients.discard(self)
-
     def data_received(self, data: bytes) -> None:
-        if self._wire.dead:
+        if self.wire.dead:
             self._unfinished = b""
             return
         # What one segment brings is answered in one segment: RPDO and SYNC often come together.
@@ -86,41 +136,40 @@ class _Client(asyncio.Protocol):
             self._command(line)
         if len(self._unfinished) > LONGEST_LINE_BYTES:
             self._unfinished = b""
-            self._wire.send(BELL)
+            self.wire.send(BELL)
         self._collecting = False
-        self._flush()
+        self.write(b"")
 
     def deliver(self, frame: CanFrame, line: bytes) -> None:
         """Pass on a frame of the bus, unless this client has stopped reading."""
-        if self.transport and self.transport.get_write_buffer_size() > UNREAD_LIMIT_BYTES:
+        if self.transport.get_write_buffer_size() > UNREAD_LIMIT_BYTES:
             self._flags |= FLAG_RECEIVE_FULL
         elif self._stamps:
             milliseconds = int(asyncio.get_running_loop().time() * 1e3) % _STAMP_MS
-            self._wire.send(encode_frame(frame, b"%04X" % milliseconds))
+            self.wire.send(encode_frame(frame, b"%04X" % milliseconds))
         else:
-            self._wire.send(line)
+            self.wire.send(line)
 
-    def _out(self, answer: bytes) -> None:
-        """What the wire lets pass goes at once, or with the rest of this segment's answers."""
-        self._answers += answer
-        if not self._collecting:
-            self._flush()
+    def write(self, data: bytes) -> None:
+        """Send at once, or with the rest of this segment's answers."""
+        self._answers += data
+        if self._answers and not self._collecting:
+            super().write(bytes(self._answers))
+            self._answers.clear()
 
-    def _flush(self) -> None:
-        if self._answers and self.transport:
-            self.transport.write(bytes(self._answers))
-        self._answers.clear()
+    def pause_writing(self) -> None:
+        """Go on reading: frames that do not fit are dropped, and the status flags say so."""
 
     # ------------------------------------------------------------ the commands
     def _command(self, line: bytes) -> None:
         if not line:
             # An empty line is how clients clear a half-typed command; it is no error.
-            self._wire.send(OK)
+            self.wire.send(OK)
         elif line[:1] in b"tTrR":
             self._transmit(line)
         else:
             answer = _COMMANDS.get(line[:1], _refuse)(self, line)
-            self._wire.send(BELL if answer is None else answer + OK)
+            self.wire.send(BELL if answer is None else answer + OK)
 
     def _set_bitrate(self, line: bytes) -> bytes | None:
         if line not in BITRATES or self.is_open:
@@ -162,12 +211,12 @@ class _Client(asyncio.Protocol):
         try:
             frame = decode_frame(line)
         except ValueError:
-            self._wire.send(BELL)
+            self.wire.send(BELL)
             return
         if not self.is_open or self._listens_only:
-            self._wire.send(BELL)
+            self.wire.send(BELL)
             return
-        self._wire.send(b"Z\r" if frame.extended else b"z\r")
+        self.wire.send(b"Z\r" if frame.extended else b"z\r")
         if self.on_bus:
             self._adapter.from_client(self, frame)
 
@@ -189,7 +238,7 @@ _COMMANDS: dict[bytes, Callable[[_Client, bytes], bytes | None]] = {
 """Each takes its line and gives what stands before the CR of a yes, or None for a no."""
 
 
-class SlcanAdapter:
+class SlcanAdapter(TcpServer):
     """The TCP server and the bus behind it.
 
     Parameters
@@ -208,28 +257,10 @@ class SlcanAdapter:
     """
 
     def __init__(self, bitrate: int, faults: Faults, received: Callable[[CanFrame], None]) -> None:
+        super().__init__(faults, lambda: _Client(self))
         self.bitrate = bitrate
-        self.faults = faults
-        self.clients: set[_Client] = set()
         self.severed = False
         self._received = received
-        self._server: asyncio.Server | None = None
-        faults.on_change(self._cut_connections)
-
-    async def start(self, port: int) -> int:
-        """Listen on 127.0.0.1; returns the port, which is a free one if `port` is 0."""
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(lambda: _Client(self), "127.0.0.1", port)
-        return int(self._server.sockets[0].getsockname()[1])
-
-    async def stop(self) -> None:
-        """Stop listening and drop every client; safe to call twice."""
-        if self._server is None:
-            return
-        self._server.close()
-        self._drop_clients()
-        await self._server.wait_closed()
-        self._server = None
 
     def send(self, can_id: int, data: bytes) -> None:
         """Put a frame with an 11-bit identifier on the bus, from the drive."""
@@ -238,22 +269,13 @@ class SlcanAdapter:
 
     def from_client(self, sender: _Client, frame: CanFrame) -> None:
         """Put a client's frame on the bus: the other clients hear it, and so does the drive."""
-        if len(self.clients) > 1:
+        if len(self.links) > 1:
             self._deliver(frame, sender)
         if not self.severed:
             self._received(frame)
 
     def _deliver(self, frame: CanFrame, sender: _Client | None) -> None:
         line = encode_frame(frame)
-        for client in self.clients:
+        for client in cast(set[_Client], self.links):
             if client is not sender and client.on_bus:
                 client.deliver(frame, line)
-
-    def _cut_connections(self, _kind: str) -> None:
-        if self.faults.away:
-            self._drop_clients()
-
-    def _drop_clients(self) -> None:
-        for client in list(self.clients):
-            if client.transport:
-                client.transport.abort()

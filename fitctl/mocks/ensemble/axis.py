@@ -51,10 +51,10 @@ class Axis:
         self._rate = self.ramp_rate
         self._changes = 0.0
 
-    # ------------------------------------------------------------ what it is told; False is refused
+    # ------------------------------------------------------------ commands; False is refused
     def enable(self) -> bool:
         """Power up, holding where it is."""
-        self._judge()
+        self._update_faults()
         if self.faults:
             return False
         if not self.enabled:
@@ -70,7 +70,7 @@ class Axis:
     def acknowledge(self) -> None:
         """Clear the faults whose cause is gone."""
         self.faults = AxisFault(0)
-        self._judge()
+        self._update_faults()
 
     def free_run(self, velocity: float) -> bool:
         """Run at a velocity from now on, for good."""
@@ -91,7 +91,7 @@ class Axis:
         self._goal, self._goal_velocity = None, 0.0
         self._rate = self._parameters[Parameter.ABORT_DECEL_RATE]
 
-    # ------------------------------------------------------------ what it says
+    # ------------------------------------------------------------ readings
     @property
     def moving(self) -> bool:
         """Its trajectory is not at its end."""
@@ -99,7 +99,7 @@ class Axis:
 
     @property
     def status(self) -> AxisStatus:
-        """As AXISSTATUS tells it."""
+        """The bits of AXISSTATUS."""
         near = _IN_POSITION_PART * self._parameters[Parameter.POSITION_ERROR_THRESHOLD]
         flags = {
             AxisStatus.ENABLED: self.enabled,
@@ -130,7 +130,7 @@ class Axis:
             self._advance(period_s)
         else:
             self.command = feedback
-        self._judge()
+        self._update_faults()
 
     def _advance(self, period_s: float) -> None:
         wanted = self._goal_velocity
@@ -153,8 +153,8 @@ class Axis:
             )
             self.abort()
 
-    def _judge(self) -> None:
-        """Take up the faults that are so now; the grave ones take the power."""
+    def _update_faults(self) -> None:
+        """Latch the faults that are present; the grave ones disable the axis."""
         self.faults |= self.causes
         if self.enabled and abs(self.error) > self._parameters[Parameter.POSITION_ERROR_THRESHOLD]:
             self.faults |= AxisFault.POSITION_ERROR

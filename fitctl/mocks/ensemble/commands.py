@@ -90,7 +90,7 @@ class Interpreter:
         }
 
     def answer(self, line: str) -> tuple[Reply, str]:
-        """Do what a line says; what became of it, and the value that was asked for."""
+        """Execute a line; returns the result and the value that was requested."""
         verb, *words = words_of(line) or [""]
         try:
             done = self._commands[verb](words)
@@ -111,7 +111,7 @@ class Interpreter:
         done = [action(self._axes[self._numbers[word]]) is not False for word in words]
         return all(done)
 
-    def _take_axis(self, words: Words) -> Axis:
+    def _pop_axis(self, words: Words) -> Axis:
         _require(bool(words) and words[0] in self._numbers)
         return self._axes[self._numbers[words.pop(0)]]
 
@@ -148,7 +148,7 @@ class Interpreter:
     def _free_run(self, words: Words) -> bool:
         wishes = []
         while words:
-            axis = self._take_axis(words)
+            axis = self._pop_axis(words)
             _require(bool(words))
             wishes.append((axis, _float(words.pop(0))))
         _require(bool(wishes))
@@ -196,7 +196,7 @@ class Interpreter:
         return True
 
     def _parameter(self, words: Words) -> tuple[dict[int, float], int]:
-        parameters = self._parameters[self._axes.index(self._take_axis(words))]
+        parameters = self._parameters[self._axes.index(self._pop_axis(words))]
         _require(bool(words) and words[0].isdecimal() and int(words[0]) in parameters)
         return parameters, int(words.pop(0))
 

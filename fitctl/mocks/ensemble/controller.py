@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
-from typing import cast
 
 from fitctl.config import EnsembleDevice, EnsembleMock, Siderostat
-from fitctl.drivers.ensemble.protocol import EOS, AxisFault, Parameter
+from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, AxisFault, Parameter, Reply
 from fitctl.mocks.ensemble.axis import Axis
 from fitctl.mocks.ensemble.commands import Interpreter
-from fitctl.mocks.ensemble.line import Client
-from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
+from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.pty import Endpoints, Pty
+from fitctl.mocks.tcp import Link, TcpServer
 from fitctl.mocks.timers import Periodic, Watchdog
 
 FAULTS = (
@@ -76,13 +76,14 @@ class EnsembleControllerMock:
         self._motors = FaultyMotors(motors, self.faults, siderostat.encoder_counts_per_rev)
         self._units_per_rad = self._motors.counts_per_rad / settings.counts_per_unit
         self._power_up()
-        self._listener: asyncio.Server | None = None
-        self.links: set[_Link] = set()
+        self._server = TcpServer(
+            self.faults, lambda: _Link(self._server, self._new_client, settings.idle_timeout_s)
+        )
         self._pty: Pty | None = None
         self._pty_client: Client | None = None
         self._cycle = Periodic(self._run_cycle)
         self._stepped_s = 0.0
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     async def start(self) -> Endpoints:
         """Listen, and begin to control.
@@ -92,17 +93,14 @@ class EnsembleControllerMock:
         OSError
             If the port is taken.
         """
-        loop = asyncio.get_running_loop()
-        self._listener = await loop.create_server(
-            lambda: _Link(self), "127.0.0.1", self._settings.tcp_port
-        )
+        port = await self._server.start(self._settings.tcp_port)
         self._pty = Pty()
-        self._pty_client = self.new_client(self._pty.write)
+        self._pty_client = self._new_client(Wire(self.faults, self._pty.write))
         self._pty.read_into(self._pty_client.receive)
-        self._stepped_s = loop.time()
+        self._stepped_s = asyncio.get_running_loop().time()
         self._run_cycle()
         self._cycle.set_period(CYCLE_S)
-        return Endpoints(self._listener.sockets[0].getsockname()[1], self._pty.path)
+        return Endpoints(port, self._pty.path)
 
     async def stop(self) -> None:
         """Take all power, disconnect everyone; safe to call twice."""
@@ -114,20 +112,10 @@ class EnsembleControllerMock:
         if self._pty is not None:
             self._pty.close()
             self._pty = None
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-        self._abort_links()
-        await asyncio.sleep(0)  # transports close their sockets on the loop's next turn
+        await self._server.stop()
 
-    def new_client(self, write: Callable[[bytes], None]) -> Client:
-        """What serves a connection."""
-        return Client(self.faults, self._answer, self._settings.reply_s, write)
-
-    @property
-    def idle_timeout_s(self) -> float:
-        """A connection is closed after so long without a byte."""
-        return self._settings.idle_timeout_s
+    def _new_client(self, wire: Wire) -> Client:
+        return Client(wire, self._answer, self._settings.reply_s)
 
     def _power_up(self) -> None:
         parameters = [self._parameters() for _ in AXES]
@@ -182,7 +170,7 @@ class EnsembleControllerMock:
             az, el = (axis.motor_velocity / self._units_per_rad for axis in self.axes)
             self._motors.command_velocity_rad_s(az, el)
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         if kind == "reboot":
             self._power_up()
         for axis, part in zip(self.axes, AXES, strict=True):
@@ -190,48 +178,115 @@ class EnsembleControllerMock:
             for name, cause in _CAUSES.items():
                 if self.faults.value(name, part) is not None:
                     axis.causes |= cause
-        if self.faults.away:
-            self._abort_links()
-
-    def _abort_links(self) -> None:
-        for link in list(self.links):
-            link.transport.abort()
 
 
-class _Link(asyncio.Protocol):
-    """One client over TCP."""
+_WAITING_MAX = 1000
 
-    transport: asyncio.Transport
 
-    def __init__(self, controller: EnsembleControllerMock) -> None:
-        self._controller = controller
+class LineSplitter:
+    """Bytes in, whole lines out; half a line waits for the rest.
+
+    What is longer than any command is cut one byte beyond that length.
+    """
+
+    def __init__(self) -> None:
+        self._pending = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Lines that are now complete, without their newline."""
+        *whole, rest = data.split(EOS)
+        lines = []
+        for piece in whole:
+            self._add(piece)
+            lines.append(bytes(self._pending))
+            self._pending.clear()
+        self._add(rest)
+        return lines
+
+    def clear(self) -> None:
+        """Forget half a line."""
+        self._pending.clear()
+
+    def _add(self, piece: bytes) -> None:
+        self._pending += piece[: COMMAND_BYTES_MAX + 1 - len(self._pending)]
+
+
+class Client:
+    """One client's commands, done one after the other, each answered after the controller's time.
+
+    Parameters
+    ----------
+    wire : Wire
+    answer : callable
+        Does a line and gives the bytes of its answer.
+    reply_s : float
+        From when a command's turn comes until its answer.
+    """
+
+    def __init__(self, wire: Wire, answer: Callable[[str], bytes], reply_s: float) -> None:
+        self._splitter = LineSplitter()
+        self._wire = wire
+        self._answer = answer
+        self._reply_s = reply_s
+        self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)
+        self._timer: asyncio.TimerHandle | None = None
+
+    def receive(self, data: bytes) -> None:
+        """Take what the client sent."""
+        if self._wire.dead:
+            self._splitter.clear()
+            self._waiting.clear()
+            return
+        self._waiting.extend(line for line in self._splitter.feed(data) if line.strip())
+        self._next()
+
+    def close(self) -> None:
+        """Forget what is under way."""
+        self._waiting.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._wire.close()
+
+    def _next(self) -> None:
+        if self._timer is None and self._waiting:
+            line = self._waiting.popleft()
+            if len(line) > COMMAND_BYTES_MAX:
+                answer = Reply.NOT_UNDERSTOOD.value + EOS
+            else:
+                answer = self._answer(line.decode("ascii", "replace"))
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_later(self._reply_s, self._send, answer)
+
+    def _send(self, answer: bytes) -> None:
+        self._timer = None
+        self._wire.send(answer)
+        self._next()
+
+
+class _Link(Link):
+    """One client over TCP; closed after `idle_timeout_s` without a byte."""
+
+    def __init__(
+        self, server: TcpServer, new_client: Callable[[Wire], Client], idle_timeout_s: float
+    ) -> None:
+        super().__init__(server)
+        self._new_client = new_client
+        self._idle = Watchdog(self._expired, idle_timeout_s)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast(asyncio.Transport, transport)
-        self._client = self._controller.new_client(self.write)
-        self._controller.links.add(self)
-        self._idle = Watchdog(self.transport.close, self._controller.idle_timeout_s)
+        super().connection_made(transport)
+        self._client = self._new_client(self.wire)
         self._idle.feed()
-        if self._controller.faults.away:
-            self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         self._idle.feed()
         self._client.receive(data)
 
-    def write(self, data: bytes) -> None:
-        """Send."""
-        if not self.transport.is_closing():
-            self.transport.write(data)
-
-    # Who sends and never reads is not read from either, so that nothing piles up.
-    def pause_writing(self) -> None:
-        self.transport.pause_reading()
-
-    def resume_writing(self) -> None:
-        self.transport.resume_reading()
-
-    def connection_lost(self, error: Exception | None) -> None:
+    def connection_lost(self, exc: Exception | None) -> None:
         self._idle.stop()
         self._client.close()
-        self._controller.links.discard(self)
+        super().connection_lost(exc)
+
+    def _expired(self) -> None:
+        self.transport.close()

@@ -22,7 +22,7 @@ LATE_S = 0.002
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionSettings:
-    """What the registers said when the acquisition was started."""
+    """The registers at the start of the acquisition."""
 
     exposure_s: float
     frame_rate_hz: float

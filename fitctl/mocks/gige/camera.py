@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable
 
@@ -19,6 +18,7 @@ from fitctl.mocks.gige.memory import MAC, OWN_ADDRESS, RegisterError
 from fitctl.mocks.gige.picture import PICTURE_FAULTS, Sensor
 from fitctl.mocks.gige.registers import CameraClock, Registers
 from fitctl.mocks.gige.stream import STREAM_FAULTS, Stream
+from fitctl.mocks.timers import Watchdog
 
 FAULTS = dict(WIRE_FAULTS) | STREAM_FAULTS | PICTURE_FAULTS
 
@@ -71,8 +71,7 @@ class GigeCameraMock:
         self._sensor = Sensor(camera, self.faults)
         self._clock = CameraClock(runs=settings.clock)
         self._controller: Address | None = None
-        self._lapse_s = 0.0
-        self._lapse_timer: asyncio.TimerHandle | None = None
+        self._heartbeat = Watchdog(self._release_control)
         self._last: tuple[bytes, Address, bytes] | None = None
         self._control: ControlSocket | None = None
         self._started: tuple[Stream, Acquisition, Registers] | None = None
@@ -95,7 +94,9 @@ class GigeCameraMock:
     async def start(self) -> int:
         """Listen; returns the GVCP port."""
         stream = Stream(self.faults, resends=self._settings.resends)
-        acquisition = Acquisition(self._seen, self._clock.ticks, self._camera.frame_delay_s, stream)
+        acquisition = Acquisition(
+            self._expose, self._clock.ticks, self._camera.frame_delay_s, stream
+        )
         self._started = stream, acquisition, self._registers(stream, acquisition)
         try:
             self._control = await listen(self.answer, self.faults, self._port)
@@ -152,7 +153,7 @@ class GigeCameraMock:
         return self._commands[command](payload, sender)
 
     def _discovery(self, _payload: bytes, _sender: Address) -> bytes:
-        return self._parts()[2].discovery()
+        return self._parts()[2].head(protocol.DISCOVERY_BYTES)
 
     def _force_ip(self, payload: bytes, _sender: Address) -> bytes | None:
         """Whom it is not for stays silent; the address cannot be changed."""
@@ -239,29 +240,16 @@ class GigeCameraMock:
     def _release_control(self) -> None:
         self._controller = None
         self._parts()[2].set_privilege(0)
-        if self._lapse_timer is not None:
-            self._lapse_timer.cancel()
-            self._lapse_timer = None
+        self._heartbeat.stop()
 
     def _refresh_heartbeat(self) -> None:
-        loop = asyncio.get_running_loop()
-        self._lapse_s = loop.time() + self._parts()[2].heartbeat_s
-        if self._lapse_timer is not None and self._lapse_timer.when() > self._lapse_s:
-            self._lapse_timer.cancel()  # the time limit was made shorter
-            self._lapse_timer = None
-        if self._lapse_timer is None:
-            self._lapse_timer = loop.call_at(self._lapse_s, self._check_lapse)
+        heartbeat_s = self._parts()[2].heartbeat_s
+        if heartbeat_s != self._heartbeat.timeout_s:
+            self._heartbeat.set_timeout(heartbeat_s)
+        self._heartbeat.feed()
 
-    def _check_lapse(self) -> None:
-        """One timer for all refreshes: it goes on to the newest time, or control has lapsed."""
-        loop = asyncio.get_running_loop()
-        if loop.time() < self._lapse_s:
-            self._lapse_timer = loop.call_at(self._lapse_s, self._check_lapse)
-        else:
-            self._release_control()
-
-    def _seen(self, mid_exposure_s: float) -> NDArray[np.uint16]:
-        return self._sensor.seen(self._render(mid_exposure_s), mid_exposure_s)
+    def _expose(self, mid_exposure_s: float) -> NDArray[np.uint16]:
+        return self._sensor.expose(self._render(mid_exposure_s), mid_exposure_s)
 
     def _registers(self, stream: Stream, acquisition: Acquisition) -> Registers:
         return Registers(self._camera, self._settings, self._clock, acquisition, stream)

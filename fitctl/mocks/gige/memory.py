@@ -17,7 +17,7 @@ _SPACE_BYTES = 0xB000
 
 
 class Feature(IntEnum):
-    """The camera's own registers, as its GenICam description tells clients."""
+    """The camera's own registers, as in its GenICam description."""
 
     WIDTH = 0xA000
     HEIGHT = 0xA004
@@ -84,32 +84,37 @@ _TEXTS = (
     TextRegister(Register.XML_URL_1, protocol.XML_URL_BYTES),
     TextRegister(Register.XML_URL_2, protocol.XML_URL_BYTES),
 )
-_WRITABLE_WORDS = frozenset(
+LOCKED_WHILE_RUNNING = frozenset(
     {
-        Register.HEARTBEAT_TIMEOUT_MS,
-        Register.TIMESTAMP_CONTROL,
-        Register.CONTROL_PRIVILEGE,
-        Register.STREAM_PORT,
         Register.STREAM_PACKET_SIZE,
         Register.STREAM_PACKET_DELAY,
         Register.STREAM_DESTINATION,
+        Feature.ACQUISITION_MODE,
+        Feature.TRIGGER_MODE,
+        Feature.GAIN_DB,
         Feature.WIDTH,
         Feature.HEIGHT,
         Feature.OFFSET_X,
         Feature.OFFSET_Y,
         Feature.PIXEL_FORMAT,
-        Feature.ACQUISITION_START,
-        Feature.ACQUISITION_STOP,
-        Feature.TL_PARAMS_LOCKED,
-        Feature.ACQUISITION_MODE,
-        Feature.TRIGGER_MODE,
-        Feature.TRIGGER_SOFTWARE,
+        Feature.EXPOSURE_TIME_US,
+        Feature.FRAME_RATE_HZ,
     }
 )
+_WRITABLE = LOCKED_WHILE_RUNNING | {
+    Register.HEARTBEAT_TIMEOUT_MS,
+    Register.TIMESTAMP_CONTROL,
+    Register.CONTROL_PRIVILEGE,
+    Register.STREAM_PORT,
+    Feature.ACQUISITION_START,
+    Feature.ACQUISITION_STOP,
+    Feature.TL_PARAMS_LOCKED,
+    Feature.TRIGGER_SOFTWARE,
+}
 
 
 class RegisterError(Exception):
-    """A command that the camera answers with an error status; `payload` says how far it got."""
+    """A command that the camera answers with an error status; `payload` gives how far it got."""
 
     def __init__(self, status: Status, payload: bytes = b"") -> None:
         super().__init__(status.name)
@@ -136,11 +141,9 @@ class Memory:
         for address, length in _TEXTS:
             self._exists.update(range(address, address + length, 4))
         user_name = protocol.USER_NAME
-        self._writable: set[int] = {int(address) for address in _WRITABLE_WORDS}
+        self._writable: set[int] = {int(address) for address in _WRITABLE}
+        self._writable |= {address + 4 for address in DOUBLES & _WRITABLE}
         self._writable |= set(range(user_name.address, user_name.address + user_name.length, 4))
-        self._writable |= {
-            address + half for address in DOUBLES - {Feature.TEMPERATURE_C} for half in (0, 4)
-        }
         for word, value in _WORDS_AT_START.items():
             self.set_word(word, value)
         for double, number in _DOUBLES_AT_START.items():

@@ -44,8 +44,8 @@ class Sensor:
         self._random = np.random.default_rng(0)
         faults.on_change(self._note)
 
-    def seen(self, image: NDArray[np.uint16], host_s: float) -> NDArray[np.uint16]:
-        """A rendered image of a host time with what is wrong with it."""
+    def expose(self, image: NDArray[np.uint16], host_s: float) -> NDArray[np.uint16]:
+        """The rendered image of a host time with the active faults applied."""
         values = {kind: self._faults.value(kind) for kind in PICTURE_FAULTS}
         if all(value is None for value in values.values()):
             return image

@@ -13,6 +13,7 @@ from fitctl.drivers.gige.protocol import Register, Status
 from fitctl.mocks.gige.acquisition import Acquisition, AcquisitionSettings
 from fitctl.mocks.gige.memory import (
     DOUBLES,
+    LOCKED_WHILE_RUNNING,
     SINGLE_FRAME,
     TICKS_PER_S,
     Feature,
@@ -32,23 +33,6 @@ SIZE_MIN_PX = 8
 _ROUNDING = 1 + 1e-9  # a period of 1 / rate and back is not exact
 
 _FORMAT_OF_CODE = {one.code: one for one in protocol.PIXEL_FORMATS.values()}
-_LOCKED_WHILE_RUNNING = frozenset(
-    {
-        Register.STREAM_PACKET_SIZE,
-        Register.STREAM_PACKET_DELAY,
-        Register.STREAM_DESTINATION,
-        Feature.ACQUISITION_MODE,
-        Feature.TRIGGER_MODE,
-        Feature.GAIN_DB,
-        Feature.WIDTH,
-        Feature.HEIGHT,
-        Feature.OFFSET_X,
-        Feature.OFFSET_Y,
-        Feature.PIXEL_FORMAT,
-        Feature.EXPOSURE_TIME_US,
-        Feature.FRAME_RATE_HZ,
-    }
-)
 
 
 class CameraClock:
@@ -67,8 +51,8 @@ class CameraClock:
         self._reset_s = host_s
 
 
-class Registers:
-    """Registers with their effects. Who may write is not decided here.
+class Registers(Memory):
+    """The register space with the effects of writing. Who may write is not decided here.
 
     Parameters
     ----------
@@ -90,7 +74,7 @@ class Registers:
         acquisition: Acquisition,
         stream: Stream,
     ) -> None:
-        self._memory = Memory(settings)
+        super().__init__(settings)
         self._clock = clock
         self._acquisition = acquisition
         self._stream = stream
@@ -113,42 +97,34 @@ class Registers:
             Feature.TRIGGER_SOFTWARE: lambda _: acquisition.trigger(),
         }
         for feature in (Feature.WIDTH, Feature.WIDTH_MAX):
-            self._memory.set_word(feature, camera.width_px)
+            self.set_word(feature, camera.width_px)
         for feature in (Feature.HEIGHT, Feature.HEIGHT_MAX):
-            self._memory.set_word(feature, camera.height_px)
-        self._memory.set_word(Register.STREAM_SOURCE_PORT, stream.source_port)
+            self.set_word(feature, camera.height_px)
+        self.set_word(Register.STREAM_SOURCE_PORT, stream.source_port)
         self._set_size()
 
     @property
     def heartbeat_s(self) -> float:
         """How long control lasts without a sign of life from its holder."""
-        return self._memory.word(Register.HEARTBEAT_TIMEOUT_MS) / 1000
+        return self.word(Register.HEARTBEAT_TIMEOUT_MS) / 1000
 
     def privilege(self) -> int:
         """The control privilege register."""
-        return self._memory.word(Register.CONTROL_PRIVILEGE)
+        return self.word(Register.CONTROL_PRIVILEGE)
 
     def set_privilege(self, value: int) -> None:
         """Set the control privilege; without any, nothing streams and the stream channel is closed."""
-        self._memory.set_word(Register.CONTROL_PRIVILEGE, value)
+        self.set_word(Register.CONTROL_PRIVILEGE, value)
         if not value:
-            self._memory.set_word(Register.STREAM_PORT, 0)
-            self._memory.set_word(Feature.TL_PARAMS_LOCKED, 0)
+            self.set_word(Register.STREAM_PORT, 0)
+            self.set_word(Feature.TL_PARAMS_LOCKED, 0)
             self._acquisition.stop()
-
-    def discovery(self) -> bytes:
-        """The answer to DISCOVERY."""
-        return self._memory.head(protocol.DISCOVERY_BYTES)
-
-    def read(self, address: int, length: int) -> bytes:
-        """Read as a client does. Raises RegisterError."""
-        return self._memory.read(address, length)
 
     def check_writable(self, address: int, length: int) -> None:
         """Raise RegisterError if no client may ever write there, or not now."""
-        self._memory.check_writable(address, length)
+        super().check_writable(address, length)
         written = range(address, address + length, 4)
-        if self._acquisition.running and not _LOCKED_WHILE_RUNNING.isdisjoint(written):
+        if self._acquisition.running and not LOCKED_WHILE_RUNNING.isdisjoint(written):
             raise RegisterError(Status.ACCESS_DENIED)
 
     def write(self, address: int, data: bytes) -> None:
@@ -163,33 +139,33 @@ class Registers:
     def _write_word(self, address: int, value: int) -> None:
         if not DOUBLES.isdisjoint({address, address - 4}):
             raise RegisterError(Status.INVALID_PARAMETER)  # half a number
-        before = self._memory.word(address)
-        self._memory.set_word(address, value)
+        before = self.word(address)
+        self.set_word(address, value)
         try:
             if address in self._actions:
                 self._actions[address](value)
         except RegisterError:
-            self._memory.set_word(address, before)
+            self.set_word(address, before)
             raise
 
     def _set_heartbeat(self, value: int) -> None:
-        self._memory.set_word(Register.HEARTBEAT_TIMEOUT_MS, max(value, HEARTBEAT_MIN_MS))
+        self.set_word(Register.HEARTBEAT_TIMEOUT_MS, max(value, HEARTBEAT_MIN_MS))
 
     def _control_timestamp(self, value: int) -> None:
         now_s = time.monotonic()
         if value & protocol.TIMESTAMP_LATCH:
             ticks = self._clock.ticks(now_s)
-            self._memory.set_word(Register.TIMESTAMP_HIGH, ticks >> 32)
-            self._memory.set_word(Register.TIMESTAMP_LOW, ticks & 0xFFFFFFFF)
+            self.set_word(Register.TIMESTAMP_HIGH, ticks >> 32)
+            self.set_word(Register.TIMESTAMP_LOW, ticks & 0xFFFFFFFF)
         if value & protocol.TIMESTAMP_RESET:
             self._clock.reset(now_s)
-        self._memory.set_word(Register.TIMESTAMP_CONTROL, 0)
+        self.set_word(Register.TIMESTAMP_CONTROL, 0)
 
     def _set_packet_size(self, value: int) -> None:
         size = value & protocol.PACKET_SIZE_MASK
         if size not in PACKET_SIZES_BYTES:
             raise RegisterError(Status.INVALID_PARAMETER)
-        self._memory.set_word(
+        self.set_word(
             Register.STREAM_PACKET_SIZE, value & ~protocol.PACKET_SIZE_FIRE_TEST & 0xFFFFFFFF
         )
         if value & protocol.PACKET_SIZE_FIRE_TEST:
@@ -201,15 +177,15 @@ class Registers:
 
     def _set_size(self, _value: int = 0) -> None:
         width, height, offset_x, offset_y = (
-            self._memory.word(feature)
+            self.word(feature)
             for feature in (Feature.WIDTH, Feature.HEIGHT, Feature.OFFSET_X, Feature.OFFSET_Y)
         )
-        pixel_format = _FORMAT_OF_CODE.get(self._memory.word(Feature.PIXEL_FORMAT))
+        pixel_format = _FORMAT_OF_CODE.get(self.word(Feature.PIXEL_FORMAT))
         fits = width + offset_x <= self._width_max_px
         fits &= height + offset_y <= self._height_max_px
         if not fits or min(width, height) < SIZE_MIN_PX or pixel_format is None:
             raise RegisterError(Status.INVALID_PARAMETER)
-        self._memory.set_word(Feature.PAYLOAD_SIZE, pixel_format.bytes * width * height)
+        self.set_word(Feature.PAYLOAD_SIZE, pixel_format.bytes * width * height)
 
     def _set_double(self, address: int, data: bytes) -> None:
         """Exposure and frame rate: neither may outgrow the other."""
@@ -219,51 +195,48 @@ class Registers:
         low, high = {
             Feature.EXPOSURE_TIME_US: (
                 EXPOSURE_MIN_US,
-                1e6 / self._memory.double(Feature.FRAME_RATE_HZ) * _ROUNDING,
+                1e6 / self.double(Feature.FRAME_RATE_HZ) * _ROUNDING,
             ),
             Feature.FRAME_RATE_HZ: (
                 FRAME_RATES_HZ[0],
                 min(
                     FRAME_RATES_HZ[1],
-                    1e6 / self._memory.double(Feature.EXPOSURE_TIME_US) * _ROUNDING,
+                    1e6 / self.double(Feature.EXPOSURE_TIME_US) * _ROUNDING,
                 ),
             ),
             Feature.GAIN_DB: GAINS_DB,
         }[Feature(address)]
         if not low <= value <= high:
             raise RegisterError(Status.INVALID_PARAMETER)
-        self._memory.set_double(address, value)
+        self.set_double(address, value)
 
     def _start_acquisition(self, _value: int) -> None:
         if self._acquisition.running:
             return
-        memory = self._memory
-        size = memory.word(Register.STREAM_PACKET_SIZE) & protocol.PACKET_SIZE_MASK
+        size = self.word(Register.STREAM_PACKET_SIZE) & protocol.PACKET_SIZE_MASK
         self._acquisition.start(
             AcquisitionSettings(
-                exposure_s=memory.double(Feature.EXPOSURE_TIME_US) / 1e6,
-                frame_rate_hz=memory.double(Feature.FRAME_RATE_HZ),
-                gain_db=memory.double(Feature.GAIN_DB),
-                single_frame=memory.word(Feature.ACQUISITION_MODE) == SINGLE_FRAME,
-                triggered=bool(memory.word(Feature.TRIGGER_MODE)),
+                exposure_s=self.double(Feature.EXPOSURE_TIME_US) / 1e6,
+                frame_rate_hz=self.double(Feature.FRAME_RATE_HZ),
+                gain_db=self.double(Feature.GAIN_DB),
+                single_frame=self.word(Feature.ACQUISITION_MODE) == SINGLE_FRAME,
+                triggered=bool(self.word(Feature.TRIGGER_MODE)),
             ),
             StreamSettings(
                 destination=self._destination(),
                 packet_size_bytes=size,
-                packet_gap_s=memory.word(Register.STREAM_PACKET_DELAY) / TICKS_PER_S,
-                pixel_format=_FORMAT_OF_CODE[memory.word(Feature.PIXEL_FORMAT)],
-                width_px=memory.word(Feature.WIDTH),
-                height_px=memory.word(Feature.HEIGHT),
-                offset_x_px=memory.word(Feature.OFFSET_X),
-                offset_y_px=memory.word(Feature.OFFSET_Y),
+                packet_gap_s=self.word(Register.STREAM_PACKET_DELAY) / TICKS_PER_S,
+                pixel_format=_FORMAT_OF_CODE[self.word(Feature.PIXEL_FORMAT)],
+                width_px=self.word(Feature.WIDTH),
+                height_px=self.word(Feature.HEIGHT),
+                offset_x_px=self.word(Feature.OFFSET_X),
+                offset_y_px=self.word(Feature.OFFSET_Y),
             ),
         )
 
     def _destination(self) -> tuple[str, int]:
-        host = socket.inet_ntoa(
-            protocol.encode_words(self._memory.word(Register.STREAM_DESTINATION))
-        )
-        return host, self._memory.word(Register.STREAM_PORT) & 0xFFFF
+        host = socket.inet_ntoa(protocol.encode_words(self.word(Register.STREAM_DESTINATION)))
+        return host, self.word(Register.STREAM_PORT) & 0xFFFF
 
 
 def _check_switch(value: int) -> None:

@@ -24,7 +24,7 @@ STREAM_FAULTS = {
 
 @dataclass(frozen=True, slots=True)
 class StreamSettings:
-    """What the registers said when the acquisition was started."""
+    """The registers at the start of the acquisition."""
 
     destination: Address
     packet_size_bytes: int

@@ -37,8 +37,8 @@ class Amplifier:
     """
 
     _set_v: list[float]
-    _low_v: list[float]
-    _high_v: list[float]
+    _low_v: dict[int | None, float]
+    _high_v: dict[int | None, float]
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Amplifier:
         self._update()
 
     def set_saturated(self, channels: Collection[str]) -> None:
-        """These outputs stay at their highest voltage, whatever they are told."""
+        """These outputs stay at their highest voltage, whatever is commanded."""
         self._saturated = channels
         self._update()
 
@@ -113,13 +113,15 @@ class Amplifier:
         self._scan_v = volts or 0.0
         self._update()
 
-    def low_v(self, channel: int) -> float:
-        """The lowest voltage that a channel may have."""
-        return max(self._low_v[channel], self.system_low_v)
+    def low_v(self, channel: int | None) -> float:
+        """The lowest voltage that a channel may have; with None, the system's limit."""
+        return max(self._low_v[channel], self._low_v[None])
 
-    def high_v(self, channel: int) -> float:
-        """The highest voltage that a channel may have."""
-        return min(self._high_v[channel], self.system_high_v, self.switch_v + LIMIT_MARGIN_V)
+    def high_v(self, channel: int | None) -> float:
+        """The highest voltage that a channel may have; with None, the system's limit."""
+        if channel is None:
+            return self._high_v[None]
+        return min(self._high_v[channel], self._high_v[None], self.switch_v + LIMIT_MARGIN_V)
 
     def set_low_v(self, channel: int | None, volts: float) -> None:
         """A channel's low limit, or with None the system's.
@@ -131,10 +133,7 @@ class Amplifier:
         channels = range(3) if channel is None else [channel]
         if not 0 <= volts <= min(self.high_v(i) for i in channels):
             raise OutOfLimitsError
-        if channel is None:
-            self.system_low_v = volts
-        else:
-            self._low_v[channel] = volts
+        self._low_v[channel] = volts
         self._update()
 
     def set_high_v(self, channel: int | None, volts: float) -> None:
@@ -148,10 +147,7 @@ class Amplifier:
         lowest_v = max(self.low_v(i) for i in channels)
         if not lowest_v <= volts <= self.switch_v + LIMIT_MARGIN_V:
             raise OutOfLimitsError
-        if channel is None:
-            self.system_high_v = volts
-        else:
-            self._high_v[channel] = volts
+        self._high_v[channel] = volts
         self._update()
 
     def measured_v(self, channel: int) -> float:
@@ -164,10 +160,8 @@ class Amplifier:
     def _set_defaults(self) -> None:
         self._set_v = [0.0] * 3
         self._scan_v = 0.0
-        self._low_v = [0.0] * 3
-        self._high_v = [_HIGHEST_V] * 3
-        self.system_low_v = 0.0
-        self.system_high_v = _HIGHEST_V
+        self._low_v = dict.fromkeys((0, 1, 2, None), 0.0)
+        self._high_v = dict.fromkeys((0, 1, 2, None), _HIGHEST_V)
 
     def _computed(self) -> list[float]:
         return [self._output_v(i) for i in range(3)]

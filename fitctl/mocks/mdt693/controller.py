@@ -68,7 +68,7 @@ class Controller:
         self._set_defaults()
 
     def answer(self, command: str) -> str:
-        """Do what a command says, and everything that the device sends back, its echo included."""
+        """Execute a command; returns everything that the device sends back, its echo included."""
         text = command.replace("\n", "")
         echo = f"{command.lower() if self._is_a else command}\r" if self.echo else ""
         try:
@@ -87,7 +87,8 @@ class Controller:
             raise CommandError
         for pattern, action in self._table:
             if match := pattern.fullmatch(text):
-                answer = action(self, *(group and group.lower() for group in match.groups()))
+                words = (group and group.lower() for group in match.groups())
+                answer = action(self, *words) or ""
                 return answer if self._is_a or not answer else f"{answer}\r"
         if not self._is_a and (match := _FRIENDLY.fullmatch(text)):
             self._friendly = match[1]
@@ -115,18 +116,6 @@ class Controller:
         text = "\r".join(lines)
         return f"     \r\r\r{text}\r\r" if self._is_a else f"\r\r\r{text}\r"
 
-    def _type(self) -> str:
-        return f"{self._settings.model}\r" if self._is_a else self._settings.model
-
-    def _help(self) -> str:
-        return HELP.replace("PUSHDISABLE", self._settings.push_command.upper())
-
-    def _get_serial(self) -> str:
-        return SERIAL_NUMBER
-
-    def _get_friendly(self) -> str:
-        return self._friendly
-
     # ------------------------------------------------------------------ how it speaks
     def _switch_echo(self, wanted: str | None = None) -> str:
         self.echo = not self.echo if wanted is None else wanted == "1"
@@ -135,21 +124,18 @@ class Controller:
     def _get_echo(self) -> str:
         return f"[Echo {'On' if self.echo else 'Off'}]" + ("\r" if self._is_a else "")
 
-    def _set_echo(self, wanted: str) -> str:
+    def _set_echo(self, wanted: str) -> None:
         self.echo = wanted == "1"
-        return ""
 
     def _get_compatible(self) -> str:
         return f"[MDT693A Compatibility Mode {'On' if self.compatible else 'Off'}]"
 
-    def _set_compatible(self, wanted: str) -> str:
+    def _set_compatible(self, wanted: str) -> None:
         self.compatible = wanted == "1"
-        return ""
 
-    def _restore(self) -> str:
+    def _restore(self) -> None:
         self._set_defaults()
         self.amplifier.restore()
-        return ""
 
     # ------------------------------------------------------------------ voltages
     def _read(self, name: str) -> str:
@@ -164,37 +150,30 @@ class Controller:
         volts = [self.amplifier.measured_v(i) for i in range(3)]
         return format_three_volts(volts, self._settings.decimals)
 
-    def _set(self, name: str, number: str) -> str:
+    def _set(self, name: str, number: str) -> None:
         """Set-point of one channel, or of all three."""
         self.amplifier.set_points(
             [float(number) if name in {one, "a", "all"} else None for one in CHANNELS]
         )
-        return ""
 
-    def _set_three(self, *numbers: str) -> str:
+    def _set_three(self, *numbers: str) -> None:
         if not self._settings.xyzvoltage:
             raise CommandError
         self.amplifier.set_points([float(number) for number in numbers])
-        return ""
 
-    def _press_arrow(self, key: str) -> str:
+    def _press_arrow(self, key: str) -> None:
         """Right and left choose a channel, up and down move its set-point."""
         turn = {"c": 1, "d": -1}.get(key, 0)
         self._selected = (self._selected + turn) % len(CHANNELS)
         steps = {"a": 1, "b": -1}.get(key, 0) * self._values["dacstep"]
         self.amplifier.step(self._selected, steps * DAC_STEP_V)
-        return ""
 
-    def _get_scan(self) -> str:
-        return self._bound(self._scan_v)
-
-    def _set_scan(self, number: str) -> str:
+    def _set_scan(self, number: str) -> None:
         volts = float(number)
         if not 0 <= volts <= max(self.amplifier.high_v(i) for i in range(3)):
             raise CommandError
         self._scan_v = volts
         self._scan()
-        return ""
 
     def _scan(self) -> None:
         self.amplifier.set_scan(self._scan_v if self._values["msenable"] else None)
@@ -207,24 +186,16 @@ class Controller:
         return f"[{LIMIT_SWITCH_V[position]:4d}]" + ("\r" if self._is_a else "")
 
     def _get_low(self, name: str) -> str:
-        return self._bound(self.amplifier.low_v(CHANNELS.index(name)))
+        return self._bound(self.amplifier.low_v(_channel(name)))
 
     def _get_high(self, name: str) -> str:
-        return self._bound(self.amplifier.high_v(CHANNELS.index(name)))
+        return self._bound(self.amplifier.high_v(_channel(name)))
 
-    def _get_system_low(self) -> str:
-        return self._bound(self.amplifier.system_low_v)
+    def _set_low(self, name: str, number: str) -> None:
+        self.amplifier.set_low_v(_channel(name), float(number))
 
-    def _get_system_high(self) -> str:
-        return self._bound(self.amplifier.system_high_v)
-
-    def _set_low(self, name: str, number: str) -> str:
-        self.amplifier.set_low_v(None if name == "sys" else CHANNELS.index(name), float(number))
-        return ""
-
-    def _set_high(self, name: str, number: str) -> str:
-        self.amplifier.set_high_v(None if name == "sys" else CHANNELS.index(name), float(number))
-        return ""
+    def _set_high(self, name: str, number: str) -> None:
+        self.amplifier.set_high_v(_channel(name), float(number))
 
     def _bound(self, volts: float) -> str:
         if self._is_a:
@@ -245,17 +216,21 @@ class Controller:
         return ""
 
 
-_Table = list[tuple[re.Pattern[str], Callable[..., str]]]
+def _channel(name: str) -> int | None:
+    return None if name == "sys" else CHANNELS.index(name)
 
 
-def _table(commands: dict[str, Callable[..., str]]) -> _Table:
+_Table = list[tuple[re.Pattern[str], Callable[..., str | None]]]
+
+
+def _table(commands: dict[str, Callable[..., str | None]]) -> _Table:
     return [(re.compile(pattern, re.IGNORECASE), action) for pattern, action in commands.items()]
 
 
 _COMMANDS_A = _table(
     {
         "i.*": Controller._identify,  # a recorded A takes anything that begins so
-        "d": Controller._type,
+        "d": lambda self: f"{self._settings.model}\r",
         "e": Controller._switch_echo,
         "%": Controller._get_switch,
         r"([xyz])r\?": Controller._read,
@@ -268,11 +243,11 @@ _COMMANDS_A = _table(
 )
 _COMMANDS_B = _table(
     {
-        r"\?": Controller._help,
+        r"\?": lambda self: HELP.replace("PUSHDISABLE", self._settings.push_command.upper()),
         r"i|id\?": Controller._identify,
-        "d": Controller._type,
-        r"serial\?": Controller._get_serial,
-        r"friendly\?": Controller._get_friendly,
+        "d": lambda self: self._settings.model,
+        r"serial\?": lambda self: SERIAL_NUMBER,
+        r"friendly\?": lambda self: self._friendly,
         "restore": Controller._restore,
         "e([01])?": Controller._switch_echo,
         r"echo\?": Controller._get_echo,
@@ -285,15 +260,15 @@ _COMMANDS_B = _table(
         rf"([xyza])v{_NUMBER}": Controller._set,
         r"xyzvoltage\?": Controller._read_all,
         rf"xyzvoltage=\[?{_NUMBER}, *{_NUMBER}, *{_NUMBER}\]?": Controller._set_three,
-        r"([xyz])(?:min|l)\?": Controller._get_low,
-        r"([xyz])(?:max|h)\?": Controller._get_high,
+        r"([xyz]|sys)min\?": Controller._get_low,
+        r"([xyz]|sys)max\?": Controller._get_high,
+        r"([xyz])l\?": Controller._get_low,
+        r"([xyz])h\?": Controller._get_high,
         rf"([xyz]|sys)min={_NUMBER}": Controller._set_low,
         rf"([xyz]|sys)max={_NUMBER}": Controller._set_high,
         rf"([xyz])l{_NUMBER}": Controller._set_low,
         rf"([xyz])h{_NUMBER}": Controller._set_high,
-        r"sysmin\?": Controller._get_system_low,
-        r"sysmax\?": Controller._get_system_high,
-        r"msvoltage\?": Controller._get_scan,
+        r"msvoltage\?": lambda self: self._bound(self._scan_v),
         f"msvoltage={_NUMBER}": Controller._set_scan,
         r"\x1b\[([abcd])": Controller._press_arrow,
     }

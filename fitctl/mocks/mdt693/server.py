@@ -49,7 +49,7 @@ class Mdt693Mock:
     nor compatibility mode), to which values; power-up values; the same errors for a value out of range
     as for an unknown command; commands of at most 64 bytes; the answer to `D`; plain numbers as the
     answers to `msvoltage?`, `sysmin?` and `sysmax?`; arrow keys without an answer of their own but the
-    prompt, and their step of 150 V / 65536; zero volts at the external inputs until told; noise and
+    prompt, and their step of 150 V / 65536; zero volts at the external inputs until set; noise and
     settling of what is measured (rig file).
 
     Parameters

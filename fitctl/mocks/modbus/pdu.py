@@ -1,4 +1,4 @@
-"""What a Modbus server answers: a request PDU in, an answer PDU out, nothing else.
+"""What a Modbus server of holding registers answers: a request PDU in, an answer PDU out, nothing else.
 
 Checks are made in the order of the state diagrams of the MODBUS Application Protocol Specification
 V1.1b3, section 6: function (exception 01), quantities and lengths (03), addresses (02), doing it (04).
@@ -13,15 +13,9 @@ from typing import Any
 
 from fitctl.drivers.modbus_dac import protocol
 
-COILS = "coils"
-DISCRETE_INPUTS = "discrete inputs"
-HOLDING_REGISTERS = "holding registers"
-INPUT_REGISTERS = "input registers"
-
 _MEI_IDENTIFICATION = 0x0E
 _BASIC_STREAM_AND_SINGLE = 0x81  # conformity level: the three basic objects, both ways to ask
 _SINGLE_OBJECT = 4
-_COIL_VALUES = {0x0000: 0, 0xFF00: 1}
 
 
 class DeviceFailure(Exception):
@@ -40,32 +34,31 @@ class DataModel:
 
     Attributes
     ----------
-    addresses : mapping
-        By table (`COILS`, `DISCRETE_INPUTS`, `HOLDING_REGISTERS`, `INPUT_REGISTERS`), the addresses that
-        exist in it, counted from 0; often a range. Functions on a table that is not here are unknown.
+    addresses : container of int
+        The holding registers that exist, counted from 0; often a range.
     read : callable
-        Gets table, first address and count; gives as many values, bits as 0 or 1, registers unsigned.
+        Gets the first address and the count; returns as many unsigned values.
     write : callable
-        Gets table, first address and values. Only existing addresses are asked for, by both; each may
-        raise `DeviceFailure`.
+        Gets the first address and the values. Both are called with existing addresses only, and may raise
+        `DeviceFailure`.
     identity : sequence of bytes
         Vendor name, product code, revision; together at most 230 bytes.
     """
 
-    addresses: Mapping[str, Container[int]]
-    read: Callable[[str, int, int], Sequence[int]]
-    write: Callable[[str, int, Sequence[int]], None]
+    addresses: Container[int]
+    read: Callable[[int, int], Sequence[int]]
+    write: Callable[[int, Sequence[int]], None]
     identity: Sequence[bytes]
 
 
 def answer(request: bytes, model: DataModel) -> bytes:
     """The answer PDU to a request PDU of at least one byte, an exception where it must be one."""
     code, body = request[0], request[1:]
-    handler, table = _FUNCTIONS.get(code, (None, ""))
-    if handler is None or (table and table not in model.addresses):
+    handler = _FUNCTIONS.get(code)
+    if handler is None:
         return exception(code, protocol.ILLEGAL_FUNCTION)
     try:
-        return bytes([code]) + handler(model, table, body)
+        return bytes([code]) + handler(model, body)
     except _Refusal as refusal:
         return exception(code, refusal.exception_code)
     except DeviceFailure:
@@ -77,69 +70,41 @@ def exception(function_code: int, exception_code: int) -> bytes:
     return bytes([function_code | 0x80, exception_code])
 
 
-def _read_bits(model: DataModel, table: str, body: bytes) -> bytes:
-    address, count = _fields(">HH", body)
-    _check(1 <= count <= 2000, protocol.ILLEGAL_VALUE)
-    _check_addresses(model, table, address, count)
-    bits = model.read(table, address, count)
-    packed = sum(bit << place for place, bit in enumerate(bits))
-    return _counted(packed.to_bytes((count + 7) // 8, "little"))
-
-
-def _read_registers(model: DataModel, table: str, body: bytes) -> bytes:
+def _read_registers(model: DataModel, body: bytes) -> bytes:
     address, count = _fields(">HH", body)
     _check(1 <= count <= 125, protocol.ILLEGAL_VALUE)
-    _check_addresses(model, table, address, count)
-    return _counted(_registers(model.read(table, address, count)))
+    _check_addresses(model, address, count)
+    return _counted(_registers(model.read(address, count)))
 
 
-def _write_coil(model: DataModel, table: str, body: bytes) -> bytes:
+def _write_register(model: DataModel, body: bytes) -> bytes:
     address, value = _fields(">HH", body)
-    _check(value in _COIL_VALUES, protocol.ILLEGAL_VALUE)
-    _check_addresses(model, table, address, 1)
-    model.write(table, address, [_COIL_VALUES[value]])
+    _check_addresses(model, address, 1)
+    model.write(address, [value])
     return body
 
 
-def _write_register(model: DataModel, table: str, body: bytes) -> bytes:
-    address, value = _fields(">HH", body)
-    _check_addresses(model, table, address, 1)
-    model.write(table, address, [value])
-    return body
-
-
-def _write_coils(model: DataModel, table: str, body: bytes) -> bytes:
-    address, count, byte_count = _fields(">HHB", body[:5])
-    packed = body[5:]
-    _check(1 <= count <= 1968, protocol.ILLEGAL_VALUE)
-    _check(byte_count == len(packed) == (count + 7) // 8, protocol.ILLEGAL_VALUE)
-    _check_addresses(model, table, address, count)
-    bits = int.from_bytes(packed, "little")
-    model.write(table, address, [bits >> place & 1 for place in range(count)])
-    return body[:4]
-
-
-def _write_registers(model: DataModel, table: str, body: bytes) -> bytes:
+def _write_registers(model: DataModel, body: bytes) -> bytes:
     address, count, byte_count = _fields(">HHB", body[:5])
     _check(1 <= count <= 123, protocol.ILLEGAL_VALUE)
     _check(byte_count == len(body[5:]) == 2 * count, protocol.ILLEGAL_VALUE)
-    _check_addresses(model, table, address, count)
-    model.write(table, address, struct.unpack(f">{count}H", body[5:]))
+    _check_addresses(model, address, count)
+    model.write(address, struct.unpack(f">{count}H", body[5:]))
     return body[:4]
 
 
-def _read_write_registers(model: DataModel, table: str, body: bytes) -> bytes:
+def _read_write_registers(model: DataModel, body: bytes) -> bytes:
     """Function 23: writes first, then reads."""
     read_at, read_count, write_at, write_count, byte_count = _fields(">HHHHB", body[:9])
     _check(1 <= read_count <= 125 and 1 <= write_count <= 121, protocol.ILLEGAL_VALUE)
     _check(byte_count == len(body[9:]) == 2 * write_count, protocol.ILLEGAL_VALUE)
-    _check_addresses(model, table, read_at, read_count)
-    _check_addresses(model, table, write_at, write_count)
-    model.write(table, write_at, struct.unpack(f">{write_count}H", body[9:]))
-    return _counted(_registers(model.read(table, read_at, read_count)))
+    _check_addresses(model, read_at, read_count)
+    _check_addresses(model, write_at, write_count)
+    model.write(write_at, struct.unpack(f">{write_count}H", body[9:]))
+    return _counted(_registers(model.read(read_at, read_count)))
 
 
-def _identify(model: DataModel, table: str, body: bytes) -> bytes:
+def _identify(model: DataModel, body: bytes) -> bytes:
     """Read Device Identification: a stream of the basic objects (codes 1 to 3), or one of them (4).
 
     A client that asks for more than the basic objects gets the basic ones, and one that begins behind
@@ -163,25 +128,15 @@ def _identity_objects(identity: Sequence[bytes], begin: int, end: int) -> Iterat
         yield bytes([number, len(identity[number])]) + identity[number]
 
 
-_FUNCTIONS: Mapping[int, tuple[Callable[[DataModel, str, bytes], bytes] | None, str]] = {
-    protocol.READ_COILS: (_read_bits, COILS),
-    protocol.READ_DISCRETE_INPUTS: (_read_bits, DISCRETE_INPUTS),
-    protocol.READ_HOLDING_REGISTERS: (_read_registers, HOLDING_REGISTERS),
-    protocol.READ_INPUT_REGISTERS: (_read_registers, INPUT_REGISTERS),
-    protocol.WRITE_SINGLE_COIL: (_write_coil, COILS),
-    protocol.WRITE_SINGLE_REGISTER: (_write_register, HOLDING_REGISTERS),
-    protocol.WRITE_MULTIPLE_COILS: (_write_coils, COILS),
-    protocol.WRITE_MULTIPLE_REGISTERS: (_write_registers, HOLDING_REGISTERS),
-    protocol.READ_WRITE_MULTIPLE_REGISTERS: (_read_write_registers, HOLDING_REGISTERS),
-    protocol.READ_DEVICE_IDENTIFICATION: (_identify, ""),
+_FUNCTIONS: Mapping[int, Callable[[DataModel, bytes], bytes]] = {
+    protocol.READ_HOLDING_REGISTERS: _read_registers,
+    protocol.WRITE_SINGLE_REGISTER: _write_register,
+    protocol.WRITE_MULTIPLE_REGISTERS: _write_registers,
+    protocol.READ_WRITE_MULTIPLE_REGISTERS: _read_write_registers,
+    protocol.READ_DEVICE_IDENTIFICATION: _identify,
 }
 
-BROADCAST_FUNCTIONS = {
-    protocol.WRITE_SINGLE_COIL,
-    protocol.WRITE_SINGLE_REGISTER,
-    protocol.WRITE_MULTIPLE_COILS,
-    protocol.WRITE_MULTIPLE_REGISTERS,
-}
+BROADCAST_FUNCTIONS = {protocol.WRITE_SINGLE_REGISTER, protocol.WRITE_MULTIPLE_REGISTERS}
 """What may be asked of all devices on a serial line at once; nobody answers that."""
 
 
@@ -197,10 +152,9 @@ def _check(is_right: bool, exception_code: int) -> None:
         raise _Refusal(exception_code)
 
 
-def _check_addresses(model: DataModel, table: str, address: int, count: int) -> None:
-    exist = model.addresses[table]
+def _check_addresses(model: DataModel, address: int, count: int) -> None:
     wanted = range(address, address + count)
-    _check(all(one in exist for one in wanted), protocol.ILLEGAL_ADDRESS)
+    _check(all(one in model.addresses for one in wanted), protocol.ILLEGAL_ADDRESS)
 
 
 def _registers(values: Sequence[int]) -> bytes:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from fitctl.config import DacMock, ModbusDacDevice
 from fitctl.drivers.modbus_dac.protocol import CHANNELS, counts_max, decode_counts, encode_volts
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
-from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel, DeviceFailure
+from fitctl.mocks.modbus.pdu import DataModel, DeviceFailure
 from fitctl.mocks.modbus.rtu import ModbusRtuServer
 from fitctl.mocks.modbus.tcp import ModbusTcpServer
 from fitctl.mocks.pty import Endpoints
@@ -80,18 +80,13 @@ class ModbusDacMock:
         self._latched = False
         self._watchdog = Watchdog(self._trip, settings.watchdog_s)
         first = dac.first_register
-        model = DataModel(
-            {HOLDING_REGISTERS: range(first, first + CHANNELS)}, self._read, self._write, _IDENTITY
-        )
+        model = DataModel(range(first, first + CHANNELS), self._read, self._write, _IDENTITY)
+        self._port = port
         self._tcp = ModbusTcpServer(
-            model,
-            self.faults,
-            unit=dac.device_id,
-            unknown_unit=settings.unknown_unit,
-            port=port,
+            model, self.faults, unit=dac.device_id, unknown_unit=settings.unknown_unit
         )
         self._rtu = ModbusRtuServer(model, self.faults, unit=dac.device_id, baud_rate=dac.baud_rate)
-        self.faults.on_change(self._take_fault)
+        self.faults.on_change(self._fault_changed)
 
     @property
     def outputs_v(self) -> list[float]:
@@ -108,7 +103,7 @@ class ModbusDacMock:
         OSError
             If the port is taken.
         """
-        endpoints = Endpoints(await self._tcp.start(), await self._rtu.start())
+        endpoints = Endpoints(await self._tcp.start(self._port), await self._rtu.start())
         self._on_outputs(self.outputs_v)
         return endpoints
 
@@ -119,12 +114,12 @@ class ModbusDacMock:
         await self._tcp.stop()
         await self._rtu.stop()
 
-    def _read(self, table: str, address: int, count: int) -> list[int]:
+    def _read(self, address: int, count: int) -> list[int]:
         self._refuse_if_tripped()
         channel = address - self._dac.first_register
         return self._counts[channel : channel + count]
 
-    def _write(self, table: str, address: int, values: Sequence[int]) -> None:
+    def _write(self, address: int, values: Sequence[int]) -> None:
         self._refuse_if_tripped()
         if max(values) > counts_max(self._dac.bits):
             raise DeviceFailure
@@ -150,7 +145,7 @@ class ModbusDacMock:
         self._latched = self._settings.watchdog_latches
         self._set(list(self._safe))
 
-    def _take_fault(self, kind: str) -> None:
+    def _fault_changed(self, kind: str) -> None:
         if kind == "watchdog_trip" and self.faults.value(kind) is not None:
             self._trip()
         if kind == "reboot":  # both its ends: power gone, power back

@@ -8,8 +8,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from scripted_server import scripted_server
 
 from fitctl import config
-from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
-from fitctl.drivers.bal_analog.probe import probe_bal_analog
+from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers, probe_bal_analog
 from fitctl.drivers.interface import (
     DeviceFault,
     DeviceProtocolError,
@@ -17,7 +16,7 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
-from fitctl.drivers.modbus import frame, take_message
+from fitctl.drivers.modbus import frame, pop_message
 
 STILL = (0.0, 0.0)
 MOCK = "mocks.loops.right.bal_analog"
@@ -45,7 +44,7 @@ class Script:
         pending = bytearray()
         while data := client.recv(1000):
             pending += data
-            while (message := take_message(pending)) is not None:
+            while (message := pop_message(pending)) is not None:
                 self.requests.append(message.pdu)
                 client.sendall(self.respond(message))
 
@@ -171,7 +170,7 @@ def test_an_answer_that_is_lost_costs_one_reading(driver, script):
     assert driver.exchange(STILL) is None
     script.respond = script.answer
     assert reading_of(driver) is not None
-    assert not driver._asked
+    assert not driver._outstanding
 
 
 def test_answers_that_nobody_asked_for_are_passed_over(driver, script):

@@ -21,7 +21,7 @@ from fitctl.drivers.modbus import (
     decode_identity,
     encode_identify,
     frame,
-    take_message,
+    pop_message,
 )
 
 
@@ -33,7 +33,7 @@ def test_one_period_on_the_wire():
         " 00 01 ff ff 00 03"
     )
     answer = bytearray.fromhex("12 34 00 00 00 09 01 17 06 ff fe 00 05 00 02")
-    message = take_message(answer)
+    message = pop_message(answer)
     assert message == Message(0x1234, 1, bytes.fromhex("17 06 ff fe 00 05 00 02"))
     assert decode_registers(message.pdu) == [0xFFFE, 5, 2]
     assert not answer
@@ -58,15 +58,15 @@ def test_who_answers():
 @given(st.integers(0, 0xFFFF), st.integers(0, 0xFF), st.binary(min_size=1, max_size=253))
 def test_frames_come_out_as_they_went_in(transaction, unit, pdu):
     pending = bytearray(frame(transaction, unit, pdu) * 2)
-    assert take_message(pending) == take_message(pending) == Message(transaction, unit, pdu)
-    assert take_message(pending) is None
+    assert pop_message(pending) == pop_message(pending) == Message(transaction, unit, pdu)
+    assert pop_message(pending) is None
 
 
 @given(st.binary(max_size=400))
 def test_any_bytes_are_messages_an_error_or_the_start_of_one(data):
     pending = bytearray(data)
     try:
-        while (message := take_message(pending)) is not None:
+        while (message := pop_message(pending)) is not None:
             decode_identity(message.pdu)
             assert len(decode_registers(message.pdu)) == 3
     except ValueError:

@@ -12,6 +12,7 @@ from fitctl.drivers.cia402 import link as link_module
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.link import CanLink
 from fitctl.drivers.cia402.node import Node
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceProtocolError, DeviceTimeout
 
 
@@ -69,7 +70,7 @@ def test_draining_a_flooded_bus_comes_to_an_end(link_that_repeats, siderostat):
 class SegmentingDrive:
     """A link to a drive whose uploads go on and on: `segments` of seven bytes, then the last."""
 
-    endpoint = "nowhere"
+    endpoint = Endpoint("drive", "nowhere")
 
     def __init__(self, segments=None, announced=None, delay_s=0.0):
         self._left = segments

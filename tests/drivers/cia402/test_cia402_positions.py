@@ -27,7 +27,7 @@ class Script:
         self.encoders.latched = None
         self.now_s += after_s
         self.encoders.sync_sent(self.now_s)
-        self.encoders.take((az, el))
+        self.encoders.add((az, el))
         return self.encoders.latched
 
 
@@ -43,7 +43,7 @@ def test_a_reading_has_the_time_of_its_sync(script):
 def test_a_copy_answers_no_sync_and_is_passed_over(script):
     script.read(5)
     script.encoders.latched = None
-    script.encoders.take((5, 0))
+    script.encoders.add((5, 0))
     assert script.encoders.latched is None
 
 
@@ -92,5 +92,5 @@ def test_the_sum_of_steps_does_not_wrap(start, steps):
     for step in [0, *steps]:
         place += step
         encoders.sync_sent(0.0)
-        encoders.take((wrap_int32(place), 0))
+        encoders.add((wrap_int32(place), 0))
         assert encoders.latched.counts[0] - place == 0

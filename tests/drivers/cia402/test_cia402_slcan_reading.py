@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.drivers.cia402.link import BulkSlcanBus, CanLink
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceError, DeviceProtocolError
 
 POSITIONS = (0x181, bytes.fromhex("0a000000ffffffff"))
@@ -20,11 +21,11 @@ def heard(data):
     with ours, theirs:
         theirs.sendall(data)
         bus = object.__new__(BulkSlcanBus)
-        bus._buffer, bus._held, bus._queue = bytearray(), None, queue.SimpleQueue()
+        bus._buffer, bus._batch, bus._queue = bytearray(), None, queue.SimpleQueue()
         bus._is_shutdown, bus._can_protocol = True, CanProtocol.CAN_20
         bus._descriptor = ours.fileno()
         link = object.__new__(CanLink)
-        link.endpoint, link._bus = "an adapter", bus
+        link.endpoint, link._bus = Endpoint("drive", "an adapter"), bus
         results = []
         for _ in range(len(data) + 1):
             try:

@@ -8,8 +8,7 @@ import pytest
 from scripted_server import scripted_server
 
 from fitctl import config
-from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
-from fitctl.drivers.ensemble.probe import probe_ensemble
+from fitctl.drivers.ensemble.driver import EnsembleAmplifiers, probe_ensemble
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceFault,

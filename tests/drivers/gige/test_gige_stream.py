@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.stream import ASK_AGAIN_S, CompleteFrame, FrameAssembler
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
@@ -25,7 +26,9 @@ class Receiver:
 
     def __init__(self) -> None:
         self.asked: list[protocol.Resend] = []
-        self.assembler = FrameAssembler(40, 30, MONO16, 576, "test", self.asked.append)
+        self.assembler = FrameAssembler(
+            40, 30, MONO16, 576, Endpoint("camera", "test"), self.asked.append
+        )
 
     def take(self, *packets: bytes) -> list[CompleteFrame]:
         frames = [self.assembler.add(memoryview(packet)) for packet in packets]

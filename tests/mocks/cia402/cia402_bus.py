@@ -9,7 +9,7 @@ from mock_bench import ToldMotors
 from fitctl import config
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.protocol import State
-from fitctl.mocks.cia402 import slcan_frames
+from fitctl.mocks.cia402 import slcan
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 
 COUNT_RAD = 2 * math.pi / 4000
@@ -46,20 +46,18 @@ class Bus:
         self._writer.close()
 
     def send(self, can_id, data=""):
-        self._writer.write(
-            slcan_frames.encode_frame(slcan_frames.CanFrame(can_id, bytes.fromhex(data)))
-        )
+        self._writer.write(slcan.encode_frame(slcan.CanFrame(can_id, bytes.fromhex(data))))
 
     def ask_for(self, can_id):
         """A remote frame."""
-        self._writer.write(slcan_frames.encode_frame(slcan_frames.CanFrame(can_id, b"", False, 8)))
+        self._writer.write(slcan.encode_frame(slcan.CanFrame(can_id, b"", False, 8)))
 
     async def frame(self, timeout_s=3.0):
         async with asyncio.timeout(timeout_s):
             while True:
                 line = (await self._reader.readuntil(b"\r"))[:-1].lstrip(b"\a")
                 if line not in {b"", b"z"}:
-                    frame = slcan_frames.decode_frame(line)
+                    frame = slcan.decode_frame(line)
                     return frame.can_id, frame.data.hex(" ")
 
     async def see(self, can_id, data):

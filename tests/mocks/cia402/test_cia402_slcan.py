@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fitctl.config import Fault
-from fitctl.mocks.cia402.slcan import SlcanAdapter
-from fitctl.mocks.cia402.slcan_frames import CanFrame, decode_frame, encode_frame
+from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter, decode_frame, encode_frame
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 
 frames = st.builds(
@@ -85,7 +84,7 @@ class Wire:
 
 
 async def connect(adapter):
-    port = adapter._server.sockets[0].getsockname()[1]
+    port = adapter._listener.sockets[0].getsockname()[1]
     return Wire(*await asyncio.open_connection("127.0.0.1", port))
 
 
@@ -209,7 +208,7 @@ def test_frames_are_stamped_with_milliseconds_where_that_is_wanted():
 def test_a_client_that_does_not_read_is_told_that_frames_were_lost():
     async def script(_received, adapter, wire):
         await wire.tell(b"S8\rO\r", b"\r\r")
-        (client,) = adapter.clients
+        (client,) = adapter.links
         client.transport.set_write_buffer_limits(high=0)
         for _ in range(2_000_000):
             adapter.send(0x181, bytes(8))

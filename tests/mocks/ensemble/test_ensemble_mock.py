@@ -15,8 +15,7 @@ from fitctl import config
 from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
 from fitctl.mocks.ensemble.axis import Axis
 from fitctl.mocks.ensemble.commands import Interpreter, words_of
-from fitctl.mocks.ensemble.controller import EnsembleControllerMock
-from fitctl.mocks.ensemble.line import LineSplitter
+from fitctl.mocks.ensemble.controller import EnsembleControllerMock, LineSplitter
 
 RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
 SIDEROSTAT = RIG.loops["right"].siderostat

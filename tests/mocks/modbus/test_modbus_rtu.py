@@ -9,9 +9,10 @@ import pytest
 from mock_bench import in_a_loop
 
 from fitctl.config import Fault
+from fitctl.drivers.modbus import rtu_frame
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu
-from fitctl.mocks.modbus.pdu import HOLDING_REGISTERS, DataModel
+from fitctl.mocks.modbus.pdu import DataModel
 
 READ = bytes.fromhex("01 03 00 00 00 01 84 0a")
 WRITE = bytes.fromhex("01 06 00 00 12 34 84 bd")
@@ -24,7 +25,7 @@ class Line:
         self.register = 7
         self.written = asyncio.Event()
         self.faults = Faults(WIRE_FAULTS)
-        model = DataModel({HOLDING_REGISTERS: {0}}, lambda *_: [self.register], self._write, ())
+        model = DataModel({0}, lambda *_: [self.register], self._write, ())
         self.server = rtu.ModbusRtuServer(model, self.faults, unit=1, baud_rate=baud_rate)
         self._came = asyncio.Queue()
 
@@ -50,7 +51,7 @@ class Line:
         await asyncio.sleep(0.1)
         return self._came.empty()
 
-    def _write(self, table, address, values):
+    def _write(self, address, values):
         self.register = values[0]
         self.written.set()
 
@@ -80,19 +81,19 @@ async def test_a_request_is_answered():
 @in_a_loop
 async def test_an_exception_is_framed_too():
     async with line() as master:
-        master.send(rtu.frame(1, bytes.fromhex("03 00 05 00 01")))
-        assert await master.hears() == rtu.frame(1, bytes.fromhex("83 02")).hex(" ")
+        master.send(rtu_frame(1, bytes.fromhex("03 00 05 00 01")))
+        assert await master.hears() == rtu_frame(1, bytes.fromhex("83 02")).hex(" ")
 
 
 @pytest.mark.parametrize(
     "frame",
     [
-        rtu.frame(2, READ[1:-2]),
+        rtu_frame(2, READ[1:-2]),
         READ[:-1] + b"\0",
         READ[:-1],
         READ + b"\x55",
         bytes(400),
-        rtu.frame(0, READ[1:-2]),
+        rtu_frame(0, READ[1:-2]),
     ],
     ids=["another unit", "wrong check", "cut off", "a byte too many", "a flood", "to all: a read"],
 )
@@ -108,7 +109,7 @@ async def test_what_is_not_for_it_or_not_whole_gets_no_answer_and_does_no_harm(f
 @in_a_loop
 async def test_a_write_to_all_is_obeyed_and_not_answered():
     async with line() as master:
-        master.send(rtu.frame(0, WRITE[1:-2]))
+        master.send(rtu_frame(0, WRITE[1:-2]))
         await asyncio.wait_for(master.written.wait(), 5)
         assert await master.hears_nothing()
         assert master.register == 0x1234
