@@ -128,7 +128,7 @@ bench-loop: $(READY) $(PYRTC)/.ready  ## From the last packet to the D/A at 50 t
 	    --pyrtc-example $(PYRTC)/source/examples/synthetic_shwfs $(ARGS)
 
 # An environment of its own: pyRTC's package brings a module `benchmarks` too. Its example is in the source alone.
-$(PYRTC)/.ready: $(READY) requirements/pyrtc.lock
+$(PYRTC)/.ready: requirements/pyrtc.lock | $(READY)
 	@echo "Getting pyRTC ..."
 	@rm -rf $(PYRTC)
 	@$(PYTHON) -m venv $(PYRTC)
