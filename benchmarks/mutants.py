@@ -199,13 +199,19 @@ def _end_session(process: subprocess.Popen[str]) -> None:
 
 
 def ordered(tests: tuple[str, ...], path: str) -> tuple[str, ...]:
-    """The tests, those first whose file names the module."""
-    own = [
-        str(file.relative_to(ROOT))
-        for folder in dict.fromkeys(tests)
-        for file in sorted((ROOT / folder).rglob(f"test_*{Path(path).stem}*.py"))
+    """The tests as files, those first whose name has the module's.
+
+    pytest given a file and the folder in which it lies runs the file only.
+    """
+    found = [
+        file
+        for name in tests
+        for file in (
+            [ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("test_*.py"))
+        )
     ]
-    return tuple(dict.fromkeys((*own, *tests)))
+    found.sort(key=lambda file: Path(path).stem not in file.name)
+    return tuple(dict.fromkeys(str(file.relative_to(ROOT)) for file in found))
 
 
 def try_mutant(copy: Copy, mutant: Mutant, limit_s: float) -> Outcome:
