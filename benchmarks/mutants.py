@@ -40,13 +40,13 @@ from mutmut.mutation.mutators import mutation_operators
 ROOT = Path(__file__).parents[1]
 _LOOP_TESTS = ("tests/loop", "tests/stages", "tests/supervisor", "tests/simulation")
 _AMPLIFIERS = "tests/drivers/test_servo_amplifier_contract.py"
-# Where code is mutated, below fitctl/, and the tests that run for it; those that most likely fail come first.
+# Where code is mutated, below fitctl/, and the tests that run for it, as patterns of files and folders.
 TESTS = {
     "controllers": ("tests/controllers",),
     "loop": _LOOP_TESTS,
     "stages": ("tests/stages", *_LOOP_TESTS),
     "supervisor": ("tests/supervisor", *_LOOP_TESTS),
-    "logging": ("tests/logging",),
+    "logging": ("tests/logging", "tests/**/test_cli_log.py"),
     "drivers": ("tests/drivers", "tests/mocks"),
     "drivers/bal_analog": ("tests/drivers/bal_analog", _AMPLIFIERS, "tests/mocks/bal_analog"),
     "drivers/cia402": ("tests/drivers/cia402", _AMPLIFIERS, "tests/mocks/cia402"),
@@ -240,7 +240,7 @@ def limits_s(copy: Copy, rooms: list[str]) -> dict[str, float]:
     """How long each room's tests may take; ends the program if they fail without a mutant."""
     limits = {}
     for room in rooms:
-        tests = tuple(dict.fromkeys(TESTS[room]))
+        tests = ordered(TESTS[room], "")
         for _ in range(TRIES):
             started_s = time.monotonic()
             status, by = copy.test(tests, 1800.0)
