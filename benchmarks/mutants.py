@@ -40,13 +40,13 @@ from mutmut.mutation.mutators import mutation_operators
 ROOT = Path(__file__).parents[1]
 _LOOP_TESTS = ("tests/loop", "tests/stages", "tests/supervisor", "tests/simulation")
 _AMPLIFIERS = "tests/drivers/test_servo_amplifier_contract.py"
-# Where code is mutated, below fitctl/, and the tests that run for it; those that most likely fail come first.
+# Where code is mutated, below fitctl/, and the tests that run for it, as patterns of files and folders.
 TESTS = {
     "controllers": ("tests/controllers",),
     "loop": _LOOP_TESTS,
     "stages": ("tests/stages", *_LOOP_TESTS),
     "supervisor": ("tests/supervisor", *_LOOP_TESTS),
-    "logging": ("tests/logging",),
+    "logging": ("tests/logging", "tests/**/test_cli_log.py"),
     "drivers": ("tests/drivers", "tests/mocks"),
     "drivers/bal_analog": ("tests/drivers/bal_analog", _AMPLIFIERS, "tests/mocks/bal_analog"),
     "drivers/cia402": ("tests/drivers/cia402", _AMPLIFIERS, "tests/mocks/cia402"),
@@ -199,13 +199,19 @@ def _end_session(process: subprocess.Popen[str]) -> None:
 
 
 def ordered(tests: tuple[str, ...], path: str) -> tuple[str, ...]:
-    """The tests, those first whose file names the module."""
-    own = [
-        str(file.relative_to(ROOT))
-        for folder in dict.fromkeys(tests)
-        for file in sorted((ROOT / folder).rglob(f"test_*{Path(path).stem}*.py"))
+    """The tests as files, those first whose name has the module's.
+
+    pytest given a file and the folder in which it lies runs the file only.
+    """
+    found = [
+        file
+        for name in tests
+        for file in (
+            [ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("test_*.py"))
+        )
     ]
-    return tuple(dict.fromkeys((*own, *tests)))
+    found.sort(key=lambda file: Path(path).stem not in file.name)
+    return tuple(dict.fromkeys(str(file.relative_to(ROOT)) for file in found))
 
 
 def try_mutant(copy: Copy, mutant: Mutant, limit_s: float) -> Outcome:
@@ -234,7 +240,7 @@ def limits_s(copy: Copy, rooms: list[str]) -> dict[str, float]:
     """How long each room's tests may take; ends the program if they fail without a mutant."""
     limits = {}
     for room in rooms:
-        tests = tuple(dict.fromkeys(TESTS[room]))
+        tests = ordered(TESTS[room], "")
         for _ in range(TRIES):
             started_s = time.monotonic()
             status, by = copy.test(tests, 1800.0)

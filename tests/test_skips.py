@@ -27,7 +27,9 @@ SKIPPED_MODULE = """
 
 
 def run(pytester):
-    return pytester.runpytest("-p", "skips", "-p", "no:textual-snapshot", "-ra")
+    return pytester.runpytest(
+        "-p", "skips", "-p", "no:textual-snapshot", "-ra", "--import-mode=importlib"
+    )
 
 
 def test_with_ci_set_a_skipped_test_fails_with_its_reason(pytester, monkeypatch):
