@@ -133,9 +133,10 @@ def test_a_run_with_nothing_in_it_makes_a_page_that_says_so(rig, tmp_path):
 
     def course(simulation):
         simulation.run(1.0)
-        simulation._take(
+        simulation.supervisor.leave(
             Event(time_s=simulation.clock.now_s(), severity="error", source="x", message=evil)
         )
+        simulation.run(0.1)
 
     record(rig, path, course)
 

@@ -5,6 +5,7 @@ import msgspec
 from fitctl.clock import VirtualClock
 from fitctl.logging.records import Event, SequenceAttempt
 from fitctl.messages.commands import SequenceStatus
+from fitctl.stages.journal import Journal
 from fitctl.supervisor.sequence_board import SILENCE_S, SequenceBoard
 
 FIRST = SequenceStatus(run="a", name="first", state="running", steps=3, step_number=1)
@@ -18,7 +19,7 @@ ATTEMPT = SequenceAttempt(
 class Board(SequenceBoard):
     def __init__(self):
         self.clock, self.records = VirtualClock(), []
-        super().__init__(self.clock, self.records.append)
+        super().__init__(Journal(self.clock, self.records.append))
 
     def after(self, seconds):
         self.clock.sleep_until(self.clock.now_s() + seconds)

@@ -2,6 +2,7 @@
 
 import subprocess
 import time
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -50,8 +51,9 @@ def recorder_of(supervisor):
     end_s = time.monotonic() + START_S
     while time.monotonic() < end_s:
         for child in psutil.Process(supervisor.pid).children():
-            if "record" in child.cmdline():
-                return child
+            with suppress(psutil.NoSuchProcess):  # a design's process has ended
+                if "record" in child.cmdline():
+                    return child
         time.sleep(0.001)
     raise AssertionError("no recorder was started")
 
