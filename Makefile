@@ -37,12 +37,13 @@ $(READY): requirements/dev.lock pyproject.toml
 demo: $(READY)  ## Run the whole instrument on mock devices
 	@$(BIN)/fitctl demo $(ARGS)
 
-# A core's worth of the tests is waiting: type checks and the instrument in real time run beside the others.
-BESIDE := $(MAKE) --no-print-directory --jobs 3 --output-sync=target
+# Type checks run beside the tests that judge no real time; the whole instrument runs when they have ended.
+BESIDE := $(MAKE) --no-print-directory --jobs 2 --output-sync=target
 
 test: lint contract  ## Lint, import contract, types, tests
-	@echo "Types and tests, about four minutes ..."
-	@$(BESIDE) types test-instrument test-parts
+	@echo "Types and tests, about nine minutes ..."
+	@$(BESIDE) types test-parts
+	@$(MAKE) --no-print-directory test-instrument
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -58,14 +59,14 @@ pytest: $(READY)
 ifdef ARGS
 	$(BIN)/pytest $(ARGS)
 else
-	@$(BESIDE) test-instrument test-parts
+	@$(MAKE) --no-print-directory test-parts test-instrument
 endif
 
 test-instrument: $(READY)
 	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system
 
 test-parts: $(READY)
-	$(BIN)/pytest --numprocesses 3 --dist loadfile --ignore tests/system
+	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system
 
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
