@@ -39,7 +39,6 @@ from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus.rtu import frame as rtu_frame
-from fitctl.mocks.modbus.tcp import Adu
 from fitctl.mocks.modbus.tcp import frame as tcp_frame
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
 from fitctl.mocks.pty import Endpoints
@@ -186,7 +185,7 @@ def every_line() -> Iterator[Line]:
 
 
 def _adu(unit: int, pdu: bytes) -> bytes:
-    return tcp_frame(Adu(1, unit, pdu))
+    return tcp_frame(1, unit, pdu)
 
 
 # ---------------------------------------------------------------- asking

@@ -11,7 +11,6 @@ import numpy as np
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceError
-from fitctl.drivers.modbus import crc16, pop_message
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 from fitctl.drivers.modbus_dac.link import RtuLink, TcpLink, limit_receiving
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
@@ -48,8 +47,8 @@ def read_tcp(data: bytes) -> None:
     server = tcp.ModbusTcpServer(_MODEL, Faults(WIRE_FAULTS), unit=1, unknown_unit="refuse")
     pending = bytearray(data)
     try:
-        while (message := pop_message(pending)) is not None:
-            back = pop_message(bytearray(server.respond(message)))
+        while (message := tcp.pop_message(pending)) is not None:
+            back = tcp.pop_message(bytearray(server.respond(message)))
             if message.protocol == 0:
                 assert back is not None
                 assert (back.transaction, back.unit) == (message.transaction, message.unit)
@@ -63,7 +62,7 @@ def read_tcp(data: bytes) -> None:
 def read_rtu(data: bytes) -> None:
     """What comes between two silences gets a sound frame or nothing, whatever its check is."""
     server = rtu.ModbusRtuServer(_MODEL, Faults(WIRE_FAULTS), unit=1, baud_rate=115200)
-    for frame in (data, data + crc16(data)):
+    for frame in (data, data + rtu.crc16(data)):
         framed = server.respond(frame)
         assert not framed or rtu.parse_frame(framed) is not None
 
@@ -128,7 +127,7 @@ class _Port:
 
 def drive_rtu(data: bytes) -> None:
     """The driver on a serial port; once as the bytes are, once with a right check at their end."""
-    for said in (data, data + crc16(data)):
+    for said in (data, data + rtu.crc16(data)):
         link = RtuLink.__new__(RtuLink)
         link._unit, link._timeout_s = _DAC.device_id, _DAC.response_timeout_s
         link._silence_s = link._free_s = 0.0

@@ -68,6 +68,7 @@ _VERSIONED = (
     "pyzmq",
     "mcap",
     "python-can",
+    "pymodbus",
     "genicam",
 )
 

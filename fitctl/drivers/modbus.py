@@ -1,87 +1,65 @@
-"""Modbus frames, on TCP and on a serial line, and the request for a station's identity.
+"""pymodbus' codecs for the drivers, made strict: they return exact answers and reject everything else.
 
-Frames are those of MODBUS Messaging on TCP/IP V1.0b and of MODBUS over Serial Line V1.02 (RTU); function
-2B/0E is that of the MODBUS Application Protocol Specification V1.1b3. Pure codecs: bytes in, values out.
+pymodbus' framers and PDU classes encode requests and decode answers. They are made for pymodbus' own client,
+which expects one answer and nothing else: at a header of another protocol `FramerSocket` waits for more data
+without end, `FramerRTU` discards all pending bytes after a bad check or a good frame, and the PDU classes
+ignore surplus bytes. The functions here pass one frame at a time to the framers and check what they ignore.
 """
 
 from __future__ import annotations
 
-import struct
+import logging
 from typing import NamedTuple
 
-PDU_BYTES_MAX = 253
-READ_HOLDING_REGISTERS = 3
-WRITE_MULTIPLE_REGISTERS = 16
-READ_DEVICE_IDENTIFICATION = 43
-EXCEPTION_FLAG = 0x80
+from pymodbus.constants import DeviceInformation
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU, ReadDeviceInformationRequest
+from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
-_HEADER = struct.Struct(">HHHB")  # transaction, protocol, length from the unit on, unit
-_MEI_IDENTIFICATION = 0x0E
-_BASIC_STREAM = 1
+# Its log lines would repeat on stderr what the drivers' exceptions already report.
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
+
+ANSWER_BYTES_MAX = 260
+
+_DECODER = DecodePDU(is_server=False)
+TCP = FramerSocket(_DECODER)
+RTU = FramerRTU(_DECODER)
+
+_PROTOCOL_AND_LENGTH = slice(2, 6)  # of a TCP header; the protocol is 0
+_LENGTH_MIN, _LENGTH_MAX = 3, 254  # the unit and a PDU of 2 bytes (an exception) to 253
 _OBJECTS = 3
-_CRC_BYTES = 2
 
 
-class Message(NamedTuple):
-    """One message without its TCP frame; `protocol` is 0 for Modbus."""
+class Answer(NamedTuple):
+    """One answer without its TCP frame."""
 
     transaction: int
     unit: int
     pdu: bytes
-    protocol: int = 0
 
 
-def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
-    """A PDU in its TCP frame."""
-    return _HEADER.pack(transaction, 0, 1 + len(pdu), unit) + pdu
-
-
-def pop_message(pending: bytearray) -> Message | None:
-    """Remove the first whole TCP message from `pending`; None while there is none.
+def pop_answer(pending: bytearray) -> Answer | None:
+    """Remove the first whole TCP answer from `pending`; None while there is none.
 
     Raises
     ------
     ValueError
-        If no message can be that long, so that nobody knows where the next one begins.
+        If the header is not that of a Modbus answer, so that nobody knows where the next one begins.
     """
-    if len(pending) < _HEADER.size:
+    if len(pending) >= _PROTOCOL_AND_LENGTH.stop:
+        protocol_and_length = int.from_bytes(pending[_PROTOCOL_AND_LENGTH], "big")
+        if not _LENGTH_MIN <= protocol_and_length <= _LENGTH_MAX:
+            protocol, length = divmod(protocol_and_length, 1 << 16)
+            msg = f"protocol {protocol}, length {length}"
+            raise ValueError(msg)
+    size, unit, transaction, pdu = TCP.decode(bytes(pending))
+    if not size:
         return None
-    transaction, protocol, length, unit = _HEADER.unpack_from(pending)
-    if not 2 <= length <= 1 + PDU_BYTES_MAX:
-        msg = f"protocol {protocol}, length {length}"
-        raise ValueError(msg)
-    end = _HEADER.size - 1 + length
-    if len(pending) < end:
-        return None
-    pdu = bytes(pending[_HEADER.size : end])
-    del pending[:end]
-    return Message(transaction, unit, pdu, protocol)
+    del pending[:size]
+    return Answer(transaction, unit, pdu)
 
 
-def _crc_of_byte(crc: int) -> int:
-    for _ in range(8):
-        crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc
-
-
-_CRC = [_crc_of_byte(byte) for byte in range(256)]
-
-
-def crc16(data: bytes) -> bytes:
-    """The check of an RTU frame, low byte first (MODBUS over Serial Line V1.02, section 2.5.1.2)."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]
-    return crc.to_bytes(_CRC_BYTES, "little")
-
-
-def rtu_frame(unit: int, pdu: bytes) -> bytes:
-    """A PDU in its RTU frame."""
-    message = bytes([unit]) + pdu
-    return message + crc16(message)
-
-
-def take_rtu_answer(pending: bytearray, unit: int) -> bytes | None:
+def pop_rtu_answer(pending: bytearray, unit: int) -> bytes | None:
     """Remove the first whole RTU answer of a unit, and all before it, from `pending`; None while there is none.
 
     An RTU frame does not say how long it is: its function code does, and its check confirms that.
@@ -97,51 +75,66 @@ def take_rtu_answer(pending: bytearray, unit: int) -> bytes | None:
     bytes or None
         The answer's PDU.
     """
-    for begin in range(len(pending)):
+    for begin in range(len(pending) - RTU.MIN_SIZE + 1):
         if pending[begin] != unit:
             continue
-        size = _answer_bytes(pending[begin + 1 :])
-        end = begin + 1 + size + _CRC_BYTES
-        message = bytes(pending[begin : end - _CRC_BYTES])
-        if size and end <= len(pending) and crc16(message) == pending[end - _CRC_BYTES : end]:
-            del pending[:end]
-            return message[1:]
+        data = bytes(pending[begin:])
+        answer_class = _DECODER.lookupPduClass(data)
+        size = answer_class.calculateRtuFrameSize(data) if answer_class else 0
+        *_, pdu = RTU.decode(data[:size])
+        if pdu:
+            del pending[: begin + size]
+            return pdu
     return None
 
 
-def _answer_bytes(pdu: bytes | bytearray) -> int:
-    """How long the answer is that begins so; 0 if that cannot be known yet, or at all."""
-    function_code = pdu[0] if pdu else 0
-    size = 0
-    if function_code & EXCEPTION_FLAG:
-        size = 2
-    elif function_code == WRITE_MULTIPLE_REGISTERS:
-        size = 5
-    elif function_code == READ_HOLDING_REGISTERS and len(pdu) > 1:
-        size = 2 + pdu[1]
-    elif function_code == READ_DEVICE_IDENTIFICATION and len(pdu) > 6:
-        size = 7
-        for _ in range(pdu[6]):
-            if size + 1 >= len(pdu):
-                return 0
-            size += 2 + pdu[size + 1]
-    return size
+def encode_pdu(message: ModbusPDU) -> bytes:
+    """A request or an answer without a frame."""
+    return bytes([message.function_code]) + message.encode()
 
 
-def encode_identify() -> bytes:
+def decode_registers(pdu: bytes, function_code: int, count: int) -> list[int]:
+    """The registers in the answer of a function that reads some.
+
+    Raises
+    ------
+    ValueError
+        If it is not that answer, with that many registers and nothing else.
+    """
+    answer = _DECODER.decode(pdu)
+    if (
+        answer is None
+        or answer.function_code != function_code
+        or len(answer.registers) != count
+        or encode_pdu(answer) != pdu
+    ):
+        msg = f"{len(pdu)} bytes: {pdu[:32].hex(' ')}"
+        raise ValueError(msg)
+    return list(answer.registers)
+
+
+def decode_exception(pdu: bytes, function_code: int) -> int | None:
+    """The exception code with which a station refused a function; None if the PDU is no such refusal."""
+    answer = _DECODER.decode(pdu)
+    if answer is None or pdu != encode_pdu(ExceptionResponse(function_code, answer.exception_code)):
+        return None
+    return answer.exception_code
+
+
+def encode_identify() -> ReadDeviceInformationRequest:
     """The request for a station's basic identification."""
-    return bytes([READ_DEVICE_IDENTIFICATION, _MEI_IDENTIFICATION, _BASIC_STREAM, 0])
+    return ReadDeviceInformationRequest(read_code=DeviceInformation.BASIC)
 
 
 def decode_identity(pdu: bytes) -> list[str]:
     """Vendor, product and revision; empty where the answer does not have them."""
-    texts = [""] * _OBJECTS
-    if pdu[:2] != bytes([READ_DEVICE_IDENTIFICATION, _MEI_IDENTIFICATION]):
-        return texts
-    rest = pdu[7:]
-    while len(rest) >= 2 and len(rest) >= 2 + rest[1]:
-        number, size = rest[0], rest[1]
-        if number < _OBJECTS:
-            texts[number] = rest[2 : 2 + size].decode("ascii", "replace")
-        rest = rest[2 + size :]
-    return texts
+    answer = _DECODER.decode(pdu)
+    if not isinstance(answer, ReadDeviceInformationResponse):
+        return [""] * _OBJECTS
+    return [_text(answer.information.get(number, b"")) for number in range(_OBJECTS)]
+
+
+def _text(value: bytes | list[bytes]) -> str:
+    """An object of an identification, of which pymodbus makes a list where it comes more than once."""
+    last = value[-1] if isinstance(value, list) else value
+    return last.decode("ascii", "replace")

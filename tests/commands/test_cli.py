@@ -40,7 +40,7 @@ def test_the_version_is_said():
 
 
 def test_help_and_completion_of_commands_do_not_import_what_is_slow():
-    slow = ("numpy", "scipy", "control", "textual", "zmq", "can", "pydantic")
+    slow = ("numpy", "scipy", "control", "textual", "zmq", "can", "pydantic", "pymodbus")
     probe = (
         "import sys, fitctl.cli\n"
         "try: fitctl.cli.main(['--help'])\n"

@@ -15,15 +15,16 @@ import time
 from collections import deque
 from contextlib import closing
 
+from pymodbus.pdu import ReadHoldingRegistersRequest
+from pymodbus.pdu.register_message import ReadWriteMultipleRegistersRequest
+
 from fitctl.config import BalAnalogDevice, Siderostat
 from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, LinkedAmplifiers
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
     EXCEPTIONS,
-    decode_registers,
-    encode_exchange,
-    encode_read,
+    REGISTERS,
     lines,
     signed,
     unwrap,
@@ -38,10 +39,11 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     ServoReading,
 )
-from fitctl.drivers.modbus import EXCEPTION_FLAG, READ_HOLDING_REGISTERS, Message
+from fitctl.drivers.modbus import Answer, decode_exception, decode_registers
 from fitctl.drivers.probe import Probe, round_trip_s
 
 _STILL = (0.0, 0.0)
+_FUNCTION = ReadWriteMultipleRegistersRequest.function_code
 _MOST_OUTSTANDING = 100
 
 
@@ -148,10 +150,10 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         sent_s = self._request(link, velocity_rad_s)
         newest: ServoReading | None = None
         while self._outstanding:
-            message = link.receive(sent_s + self._period_s)
-            if message is None:
+            answer = link.receive(sent_s + self._period_s)
+            if answer is None:
                 break
-            newest = self._reading_of(message) or newest
+            newest = self._reading_of(answer) or newest
         if newest is None and sent_s - self._answered_s > self._device.response_timeout_s:
             raise self._silent()
         return newest
@@ -167,13 +169,16 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
             for wanted, rad_s_per_v in zip(wanted_rad_s, (scale.az, scale.el), strict=True)
         )
         enable = word_of(self._enable, self._enable, device.enabled_level)
-        pdu = encode_exchange(
-            device.first_input_register, device.first_output_register, [az, el, enable]
+        request = ReadWriteMultipleRegistersRequest(
+            read_address=device.first_input_register,
+            read_count=REGISTERS,
+            write_address=device.first_output_register,
+            write_registers=[az, el, enable],
         )
         sent_s = time.monotonic()
         if not self._outstanding:
             self._answered_s = sent_s
-        self._outstanding.append((link.send(pdu), sent_s))
+        self._outstanding.append((link.send(request), sent_s))
         return sent_s
 
     def _settle(self) -> ServoReading:
@@ -181,26 +186,26 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         link = self._opened()
         sent_s = self._request(link, _STILL)
         number = self._outstanding[-1][0]
-        while (message := link.receive(sent_s + self._device.response_timeout_s)) is not None:
-            reading = self._reading_of(message)
-            if reading is not None and message.transaction == number:
+        while (answer := link.receive(sent_s + self._device.response_timeout_s)) is not None:
+            reading = self._reading_of(answer)
+            if reading is not None and answer.transaction == number:
                 return reading
         raise self._silent()
 
     # ------------------------------------------------------------ answers
-    def _reading_of(self, message: Message) -> ServoReading | None:
+    def _reading_of(self, answer: Answer) -> ServoReading | None:
         """The reading in an answer; None if it answers no outstanding request."""
         sent_s = next(
-            (sent for number, sent in self._outstanding if number == message.transaction), None
+            (sent for number, sent in self._outstanding if number == answer.transaction), None
         )
         if sent_s is None:
             return None
-        while self._outstanding.popleft()[0] != message.transaction:
+        while self._outstanding.popleft()[0] != answer.transaction:
             pass
         now_s = self._answered_s = time.monotonic()
-        self._check_unit_and_exception(message)
+        self._check_unit_and_exception(answer)
         try:
-            az, el, faults = decode_registers(message.pdu)
+            az, el, faults = decode_registers(answer.pdu, _FUNCTION, REGISTERS)
         except ValueError as error:
             raise self._opened().nonsense("three registers", str(error)) from None
         self._counts = self._count((az, el), now_s)
@@ -218,15 +223,17 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
             fault=fault,
         )
 
-    def _check_unit_and_exception(self, message: Message) -> None:
-        if message.unit != self._device.device_id:
-            got = f"unit {message.unit}"
+    def _check_unit_and_exception(self, answer: Answer) -> None:
+        if answer.unit != self._device.device_id:
+            got = f"unit {answer.unit}"
             raise self._opened().nonsense(f"unit {self._device.device_id}", got)
-        if len(message.pdu) == 2 and message.pdu[0] & EXCEPTION_FLAG:
-            code = message.pdu[1]
+        if answer.pdu[0] == _FUNCTION:
+            return
+        code = decode_exception(answer.pdu, _FUNCTION)
+        if code is not None:
             raise self._endpoint.error(
                 DeviceRefused,
-                "function 23 to be carried out",
+                f"function {_FUNCTION} to be carried out",
                 f"exception {code:02X}, {EXCEPTIONS.get(code, 'see the station manual')}",
                 "check device_id, first_output_register and first_input_register",
             )
@@ -274,14 +281,14 @@ def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
     device = siderostat.device
     with closing(ModbusLink(device)) as link:
         identity = link.identify()
-        read = encode_read(device.first_input_register)
+        read = ReadHoldingRegistersRequest(address=device.first_input_register, count=REGISTERS)
         answer = link.ask(read)
         if not answer:
             expected = f"an answer within {device.response_timeout_s:g} s"
             hint = "check siderostat.device.device_id"
             raise DeviceTimeout(DEVICE, device.endpoint, expected, "none", hint)
         try:
-            _, _, faults = decode_registers(answer, READ_HOLDING_REGISTERS)
+            _, _, faults = decode_registers(answer, read.function_code, REGISTERS)
         except ValueError as error:
             hint = "check siderostat.device.first_input_register"
             raise DeviceRefused(

@@ -9,19 +9,20 @@ import select
 import socket
 import time
 
+from pymodbus.pdu import ModbusPDU
+
 from fitctl.config import BalAnalogDevice
 from fitctl.drivers.amplifiers import DEVICE
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
 from fitctl.drivers.modbus import (
-    Message,
+    ANSWER_BYTES_MAX,
+    TCP,
+    Answer,
     decode_identity,
     encode_identify,
-    frame,
-    pop_message,
+    pop_answer,
 )
-
-_MESSAGE_BYTES_MAX = 260
 
 
 class ModbusLink:
@@ -55,7 +56,7 @@ class ModbusLink:
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def send(self, pdu: bytes) -> int:
+    def send(self, request: ModbusPDU) -> int:
         """Send a request; returns the number that its answer will have.
 
         Raises
@@ -63,13 +64,14 @@ class ModbusLink:
         DeviceUnreachable
         """
         self._transaction = self._transaction + 1 & 0xFFFF
+        request.transaction_id, request.dev_id = self._transaction, self._device.device_id
         try:
-            self._socket.sendall(frame(self._transaction, self._device.device_id, pdu))
+            self._socket.sendall(TCP.buildFrame(request))
         except OSError as error:
             raise self._broken(str(error)) from error
         return self._transaction
 
-    def receive(self, deadline_s: float) -> Message | None:
+    def receive(self, deadline_s: float) -> Answer | None:
         """The next answer; None when none is complete by `deadline_s`.
 
         Raises
@@ -78,36 +80,34 @@ class ModbusLink:
         """
         while True:
             try:
-                message = pop_message(self._pending)
+                answer = pop_answer(self._pending)
             except ValueError as error:
                 raise self.nonsense("a Modbus header", str(error)) from None
-            if message is not None:
-                if message.protocol != 0:
-                    raise self.nonsense("a Modbus header", f"protocol {message.protocol}")
-                return message
+            if answer is not None:
+                return answer
             try:
                 left_s = max(0.0, deadline_s - time.monotonic())
                 if not select.select([self._socket], [], [], left_s)[0]:
                     return None
-                data = self._socket.recv(_MESSAGE_BYTES_MAX)
+                data = self._socket.recv(ANSWER_BYTES_MAX)
             except (OSError, ValueError) as error:  # ValueError: closed before
                 raise self._broken(str(error)) from error
             if not data:
                 raise self._broken("closed by the station")
             self._pending += data
 
-    def ask(self, pdu: bytes) -> bytes:
-        """The answer to a request; empty when none comes within `response_timeout_s`.
+    def ask(self, request: ModbusPDU) -> bytes:
+        """The answer's PDU to a request; empty when none comes within `response_timeout_s`.
 
         Raises
         ------
         DeviceUnreachable, DeviceProtocolError
         """
-        number = self.send(pdu)
+        number = self.send(request)
         deadline_s = time.monotonic() + self._device.response_timeout_s
-        while (message := self.receive(deadline_s)) is not None:
-            if message.transaction == number:
-                return message.pdu
+        while (answer := self.receive(deadline_s)) is not None:
+            if answer.transaction == number:
+                return answer.pdu
         return b""
 
     def identify(self) -> DeviceIdentity:

@@ -8,15 +8,9 @@ before digital, as stations map them.
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Sequence
-
-from fitctl.drivers.modbus import READ_HOLDING_REGISTERS
 
 REGISTERS = 3
 COUNTER_MODULUS = 1 << 16
-
-READ_WRITE_MULTIPLE_REGISTERS = 23
 
 EXCEPTIONS = {
     0x01: "illegal function: the station does not know function 23",
@@ -27,43 +21,6 @@ EXCEPTIONS = {
     0x0A: "gateway path unavailable",
     0x0B: "gateway target does not respond",
 }
-
-
-def encode_exchange(first_input: int, first_output: int, outputs: Sequence[int]) -> bytes:
-    """The request of function 23: write three registers, then read three."""
-    return struct.pack(
-        f">BHHHHB{REGISTERS}H",
-        READ_WRITE_MULTIPLE_REGISTERS,
-        first_input,
-        REGISTERS,
-        first_output,
-        REGISTERS,
-        2 * REGISTERS,
-        *outputs,
-    )
-
-
-def encode_read(first_input: int) -> bytes:
-    """The request of function 03 for the three input registers."""
-    return struct.pack(">BHH", READ_HOLDING_REGISTERS, first_input, REGISTERS)
-
-
-def decode_registers(pdu: bytes, function_code: int = READ_WRITE_MULTIPLE_REGISTERS) -> list[int]:
-    """The three registers in the answer of a function.
-
-    Raises
-    ------
-    ValueError
-        If it is not that answer.
-    """
-    try:
-        code, size, *registers = struct.unpack(f">BB{REGISTERS}H", pdu)
-    except struct.error:
-        code, size, registers = 0, 0, []
-    if (code, size) != (function_code, 2 * REGISTERS):
-        msg = f"{len(pdu)} bytes: {pdu[:16].hex(' ')}"
-        raise ValueError(msg)
-    return registers
 
 
 def velocity_to_counts(

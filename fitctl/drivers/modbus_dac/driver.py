@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from pymodbus.pdu import ModbusPDU, ReadHoldingRegistersRequest
+from pymodbus.pdu.register_message import (
+    WriteMultipleRegistersRequest,
+    WriteMultipleRegistersResponse,
+)
 
 from fitctl.config import ModbusDacDevice
 from fitctl.drivers.interface import (
@@ -14,17 +19,19 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
-from fitctl.drivers.modbus import EXCEPTION_FLAG, decode_identity, encode_identify
+from fitctl.drivers.modbus import (
+    decode_exception,
+    decode_identity,
+    decode_registers,
+    encode_identify,
+    encode_pdu,
+)
 from fitctl.drivers.modbus_dac.link import Link, NonsenseError, RtuLink, TcpLink
 from fitctl.drivers.modbus_dac.protocol import (
     CHANNELS,
     EXCEPTIONS,
     decode_counts,
-    decode_read,
-    encode_read,
     encode_volts,
-    encode_write,
-    encode_written,
 )
 
 _NAME = "D/A"
@@ -51,8 +58,10 @@ class ModbusDac:
         self._dac = dac
         self._endpoint = dac.endpoint
         self._link: Link | None = None
-        self._written = encode_written(dac.first_register)
-        self._unconfirmed = b""
+        self._written = encode_pdu(
+            WriteMultipleRegistersResponse(address=dac.first_register, count=CHANNELS)
+        )
+        self._unconfirmed: ModbusPDU | None = None
 
     def open(self) -> DeviceIdentity:
         """Connect, and read the three registers to see that they exist; outputs stay as they are.
@@ -97,7 +106,7 @@ class ModbusDac:
         dac = self._dac
         counts = encode_volts(volts.tolist(), dac.full_scale_v, dac.bits)
         self.confirm()
-        self._send(encode_write(dac.first_register, counts))
+        self._send(WriteMultipleRegistersRequest(address=dac.first_register, registers=counts))
 
     def confirm(self) -> None:
         """Wait for the answer to the last :meth:`send_v`, no longer than `response_timeout_s`.
@@ -106,9 +115,9 @@ class ModbusDac:
         ------
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
-        if not self._unconfirmed:
+        if self._unconfirmed is None:
             return
-        answer = self._receive()
+        answer = self._receive(self._unconfirmed)
         if answer != self._written:
             raise self._nonsense(
                 f"{CHANNELS} registers written from {self._dac.first_register} on", answer.hex(" ")
@@ -142,15 +151,16 @@ class ModbusDac:
 
     def read_counts(self) -> list[int]:
         """Read the registers once; raises as :meth:`read_v`, which reads more than once."""
-        answer = self._ask(encode_read(self._dac.first_register))
+        request = ReadHoldingRegistersRequest(address=self._dac.first_register, count=CHANNELS)
+        answer = self._ask(request)
         try:
-            return decode_read(answer)
+            return decode_registers(answer, request.function_code, CHANNELS)
         except ValueError as error:
             raise self._nonsense(f"{CHANNELS} registers", str(error)) from None
 
     def close(self) -> None:
         """Disconnect; outputs stay as they are, until the station's own watchdog acts."""
-        link, self._link, self._unconfirmed = self._link, None, b""
+        link, self._link, self._unconfirmed = self._link, None, None
         if link is not None:
             link.close()
 
@@ -169,12 +179,12 @@ class ModbusDac:
         maker, model, firmware = decode_identity(answer)
         return DeviceIdentity(maker, model, "", firmware)
 
-    def _ask(self, request: bytes) -> bytes:
+    def _ask(self, request: ModbusPDU) -> bytes:
         self.confirm()
         self._send(request)
-        return self._receive()
+        return self._receive(request)
 
-    def _send(self, request: bytes) -> None:
+    def _send(self, request: ModbusPDU) -> None:
         if self._link is None:
             raise DeviceUnreachable(
                 _NAME, self._endpoint, "an open connection", "none", "open it again"
@@ -185,10 +195,10 @@ class ModbusDac:
             raise self._broken(error) from error
         self._unconfirmed = request
 
-    def _receive(self) -> bytes:
-        """The answer to the request that was just sent, if it is one to its function and no refusal."""
-        request, self._unconfirmed = self._unconfirmed, b""
-        function_code = request[0]
+    def _receive(self, request: ModbusPDU) -> bytes:
+        """The answer's PDU to the request that was just sent, if it is one to its function and no refusal."""
+        self._unconfirmed = None
+        function_code = request.function_code
         expected = f"an answer to function {function_code}"
         if self._link is None:
             raise DeviceUnreachable(
@@ -210,14 +220,15 @@ class ModbusDac:
             )
         if answer[0] == function_code:
             return answer
-        if answer[0] != function_code | EXCEPTION_FLAG or len(answer) != 2:
+        code = decode_exception(answer, function_code)
+        if code is None:
             raise self._nonsense(expected, answer[:32].hex(" "))
-        name, hint = EXCEPTIONS.get(answer[1], ("an unknown exception", "see the station's manual"))
+        name, hint = EXCEPTIONS.get(code, ("an unknown exception", "see the station's manual"))
         raise DeviceRefused(
             _NAME,
             self._endpoint,
             f"function {function_code} to be carried out",
-            f"exception {answer[1]:02X}, {name}",
+            f"exception {code:02X}, {name}",
             hint,
         )
 

@@ -13,19 +13,14 @@ import time
 from typing import Protocol
 
 import serial
+from pymodbus.pdu import ModbusPDU
 
 from fitctl.config import ModbusDacDevice
-from fitctl.drivers.modbus import (
-    EXCEPTION_FLAG,
-    frame,
-    pop_message,
-    rtu_frame,
-    take_rtu_answer,
-)
+from fitctl.drivers.modbus import ANSWER_BYTES_MAX, RTU, TCP, pop_answer, pop_rtu_answer
 from fitctl.drivers.modbus_dac.protocol import rtu_silence_s
 
 _RECEIVE_BYTES = 4096
-_MESSAGE_BYTES_MAX = 260
+_EXCEPTION_FLAG = 0x80
 
 
 class NonsenseError(Exception):
@@ -35,7 +30,7 @@ class NonsenseError(Exception):
 class Link(Protocol):
     """One wire to one station. All errors of the wire itself are :class:`OSError`."""
 
-    def send(self, pdu: bytes) -> None:
+    def send(self, request: ModbusPDU) -> None:
         """Send a request; whatever came before it is no answer to it."""
         ...
 
@@ -74,10 +69,11 @@ class TcpLink:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         limit_receiving(self._socket, dac.response_timeout_s)
 
-    def send(self, pdu: bytes) -> None:
+    def send(self, request: ModbusPDU) -> None:
         """Send a request under a new transaction number."""
         self._transaction = self._transaction + 1 & 0xFFFF
-        self._socket.sendall(frame(self._transaction, self._unit, pdu))
+        request.transaction_id, request.dev_id = self._transaction, self._unit
+        self._socket.sendall(TCP.buildFrame(request))
 
     def receive(self) -> bytes | None:
         """The answer with the request's number; answers with other numbers are thrown away."""
@@ -93,13 +89,11 @@ class TcpLink:
                 raise ConnectionResetError("closed by the station")
             self._pending += data
             try:
-                while (message := pop_message(self._pending)) is not None:
-                    if message.protocol != 0:
-                        raise NonsenseError(f"protocol {message.protocol}")
-                    if message.transaction == self._transaction:
-                        if message.unit != self._unit:
-                            raise NonsenseError(f"an answer of unit {message.unit}")
-                        return message.pdu
+                while (answer := pop_answer(self._pending)) is not None:
+                    if answer.transaction == self._transaction:
+                        if answer.unit != self._unit:
+                            raise NonsenseError(f"an answer of unit {answer.unit}")
+                        return answer.pdu
             except ValueError as error:
                 raise NonsenseError(str(error)) from None
             # An answer that comes whole never gets here: the kernel has kept its time limit.
@@ -144,14 +138,15 @@ class RtuLink:
             exclusive=True,
         )
 
-    def send(self, pdu: bytes) -> None:
+    def send(self, request: ModbusPDU) -> None:
         """Send a request once the line has been silent for long enough."""
         wait_s = self._free_s - time.monotonic()
         if wait_s > 0:
             time.sleep(wait_s)
         self._port.read(self._port.in_waiting)  # late, or twice: no answer to what follows
-        self._function_code = pdu[0]
-        self._port.write(rtu_frame(self._unit, pdu))
+        self._function_code = request.function_code
+        request.dev_id = self._unit
+        self._port.write(RTU.buildFrame(request))
 
     def receive(self) -> bytes | None:
         """The first answer of our unit to the request's function that passes its check."""
@@ -162,11 +157,11 @@ class RtuLink:
             data = self._port.read(max(1, self._port.in_waiting))
             pending += data
             heard += data
-            while (pdu := take_rtu_answer(pending, self._unit)) is not None:
-                if pdu[0] & ~EXCEPTION_FLAG == self._function_code:
+            while (pdu := pop_rtu_answer(pending, self._unit)) is not None:
+                if pdu[0] & ~_EXCEPTION_FLAG == self._function_code:
                     self._free_s = time.monotonic() + self._silence_s
                     return pdu
-            del pending[:-_MESSAGE_BYTES_MAX]
+            del pending[:-ANSWER_BYTES_MAX]
         if heard:
             raise NonsenseError(_shown(heard))
         return None

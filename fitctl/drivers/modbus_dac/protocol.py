@@ -6,7 +6,6 @@ Function and exception codes are those of the MODBUS Application Protocol Specif
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
 
 CHANNELS = 3
@@ -48,45 +47,6 @@ def rtu_silence_s(baud_rate: int) -> float:
     if baud_rate > 19200:
         return _SILENCE_FROM_19200_BAUD_S
     return _SILENT_CHARACTERS * 11 / baud_rate
-
-
-_WRITE = struct.Struct(f">BHHB{CHANNELS}H")
-_WRITTEN = struct.Struct(">BHH")
-_READ = struct.Struct(">BHH")
-_REGISTERS = struct.Struct(f">BB{CHANNELS}H")
-
-
-def encode_write(first_register: int, counts: Sequence[int]) -> bytes:
-    """The request that sets all channels at once, by function 16."""
-    return _WRITE.pack(WRITE_MULTIPLE_REGISTERS, first_register, CHANNELS, 2 * CHANNELS, *counts)
-
-
-def encode_written(first_register: int) -> bytes:
-    """The answer to :func:`encode_write` that says that it was done."""
-    return _WRITTEN.pack(WRITE_MULTIPLE_REGISTERS, first_register, CHANNELS)
-
-
-def encode_read(first_register: int) -> bytes:
-    """The request for what the channels are set to, by function 03."""
-    return _READ.pack(READ_HOLDING_REGISTERS, first_register, CHANNELS)
-
-
-def decode_read(pdu: bytes) -> list[int]:
-    """The counts in the answer to :func:`encode_read`.
-
-    Raises
-    ------
-    ValueError
-        If it is not that answer.
-    """
-    try:
-        function_code, size, *counts = _REGISTERS.unpack(pdu)
-    except struct.error:
-        function_code = size = 0
-    if (function_code, size) != (READ_HOLDING_REGISTERS, 2 * CHANNELS):
-        msg = f"{len(pdu)} bytes: {pdu[:32].hex(' ')}"
-        raise ValueError(msg)
-    return counts
 
 
 def counts_max(bits: int) -> int:

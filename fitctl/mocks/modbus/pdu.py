@@ -13,6 +13,8 @@ from typing import Any
 
 from fitctl.drivers.modbus_dac import protocol
 
+PDU_BYTES_MAX = 253
+
 _MEI_IDENTIFICATION = 0x0E
 _BASIC_STREAM_AND_SINGLE = 0x81  # conformity level: the three basic objects, both ways to ask
 _SINGLE_OBJECT = 4

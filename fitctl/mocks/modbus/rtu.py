@@ -5,15 +5,30 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from fitctl.drivers.modbus import PDU_BYTES_MAX, crc16, rtu_frame
 from fitctl.drivers.modbus_dac.protocol import rtu_silence_s
 from fitctl.mocks.faults import Faults, Wire
-from fitctl.mocks.modbus.pdu import BROADCAST_FUNCTIONS, DataModel, answer
+from fitctl.mocks.modbus.pdu import BROADCAST_FUNCTIONS, PDU_BYTES_MAX, DataModel, answer
 from fitctl.mocks.pty import Pty
 
 _BROADCAST = 0
 _BITS_PER_BYTE = 11  # start, eight data, parity or a second stop, stop
 _FRAME_BYTES_MAX = 1 + PDU_BYTES_MAX + 2
+
+
+def crc16(data: bytes) -> bytes:
+    """The check of a frame, low byte first (section 2.5.1.2)."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+def frame(unit: int, pdu: bytes) -> bytes:
+    """A PDU in its frame."""
+    message = bytes([unit]) + pdu
+    return message + crc16(message)
 
 
 def parse_frame(data: bytes) -> tuple[int, bytes] | None:
@@ -74,7 +89,7 @@ class ModbusRtuServer:
             if request[0] in BROADCAST_FUNCTIONS:
                 answer(request, self._model)
             return b""
-        return rtu_frame(unit, answer(request, self._model)) if unit == self._unit else b""
+        return frame(unit, answer(request, self._model)) if unit == self._unit else b""
 
     def _receive(self, data: bytes) -> None:
         if self._wire.dead or self._pty is None or not self._pty.is_at_our_baud_rate():

@@ -2,17 +2,54 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import struct
+from typing import Literal, NamedTuple
 
-from fitctl.drivers.modbus import Message, frame, pop_message
 from fitctl.drivers.modbus_dac.protocol import NO_SUCH_DEVICE
 from fitctl.mocks.faults import Faults
-from fitctl.mocks.modbus.pdu import DataModel, answer, exception
+from fitctl.mocks.modbus.pdu import PDU_BYTES_MAX, DataModel, answer, exception
 from fitctl.mocks.tcp import Link, TcpServer
 
 UnknownUnit = Literal["refuse", "ignore", "serve"]
 
 _THIS_DEVICE = {0, 0xFF}  # a server that is reached by its IP address alone needs no unit
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol, length from the unit on, unit
+
+
+class Message(NamedTuple):
+    """One message without its frame; `protocol` is 0 for Modbus."""
+
+    transaction: int
+    unit: int
+    pdu: bytes
+    protocol: int = 0
+
+
+def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
+    """A PDU in its frame."""
+    return _HEADER.pack(transaction, 0, 1 + len(pdu), unit) + pdu
+
+
+def pop_message(pending: bytearray) -> Message | None:
+    """Remove the first whole message from `pending`; None while there is none.
+
+    Raises
+    ------
+    ValueError
+        If no message can be that long, so that nobody knows where the next one begins.
+    """
+    if len(pending) < _HEADER.size:
+        return None
+    transaction, protocol, length, unit = _HEADER.unpack_from(pending)
+    if not 2 <= length <= 1 + PDU_BYTES_MAX:
+        msg = f"protocol {protocol}, length {length}"
+        raise ValueError(msg)
+    end = _HEADER.size - 1 + length
+    if len(pending) < end:
+        return None
+    pdu = bytes(pending[_HEADER.size : end])
+    del pending[:end]
+    return Message(transaction, unit, pdu, protocol)
 
 
 class ModbusTcpServer(TcpServer):

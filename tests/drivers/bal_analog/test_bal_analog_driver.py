@@ -16,7 +16,7 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
-from fitctl.drivers.modbus import frame, pop_message
+from fitctl.mocks.modbus.tcp import frame, pop_message
 
 STILL = (0.0, 0.0)
 MOCK = "mocks.loops.right.bal_analog"

@@ -6,71 +6,12 @@ from hypothesis import strategies as st
 
 from fitctl.drivers.bal_analog.protocol import (
     counts_to_volts,
-    decode_registers,
-    encode_exchange,
-    encode_read,
     lines,
     signed,
     unwrap,
     velocity_to_counts,
     word_of,
 )
-from fitctl.drivers.modbus import (
-    READ_HOLDING_REGISTERS,
-    Message,
-    decode_identity,
-    encode_identify,
-    frame,
-    pop_message,
-)
-
-
-def test_one_period_on_the_wire():
-    request = frame(0x1234, 1, encode_exchange(16, 0, [0x0001, 0xFFFF, 0x0003]))
-    assert request.hex(" ") == (
-        "12 34 00 00 00 11 01"  # 17 bytes to unit 1
-        " 17 00 10 00 03 00 00 00 03 06"  # read three from 16, write three from 0
-        " 00 01 ff ff 00 03"
-    )
-    answer = bytearray.fromhex("12 34 00 00 00 09 01 17 06 ff fe 00 05 00 02")
-    message = pop_message(answer)
-    assert message == Message(0x1234, 1, bytes.fromhex("17 06 ff fe 00 05 00 02"))
-    assert decode_registers(message.pdu) == [0xFFFE, 5, 2]
-    assert not answer
-
-
-def test_a_question_without_effect():
-    assert encode_read(16).hex(" ") == "03 00 10 00 03"
-    assert decode_registers(bytes.fromhex("03 06 0001 0002 0003"), READ_HOLDING_REGISTERS) == [
-        1,
-        2,
-        3,
-    ]
-    assert encode_identify().hex(" ") == "2b 0e 01 00"
-
-
-def test_who_answers():
-    answer = bytes.fromhex("2b 0e 01 81 00 00 03") + b"\x00\x04Acme\x01\x02IO\x02\x031.2"
-    assert decode_identity(answer) == ["Acme", "IO", "1.2"]
-    assert decode_identity(b"\xab\x01") == decode_identity(b"") == ["", "", ""]
-
-
-@given(st.integers(0, 0xFFFF), st.integers(0, 0xFF), st.binary(min_size=1, max_size=253))
-def test_frames_come_out_as_they_went_in(transaction, unit, pdu):
-    pending = bytearray(frame(transaction, unit, pdu) * 2)
-    assert pop_message(pending) == pop_message(pending) == Message(transaction, unit, pdu)
-    assert pop_message(pending) is None
-
-
-@given(st.binary(max_size=400))
-def test_any_bytes_are_messages_an_error_or_the_start_of_one(data):
-    pending = bytearray(data)
-    try:
-        while (message := pop_message(pending)) is not None:
-            decode_identity(message.pdu)
-            assert len(decode_registers(message.pdu)) == 3
-    except ValueError:
-        pass
 
 
 @given(st.floats(-1e6, 1e6), st.floats(0.1, 100) | st.floats(-100, -0.1))

@@ -23,9 +23,9 @@ from fitctl.drivers.interface import (
     DeviceTimeout,
     DeviceUnreachable,
 )
-from fitctl.drivers.modbus import rtu_frame
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 from fitctl.drivers.modbus_dac.protocol import WRITE_MULTIPLE_REGISTERS
+from fitctl.mocks.modbus import rtu
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
 
 RIG = load_rig(default_rig_path())
@@ -244,7 +244,7 @@ def repeating_line():
             request = os.read(ours, 300)
             counts = request[7:13] if request[1] == WRITE_MULTIPLE_REGISTERS else counts
             pdu = {3: bytes([3, 6]) + counts, 16: request[1:6]}.get(request[1], b"\xab\x01")
-            answer = rtu_frame(request[0], pdu)
+            answer = rtu.frame(request[0], pdu)
             os.write(ours, before)
             threading.Event().wait(0.002)
             os.write(ours, answer)

@@ -3,12 +3,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.framer.rtu import FramerRTU
 
-from fitctl.drivers.modbus import Message, crc16, frame, pop_message, rtu_frame
 from fitctl.drivers.modbus_dac.protocol import rtu_silence_s
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu
 from fitctl.mocks.modbus.pdu import DataModel
-from fitctl.mocks.modbus.tcp import ModbusTcpServer
+from fitctl.mocks.modbus.tcp import Message, ModbusTcpServer, frame, pop_message
 
 MESSAGES = st.builds(
     Message,
@@ -72,18 +71,18 @@ def test_any_bytes_leave_less_than_a_message_waiting(noise):
 
 def test_the_check_of_an_rtu_frame_is_the_standards():
     # The serial line guide's own example, then one that is printed everywhere.
-    assert crc16(bytes([2, 7])).hex(" ") == "41 12"
-    assert rtu_frame(1, bytes.fromhex("03 00 00 00 0a")).hex(" ") == "01 03 00 00 00 0a c5 cd"
+    assert rtu.crc16(bytes([2, 7])).hex(" ") == "41 12"
+    assert rtu.frame(1, bytes.fromhex("03 00 00 00 0a")).hex(" ") == "01 03 00 00 00 0a c5 cd"
 
 
 @given(st.binary(max_size=254))
 def test_another_implementation_finds_the_same_check(data):
-    assert crc16(data) == FramerRTU.compute_CRC(data).to_bytes(2, "big")
+    assert rtu.crc16(data) == FramerRTU.compute_CRC(data).to_bytes(2, "big")
 
 
 @given(st.integers(0, 255), st.binary(min_size=1, max_size=253), st.data())
 def test_an_rtu_frame_comes_back_and_a_turned_bit_is_seen(unit, pdu, data):
-    framed = rtu_frame(unit, pdu)
+    framed = rtu.frame(unit, pdu)
     assert rtu.parse_frame(framed) == (unit, pdu)
     bit = data.draw(st.integers(0, 8 * len(framed) - 1))
     turned = bytearray(framed)
@@ -94,7 +93,7 @@ def test_an_rtu_frame_comes_back_and_a_turned_bit_is_seen(unit, pdu, data):
 @given(st.binary(max_size=300))
 def test_any_bytes_are_a_frame_or_none(noise):
     parsed = rtu.parse_frame(noise)
-    assert parsed is None or rtu_frame(*parsed) == noise
+    assert parsed is None or rtu.frame(*parsed) == noise
 
 
 def test_the_silence_between_frames_is_three_and_a_half_characters_but_never_too_short():

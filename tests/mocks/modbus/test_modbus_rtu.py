@@ -9,7 +9,6 @@ import pytest
 from mock_bench import in_a_loop
 
 from fitctl.config import Fault
-from fitctl.drivers.modbus import rtu_frame
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus import rtu
 from fitctl.mocks.modbus.pdu import DataModel
@@ -81,19 +80,19 @@ async def test_a_request_is_answered():
 @in_a_loop
 async def test_an_exception_is_framed_too():
     async with line() as master:
-        master.send(rtu_frame(1, bytes.fromhex("03 00 05 00 01")))
-        assert await master.hears() == rtu_frame(1, bytes.fromhex("83 02")).hex(" ")
+        master.send(rtu.frame(1, bytes.fromhex("03 00 05 00 01")))
+        assert await master.hears() == rtu.frame(1, bytes.fromhex("83 02")).hex(" ")
 
 
 @pytest.mark.parametrize(
     "frame",
     [
-        rtu_frame(2, READ[1:-2]),
+        rtu.frame(2, READ[1:-2]),
         READ[:-1] + b"\0",
         READ[:-1],
         READ + b"\x55",
         bytes(400),
-        rtu_frame(0, READ[1:-2]),
+        rtu.frame(0, READ[1:-2]),
     ],
     ids=["another unit", "wrong check", "cut off", "a byte too many", "a flood", "to all: a read"],
 )
@@ -109,7 +108,7 @@ async def test_what_is_not_for_it_or_not_whole_gets_no_answer_and_does_no_harm(f
 @in_a_loop
 async def test_a_write_to_all_is_obeyed_and_not_answered():
     async with line() as master:
-        master.send(rtu_frame(0, WRITE[1:-2]))
+        master.send(rtu.frame(0, WRITE[1:-2]))
         await asyncio.wait_for(master.written.wait(), 5)
         assert await master.hears_nothing()
         assert master.register == 0x1234
