@@ -146,11 +146,11 @@ class Axis:
         self.velocity += change
         self.command += self.velocity * period_s
         low, high = self._software_limits
-        if not low <= self.command <= high and (self.command > high) == (self.velocity > 0):
-            beyond_high = self.command > high
-            self.faults |= (
-                AxisFault.CW_SOFTWARE_LIMIT if beyond_high else AxisFault.CCW_SOFTWARE_LIMIT
-            )
+        if self.velocity > 0 and self.command > high:
+            self.faults |= AxisFault.CW_SOFTWARE_LIMIT
+            self.abort()
+        elif self.velocity < 0 and self.command < low:
+            self.faults |= AxisFault.CCW_SOFTWARE_LIMIT
             self.abort()
 
     def _update_faults(self) -> None:

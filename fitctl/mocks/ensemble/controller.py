@@ -43,7 +43,9 @@ class EnsembleControllerMock:
     Known limitations
     -----------------
     - No end-of-travel or emergency stop inputs, no homing, no S-curves, no current limits; enabling
-      takes no time. A software limit ends a move with the abort deceleration and a fault.
+      takes no time. A software limit ends a motion that leads out with the abort deceleration and a
+      fault; at rest beyond a limit an axis can be acknowledged and moved back. The real one may keep the
+      fault there, or move the axis inside (parameter 665, FaultAckMoveOutOfLimit): unknown.
     - Any number of clients; the real one's socket takes one. Its answers come at `reply_s` whatever they
       are.
     - The pty has no baud rate.

@@ -313,17 +313,18 @@ def test_a_stuck_axis_becomes_the_controllers_position_error(bench_of):
     assert reading.fault == "elevation: position error"
 
 
-def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of):
+@pytest.mark.parametrize(("outward", "name"), [(1, "cw"), (-1, "ccw")], ids=["high", "low"])
+def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of, outward, name):
     bench = bench_of("ensemble")  # two revolutions
     bench.driver.open()
     bench.driver.enable()
     end_s = time.monotonic() + 5
-    while not (reading := bench.driver.exchange((30.0, 0.0))).fault:
+    while not (reading := bench.driver.exchange((30.0 * outward, 0.0))).fault:
         assert time.monotonic() < end_s
-    assert reading.fault == "azimuth: cw software limit"
+    assert reading.fault == f"azimuth: {name} software limit"
     bench.driver.reset_fault()
     bench.driver.enable()
-    while bench.driver.exchange((-10.0, 0.0)).position_rad[0] > 11.0:
+    while bench.driver.exchange((-10.0 * outward, 0.0)).position_rad[0] * outward > 11.0:
         assert time.monotonic() < end_s
 
 

@@ -9,7 +9,7 @@ import hypothesis
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mock_bench import ToldMotors
+from mock_bench import SimulatedMotors, ToldMotors
 
 from fitctl import config
 from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
@@ -23,7 +23,7 @@ SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
 PERIOD_S = 0.002
 
 
-def spoken(test=None, **update):
+def spoken(test=None, *, motors=ToldMotors, **update):
     """Run a test with a connection to a mock: ``say(command)`` gives the whole answer."""
 
     def decorate(test):
@@ -36,7 +36,7 @@ def spoken(test=None, **update):
 
     async def serve(test):
         settings = SETTINGS.model_copy(update=update)
-        mock = EnsembleControllerMock(SIDEROSTAT, settings, ToldMotors())
+        mock = EnsembleControllerMock(SIDEROSTAT, settings, motors())
         ends = await mock.start()
         reader, writer = await asyncio.open_connection("127.0.0.1", ends.tcp_port)
 
@@ -54,6 +54,13 @@ def spoken(test=None, **update):
         assert len(asyncio.all_tasks()) == 1
 
     return decorate(test) if test else decorate
+
+
+async def until(say, question, holds):
+    """Ask until the number in the answer is as wanted."""
+    end_s = asyncio.get_running_loop().time() + 5
+    while not holds(float((await say(question))[1:])):
+        assert asyncio.get_running_loop().time() < end_s
 
 
 # ---------------------------------------------------------------- transcripts
@@ -304,18 +311,68 @@ def test_a_move_ends_where_it_should_and_rests(position, speed):
     assert not axis.faults
 
 
-def test_beyond_a_software_limit_it_stops_and_only_leads_back():
+LIMIT_SIDES = pytest.mark.parametrize(
+    ("outward", "fault"),
+    [(1, AxisFault.CW_SOFTWARE_LIMIT), (-1, AxisFault.CCW_SOFTWARE_LIMIT)],
+    ids=["high", "low"],
+)
+
+
+@LIMIT_SIDES
+def test_beyond_a_software_limit_it_stops_and_only_leads_back(outward, fault):
     axis = enabled_axis()
-    axis.free_run(4.0)
+    axis.free_run(4.0 * outward)
     run(axis, 3.0)
-    assert axis.faults == AxisFault.CW_SOFTWARE_LIMIT
-    assert axis.command == pytest.approx(5.0, abs=0.1)
-    assert not axis.free_run(-1.0)
+    assert axis.faults == fault
+    assert axis.command == pytest.approx(5.0 * outward, abs=0.1)
+    assert not axis.free_run(-1.0 * outward)
     axis.acknowledge()
-    assert axis.free_run(-1.0)
+    run(axis, 0.1)
+    assert not axis.faults, "at rest beyond the limit no fault appears by itself"
+    assert axis.free_run(-1.0 * outward)
     run(axis, 1.0)
-    assert axis.command < 4.8
+    assert axis.command * outward < 4.8
     assert not axis.faults
+
+
+@LIMIT_SIDES
+def test_beyond_a_software_limit_a_motion_outward_faults_again(outward, fault):
+    axis = enabled_axis()
+    axis.free_run(4.0 * outward)
+    run(axis, 3.0)
+    axis.acknowledge()
+    assert axis.free_run(1.0 * outward)
+    run(axis, PERIOD_S)
+    assert axis.faults == fault
+
+
+@LIMIT_SIDES
+def test_enabled_at_rest_beyond_a_software_limit_an_axis_is_well(outward, fault):
+    axis = Axis(parameters())
+    axis.step(6.0 * outward, PERIOD_S)
+    assert axis.enable()
+    run(axis, 0.1)
+    assert not axis.faults
+    assert axis.free_run(-1.0 * outward)
+
+
+@spoken(motors=SimulatedMotors, software_limit_units=0.05)
+async def test_on_the_wire_both_limits_are_hit_acknowledged_and_left(mock, say, *_):
+    for at, outward, fault in (
+        ("@0", 1, AxisFault.CW_SOFTWARE_LIMIT),
+        ("@1", -1, AxisFault.CCW_SOFTWARE_LIMIT),
+    ):
+        assert await say(f"ENABLE {at}") == "%\n"
+        assert await say(f"FREERUN {at} {outward}.0") == "%\n"
+        await until(say, f"AXISFAULT({at})", lambda word, fault=fault: word == fault)
+        assert await say(f"FREERUN {at} {-outward}.0") == "#\n"
+        assert await say(f"FAULTACK {at}") == "%\n"
+        await asyncio.sleep(5 * PERIOD_S)
+        assert await say(f"AXISFAULT({at})") == "%0\n"
+        assert await say(f"FREERUN {at} {-outward}.0") == "%\n"
+        await until(say, f"PFBKPROG({at})", lambda place, out=outward: place * out < 0.04)
+        assert await say(f"ABORT {at}") == "%\n"
+        assert await say(f"AXISFAULT({at})") == "%0\n"
 
 
 def test_without_software_limits_it_runs_on():
