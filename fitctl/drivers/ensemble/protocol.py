@@ -27,7 +27,11 @@ class Reply(Enum):
 
 
 class AxisStatus(IntFlag):
-    """Bits of AXISSTATUS that are used here."""
+    """Bits of AXISSTATUS that are used here.
+
+    CLOCKWISE is the direction of the active or of the last motion. The three limit inputs are levels at the
+    pins, whatever polarity the controller has been given: unconnected ones read high.
+    """
 
     ENABLED = 1 << 0
     HOMED = 1 << 1
@@ -38,6 +42,7 @@ class AxisStatus(IntFlag):
     CLOCKWISE = 1 << 9
     CW_END_OF_TRAVEL = 1 << 22
     CCW_END_OF_TRAVEL = 1 << 23
+    HOME_LIMIT = 1 << 24
     EMERGENCY_STOP = 1 << 31
 
 

@@ -14,6 +14,11 @@ LOOP_GAIN_PER_S = 30.0
 DEFAULT_SPEED = 1.0
 _IN_POSITION_PART = 0.1  # of the position error threshold
 
+_UNCONNECTED_INPUTS = (
+    AxisStatus.CW_END_OF_TRAVEL | AxisStatus.CCW_END_OF_TRAVEL | AxisStatus.HOME_LIMIT
+)
+"""Inputs with nothing on them: the controller pulls them high."""
+
 _DISABLING = (
     AxisFault.POSITION_ERROR
     | AxisFault.AMPLIFIER
@@ -50,6 +55,7 @@ class Axis:
         self._goal: float | None = None
         self._rate = self.ramp_rate
         self._changes = 0.0
+        self._clockwise = False
 
     # ------------------------------------------------------------ commands; False is refused
     def enable(self) -> bool:
@@ -107,10 +113,10 @@ class Axis:
             AxisStatus.MOVING: self.moving,
             AxisStatus.ACCELERATING: self._changes > 0,
             AxisStatus.DECELERATING: self._changes < 0,
-            AxisStatus.CLOCKWISE: self.velocity > 0,
+            AxisStatus.CLOCKWISE: self._clockwise,
             AxisStatus.EMERGENCY_STOP: bool(self.causes & AxisFault.EMERGENCY_STOP),
         }
-        return AxisStatus(sum(flag for flag, holds in flags.items() if holds))
+        return _UNCONNECTED_INPUTS | sum(flag for flag, holds in flags.items() if holds)
 
     @property
     def error(self) -> float:
@@ -145,6 +151,8 @@ class Axis:
         self._changes = change * self.velocity if self.velocity else abs(change)
         self.velocity += change
         self.command += self.velocity * period_s
+        if self.velocity:
+            self._clockwise = self.velocity > 0
         low, high = self._software_limits
         if self.velocity > 0 and self.command > high:
             self.faults |= AxisFault.CW_SOFTWARE_LIMIT

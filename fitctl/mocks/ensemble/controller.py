@@ -42,10 +42,20 @@ class EnsembleControllerMock:
 
     Known limitations
     -----------------
-    - No end-of-travel or emergency stop inputs, no homing, no S-curves, no current limits; enabling
-      takes no time. A software limit ends a motion that leads out with the abort deceleration and a
-      fault; at rest beyond a limit an axis can be acknowledged and moved back. The real one may keep the
-      fault there, or move the axis inside (parameter 665, FaultAckMoveOutOfLimit): unknown.
+    - Nothing is connected to the inputs for end of travel and home: AXISSTATUS always has bits 22, 23 and
+      24, which are the levels at the pins. With parameter 61 at 0 (active low) they are not active. Set to
+      active high, a real controller would fault; this one does not. That bit 24 is pulled high as the other
+      two are is inferred from the maker's newer controllers.
+    - Bit 31 of AXISSTATUS is set while a fault of the mock presses the emergency stop. Words of real
+      controllers in normal use have it set, so its sense may be the other one: nothing may conclude from it.
+    - Bit 9 of AXISSTATUS, the direction of the active or last motion, is 1 for positive, as the maker's header
+      has it ("clockwise (positive)"). epics-motor's driver takes 1 for negative: with
+      ReverseMotionDirection 0 its record shows the opposite direction. Turning a disabled axis by hand
+      does not change the bit (unknown).
+    - No S-curves, no current limits, no homing; enabling takes no time.
+    - A software limit ends a motion that leads out with the abort deceleration and a fault; at rest beyond
+      a limit an axis can be acknowledged and moved back. The real one may keep the fault there, or move the
+      axis inside (parameter 665, FaultAckMoveOutOfLimit): unknown.
     - Any number of clients; the real one's socket takes one. Its answers come at `reply_s` whatever they
       are.
     - The pty has no baud rate.

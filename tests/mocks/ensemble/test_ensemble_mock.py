@@ -21,6 +21,8 @@ RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
 SIDEROSTAT = RIG.loops["right"].siderostat
 SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
 PERIOD_S = 0.002
+AT_REST = 0x01C00000
+"""AXISSTATUS of an axis without power that has not moved: three unconnected inputs read high."""
 
 
 def spoken(test=None, *, motors=ToldMotors, **update):
@@ -81,12 +83,24 @@ async def test_what_epics_motor_asks_at_start(mock, say, *_):
 
 @spoken
 async def test_what_epics_motor_polls(mock, say, *_):
-    assert await say("AXISSTATUS(@0)") == "%0\n"
+    assert await say("AXISSTATUS(@0)") == f"%{AT_REST}\n"
     assert await say("PLANESTATUS(0)") == "%0\n"
     assert await say("PFBKPROG(@0)") == "%0.000000\n"
     assert await say("PCMDPROG(@0)") == "%0.000000\n"
     assert await say("AXISFAULT(@0)") == "%0\n"
     assert await say("VFBK(@0)") == "%0.000000\n"
+
+
+@spoken
+async def test_epics_motor_reads_no_active_limit(mock, say, *_):
+    """As drvEnsembleAsyn.cc combines the status bits with parameter 61."""
+    setup = float((await say("GETPARM(@0, 61)"))[1:])
+    for switch_on in (False, True):
+        status = int((await say("AXISSTATUS(@0)"))[1:])
+        cw, ccw = (status >> 22 & 1), (status >> 23 & 1)
+        assert not 1 ^ cw ^ (int(setup) >> 2 & 1)
+        assert not 1 ^ ccw ^ (int(setup) >> 1 & 1)
+        assert switch_on or await say("ENABLE @0") == "%\n"
 
 
 @spoken
@@ -106,7 +120,7 @@ async def test_what_epics_motor_says_to_enable_jog_and_move(mock, say, *_):
     assert await say("RAMP RATE 0.10000") == "%\n"
     assert await say("LINEAR @0 0.10000 F0.01000") == "%\n"
     assert await say("DISABLE @0") == "%\n"
-    assert await say("AXISSTATUS(@0)") == "%0\n"
+    assert await say("AXISSTATUS(@0)") == f"%{AT_REST | AxisStatus.CLOCKWISE}\n"
 
 
 @spoken
@@ -171,7 +185,7 @@ async def test_answers_come_one_after_the_other_in_the_controllers_time(mock, sa
     loop = asyncio.get_running_loop()
     before_s = loop.time()
     writer.write(b"NONE\nAXISFAULT(@0)\nAXIS")
-    writer.write(b"STATUS(@1)\n")
+    writer.write(b"FAULT(@1)\n")
     assert await asyncio.wait_for(reader.readexactly(8), 5) == b"!\n%0\n%0\n"
     assert loop.time() - before_s >= 3 * 0.05
 
@@ -214,7 +228,7 @@ async def test_an_amplifiers_fault_disables_and_comes_back_while_its_cause_is_th
     set_fault(mock, "amplifier_fault", part="el")
     assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
     assert await say("AXISFAULT(@0)") == "%0\n"
-    assert await say("AXISSTATUS(@1)") == "%0\n"
+    assert await say("AXISSTATUS(@1)") == f"%{AT_REST}\n"
     assert await say("FAULTACK @1") == "%\n"
     assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
     assert await say("ENABLE @1") == "#\n"
@@ -373,6 +387,21 @@ async def test_on_the_wire_both_limits_are_hit_acknowledged_and_left(mock, say, 
         await until(say, f"PFBKPROG({at})", lambda place, out=outward: place * out < 0.04)
         assert await say(f"ABORT {at}") == "%\n"
         assert await say(f"AXISFAULT({at})") == "%0\n"
+
+
+def test_the_direction_bit_is_of_the_last_motion():
+    axis = enabled_axis()
+    assert not axis.status & AxisStatus.CLOCKWISE
+    for velocity, clockwise in ((1.0, True), (-1.0, False), (1.0, True)):
+        axis.free_run(velocity)
+        run(axis, 0.3)
+        axis.abort()
+        run(axis, 0.3)
+        assert not axis.moving
+        assert bool(axis.status & AxisStatus.CLOCKWISE) is clockwise
+    axis.disable()
+    run(axis, 0.1)
+    assert axis.status & AxisStatus.CLOCKWISE
 
 
 def test_without_software_limits_it_runs_on():
