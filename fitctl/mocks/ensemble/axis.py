@@ -106,7 +106,7 @@ class Axis:
     @property
     def status(self) -> AxisStatus:
         """The bits of AXISSTATUS."""
-        near = _IN_POSITION_PART * self._parameters[Parameter.POSITION_ERROR_THRESHOLD]
+        near = _IN_POSITION_PART * self._position_error_limit
         flags = {
             AxisStatus.ENABLED: self.enabled,
             AxisStatus.IN_POSITION: self.enabled and abs(self.error) < near and not self.moving,
@@ -164,10 +164,14 @@ class Axis:
     def _update_faults(self) -> None:
         """Latch the faults that are present; the grave ones disable the axis."""
         self.faults |= self.causes
-        if self.enabled and abs(self.error) > self._parameters[Parameter.POSITION_ERROR_THRESHOLD]:
+        if self.enabled and abs(self.error) > self._position_error_limit:
             self.faults |= AxisFault.POSITION_ERROR
         if self.enabled and self.faults & _DISABLING:
             self.disable()
+
+    @property
+    def _position_error_limit(self) -> float:
+        return self._parameters[Parameter.POSITION_ERROR_THRESHOLD] or math.inf
 
     @property
     def _software_limits(self) -> tuple[float, float]:

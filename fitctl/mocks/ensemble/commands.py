@@ -5,7 +5,9 @@ public clients write ``AXISFAULT(@0)``, ``AXISFAULT @0``, ``MOVEABS X 1`` and ``
 
 Known limitations: of AeroBasic these commands only, no expressions, variables, programs or tasks;
 one plane, in which LINEAR moves each axis by its own ramp and not along a line; the interpreter never
-waits for a move, as after WAIT MODE NOWAIT.
+waits for a move, as after WAIT MODE NOWAIT. SETPARM of a value out of range is answered ``#``: the ranges
+are those of the maker's newer controllers, the character is invented. A changed CountsPerUnit or
+ReverseMotionDirection has no effect; whether the real one needs a RESET first is unknown.
 """
 
 from __future__ import annotations
@@ -16,6 +18,10 @@ from collections.abc import Callable, Sequence
 
 from fitctl.drivers.ensemble.protocol import Parameter, Reply, format_bits
 from fitctl.mocks.ensemble.axis import Axis
+
+_REVERSE_DIRECTION, _LIMIT_SETUP, _HOME_SETUP = 1, 61, 75
+_MASKS = {_REVERSE_DIRECTION, _LIMIT_SETUP, _HOME_SETUP, Parameter.POSITION_FEEDBACK_TYPE}
+_ABOVE_ZERO = {Parameter.DEFAULT_RAMP_RATE, Parameter.ABORT_DECEL_RATE}
 
 AXIS_NAME_NUMBERS = (99, 140)
 """Parameter AxisName: public headers disagree on its number."""
@@ -189,16 +195,26 @@ class Interpreter:
         parameters, number = self._parameter(words)
         _require(len(words) == 1)
         value = _float(words[0])
-        positive = number not in {Parameter.SOFTWARE_LIMIT_LOW, Parameter.SOFTWARE_LIMIT_HIGH}
-        if positive and value <= 0:
-            return False
-        parameters[number] = value
-        return True
+        if in_range(number, value):
+            parameters[number] = value
+            return True
+        return False
 
     def _parameter(self, words: Words) -> tuple[dict[int, float], int]:
         parameters = self._parameters[self._axes.index(self._pop_axis(words))]
         _require(bool(words) and words[0].isdecimal() and int(words[0]) in parameters)
         return parameters, int(words.pop(0))
+
+
+def in_range(number: int, value: float) -> bool:
+    """Whether the controller takes a finite value for a parameter."""
+    if number in _MASKS:
+        return value >= 0 and value.is_integer()
+    if number in _ABOVE_ZERO:
+        return value > 0
+    if number == Parameter.COUNTS_PER_UNIT:
+        return value != 0
+    return value >= 0 or number != Parameter.POSITION_ERROR_THRESHOLD
 
 
 def _require(holds: bool) -> None:

@@ -174,6 +174,40 @@ async def test_what_cannot_be_done_now_is_a_fault(mock, say, *_):
     assert await say("SETPARM @0, 32, -1") == "#\n"
 
 
+@pytest.mark.parametrize(
+    ("number", "taken", "refused"),
+    [
+        (1, "1 0", "-1 0.5"),
+        (61, "6 0", "-1 0.5"),
+        (75, "1 0", "-1 0.5"),
+        (47, "2 0", "-1"),
+        (2, "-4000.0 2000", "0"),
+        (32, "0.5 0", "-1"),
+        (72, "5.0", "0 -5"),
+        (73, "250.0", "0 -5"),
+        (37, "-3.0 0 3", ""),
+        (38, "-3.0 0 3", ""),
+        (77, "-1.5 0 1.5", ""),
+    ],
+)
+def test_parameters_are_set_within_their_range(number, taken, refused):
+    controller = interpreter(dict.fromkeys((1, 2, 47, 61, 75, 77), 7.0))
+    for value in taken.split():
+        assert controller.answer(f"SETPARM @0, {number}, {value}") == (Reply.DONE, "")
+        assert controller.answer(f"GETPARM(@0, {number})") == (Reply.DONE, f"{float(value):.6f}")
+    for wrong in refused.split():
+        assert controller.answer(f"SETPARM @0, {number}, {wrong}") == (Reply.FAULT, "")
+        assert controller.answer(f"GETPARM(@0, {number})") == (Reply.DONE, f"{float(value):.6f}")
+
+
+def test_a_position_error_threshold_of_zero_is_none():
+    axis = Axis(parameters() | {Parameter.POSITION_ERROR_THRESHOLD: 0.0})
+    axis.enable()
+    axis.step(3.0, PERIOD_S)
+    assert not axis.faults
+    assert axis.status & AxisStatus.IN_POSITION
+
+
 @spoken(always_send_eos=False)
 async def test_without_always_send_eos_only_values_end_in_a_newline(mock, say, reader, writer):
     writer.write(b"ENABLE @0\nNONE\nAXISFAULT(@0)\n")
@@ -284,8 +318,8 @@ def parameters(**update):
     } | update
 
 
-def interpreter():
-    tables = [parameters(), parameters()]
+def interpreter(update=None):
+    tables = [parameters() | (update or {}), parameters()]
     return Interpreter([Axis(table) for table in tables], tables, ["X", "Y"])
 
 
