@@ -56,6 +56,7 @@ class Axis:
         self._rate = self.ramp_rate
         self._changes = 0.0
         self._clockwise = False
+        self._coordinated = False
 
     # ------------------------------------------------------------ commands; False is refused
     def enable(self) -> bool:
@@ -83,12 +84,14 @@ class Axis:
         if not self.enabled or self.faults:
             return False
         self._goal, self._goal_velocity, self._rate = None, velocity, self.ramp_rate
+        self._coordinated = False
         return True
 
-    def move_to(self, position: float, speed: float) -> bool:
-        """Move to a place and stay there."""
+    def move_to(self, position: float, speed: float, *, coordinated: bool = False) -> bool:
+        """Move to a place and stay there; a coordinated move is its plane's motion."""
         if not self.enabled or self.faults:
             return False
+        self._coordinated = coordinated
         self._goal, self._goal_velocity, self._rate = position, abs(speed), self.ramp_rate
         return True
 
@@ -102,6 +105,11 @@ class Axis:
     def moving(self) -> bool:
         """Its trajectory is not at its end."""
         return self.velocity != 0 or self._goal is not None or self._goal_velocity != 0
+
+    @property
+    def moving_in_plane(self) -> bool:
+        """Its trajectory is a coordinated move, not at its end."""
+        return self._coordinated and self.moving
 
     @property
     def status(self) -> AxisStatus:

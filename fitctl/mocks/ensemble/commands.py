@@ -4,7 +4,9 @@ Axes are ``@0`` and ``@1`` or names; parentheses, commas and blanks are all the 
 public clients write ``AXISFAULT(@0)``, ``AXISFAULT @0``, ``MOVEABS X 1`` and ``MOVEABS X1 XF10 Y2 YF10``.
 
 Known limitations: of AeroBasic these commands only, no expressions, variables, programs or tasks;
-one plane, in which LINEAR moves each axis by its own ramp and not along a line; the interpreter never
+one plane, in which LINEAR moves each axis by its own ramp and not along a line; of PLANESTATUS bit 0 alone, set
+while a LINEAR runs and by no other motion (that MOVEABS and MOVEINC do not set it is inferred), while bit 3 of
+AXISSTATUS is set by all of them (by LINEAR: unknown); the interpreter never
 waits for a move, as after WAIT MODE NOWAIT. SETPARM of a value out of range is answered ``#``: the ranges
 are those of the maker's newer controllers, the character is invented. A changed CountsPerUnit or
 ReverseMotionDirection has no effect; whether the real one needs a RESET first is unknown.
@@ -81,7 +83,9 @@ class Interpreter:
             "ABS": lambda words: self._set_incremental(words, False),
             "INC": lambda words: self._set_incremental(words, True),
             "FREERUN": self._free_run,
-            "LINEAR": lambda words: self._move(words, incremental=self._incremental),
+            "LINEAR": lambda words: self._move(
+                words, incremental=self._incremental, coordinated=True
+            ),
             "MOVEABS": lambda words: self._move(words, incremental=False),
             "MOVEINC": lambda words: self._move(words, incremental=True),
             "AXISSTATUS": lambda words: format_bits(self._one(words).status),
@@ -161,7 +165,7 @@ class Interpreter:
         done = [axis.free_run(velocity) for axis, velocity in wishes]
         return all(done)
 
-    def _move(self, words: Words, *, incremental: bool) -> bool:
+    def _move(self, words: Words, *, incremental: bool, coordinated: bool = False) -> bool:
         """Axis and place, its own speed or one for all: ``X 1 XF 10 Y 2 YF 10``, ``@0 1 F 10``."""
         places: dict[Axis, float] = {}
         while words:
@@ -177,12 +181,15 @@ class Interpreter:
                 for axis in places:
                     axis.speed = abs(value)
         _require(bool(places))
-        done = [axis.move_to(place, axis.speed) for axis, place in places.items()]
+        done = [
+            axis.move_to(place, axis.speed, coordinated=coordinated)
+            for axis, place in places.items()
+        ]
         return all(done)
 
     def _plane_status(self, words: Words) -> str:
         _require(words == ["0"])
-        return format_bits(int(any(axis.moving for axis in self._axes)))
+        return format_bits(int(any(axis.moving_in_plane for axis in self._axes)))
 
     def _get_parameter(self, words: Words) -> str:
         if len(words) == 2 and words[1] in map(str, AXIS_NAME_NUMBERS):

@@ -114,13 +114,31 @@ async def test_what_epics_motor_says_to_enable_jog_and_move(mock, say, *_):
     assert await say("RAMP RATE @0 0.10000") == "%\n"
     assert await say("FREERUN @0 0.01000") == "%\n"
     assert int((await say("AXISSTATUS(@0)"))[1:]) & (AxisStatus.ENABLED | AxisStatus.MOVING) == 9
-    assert await say("PLANESTATUS(0)") == "%1\n"
+    assert await say("PLANESTATUS(0)") == "%0\n"
     assert await say("ABORT @0") == "%\n"
     assert await say("ABS") == "%\n"
     assert await say("RAMP RATE 0.10000") == "%\n"
     assert await say("LINEAR @0 0.10000 F0.01000") == "%\n"
     assert await say("DISABLE @0") == "%\n"
     assert await say("AXISSTATUS(@0)") == f"%{AT_REST | AxisStatus.CLOCKWISE}\n"
+
+
+@spoken(motors=SimulatedMotors)
+async def test_the_plane_moves_while_a_coordinated_move_runs(mock, say, *_):
+    """epics-motor asks PLANESTATUS for each axis: during a LINEAR of one, all its records are moving."""
+    await say("ENABLE @0")
+    await say("ENABLE @1")
+    assert await say("LINEAR @0 0.05000 F1.00000") == "%\n"
+    assert await say("PLANESTATUS(0)") == "%1\n"
+    await until(say, "PLANESTATUS(0)", lambda bits: bits == 0)
+    assert await say("PCMDPROG(@0)") == "%0.050000\n"
+    assert await say("FREERUN @1 0.01000") == "%\n"
+    assert await say("PLANESTATUS(0)") == "%0\n", "another axis' free run is not the plane's motion"
+    assert not int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.MOVING
+    assert int((await say("AXISSTATUS(@1)"))[1:]) & AxisStatus.MOVING
+    assert await say("MOVEABS X 0.06 XF 0.1") == "%\n"
+    assert await say("PLANESTATUS(0)") == "%0\n"
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.MOVING
 
 
 @spoken
