@@ -12,6 +12,8 @@ from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter
 
 LOOP_GAIN_PER_S = 30.0
 DEFAULT_SPEED = 1.0
+LONGEST_STEP_S = 0.02
+VELOCITY_WINDOW_S = 0.02
 _IN_POSITION_PART = 0.1  # of the position error threshold
 
 _UNCONNECTED_INPUTS = (
@@ -39,6 +41,8 @@ class Axis:
     ----------
     causes : AxisFault
         What cannot be acknowledged away, because it is so now.
+    feedback_velocity : float
+        Of the encoder, whether the axis has power or not: a mean over `VELOCITY_WINDOW_S` or a little more.
     """
 
     def __init__(self, parameters: Mapping[int, float]) -> None:
@@ -50,6 +54,7 @@ class Axis:
         self.command = 0.0
         self.velocity = 0.0
         self.feedback = 0.0
+        self.feedback_velocity = 0.0
         self._parameters = parameters
         self._goal_velocity = 0.0
         self._goal: float | None = None
@@ -57,6 +62,8 @@ class Axis:
         self._changes = 0.0
         self._clockwise = False
         self._coordinated = False
+        self._window_s = 0.0
+        self._window_began_at = 0.0
 
     # ------------------------------------------------------------ commands; False is refused
     def enable(self) -> bool:
@@ -138,13 +145,24 @@ class Axis:
 
     # ------------------------------------------------------------ time
     def step(self, feedback: float, period_s: float) -> None:
-        """One period of the controller, with what the encoder reads now."""
+        """One period of the controller, with what the encoder reads now.
+
+        After a longer period than `LONGEST_STEP_S` the trajectory goes on from where it was.
+        """
         self.feedback = feedback
+        self._measure_velocity(feedback, period_s)
+        period_s = min(period_s, LONGEST_STEP_S)
         if self.enabled:
             self._advance(period_s)
         else:
             self.command = feedback
         self._update_faults()
+
+    def _measure_velocity(self, feedback: float, period_s: float) -> None:
+        self._window_s += period_s
+        if self._window_s >= VELOCITY_WINDOW_S:
+            self.feedback_velocity = (feedback - self._window_began_at) / self._window_s
+            self._window_s, self._window_began_at = 0.0, feedback
 
     def _advance(self, period_s: float) -> None:
         wanted = self._goal_velocity

@@ -94,7 +94,7 @@ class Interpreter:
             "PFBKPROG": lambda words: _number(self._one(words).feedback),
             "PFBK": lambda words: _number(self._one(words).feedback),
             "PCMDPROG": lambda words: _number(self._one(words).command),
-            "VFBK": lambda words: _number(self._one(words).velocity),
+            "VFBK": lambda words: _number(self._one(words).feedback_velocity),
             "GETPARM": self._get_parameter,
             "SETPARM": self._set_parameter,
         }

@@ -27,7 +27,6 @@ FAULTS = (
     }
 )
 CYCLE_S = 0.002
-_LONGEST_STEP_S = 0.02
 _CAUSES = {
     "amplifier_fault": AxisFault.AMPLIFIER,
     "following_error": AxisFault.POSITION_ERROR,
@@ -63,8 +62,9 @@ class EnsembleControllerMock:
 
     Invented constants
     ------------------
-    The controller's cycle and loop gain, its default ramp and speed, the in-position window, six decimals
-    in every number, and that FAULTACK is obeyed though the fault comes back.
+    The controller's cycle and loop gain, its default ramp and speed, the in-position window, the time over
+    which VFBK is the mean of the encoder's velocity, six decimals in every number, and that
+    FAULTACK is obeyed though the fault comes back.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class EnsembleControllerMock:
 
     def _step(self) -> None:
         now_s = asyncio.get_running_loop().time()
-        period_s = min(now_s - self._stepped_s, _LONGEST_STEP_S)
+        period_s = now_s - self._stepped_s
         self._stepped_s = now_s
         for axis, counts in zip(self.axes, self._motors.position_counts(), strict=True):
             axis.step(counts / self._settings.counts_per_unit, period_s)

@@ -456,6 +456,30 @@ def test_the_direction_bit_is_of_the_last_motion():
     assert axis.status & AxisStatus.CLOCKWISE
 
 
+def test_the_velocity_feedback_is_the_encoders():
+    axis = enabled_axis()
+    axis.free_run(2.0)
+    run(axis, 0.5)
+    assert axis.feedback_velocity == pytest.approx(2.0, rel=0.01)
+    axis.step(axis.feedback, 0.0)  # a command between two cycles
+    assert axis.feedback_velocity == pytest.approx(2.0, rel=0.01)
+    axis.disable()
+    for _ in range(20):
+        axis.step(axis.feedback - 0.001, PERIOD_S)  # turned by hand
+    assert axis.feedback_velocity == pytest.approx(-0.5)
+    run(axis, 0.1)
+    assert axis.feedback_velocity == 0
+
+
+@spoken(position_error_units=5.0)
+async def test_the_velocity_feedback_of_a_stuck_motor_is_zero(mock, say, *_):
+    await say("ENABLE @0")
+    await say("FREERUN @0 1.0")
+    await asyncio.sleep(0.1)
+    assert await say("VFBK(@0)") == "%0.000000\n"
+    assert mock.axes[0].velocity > 0
+
+
 def test_without_software_limits_it_runs_on():
     table = parameters() | {Parameter.SOFTWARE_LIMIT_LOW: 0.0, Parameter.SOFTWARE_LIMIT_HIGH: 0.0}
     axis = Axis(table)
