@@ -40,6 +40,7 @@ class AxisStatus(IntFlag):
     ACCELERATING = 1 << 4
     DECELERATING = 1 << 5
     CLOCKWISE = 1 << 9
+    HOMING = 1 << 14
     CW_END_OF_TRAVEL = 1 << 22
     CCW_END_OF_TRAVEL = 1 << 23
     HOME_LIMIT = 1 << 24

@@ -1,6 +1,7 @@
 """One axis of the mock controller: a trajectory with ramps, a position loop about it, and its faults.
 
-Everything in the controller's own units.
+Everything in the controller's own units. Places are about the home, those of the program about wherever
+POSOFFSET has put its zero.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter
 
 LOOP_GAIN_PER_S = 30.0
 DEFAULT_SPEED = 1.0
+HOME_SPEED, HOME_OFFSET, HOME_RAMP_RATE = 76, 77, 78
+"""Parameters of homing, by the numbers of the maker's header."""
 LONGEST_STEP_S = 0.02
 VELOCITY_WINDOW_S = 0.02
 _IN_POSITION_PART = 0.1  # of the position error threshold
@@ -41,6 +44,10 @@ class Axis:
     ----------
     causes : AxisFault
         What cannot be acknowledged away, because it is so now.
+    homed : bool
+        It has been homed since power came.
+    offset : float
+        A place of the program, less the same one about the home.
     feedback_velocity : float
         Of the encoder, whether the axis has power or not: a mean over `VELOCITY_WINDOW_S` or a little more.
     """
@@ -49,6 +56,8 @@ class Axis:
         self.enabled = False
         self.faults = AxisFault(0)
         self.causes = AxisFault(0)
+        self.homed = False
+        self.offset = 0.0
         self.ramp_rate = parameters[Parameter.DEFAULT_RAMP_RATE]
         self.speed = DEFAULT_SPEED
         self.command = 0.0
@@ -62,6 +71,8 @@ class Axis:
         self._changes = 0.0
         self._clockwise = False
         self._coordinated = False
+        self._homing = False
+        self._home = 0.0
         self._window_s = 0.0
         self._window_began_at = 0.0
 
@@ -91,20 +102,38 @@ class Axis:
         if not self.enabled or self.faults:
             return False
         self._goal, self._goal_velocity, self._rate = None, velocity, self.ramp_rate
-        self._coordinated = False
+        self._coordinated = self._homing = False
         return True
 
     def move_to(self, position: float, speed: float, *, coordinated: bool = False) -> bool:
         """Move to a place and stay there; a coordinated move is its plane's motion."""
         if not self.enabled or self.faults:
             return False
-        self._coordinated = coordinated
+        self._coordinated, self._homing = coordinated, False
         self._goal, self._goal_velocity, self._rate = position, abs(speed), self.ramp_rate
         return True
 
+    def home(self) -> bool:
+        """Move to the marker, which is where the encoder was at power-up, and HomeOffset beyond.
+
+        That place is zero from then on, also the program's. ABORT, DISABLE, a fault or another motion leave
+        the axis unhomed.
+        """
+        if not self.enabled or self.faults:
+            return False
+        self._coordinated, self._homing, self.homed = False, True, False
+        self._goal = self._parameters[HOME_OFFSET] - self._home
+        self._goal_velocity = self._parameters[HOME_SPEED]
+        self._rate = self._parameters[HOME_RAMP_RATE]
+        return True
+
+    def set_program_position(self, position: float) -> None:
+        """Let the place where the trajectory is have that position in the program; nothing moves."""
+        self.offset = position - self.command
+
     def abort(self) -> None:
         """Stop, at the rate for that."""
-        self._goal, self._goal_velocity = None, 0.0
+        self._goal, self._goal_velocity, self._homing = None, 0.0, False
         self._rate = self._parameters[Parameter.ABORT_DECEL_RATE]
 
     # ------------------------------------------------------------ readings
@@ -124,6 +153,8 @@ class Axis:
         near = _IN_POSITION_PART * self._position_error_limit
         flags = {
             AxisStatus.ENABLED: self.enabled,
+            AxisStatus.HOMED: self.homed,
+            AxisStatus.HOMING: self._homing,
             AxisStatus.IN_POSITION: self.enabled and abs(self.error) < near and not self.moving,
             AxisStatus.MOVING: self.moving,
             AxisStatus.ACCELERATING: self._changes > 0,
@@ -139,6 +170,11 @@ class Axis:
         return self.command - self.feedback
 
     @property
+    def velocity_error(self) -> float:
+        """How fast the trajectory runs, less how fast the encoder turns."""
+        return self.velocity - self.feedback_velocity
+
+    @property
     def motor_velocity(self) -> float:
         """What the position loop asks of the motor."""
         return self.velocity + LOOP_GAIN_PER_S * self.error if self.enabled else 0.0
@@ -149,7 +185,7 @@ class Axis:
 
         After a longer period than `LONGEST_STEP_S` the trajectory goes on from where it was.
         """
-        self.feedback = feedback
+        self.feedback = feedback - self._home
         self._measure_velocity(feedback, period_s)
         period_s = min(period_s, LONGEST_STEP_S)
         if self.enabled:
@@ -170,7 +206,7 @@ class Axis:
             left = self._goal - self.command
             wanted = math.copysign(min(wanted, math.sqrt(2 * self._rate * abs(left))), left)
             if abs(left) <= abs(self.velocity) * period_s or abs(left) < self._rate * period_s**2:
-                self._rest_at(self._goal)
+                self._arrive(self._goal)
                 return
         most = self._rate * period_s
         change = max(-most, min(most, wanted - self.velocity))
@@ -179,6 +215,19 @@ class Axis:
         self.command += self.velocity * period_s
         if self.velocity:
             self._clockwise = self.velocity > 0
+        if not self._homing:
+            self._stop_beyond_limits()
+
+    def _arrive(self, goal: float) -> None:
+        homed = self._homing
+        self._rest_at(goal)
+        if homed:
+            self._home += goal
+            self.feedback -= goal
+            self.command = self.offset = 0.0
+            self.homed = True
+
+    def _stop_beyond_limits(self) -> None:
         low, high = self._software_limits
         if self.velocity > 0 and self.command > high:
             self.faults |= AxisFault.CW_SOFTWARE_LIMIT
@@ -207,4 +256,5 @@ class Axis:
 
     def _rest_at(self, position: float) -> None:
         self.command, self.velocity, self._changes = position, 0.0, 0.0
+        self._homing = False
         self._goal, self._goal_velocity = None, 0.0

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from fitctl.config import EnsembleDevice, EnsembleMock, Siderostat
 from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, AxisFault, Parameter, Reply
-from fitctl.mocks.ensemble.axis import Axis
+from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
@@ -51,7 +51,7 @@ class EnsembleControllerMock:
       has it ("clockwise (positive)"). epics-motor's driver takes 1 for negative: with
       ReverseMotionDirection 0 its record shows the opposite direction. Turning a disabled axis by hand
       does not change the bit (unknown).
-    - No S-curves, no current limits, no homing; enabling takes no time.
+    - No S-curves, no current limits; enabling takes no time.
     - A software limit ends a motion that leads out with the abort deceleration and a fault; at rest beyond
       a limit an axis can be acknowledged and moved back. The real one may keep the fault there, or move the
       axis inside (parameter 665, FaultAckMoveOutOfLimit): unknown.
@@ -62,7 +62,7 @@ class EnsembleControllerMock:
 
     Invented constants
     ------------------
-    The controller's cycle and loop gain, its default ramp and speed, the in-position window, the time over
+    The controller's cycle and loop gain, its default ramps and speeds, the in-position window, the time over
     which VFBK is the mean of the encoder's velocity, six decimals in every number, and that
     FAULTACK is obeyed though the fault comes back.
 
@@ -140,7 +140,7 @@ class EnsembleControllerMock:
     def _parameters(self) -> dict[int, float]:
         """One axis' parameters; those without a name here are read by epics-motor's driver."""
         settings = self._settings
-        reverse_direction, limit_setup, home_setup, home_offset = 1, 61, 75, 77
+        reverse_direction, limit_setup, home_setup = 1, 61, 75
         return {
             Parameter.COUNTS_PER_UNIT: settings.counts_per_unit,
             Parameter.POSITION_ERROR_THRESHOLD: settings.position_error_units,
@@ -152,7 +152,9 @@ class EnsembleControllerMock:
             reverse_direction: 0.0,
             limit_setup: 0.0,
             home_setup: 0.0,
-            home_offset: 0.0,
+            HOME_SPEED: 1.0,
+            HOME_OFFSET: 0.0,
+            HOME_RAMP_RATE: 10.0,
         }
 
     def _answer(self, line: str) -> bytes:

@@ -13,7 +13,7 @@ from mock_bench import SimulatedMotors, ToldMotors
 
 from fitctl import config
 from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
-from fitctl.mocks.ensemble.axis import Axis
+from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter, words_of
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock, LineSplitter
 
@@ -141,6 +141,54 @@ async def test_the_plane_moves_while_a_coordinated_move_runs(mock, say, *_):
     assert int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.MOVING
 
 
+@spoken(motors=SimulatedMotors)
+async def test_what_epics_motor_says_to_home(mock, say, *_):
+    assert await say("ENABLE @0") == "%\n"
+    assert await say("LINEAR @0 0.10000 F5.00000") == "%\n"
+    await until(say, "PLANESTATUS(0)", lambda bits: bits == 0)
+    assert await say("SETPARM @0, 76, 0.50000") == "%\n"
+    assert await say("SETPARM @0, 75, 0") == "%\n"
+    assert await say("IGLOBAL(32) = 1") == "%\n"
+    assert await say("IGLOBAL(33) = 0") == "%\n"
+    assert await say("IGLOBAL(32)") == "%1\n"
+    assert await say('PROGRAM RUN 5, "HomeAsync.bcx"') == "%\n"
+    homing = AxisStatus.HOMING | AxisStatus.MOVING
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & (homing | AxisStatus.HOMED) == homing
+    await until(say, "AXISSTATUS(@0)", lambda bits: not int(bits) & homing)
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.HOMED
+    assert await say("PCMDPROG(@0)") == "%0.000000\n"
+    assert abs(float((await say("PFBKPROG(@0)"))[1:])) < 1e-3
+    assert await say("AXISFAULT(@0)") == "%0\n"
+
+
+@spoken(motors=SimulatedMotors)
+async def test_what_epics_motor_says_to_set_a_position(mock, say, *_):
+    await say("ENABLE @0")
+    assert await say("POSOFFSET SET @0, 1.50000") == "%\n"
+    assert await say("PFBKPROG(@0)") == "%1.500000\n"
+    assert await say("PCMDPROG(@0)") == "%1.500000\n"
+    assert await say("PFBK(@0)") == "%0.000000\n", "nothing moved"
+    assert await say("ABS") == "%\n"
+    assert await say("LINEAR @0 1.55000 F5.00000") == "%\n"
+    await until(say, "PLANESTATUS(0)", lambda bits: bits == 0)
+    assert await say("PCMDPROG(@0)") == "%1.550000\n"
+    await until(say, "PFBK(@0)", lambda place: abs(place - 0.05) < 1e-3)
+    assert await say("POSOFFSET SET X 0 Y 2") == "%\n"
+    assert await say("PCMDPROG(@1)") == "%2.000000\n"
+    assert await say("POSOFFSET CLEAR @0") == "%\n"
+    assert await say("PCMDPROG(@0)") == "%0.050000\n"
+
+
+@spoken(position_error_units=5.0)
+async def test_epics_motors_records_of_errors(mock, say, *_):
+    assert await say("perr(0)") == "%0.000000\n"
+    assert await say("verr(@0)") == "%0.000000\n"
+    await say("ENABLE @0")
+    await say("FREERUN @0 1.0")  # a motor that does not turn
+    await until(say, "perr(0)", lambda error: error > 0.01)
+    await until(say, "verr(0)", lambda error: error == pytest.approx(1.0))
+
+
 @spoken
 async def test_what_other_public_clients_say(mock, say, *_):
     assert await say("enable X") == "%\n"
@@ -177,6 +225,15 @@ async def test_what_other_public_clients_say(mock, say, *_):
         "PLANESTATUS(1)",
         "ABS 1",
         "ENABLE @0; DISABLE @0",
+        "IGLOBAL",
+        "IGLOBAL(32) = ",
+        "IGLOBAL(32) 1",
+        "IGLOBAL(32) = 1.5",
+        "POSOFFSET @0, 1",
+        "POSOFFSET SET @0",
+        "POSOFFSET SET @2, 1",
+        "PROGRAM RUN 5",
+        "PERR(2)",
         "\x80",
     ],
 )
@@ -190,6 +247,13 @@ async def test_what_cannot_be_done_now_is_a_fault(mock, say, *_):
     assert await say("MOVEABS X 1") == "#\n"
     assert await say("RAMP RATE @0 0") == "#\n"
     assert await say("SETPARM @0, 32, -1") == "#\n"
+    assert await say("IGLOBAL(50) = 1") == "#\n"
+    assert await say("IGLOBAL(32) = 1") == "%\n"
+    assert await say('PROGRAM RUN 5, "HomeAsync.bcx"') == "#\n", "no power"
+    assert await say("ENABLE @0") == "%\n"
+    assert await say('PROGRAM RUN 5, "Other.bcx"') == "#\n"
+    assert await say("IGLOBAL(33) = 2") == "%\n"
+    assert await say('PROGRAM RUN 5, "HomeAsync.bcx"') == "#\n", "no such axis"
 
 
 @pytest.mark.parametrize(
@@ -205,11 +269,13 @@ async def test_what_cannot_be_done_now_is_a_fault(mock, say, *_):
         (73, "250.0", "0 -5"),
         (37, "-3.0 0 3", ""),
         (38, "-3.0 0 3", ""),
+        (76, "0.5", "0 -0.5"),
         (77, "-1.5 0 1.5", ""),
+        (78, "0.5", "0 -0.5"),
     ],
 )
 def test_parameters_are_set_within_their_range(number, taken, refused):
-    controller = interpreter(dict.fromkeys((1, 2, 47, 61, 75, 77), 7.0))
+    controller = interpreter(dict.fromkeys((1, 2, 47, 61, 75), 7.0))
     for value in taken.split():
         assert controller.answer(f"SETPARM @0, {number}, {value}") == (Reply.DONE, "")
         assert controller.answer(f"GETPARM(@0, {number})") == (Reply.DONE, f"{float(value):.6f}")
@@ -333,6 +399,9 @@ def parameters(**update):
         Parameter.SOFTWARE_LIMIT_HIGH: 5.0,
         Parameter.DEFAULT_RAMP_RATE: 10.0,
         Parameter.ABORT_DECEL_RATE: 1000.0,
+        HOME_SPEED: 1.0,
+        HOME_OFFSET: 0.0,
+        HOME_RAMP_RATE: 10.0,
     } | update
 
 
@@ -480,6 +549,36 @@ async def test_the_velocity_feedback_of_a_stuck_motor_is_zero(mock, say, *_):
     assert mock.axes[0].velocity > 0
 
 
+@pytest.mark.parametrize("end", [Axis.abort, Axis.disable, lambda axis: axis.free_run(0.0)])
+def test_homing_that_is_ended_leaves_the_axis_unhomed(end):
+    axis = enabled_axis()
+    axis.move_to(1.0, 10.0)
+    run(axis, 2.0)
+    axis.home()
+    run(axis, 0.1)
+    assert axis.status & AxisStatus.HOMING
+    end(axis)
+    run(axis, 3.0)
+    assert not axis.status & (AxisStatus.HOMING | AxisStatus.HOMED)
+    assert axis.command > 0.5
+
+
+def test_home_is_beside_the_marker_by_the_offset():
+    axis = Axis(parameters() | {HOME_OFFSET: 0.25})
+    axis.enable()
+    encoder = 0.0
+    axis.set_program_position(7.0)
+    for goal in (1.0, None):
+        assert axis.home() if goal is None else axis.move_to(goal, 10.0)
+        for _ in range(2000):
+            encoder += axis.motor_velocity * PERIOD_S
+            axis.step(encoder, PERIOD_S)
+    assert axis.homed
+    assert encoder == pytest.approx(0.25, abs=1e-3)
+    assert axis.feedback == pytest.approx(0.0, abs=1e-3)
+    assert axis.command == axis.offset == 0.0
+
+
 def test_without_software_limits_it_runs_on():
     table = parameters() | {Parameter.SOFTWARE_LIMIT_LOW: 0.0, Parameter.SOFTWARE_LIMIT_HIGH: 0.0}
     axis = Axis(table)
@@ -506,7 +605,8 @@ def test_any_line_is_answered(line):
     assert "\n" not in value
 
 
-WORDS = ["FREERUN", "MOVEABS", "RAMP", "RATE", "@0", "X", "YF", "F", "1.5", "-2E1", "GETPARM", "2"]
+WORDS = ["FREERUN", "MOVEABS", "RAMP", "RATE", "GETPARM", "POSOFFSET", "SET", "IGLOBAL", "PROGRAM"]
+WORDS += ["RUN", "PERR", "@0", "X", "YF", "F", "1.5", "-2E1", "2", "32", "="]
 
 
 @given(st.lists(st.sampled_from(WORDS), max_size=6))
@@ -517,4 +617,6 @@ def test_any_order_of_known_words_is_answered(words):
 def test_words_are_the_same_however_they_are_set_apart():
     assert words_of("getparm(@0, 2)") == words_of("GETPARM @0,2") == ["GETPARM", "@0", "2"]
     assert words_of("MOVEABS X1.5 XF10") == ["MOVEABS", "X", "1.5", "XF", "10"]
-    assert words_of('PROGRAM RUN 5, "x"') == []
+    assert words_of('PROGRAM RUN 5, "x"') == ["PROGRAM", "RUN", "5", '"X"']
+    assert words_of("IGLOBAL(32) = 1") == words_of("IGLOBAL(32)=1") == ["IGLOBAL", "32", "=", "1"]
+    assert words_of('PROGRAM RUN 5, "x') == []
