@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter
+from fitctl.drivers.ensemble.protocol import FAULT_MASKS, AxisFault, AxisStatus, Parameter
 
 LOOP_GAIN_PER_S = 30.0
 DEFAULT_SPEED = 1.0
@@ -39,24 +39,26 @@ class Axis:
     ----------
     parameters : mapping of int to float
         By parameter number; what SETPARM changes shows here at once.
+    homed : bool
+        Whether it is homed at power-up.
 
     Attributes
     ----------
     causes : AxisFault
         What cannot be acknowledged away, because it is so now.
     homed : bool
-        It has been homed since power came.
+        Only then its software limits act, as far as the fault masks have them.
     offset : float
         A place of the program, less the same one about the home.
     feedback_velocity : float
         Of the encoder, whether the axis has power or not: a mean over `VELOCITY_WINDOW_S` or a little more.
     """
 
-    def __init__(self, parameters: Mapping[int, float]) -> None:
+    def __init__(self, parameters: Mapping[int, float], *, homed: bool = True) -> None:
         self.enabled = False
         self.faults = AxisFault(0)
         self.causes = AxisFault(0)
-        self.homed = False
+        self.homed = homed
         self.offset = 0.0
         self.ramp_rate = parameters[Parameter.DEFAULT_RAMP_RATE]
         self.speed = DEFAULT_SPEED
@@ -215,8 +217,8 @@ class Axis:
         self.command += self.velocity * period_s
         if self.velocity:
             self._clockwise = self.velocity > 0
-        if not self._homing:
-            self._stop_beyond_limits()
+        if self.homed:
+            self._check_limits()
 
     def _arrive(self, goal: float) -> None:
         homed = self._homing
@@ -227,13 +229,19 @@ class Axis:
             self.command = self.offset = 0.0
             self.homed = True
 
-    def _stop_beyond_limits(self) -> None:
+    def _check_limits(self) -> None:
         low, high = self._software_limits
+        fault = AxisFault(0)
         if self.velocity > 0 and self.command > high:
-            self.faults |= AxisFault.CW_SOFTWARE_LIMIT
-            self.abort()
+            fault = AxisFault.CW_SOFTWARE_LIMIT
         elif self.velocity < 0 and self.command < low:
-            self.faults |= AxisFault.CCW_SOFTWARE_LIMIT
+            fault = AxisFault.CCW_SOFTWARE_LIMIT
+        raised, disabling, stopping = (int(self._parameters[mask]) for mask in FAULT_MASKS)
+        fault &= raised
+        self.faults |= fault
+        if fault & disabling:
+            self.disable()
+        elif fault & stopping:
             self.abort()
 
     def _update_faults(self) -> None:

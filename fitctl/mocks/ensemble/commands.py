@@ -32,11 +32,17 @@ import math
 import re
 from collections.abc import Callable, Sequence
 
-from fitctl.drivers.ensemble.protocol import Parameter, Reply, format_bits
+from fitctl.drivers.ensemble.protocol import FAULT_MASKS, Parameter, Reply, format_bits
 from fitctl.mocks.ensemble.axis import HOME_RAMP_RATE, HOME_SPEED, Axis
 
 _REVERSE_DIRECTION, _LIMIT_SETUP, _HOME_SETUP = 1, 61, 75
-_MASKS = {_REVERSE_DIRECTION, _LIMIT_SETUP, _HOME_SETUP, Parameter.POSITION_FEEDBACK_TYPE}
+_MASKS = {
+    _REVERSE_DIRECTION,
+    _LIMIT_SETUP,
+    _HOME_SETUP,
+    Parameter.POSITION_FEEDBACK_TYPE,
+    *FAULT_MASKS,
+}
 _ABOVE_ZERO = {
     Parameter.DEFAULT_RAMP_RATE,
     Parameter.ABORT_DECEL_RATE,

@@ -7,7 +7,14 @@ from collections import deque
 from collections.abc import Callable
 
 from fitctl.config import EnsembleDevice, EnsembleMock, Siderostat
-from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, AxisFault, Parameter, Reply
+from fitctl.drivers.ensemble.protocol import (
+    COMMAND_BYTES_MAX,
+    EOS,
+    SOFTWARE_LIMITS,
+    AxisFault,
+    Parameter,
+    Reply,
+)
 from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
@@ -27,6 +34,8 @@ FAULTS = (
     }
 )
 CYCLE_S = 0.002
+_FAULT_MASK = 0x50C42FCF | SOFTWARE_LIMITS
+"""The newer controllers' default, and the software limits."""
 _CAUSES = {
     "amplifier_fault": AxisFault.AMPLIFIER,
     "following_error": AxisFault.POSITION_ERROR,
@@ -41,6 +50,8 @@ class EnsembleControllerMock:
 
     Known limitations
     -----------------
+    - Homed from power-up on, as by a program that a real controller would run then, unless the setting `homed`
+      is false.
     - Nothing is connected to the inputs for end of travel and home: AXISSTATUS always has bits 22, 23 and
       24, which are the levels at the pins. With parameter 61 at 0 (active low) they are not active. Set to
       active high, a real controller would fault; this one does not. That bit 24 is pulled high as the other
@@ -52,6 +63,9 @@ class EnsembleControllerMock:
       ReverseMotionDirection 0 its record shows the opposite direction. Turning a disabled axis by hand
       does not change the bit (unknown).
     - No S-curves, no current limits; enabling takes no time.
+    - Software limits act on a homed axis only, if FaultMask has their bits, and end a motion if one of
+      FaultMaskDecel and FaultMaskDisable has them. So it is on the maker's newer controllers, by their public
+      help; for the Ensemble it is unknown. Other bits of the masks have no effect.
     - A software limit ends a motion that leads out with the abort deceleration and a fault; at rest beyond
       a limit an axis can be acknowledged and moved back. The real one may keep the fault there, or move the
       axis inside (parameter 665, FaultAckMoveOutOfLimit): unknown.
@@ -131,7 +145,7 @@ class EnsembleControllerMock:
 
     def _power_up(self) -> None:
         parameters = [self._parameters() for _ in AXES]
-        self.axes = [Axis(table) for table in parameters]
+        self.axes = [Axis(table, homed=self._settings.homed) for table in parameters]
         self._interpreter = Interpreter(self.axes, parameters, self._settings.axis_names)
         self._powered = [False, False]
         for axis in range(len(AXES)):
@@ -146,6 +160,9 @@ class EnsembleControllerMock:
             Parameter.POSITION_ERROR_THRESHOLD: settings.position_error_units,
             Parameter.SOFTWARE_LIMIT_LOW: -settings.software_limit_units,
             Parameter.SOFTWARE_LIMIT_HIGH: settings.software_limit_units,
+            Parameter.FAULT_MASK: float(_FAULT_MASK),
+            Parameter.FAULT_MASK_DISABLE: 0.0,
+            Parameter.FAULT_MASK_DECEL: float(SOFTWARE_LIMITS),
             Parameter.POSITION_FEEDBACK_TYPE: 1.0,
             Parameter.DEFAULT_RAMP_RATE: 10.0,
             Parameter.ABORT_DECEL_RATE: 1000.0,

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from mock_bench import SimulatedMotors, ToldMotors
 
 from fitctl import config
-from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
+from fitctl.drivers.ensemble.protocol import (
+    FAULT_MASKS,
+    SOFTWARE_LIMITS,
+    AxisFault,
+    AxisStatus,
+    Parameter,
+    Reply,
+)
 from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter, words_of
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock, LineSplitter
@@ -21,8 +28,8 @@ RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
 SIDEROSTAT = RIG.loops["right"].siderostat
 SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
 PERIOD_S = 0.002
-AT_REST = 0x01C00000
-"""AXISSTATUS of an axis without power that has not moved: three unconnected inputs read high."""
+AT_REST = 0x01C00002
+"""AXISSTATUS of a homed axis without power that has not moved: three unconnected inputs read high."""
 
 
 def spoken(test=None, *, motors=ToldMotors, **update):
@@ -399,6 +406,9 @@ def parameters(**update):
         Parameter.SOFTWARE_LIMIT_HIGH: 5.0,
         Parameter.DEFAULT_RAMP_RATE: 10.0,
         Parameter.ABORT_DECEL_RATE: 1000.0,
+        Parameter.FAULT_MASK: SOFTWARE_LIMITS,
+        Parameter.FAULT_MASK_DISABLE: 0,
+        Parameter.FAULT_MASK_DECEL: SOFTWARE_LIMITS,
         HOME_SPEED: 1.0,
         HOME_OFFSET: 0.0,
         HOME_RAMP_RATE: 10.0,
@@ -410,8 +420,8 @@ def interpreter(update=None):
     return Interpreter([Axis(table) for table in tables], tables, ["X", "Y"])
 
 
-def enabled_axis():
-    axis = Axis(parameters())
+def enabled_axis(**state):
+    axis = Axis(parameters(), **state)
     assert axis.enable()
     return axis
 
@@ -493,6 +503,7 @@ def test_enabled_at_rest_beyond_a_software_limit_an_axis_is_well(outward, fault)
 
 @spoken(motors=SimulatedMotors, software_limit_units=0.05)
 async def test_on_the_wire_both_limits_are_hit_acknowledged_and_left(mock, say, *_):
+    """As epics-motor jogs, and powers an axis in fault."""
     for at, outward, fault in (
         ("@0", 1, AxisFault.CW_SOFTWARE_LIMIT),
         ("@1", -1, AxisFault.CCW_SOFTWARE_LIMIT),
@@ -501,7 +512,11 @@ async def test_on_the_wire_both_limits_are_hit_acknowledged_and_left(mock, say, 
         assert await say(f"FREERUN {at} {outward}.0") == "%\n"
         await until(say, f"AXISFAULT({at})", lambda word, fault=fault: word == fault)
         assert await say(f"FREERUN {at} {-outward}.0") == "#\n"
+        assert await say(f"GETPARM({at}, 2)") == "%4000.000000\n"
+        assert await say(f"AXISFAULT {at}") == f"%{fault:d}\n"
         assert await say(f"FAULTACK {at}") == "%\n"
+        assert await say(f"ENABLE {at}") == "%\n"
+        assert await say("WAIT MODE NOWAIT") == "%\n"
         await asyncio.sleep(5 * PERIOD_S)
         assert await say(f"AXISFAULT({at})") == "%0\n"
         assert await say(f"FREERUN {at} {-outward}.0") == "%\n"
@@ -577,6 +592,39 @@ def test_home_is_beside_the_marker_by_the_offset():
     assert encoder == pytest.approx(0.25, abs=1e-3)
     assert axis.feedback == pytest.approx(0.0, abs=1e-3)
     assert axis.command == axis.offset == 0.0
+
+
+def test_before_it_is_homed_no_software_limit_acts():
+    axis = enabled_axis(homed=False)
+    axis.move_to(7.0, 10.0)
+    run(axis, 3.0)
+    assert axis.command == 7.0
+    assert not axis.faults
+    assert axis.home()
+    run(axis, 10.0)
+    assert axis.homed
+    axis.free_run(4.0)
+    run(axis, 3.0)
+    assert axis.faults == AxisFault.CW_SOFTWARE_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("masks", "fault", "ends", "powered"),
+    [
+        ((0, 0x30, 0x30), 0, False, True),
+        ((0x30, 0, 0), AxisFault.CW_SOFTWARE_LIMIT, False, True),
+        ((0x30, 0, 0x30), AxisFault.CW_SOFTWARE_LIMIT, True, True),
+        ((0x30, 0x30, 0), AxisFault.CW_SOFTWARE_LIMIT, True, False),
+    ],
+)
+def test_the_fault_masks_decide_what_a_software_limit_does(masks, fault, ends, powered):
+    axis = Axis(parameters() | dict(zip(FAULT_MASKS, masks, strict=True)))
+    axis.enable()
+    axis.free_run(4.0)
+    run(axis, 3.0)
+    assert axis.faults == fault
+    assert axis.moving is not ends
+    assert axis.enabled is powered
 
 
 def test_without_software_limits_it_runs_on():
