@@ -13,7 +13,7 @@ from fitctl.drivers.ensemble.protocol import (
     parse_bits,
     parse_number,
 )
-from fitctl.mocks.ensemble.axis import Axis
+from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter
 from fitctl.mocks.ensemble.controller import LineSplitter
 
@@ -23,7 +23,13 @@ _PARAMETERS = {
     Parameter.SOFTWARE_LIMIT_LOW: -12.5,
     Parameter.SOFTWARE_LIMIT_HIGH: 12.5,
     Parameter.DEFAULT_RAMP_RATE: 10.0,
+    Parameter.FAULT_MASK: 0x30,
+    Parameter.FAULT_MASK_DISABLE: 0,
+    Parameter.FAULT_MASK_DECEL: 0x30,
     Parameter.ABORT_DECEL_RATE: 1000.0,
+    HOME_SPEED: 1.0,
+    HOME_OFFSET: 0.0,
+    HOME_RAMP_RATE: 10.0,
 }
 _PERIOD_S = 0.002
 

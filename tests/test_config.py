@@ -235,6 +235,7 @@ def test_an_amplifiers_mock_that_is_not_described_is_asked_for():
         "baud_rate": 115200,
         "axes": [0, 1],
         "response_timeout_s": 0.5,
+        "software_limits_verified": False,
     }
     assert "mocks.loops.right.ensemble is missing" in complaint(document)
 

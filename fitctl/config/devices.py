@@ -114,13 +114,21 @@ class Cia402Device(Settings):
 
 
 class EnsembleDevice(Settings):
-    """An Aerotech Ensemble with two axes, spoken to in its ASCII commands."""
+    """An Aerotech Ensemble with two axes, spoken to in its ASCII commands.
+
+    Attributes
+    ----------
+    software_limits_verified : bool
+        Someone has driven both axes of this controller into both software limits, not homed, and they
+        stopped: neither homing nor the fault masks are checked.
+    """
 
     driver: Literal["ensemble"]
     port: str
     baud_rate: Count
     axes: Annotated[list[Annotated[int, Field(ge=0, le=9)]], Field(min_length=2, max_length=2)]
     response_timeout_s: TimeoutS
+    software_limits_verified: bool
 
     @property
     def endpoint(self) -> str:

@@ -86,6 +86,8 @@ class EnsembleMock(Settings):
         Encoder counts in one of the controller's own units.
     software_limit_units : float
         Each way from zero; 0 is none.
+    homed : bool
+        Whether its axes are homed after power-up; before they are, no software limit acts.
     position_error_units : float
         A larger one disables an axis.
     reply_s : float
@@ -102,6 +104,7 @@ class EnsembleMock(Settings):
     ]
     counts_per_unit: Positive
     software_limit_units: NonNegative
+    homed: bool
     position_error_units: Positive
     reply_s: NonNegative
     idle_timeout_s: Positive

@@ -3,12 +3,16 @@
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 
 import pytest
+from served import Served
 
 from fitctl.cli import main
+from fitctl.commands.set_up.doctor import PROBES
+from fitctl.messages.commands import Standby
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +52,7 @@ def devices(out):
 
 def test_every_device_says_who_it_is_and_how_soon(doctor, mocks):
     status, out = doctor("--json", *mocks)
+    assert json.loads(out)["asked"] == "devices"
     found = devices(out)
     assert [one["disagreements"] for one in found.values()] == [[]] * 4
     assert status == 0
@@ -89,6 +94,60 @@ def test_asking_changes_nothing(doctor, mocks):
     first, again = (doctor("--json", *mocks)[1] for _ in range(2))
     identities = [[one["identity"] for one in devices(out).values()] for out in (first, again)]
     assert identities[0] == identities[1]
+
+
+# ---------------------------------------------------------------- beside a running supervisor
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    """A running supervisor; a device that doctor asks all the same is an error."""
+
+    def ask(_settings):
+        pytest.fail("doctor asked a device of a running supervisor")
+
+    for driver in PROBES:
+        monkeypatch.setitem(PROBES, driver, ask)
+    served = Served(tmp_path)
+    served.start()
+    yield served
+    served.close()
+
+
+def of_rig(served):
+    return ["--set", f"service.folder={served.folder}"]
+
+
+def test_beside_a_running_supervisor_its_report_is_printed_and_no_device_asked(doctor, served):
+    assert served.client.send(Standby()).accepted
+    assert served.follow(lambda message: message.loops[0].mode == "STANDBY")
+    assert served.follow(lambda message: {one.state for one in message.devices} == {"ok"})
+    _, out = doctor("--json", *of_rig(served))
+    document = json.loads(out)
+    assert document["asked"] == "supervisor"
+    found = devices(out)
+    assert found["right siderostat"]["driver"] == "cia402"
+    assert found["right siderostat"]["found"]
+    assert found["right siderostat"]["disagreements"] == []
+    _, table = doctor(*of_rig(served))
+    assert f"runs (process {os.getpid()})" in " ".join(table.split())
+
+
+def test_devices_that_the_running_supervisor_has_not_opened_are_not_found(doctor, served):
+    status, out = doctor("--json", *of_rig(served))
+    (complaint,) = devices(out)["right siderostat"]["disagreements"]
+    assert "has not opened it" in complaint
+    assert status == 1
+
+
+def test_a_socket_that_a_supervisor_left_behind_keeps_nobody_from_asking(doctor, mocks, tmp_path):
+    folder = tmp_path / "s"
+    folder.mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(folder / "command"))
+    status, out = doctor("--json", *mocks, "--set", f"service.folder={folder}")
+    assert json.loads(out)["asked"] == "devices"
+    assert status == 0
 
 
 @pytest.mark.skipif(

@@ -8,6 +8,7 @@ import asyncio
 import pytest
 
 from fitctl import config
+from fitctl.drivers.ensemble.protocol import AxisStatus
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock
 
 pytestmark = pytest.mark.peer
@@ -62,7 +63,7 @@ def test_it_enables_moves_and_reads_positions(served):
     client.enable()  # X and Y, and Z, which is refused
     assert motors.enabled == [True, True]
     client.write_read("MOVEABS X0.500000 XF10.0 Y-0.250000 YF10.0")
-    while client.write_read("PLANESTATUS(0)") == "1":
+    while any(int(client.write_read(f"AXISSTATUS({name})")) & AxisStatus.MOVING for name in "XY"):
         pass
     assert float(client.write_read("PFBK X")) == pytest.approx(0.5, abs=1e-3)
     assert float(client.write_read("PFBK Y")) == pytest.approx(-0.25, abs=1e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -13,10 +14,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from fitctl.commands.operate.status import newest_telemetry
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import to_json
 from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.supervisor import client_of
 from fitctl.config import Rig
 from fitctl.drivers.bal_analog.driver import probe_bal_analog
 from fitctl.drivers.cia402.configure import probe_drive
@@ -26,8 +29,11 @@ from fitctl.drivers.interface import DeviceError, DeviceIdentity, DeviceTimeout,
 from fitctl.drivers.mdt693.driver import probe_mdt693
 from fitctl.drivers.modbus_dac.probe import probe_dac
 from fitctl.drivers.probe import Probe
+from fitctl.messages.endpoints import COMMAND_SOCKET, service_folder
+from fitctl.messages.telemetry import Telemetry
 
 _WIDEST = 118
+_FIRST_REPORT_S = 3.0
 PROBES: dict[str, Callable[[Any], Probe]] = {
     "gige": probe_camera,
     "aravis": probe_camera,
@@ -65,7 +71,8 @@ class Finding(NamedTuple):
 def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
     """Ask every device of the rig who it is; nothing is set, nothing moves.
 
-    Exit status 1 if one is missing or is not as the rig file says.
+    While the rig's supervisor runs, print what it reports of its devices instead, and ask none.
+    Exit status 1 if a device is missing or is not as the rig file says.
     """
     raise typer.Exit(ask_devices(rig_of(rig, overrides), as_json=as_json))
 
@@ -73,13 +80,24 @@ def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOpti
 def ask_devices(rig: Rig, *, as_json: bool) -> int:
     """Ask every device of a rig, print what they answer; returns the exit status."""
     logging.disable()  # libraries print on stderr what is in the table
-    parts = list(_parts(rig))
-    with ThreadPoolExecutor(len(parts)) as pool:
-        findings = list(pool.map(lambda part: examine(*part), parts))
+    running = _running_supervisor(rig)
+    if running is None:
+        parts = list(_parts(rig))
+        with ThreadPoolExecutor(len(parts)) as pool:
+            findings = list(pool.map(lambda part: examine(*part), parts))
+    else:
+        findings = reported(rig, running)
+    asked = "devices" if running is None else "supervisor"
     if as_json:
-        typer.echo(to_json({"rig": rig.name, "devices": [_plain(one) for one in findings]}))
+        plain = [_plain(one) for one in findings]
+        typer.echo(to_json({"rig": rig.name, "asked": asked, "devices": plain}))
     else:
         _print(rig, findings)
+        if running is not None:
+            typer.echo(
+                f"The supervisor of {rig.name} runs (process {running.pid}). This is its report: doctor has"
+                " not asked the devices, which it would disturb. To have them asked, end it first."
+            )
     return FAILED if any(finding.disagreements for finding in findings) else 0
 
 
@@ -92,6 +110,46 @@ def examine(device: str, driver: str, settings: Any) -> Finding:
         return Finding(device, driver, found, None, None, [str(error)])
     round_trip_ms = 1e3 * probe.round_trip_s
     return Finding(device, driver, True, probe.identity, round_trip_ms, list(probe.disagreements))
+
+
+def reported(rig: Rig, running: Telemetry) -> list[Finding]:
+    """What the running supervisor reports of its devices."""
+    drivers = {device.removesuffix(" amplifier"): driver for device, driver, _ in _parts(rig)}
+    findings = []
+    for health in running.devices:
+        trouble = {
+            "ok": [],
+            "fault": [health.detail],
+            "closed": ["the supervisor has not opened it: send standby, or end the supervisor"],
+        }[health.state]
+        identity = DeviceIdentity("", health.identity, "", "") if health.identity else None
+        found = health.state == "ok"
+        driver = drivers.get(health.device, "")
+        findings.append(Finding(health.device, driver, found, identity, None, trouble))
+    if not findings:
+        nothing = "the supervisor has not reported any device yet: run doctor again"
+        findings.append(Finding("devices", "", False, None, None, [nothing]))
+    return findings
+
+
+def _running_supervisor(rig: Rig) -> Telemetry | None:
+    """A message of the rig's supervisor on this machine, if one answers.
+
+    One that has just started reports its devices within a second or two.
+    """
+    if not (service_folder(rig) / COMMAND_SOCKET).exists():
+        return None
+    client = client_of(rig)
+    try:
+        running = newest_telemetry(client)
+        deadline_s = time.monotonic() + _FIRST_REPORT_S
+        while not running.devices and time.monotonic() < deadline_s:
+            running = client.receive(_FIRST_REPORT_S) or running
+        return running
+    except ConnectionError:
+        return None
+    finally:
+        client.close()
 
 
 def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:

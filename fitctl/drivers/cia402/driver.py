@@ -283,8 +283,16 @@ class Cia402Amplifiers(_Base):
         velocities = _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
         sync_s = time.monotonic()
         self._opened().link.send((self._rpdo_id, velocities), (protocol.SYNC_ID, b""))
-        self._encoders.sync_sent(sync_s)
+        self._encoders.sync_sent(sync_s, self._driven(az_rad_s, el_rad_s))
         return sync_s
+
+    def _driven(self, az_rad_s: float, el_rad_s: float) -> AzEl | None:
+        """Velocities in encoder counts/s; None while an axis may be without current."""
+        if not all(
+            protocol.state_of(word) is State.OPERATION_ENABLED for word in self._statuswords
+        ):
+            return None
+        return az_rad_s / self._rad_per_count, el_rad_s / self._rad_per_count
 
     def _find_lost(self) -> None:
         """Once behind for long, distinguish a lost TPDO from a slow link.

@@ -6,12 +6,14 @@ system calls each; :class:`BulkSlcanBus` reads what is there in one call, and is
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import re
 import select
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 import can
@@ -32,16 +34,30 @@ _STAMP_DIGITS = 4
 
 
 class BulkSlcanBus(slcanBus):
-    """python-can's SLCAN bus, with reads in chunks, no Nagle delay, and a shutdown that always closes."""
+    """python-can's SLCAN bus, with reads in chunks, no Nagle delay, and a shutdown that always closes.
+
+    A serial port is locked before the adapter on it gets a byte: python-can shares its port, and sets the
+    adapter up anew under whoever uses it.
+
+    Raises
+    ------
+    OSError
+        If another process has the port.
+    """
 
     # LAWICEL's S7 is 800 kbit/s; python-can lists 750.
     _BITRATES = {**slcanBus._BITRATES, 800000: "S7"}  # noqa: RUF012 (overrides python-can's)
 
     def __init__(self, channel: str, bitrate: int) -> None:
         self._batch: bytearray | None = None
-        super().__init__(channel, bitrate=bitrate, sleep_after_open=0)
+        socket_url = channel.startswith("socket://")
+        with contextlib.ExitStack() as stack:
+            if not socket_url:
+                stack.enter_context(_locked(channel.partition("@")[0]))
+            super().__init__(channel, bitrate=bitrate, sleep_after_open=0)
+            self._lock = stack.pop_all()
         self._descriptor = self.fileno()
-        if channel.startswith("socket://"):
+        if socket_url:
             link = socket.socket(fileno=self._descriptor)
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             link.detach()
@@ -114,6 +130,22 @@ class BulkSlcanBus(slcanBus):
             super().shutdown()
         finally:
             self.serialPortOrig.close()
+            self._lock.close()
+
+
+@contextlib.contextmanager
+def _locked(path: str) -> Iterator[None]:
+    """The lock that pyserial puts on a port which it opens with ``exclusive=True``."""
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            msg = f"{path} is in use by another process"
+            raise OSError(msg) from error
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _checked(line: bytes) -> str:

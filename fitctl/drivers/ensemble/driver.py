@@ -5,7 +5,8 @@ fast that trajectory runs. The servo above sees angles and commands velocities a
 so that it takes out what the trajectories do not.
 
 A free run has no end: when we are gone the motors go on, up to the controller's software limits. Therefore
-a controller without them is refused.
+a controller without them is refused, and so is an axis that is not homed or whose fault masks leave them out:
+there the limits may not act. `software_limits_verified` is for a controller on which they have been tried.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from fitctl.config import EnsembleDevice, Siderostat
 from fitctl.drivers.amplifiers import AXES, LinkedAmplifiers
 from fitctl.drivers.ensemble.link import EnsembleLink
 from fitctl.drivers.ensemble.protocol import (
+    FAULT_MASKS,
     AxisStatus,
     Parameter,
     Reply,
@@ -27,6 +29,7 @@ from fitctl.drivers.ensemble.protocol import (
     fault_text,
     parse_bits,
     parse_number,
+    why_limits_may_not_act,
 )
 from fitctl.drivers.interface import (
     AzEl,
@@ -67,7 +70,7 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         Raises
         ------
         DeviceMismatch
-            An axis has no encoder counts or no software limits.
+            An axis has no encoder counts, or no software limits that are known to act.
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
         self.close()
@@ -155,9 +158,9 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
             position_rad=(az_rad, el_rad),
             enabled=all(status & AxisStatus.ENABLED for status in self._status),
             fault="; ".join(
-                f"{name}: {fault_text(faults)}"
-                for name, faults in zip(AXES, self._faults, strict=True)
-                if faults
+                f"{name}: {fault}"
+                for axis, name in enumerate(AXES)
+                if (fault := self._fault_of(axis))
             ),
         )
 
@@ -184,6 +187,16 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
             self._command(command)
         self._is_enabled(axis)
         self._read_faults(axis)
+        if not self._device.software_limits_verified:
+            masks = (int(self._parameter(axis, mask)) for mask in FAULT_MASKS)
+            if why := why_limits_may_not_act(self._status[axis], *masks):
+                raise self._mismatch(axis, "software limits that act", why)
+
+    def _fault_of(self, axis: int) -> str:
+        if self._faults[axis]:
+            return fault_text(self._faults[axis])
+        unhomed = not self._status[axis] & AxisStatus.HOMED
+        return "not homed" if unhomed and not self._device.software_limits_verified else ""
 
     def _free_run(self, axis: int, velocity_rad_s: float) -> None:
         """Command a velocity, unless it is the last one commanded."""
@@ -257,13 +270,13 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         return self._opened().value(text, parse_bits)
 
     def _mismatch(self, axis: int, expected: str, got: str) -> DeviceMismatch:
-        hint = "set them in the controller with its maker's tool"
+        hint = "set them in the controller, or home it, with its maker's tool"
         return self._endpoint.error(DeviceMismatch, f"{AXES[axis]}: {expected}", got, hint)
 
     def _axis_fault(self, axis: int, goal: str, got: str) -> DeviceFault:
         faults = fault_text(self._read_faults(axis))
         got = f"{got}; {faults}" if faults else got
-        hint = "remove its cause, then recover"
+        hint = "remove its cause, in the controller with its maker's tool if need be; then recover"
         return self._endpoint.error(DeviceFault, f"{AXES[axis]} {goal}", got, hint)
 
 
@@ -288,6 +301,17 @@ def probe_ensemble(siderostat: Siderostat[EnsembleDevice]) -> Probe:
                 disagreements.append(
                     f"axis @{axis} has no software limits: set SoftwareLimitLow and SoftwareLimitHigh"
                 )
+            elif not device.software_limits_verified:
+                masks = (
+                    int(link.value(f"GETPARM(@{axis}, {mask.value})", parse_number))
+                    for mask in FAULT_MASKS
+                )
+                status = link.value(f"AXISSTATUS(@{axis})", parse_bits)
+                if why := why_limits_may_not_act(status, *masks):
+                    disagreements.append(
+                        f"axis @{axis} has software limits that may not act ({why}): home it, and set"
+                        " FaultMask and FaultMaskDecel"
+                    )
             faults = link.value(f"AXISFAULT(@{axis})", parse_bits)
             if faults:
                 disagreements.append(

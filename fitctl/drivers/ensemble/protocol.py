@@ -27,7 +27,11 @@ class Reply(Enum):
 
 
 class AxisStatus(IntFlag):
-    """Bits of AXISSTATUS that are used here."""
+    """Bits of AXISSTATUS that are used here.
+
+    CLOCKWISE is the direction of the active or of the last motion. The three limit inputs are levels at the
+    pins, whatever polarity the controller has been given: unconnected ones read high.
+    """
 
     ENABLED = 1 << 0
     HOMED = 1 << 1
@@ -36,8 +40,10 @@ class AxisStatus(IntFlag):
     ACCELERATING = 1 << 4
     DECELERATING = 1 << 5
     CLOCKWISE = 1 << 9
+    HOMING = 1 << 14
     CW_END_OF_TRAVEL = 1 << 22
     CCW_END_OF_TRAVEL = 1 << 23
+    HOME_LIMIT = 1 << 24
     EMERGENCY_STOP = 1 << 31
 
 
@@ -65,15 +71,46 @@ class AxisFault(IntFlag):
 
 
 class Parameter(IntEnum):
-    """Numbers of axis parameters, the same in all headers that are public."""
+    """Numbers of axis parameters, the same in all headers that are public.
+
+    Except those of the fault masks, which are in the maker's header for the Ensemble alone.
+    """
 
     COUNTS_PER_UNIT = 2
+    FAULT_MASK = 26
+    FAULT_MASK_DISABLE = 27
+    FAULT_MASK_DECEL = 28
     POSITION_ERROR_THRESHOLD = 32
     SOFTWARE_LIMIT_LOW = 37
     SOFTWARE_LIMIT_HIGH = 38
     POSITION_FEEDBACK_TYPE = 47
     DEFAULT_RAMP_RATE = 72
     ABORT_DECEL_RATE = 73
+
+
+FAULT_MASKS = (Parameter.FAULT_MASK, Parameter.FAULT_MASK_DISABLE, Parameter.FAULT_MASK_DECEL)
+SOFTWARE_LIMITS = AxisFault.CW_SOFTWARE_LIMIT | AxisFault.CCW_SOFTWARE_LIMIT
+
+
+def why_limits_may_not_act(status: int, raised: int, disabling: int, stopping: int) -> str:
+    """What may keep an axis from stopping at its software limits; empty if nothing is known.
+
+    Parameters
+    ----------
+    status : int
+        AXISSTATUS. On the maker's newer controllers, no software limit acts before the axis has been homed.
+    raised, disabling, stopping : int
+        FaultMask, FaultMaskDisable and FaultMaskDecel: which faults are raised, and which of them end a
+        motion.
+    """
+    if not status & AxisStatus.HOMED:
+        return "not homed"
+    if raised & SOFTWARE_LIMITS != SOFTWARE_LIMITS:
+        return f"FaultMask 0x{raised:X} without software limits (0x{SOFTWARE_LIMITS:X})"
+    ending = disabling | stopping
+    if ending & SOFTWARE_LIMITS != SOFTWARE_LIMITS:
+        return f"FaultMaskDecel and FaultMaskDisable 0x{ending:X} without software limits"
+    return ""
 
 
 def fault_text(faults: int) -> str:

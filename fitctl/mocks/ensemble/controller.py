@@ -7,8 +7,15 @@ from collections import deque
 from collections.abc import Callable
 
 from fitctl.config import EnsembleDevice, EnsembleMock, Siderostat
-from fitctl.drivers.ensemble.protocol import COMMAND_BYTES_MAX, EOS, AxisFault, Parameter, Reply
-from fitctl.mocks.ensemble.axis import Axis
+from fitctl.drivers.ensemble.protocol import (
+    COMMAND_BYTES_MAX,
+    EOS,
+    SOFTWARE_LIMITS,
+    AxisFault,
+    Parameter,
+    Reply,
+)
+from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, Wire
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
@@ -27,7 +34,8 @@ FAULTS = (
     }
 )
 CYCLE_S = 0.002
-_LONGEST_STEP_S = 0.02
+_FAULT_MASK = 0x50C42FCF | SOFTWARE_LIMITS
+"""The newer controllers' default, and the software limits."""
 _CAUSES = {
     "amplifier_fault": AxisFault.AMPLIFIER,
     "following_error": AxisFault.POSITION_ERROR,
@@ -42,8 +50,25 @@ class EnsembleControllerMock:
 
     Known limitations
     -----------------
-    - No end-of-travel or emergency stop inputs, no homing, no S-curves, no current limits; enabling
-      takes no time. A software limit ends a move with the abort deceleration and a fault.
+    - Homed from power-up on, as by a program that a real controller would run then, unless the setting `homed`
+      is false.
+    - Nothing is connected to the inputs for end of travel and home: AXISSTATUS always has bits 22, 23 and
+      24, which are the levels at the pins. With parameter 61 at 0 (active low) they are not active. Set to
+      active high, a real controller would fault; this one does not. That bit 24 is pulled high as the other
+      two are is inferred from the maker's newer controllers.
+    - Bit 31 of AXISSTATUS is set while a fault of the mock presses the emergency stop. Words of real
+      controllers in normal use have it set, so its sense may be the other one: nothing may conclude from it.
+    - Bit 9 of AXISSTATUS, the direction of the active or last motion, is 1 for positive, as the maker's header
+      has it ("clockwise (positive)"). epics-motor's driver takes 1 for negative: with
+      ReverseMotionDirection 0 its record shows the opposite direction. Turning a disabled axis by hand
+      does not change the bit (unknown).
+    - No S-curves, no current limits; enabling takes no time.
+    - Software limits act on a homed axis only, if FaultMask has their bits, and end a motion if one of
+      FaultMaskDecel and FaultMaskDisable has them. So it is on the maker's newer controllers, by their public
+      help; for the Ensemble it is unknown. Other bits of the masks have no effect.
+    - A software limit ends a motion that leads out with the abort deceleration and a fault; at rest beyond
+      a limit an axis can be acknowledged and moved back. The real one may keep the fault there, or move the
+      axis inside (parameter 665, FaultAckMoveOutOfLimit): unknown.
     - Any number of clients; the real one's socket takes one. Its answers come at `reply_s` whatever they
       are.
     - The pty has no baud rate.
@@ -51,8 +76,9 @@ class EnsembleControllerMock:
 
     Invented constants
     ------------------
-    The controller's cycle and loop gain, its default ramp and speed, the in-position window, six decimals
-    in every number, and that FAULTACK is obeyed though the fault comes back.
+    The controller's cycle and loop gain, its default ramps and speeds, the in-position window, the time over
+    which VFBK is the mean of the encoder's velocity, six decimals in every number, and that
+    FAULTACK is obeyed though the fault comes back.
 
     Parameters
     ----------
@@ -119,7 +145,7 @@ class EnsembleControllerMock:
 
     def _power_up(self) -> None:
         parameters = [self._parameters() for _ in AXES]
-        self.axes = [Axis(table) for table in parameters]
+        self.axes = [Axis(table, homed=self._settings.homed) for table in parameters]
         self._interpreter = Interpreter(self.axes, parameters, self._settings.axis_names)
         self._powered = [False, False]
         for axis in range(len(AXES)):
@@ -128,19 +154,24 @@ class EnsembleControllerMock:
     def _parameters(self) -> dict[int, float]:
         """One axis' parameters; those without a name here are read by epics-motor's driver."""
         settings = self._settings
-        reverse_direction, limit_setup, home_setup, home_offset = 1, 61, 75, 77
+        reverse_direction, limit_setup, home_setup = 1, 61, 75
         return {
             Parameter.COUNTS_PER_UNIT: settings.counts_per_unit,
             Parameter.POSITION_ERROR_THRESHOLD: settings.position_error_units,
             Parameter.SOFTWARE_LIMIT_LOW: -settings.software_limit_units,
             Parameter.SOFTWARE_LIMIT_HIGH: settings.software_limit_units,
+            Parameter.FAULT_MASK: float(_FAULT_MASK),
+            Parameter.FAULT_MASK_DISABLE: 0.0,
+            Parameter.FAULT_MASK_DECEL: float(SOFTWARE_LIMITS),
             Parameter.POSITION_FEEDBACK_TYPE: 1.0,
             Parameter.DEFAULT_RAMP_RATE: 10.0,
             Parameter.ABORT_DECEL_RATE: 1000.0,
             reverse_direction: 0.0,
             limit_setup: 0.0,
             home_setup: 0.0,
-            home_offset: 0.0,
+            HOME_SPEED: 1.0,
+            HOME_OFFSET: 0.0,
+            HOME_RAMP_RATE: 10.0,
         }
 
     def _answer(self, line: str) -> bytes:
@@ -156,7 +187,7 @@ class EnsembleControllerMock:
 
     def _step(self) -> None:
         now_s = asyncio.get_running_loop().time()
-        period_s = min(now_s - self._stepped_s, _LONGEST_STEP_S)
+        period_s = now_s - self._stepped_s
         self._stepped_s = now_s
         for axis, counts in zip(self.axes, self._motors.position_counts(), strict=True):
             axis.step(counts / self._settings.counts_per_unit, period_s)

@@ -1,5 +1,6 @@
 """What the driver makes of everything that can go wrong with the drive and its link."""
 
+import math
 import time
 
 import pytest
@@ -164,6 +165,24 @@ def test_a_jumped_encoder_is_said_until_it_is_reset_and_commands_still_reach_the
         wait_until(lambda wanted=wanted: bench.motors.velocity_rad_s == wanted)
     enabled.reset_fault()
     assert error_from(enabled, STILL, within_s=0.2) is None
+
+
+def test_readings_are_held_against_commands_while_both_motors_have_current(
+    enabled, monkeypatch, siderostat
+):
+    sent = []
+    record = enabled._encoders.sync_sent
+    monkeypatch.setattr(
+        enabled._encoders,
+        "sync_sent",
+        lambda time_s, commanded: (sent.append(commanded), record(time_s, commanded)),
+    )
+    enabled.exchange((3.0, -2.0))
+    counts_per_rad = siderostat.encoder_counts_per_rev / (2 * math.pi)
+    assert sent.pop() == pytest.approx((3.0 * counts_per_rad, -2.0 * counts_per_rad))
+    enabled.disable()
+    enabled.exchange(STILL)
+    assert sent.pop() is None
 
 
 def test_a_stuck_axis_is_read_where_it_stands(bench, enabled):

@@ -22,11 +22,11 @@ class Script:
         monkeypatch.setattr(positions, "time", SimpleNamespace(monotonic=lambda: self.now_s))
         self.encoders = Encoders(FASTEST_COUNTS_S)
 
-    def read(self, az, el=0, after_s=0.002):
+    def read(self, az, el=0, after_s=0.002, commanded=None):
         """One period: SYNC, and its answer."""
         self.encoders.latched = None
         self.now_s += after_s
-        self.encoders.sync_sent(self.now_s)
+        self.encoders.sync_sent(self.now_s, commanded)
         self.encoders.add((az, el))
         return self.encoders.latched
 
@@ -77,6 +77,65 @@ def test_a_motor_may_go_on_at_its_limit_after_any_silence(script):
     for turn in range(1, 10):
         assert script.read(round(turn * FASTEST_COUNTS_S * 0.5), after_s=0.5) is not None
     assert script.encoders.jumped == ""
+
+
+def test_what_the_velocity_limit_allows_is_false_for_a_motor_that_is_commanded_less(script):
+    """Of a false digit in the count: 200 is what the limit lets it turn in the time, not the command."""
+    fast = 0.2
+    for _ in range(3):
+        script.read(0, commanded=(0.0, 0.0), after_s=fast)
+    assert script.read(100, commanded=(0.0, 0.0), after_s=fast) is None
+    assert script.read(1, commanded=(0.0, 0.0), after_s=fast).counts == (1, 0)
+    assert script.encoders.jumped == ""
+    assert script.read(100, commanded=(0.0, 0.0), after_s=fast) is None
+    script.read(101, commanded=(0.0, 0.0), after_s=fast)
+    assert script.encoders.jumped == "azimuth moved by 100 counts, elevation moved by 0 counts"
+
+
+def test_a_motor_may_go_on_at_what_it_was_commanded_and_slow_down(script):
+    place = 0.0
+    for speed in (0.0, 0.0, 900.0, 900.0, 0.0, 0.0):
+        assert script.read(int(place), commanded=(speed, 0.0), after_s=0.02), (speed, place)
+        place += speed * 0.02
+    assert script.read(int(place), commanded=(0.0, 0.0), after_s=0.3)
+    assert script.read(int(place) + 270, commanded=(0.0, 0.0), after_s=0.3) is None
+
+
+def test_after_a_silence_the_motor_has_had_its_last_command_all_the_time(script):
+    for _ in range(3):
+        script.read(0, commanded=(0.0, 0.0), after_s=0.2)
+    script.read(0, commanded=(-800.0, 0.0), after_s=0.02)
+    assert script.read(-320, commanded=(0.0, 0.0), after_s=0.4)
+
+
+def test_late_answers_are_held_against_the_commands_of_their_time(script):
+    for _ in range(3):
+        script.read(0, commanded=(0.0, 0.0), after_s=0.2)
+    encoders = script.encoders
+    for speed in (1000.0, 1000.0, *[0.0] * 20):  # the link stands still, and so the servo
+        script.now_s += 0.02
+        encoders.sync_sent(script.now_s, (speed, 0.0))
+    for place in (0, 20, 40, *[40] * 19):
+        encoders.latched = None
+        encoders.add((place, 0))
+        assert encoders.latched is not None
+    assert encoders.jumped == ""
+
+
+def test_answers_that_never_come_leave_what_was_commanded_with_them(script):
+    for _ in range(3):
+        script.read(0, commanded=(0.0, 0.0), after_s=0.2)
+    for speed in (1000.0, *[0.0] * 20):
+        script.now_s += 0.02
+        script.encoders.sync_sent(script.now_s, (speed, 0.0))
+    script.encoders.give_up()
+    assert script.read(300, commanded=(0.0, 0.0)) is not None
+
+
+def test_motors_without_current_may_be_turned_by_hand(script):
+    script.read(0, commanded=(0.0, 0.0))
+    for turn in range(1, 5):
+        assert script.read(180 * turn, after_s=0.2) is not None
 
 
 def test_after_a_restart_any_place_is_believed(script):

@@ -9,6 +9,8 @@ from scripted_server import scripted_server
 
 from fitctl import config
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers, probe_ensemble
+from fitctl.drivers.ensemble.link import EnsembleLink
+from fitctl.drivers.ensemble.protocol import Reply
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceFault,
@@ -29,8 +31,13 @@ WELL = {
     "GETPARM(@1, 37)": "%-10.0\n",
     "GETPARM(@0, 38)": "%10.0\n",
     "GETPARM(@1, 38)": "%10.0\n",
-    "AXISSTATUS(@0)": "%1\n",
-    "AXISSTATUS(@1)": "%1\n",
+    **{
+        f"GETPARM(@{axis}, {mask})": f"%{bits}.0\n"
+        for axis in (0, 1)
+        for mask, bits in ((26, 0x30), (27, 0x10), (28, 0x20))
+    },
+    "AXISSTATUS(@0)": "%3\n",
+    "AXISSTATUS(@1)": "%3\n",
     "AXISFAULT(@0)": "%0\n",
     "AXISFAULT(@1)": "%0\n",
     "PFBKPROG(@0)": "%1.5\n",
@@ -96,6 +103,9 @@ def test_the_wire_when_it_is_opened(scripted):
         "RAMP RATE @0 3819.71863",
         "AXISSTATUS(@0)",
         "AXISFAULT(@0)",
+        "GETPARM(@0, 26)",
+        "GETPARM(@0, 27)",
+        "GETPARM(@0, 28)",
         "GETPARM(@1, 2)",
         "GETPARM(@1, 37)",
         "GETPARM(@1, 38)",
@@ -105,6 +115,9 @@ def test_the_wire_when_it_is_opened(scripted):
         "RAMP RATE @1 1909.859317",
         "AXISSTATUS(@1)",
         "AXISFAULT(@1)",
+        "GETPARM(@1, 26)",
+        "GETPARM(@1, 27)",
+        "GETPARM(@1, 28)",
         "WAIT MODE NOWAIT",
     ]
 
@@ -171,6 +184,10 @@ def test_what_controllers_differ_in_is_taken(scripted, style):
         ({"GETPARM(@1, 2)": "!\n"}, DeviceRefused, r"GETPARM\(@1, 2\) .* not understood"),
         ({"GETPARM(@0, 2)": "%0.0\n"}, DeviceMismatch, "azimuth: .*CountsPerUnit"),
         ({"GETPARM(@1, 38)": "%-10.0\n"}, DeviceMismatch, "elevation: software limits"),
+        ({"AXISSTATUS(@1)": "%1\n"}, DeviceMismatch, "elevation: .* that act, got not homed"),
+        ({"GETPARM(@0, 26)": "%16.0\n"}, DeviceMismatch, "azimuth: .*got FaultMask 0x10 without"),
+        ({"GETPARM(@0, 27)": "%0.0\n"}, DeviceMismatch, "FaultMaskDecel and FaultMaskDisable 0x20"),
+        ({"GETPARM(@0, 28)": "!\n"}, DeviceRefused, r"GETPARM\(@0, 28\) .* not understood"),
         ({"GETPARM(@0, 2)": "%nan\n"}, DeviceProtocolError, "a number"),
         ({"GETPARM(@0, 2)": "?\n"}, DeviceProtocolError, "one of"),
         ({"GETPARM(@0, 2)": "%" + "1" * 2000}, DeviceProtocolError, "without an end"),
@@ -184,6 +201,21 @@ def test_what_is_wrong_at_open_is_said(scripted, answers, error, said):
         driver.open()
     with pytest.raises(DeviceUnreachable, match="open"):
         driver.exchange(STILL)
+
+
+def test_limits_that_someone_has_verified_need_neither_homing_nor_masks(scripted):
+    unhomed = {"AXISSTATUS(@0)": "%1\n", "AXISSTATUS(@1)": "%1\n", "GETPARM(@0, 26)": "!\n"}
+    driver, _ = scripted(answers=unhomed, software_limits_verified=True)
+    driver.open()
+    assert driver.exchange(STILL).fault == ""
+
+
+def test_an_axis_that_is_homed_no_longer_is_a_fault(scripted):
+    driver, script = scripted()
+    driver.open()
+    script.answers["AXISSTATUS(@1)"] = "%1\n"
+    readings = [driver.exchange(STILL) for _ in range(4)]
+    assert readings[-1].fault == "elevation: not homed"
 
 
 def test_an_answer_that_nobody_asked_for_is_an_error(scripted):
@@ -313,18 +345,34 @@ def test_a_stuck_axis_becomes_the_controllers_position_error(bench_of):
     assert reading.fault == "elevation: position error"
 
 
-def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of):
+@pytest.mark.parametrize(("outward", "name"), [(1, "cw"), (-1, "ccw")], ids=["high", "low"])
+def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of, outward, name):
     bench = bench_of("ensemble")  # two revolutions
     bench.driver.open()
     bench.driver.enable()
     end_s = time.monotonic() + 5
-    while not (reading := bench.driver.exchange((30.0, 0.0))).fault:
+    while not (reading := bench.driver.exchange((30.0 * outward, 0.0))).fault:
         assert time.monotonic() < end_s
-    assert reading.fault == "azimuth: cw software limit"
+    assert reading.fault == f"azimuth: {name} software limit"
     bench.driver.reset_fault()
     bench.driver.enable()
-    while bench.driver.exchange((-10.0, 0.0)).position_rad[0] > 11.0:
+    while bench.driver.exchange((-10.0 * outward, 0.0)).position_rad[0] * outward > 11.0:
         assert time.monotonic() < end_s
+
+
+def test_a_controller_that_is_not_homed_is_refused_until_it_is(bench_of):
+    bench = bench_of("ensemble", f"{MOCK}.homed=false")
+    with pytest.raises(DeviceMismatch, match="not homed"):
+        bench.driver.open()
+    assert [text.split(":")[0] for text in probe_ensemble(bench.siderostat).disagreements] == [
+        "axis @0 has software limits that may not act (not homed)",
+        "axis @1 has software limits that may not act (not homed)",
+    ]
+    with contextlib.closing(EnsembleLink(bench.siderostat.device)) as link:
+        for command in ("ENABLE @0 @1", "IGLOBAL(32) = 2", 'PROGRAM RUN 5, "HomeAsync.bcx"'):
+            assert link.command(command) is Reply.DONE
+        time.sleep(0.1)
+    bench.driver.open()
 
 
 def test_asked_only_it_tells_what_disagrees_and_stays_as_it_is(bench_of):

@@ -9,11 +9,18 @@ import hypothesis
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mock_bench import ToldMotors
+from mock_bench import SimulatedMotors, ToldMotors
 
 from fitctl import config
-from fitctl.drivers.ensemble.protocol import AxisFault, AxisStatus, Parameter, Reply
-from fitctl.mocks.ensemble.axis import Axis
+from fitctl.drivers.ensemble.protocol import (
+    FAULT_MASKS,
+    SOFTWARE_LIMITS,
+    AxisFault,
+    AxisStatus,
+    Parameter,
+    Reply,
+)
+from fitctl.mocks.ensemble.axis import HOME_OFFSET, HOME_RAMP_RATE, HOME_SPEED, Axis
 from fitctl.mocks.ensemble.commands import Interpreter, words_of
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock, LineSplitter
 
@@ -21,9 +28,11 @@ RIG = config.load_rig(config.default_rig_path().parent / "ensemble.toml")
 SIDEROSTAT = RIG.loops["right"].siderostat
 SETTINGS = RIG.mocks.loops["right"].ensemble.model_copy(update={"tcp_port": 0})
 PERIOD_S = 0.002
+AT_REST = 0x01C00002
+"""AXISSTATUS of a homed axis without power that has not moved: three unconnected inputs read high."""
 
 
-def spoken(test=None, **update):
+def spoken(test=None, *, motors=ToldMotors, **update):
     """Run a test with a connection to a mock: ``say(command)`` gives the whole answer."""
 
     def decorate(test):
@@ -36,7 +45,7 @@ def spoken(test=None, **update):
 
     async def serve(test):
         settings = SETTINGS.model_copy(update=update)
-        mock = EnsembleControllerMock(SIDEROSTAT, settings, ToldMotors())
+        mock = EnsembleControllerMock(SIDEROSTAT, settings, motors())
         ends = await mock.start()
         reader, writer = await asyncio.open_connection("127.0.0.1", ends.tcp_port)
 
@@ -54,6 +63,13 @@ def spoken(test=None, **update):
         assert len(asyncio.all_tasks()) == 1
 
     return decorate(test) if test else decorate
+
+
+async def until(say, question, holds):
+    """Ask until the number in the answer is as wanted."""
+    end_s = asyncio.get_running_loop().time() + 5
+    while not holds(float((await say(question))[1:])):
+        assert asyncio.get_running_loop().time() < end_s
 
 
 # ---------------------------------------------------------------- transcripts
@@ -74,12 +90,24 @@ async def test_what_epics_motor_asks_at_start(mock, say, *_):
 
 @spoken
 async def test_what_epics_motor_polls(mock, say, *_):
-    assert await say("AXISSTATUS(@0)") == "%0\n"
+    assert await say("AXISSTATUS(@0)") == f"%{AT_REST}\n"
     assert await say("PLANESTATUS(0)") == "%0\n"
     assert await say("PFBKPROG(@0)") == "%0.000000\n"
     assert await say("PCMDPROG(@0)") == "%0.000000\n"
     assert await say("AXISFAULT(@0)") == "%0\n"
     assert await say("VFBK(@0)") == "%0.000000\n"
+
+
+@spoken
+async def test_epics_motor_reads_no_active_limit(mock, say, *_):
+    """As drvEnsembleAsyn.cc combines the status bits with parameter 61."""
+    setup = float((await say("GETPARM(@0, 61)"))[1:])
+    for switch_on in (False, True):
+        status = int((await say("AXISSTATUS(@0)"))[1:])
+        cw, ccw = (status >> 22 & 1), (status >> 23 & 1)
+        assert not 1 ^ cw ^ (int(setup) >> 2 & 1)
+        assert not 1 ^ ccw ^ (int(setup) >> 1 & 1)
+        assert switch_on or await say("ENABLE @0") == "%\n"
 
 
 @spoken
@@ -93,13 +121,79 @@ async def test_what_epics_motor_says_to_enable_jog_and_move(mock, say, *_):
     assert await say("RAMP RATE @0 0.10000") == "%\n"
     assert await say("FREERUN @0 0.01000") == "%\n"
     assert int((await say("AXISSTATUS(@0)"))[1:]) & (AxisStatus.ENABLED | AxisStatus.MOVING) == 9
-    assert await say("PLANESTATUS(0)") == "%1\n"
+    assert await say("PLANESTATUS(0)") == "%0\n"
     assert await say("ABORT @0") == "%\n"
     assert await say("ABS") == "%\n"
     assert await say("RAMP RATE 0.10000") == "%\n"
     assert await say("LINEAR @0 0.10000 F0.01000") == "%\n"
     assert await say("DISABLE @0") == "%\n"
-    assert await say("AXISSTATUS(@0)") == "%0\n"
+    assert await say("AXISSTATUS(@0)") == f"%{AT_REST | AxisStatus.CLOCKWISE}\n"
+
+
+@spoken(motors=SimulatedMotors)
+async def test_the_plane_moves_while_a_coordinated_move_runs(mock, say, *_):
+    """epics-motor asks PLANESTATUS for each axis: during a LINEAR of one, all its records are moving."""
+    await say("ENABLE @0")
+    await say("ENABLE @1")
+    assert await say("LINEAR @0 0.05000 F1.00000") == "%\n"
+    assert await say("PLANESTATUS(0)") == "%1\n"
+    await until(say, "PLANESTATUS(0)", lambda bits: bits == 0)
+    assert await say("PCMDPROG(@0)") == "%0.050000\n"
+    assert await say("FREERUN @1 0.01000") == "%\n"
+    assert await say("PLANESTATUS(0)") == "%0\n", "another axis' free run is not the plane's motion"
+    assert not int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.MOVING
+    assert int((await say("AXISSTATUS(@1)"))[1:]) & AxisStatus.MOVING
+    assert await say("MOVEABS X 0.06 XF 0.1") == "%\n"
+    assert await say("PLANESTATUS(0)") == "%0\n"
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.MOVING
+
+
+@spoken(motors=SimulatedMotors)
+async def test_what_epics_motor_says_to_home(mock, say, *_):
+    assert await say("ENABLE @0") == "%\n"
+    assert await say("LINEAR @0 0.10000 F5.00000") == "%\n"
+    await until(say, "PLANESTATUS(0)", lambda bits: bits == 0)
+    assert await say("SETPARM @0, 76, 0.50000") == "%\n"
+    assert await say("SETPARM @0, 75, 0") == "%\n"
+    assert await say("IGLOBAL(32) = 1") == "%\n"
+    assert await say("IGLOBAL(33) = 0") == "%\n"
+    assert await say("IGLOBAL(32)") == "%1\n"
+    assert await say('PROGRAM RUN 5, "HomeAsync.bcx"') == "%\n"
+    homing = AxisStatus.HOMING | AxisStatus.MOVING
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & (homing | AxisStatus.HOMED) == homing
+    await until(say, "AXISSTATUS(@0)", lambda bits: not int(bits) & homing)
+    assert int((await say("AXISSTATUS(@0)"))[1:]) & AxisStatus.HOMED
+    assert await say("PCMDPROG(@0)") == "%0.000000\n"
+    assert abs(float((await say("PFBKPROG(@0)"))[1:])) < 1e-3
+    assert await say("AXISFAULT(@0)") == "%0\n"
+
+
+@spoken(motors=SimulatedMotors)
+async def test_what_epics_motor_says_to_set_a_position(mock, say, *_):
+    await say("ENABLE @0")
+    assert await say("POSOFFSET SET @0, 1.50000") == "%\n"
+    assert await say("PFBKPROG(@0)") == "%1.500000\n"
+    assert await say("PCMDPROG(@0)") == "%1.500000\n"
+    assert await say("PFBK(@0)") == "%0.000000\n", "nothing moved"
+    assert await say("ABS") == "%\n"
+    assert await say("LINEAR @0 1.55000 F5.00000") == "%\n"
+    await until(say, "PLANESTATUS(0)", lambda bits: bits == 0)
+    assert await say("PCMDPROG(@0)") == "%1.550000\n"
+    await until(say, "PFBK(@0)", lambda place: abs(place - 0.05) < 1e-3)
+    assert await say("POSOFFSET SET X 0 Y 2") == "%\n"
+    assert await say("PCMDPROG(@1)") == "%2.000000\n"
+    assert await say("POSOFFSET CLEAR @0") == "%\n"
+    assert await say("PCMDPROG(@0)") == "%0.050000\n"
+
+
+@spoken(position_error_units=5.0)
+async def test_epics_motors_records_of_errors(mock, say, *_):
+    assert await say("perr(0)") == "%0.000000\n"
+    assert await say("verr(@0)") == "%0.000000\n"
+    await say("ENABLE @0")
+    await say("FREERUN @0 1.0")  # a motor that does not turn
+    await until(say, "perr(0)", lambda error: error > 0.01)
+    await until(say, "verr(0)", lambda error: error == pytest.approx(1.0))
 
 
 @spoken
@@ -138,6 +232,15 @@ async def test_what_other_public_clients_say(mock, say, *_):
         "PLANESTATUS(1)",
         "ABS 1",
         "ENABLE @0; DISABLE @0",
+        "IGLOBAL",
+        "IGLOBAL(32) = ",
+        "IGLOBAL(32) 1",
+        "IGLOBAL(32) = 1.5",
+        "POSOFFSET @0, 1",
+        "POSOFFSET SET @0",
+        "POSOFFSET SET @2, 1",
+        "PROGRAM RUN 5",
+        "PERR(2)",
         "\x80",
     ],
 )
@@ -151,6 +254,49 @@ async def test_what_cannot_be_done_now_is_a_fault(mock, say, *_):
     assert await say("MOVEABS X 1") == "#\n"
     assert await say("RAMP RATE @0 0") == "#\n"
     assert await say("SETPARM @0, 32, -1") == "#\n"
+    assert await say("IGLOBAL(50) = 1") == "#\n"
+    assert await say("IGLOBAL(32) = 1") == "%\n"
+    assert await say('PROGRAM RUN 5, "HomeAsync.bcx"') == "#\n", "no power"
+    assert await say("ENABLE @0") == "%\n"
+    assert await say('PROGRAM RUN 5, "Other.bcx"') == "#\n"
+    assert await say("IGLOBAL(33) = 2") == "%\n"
+    assert await say('PROGRAM RUN 5, "HomeAsync.bcx"') == "#\n", "no such axis"
+
+
+@pytest.mark.parametrize(
+    ("number", "taken", "refused"),
+    [
+        (1, "1 0", "-1 0.5"),
+        (61, "6 0", "-1 0.5"),
+        (75, "1 0", "-1 0.5"),
+        (47, "2 0", "-1"),
+        (2, "-4000.0 2000", "0"),
+        (32, "0.5 0", "-1"),
+        (72, "5.0", "0 -5"),
+        (73, "250.0", "0 -5"),
+        (37, "-3.0 0 3", ""),
+        (38, "-3.0 0 3", ""),
+        (76, "0.5", "0 -0.5"),
+        (77, "-1.5 0 1.5", ""),
+        (78, "0.5", "0 -0.5"),
+    ],
+)
+def test_parameters_are_set_within_their_range(number, taken, refused):
+    controller = interpreter(dict.fromkeys((1, 2, 47, 61, 75), 7.0))
+    for value in taken.split():
+        assert controller.answer(f"SETPARM @0, {number}, {value}") == (Reply.DONE, "")
+        assert controller.answer(f"GETPARM(@0, {number})") == (Reply.DONE, f"{float(value):.6f}")
+    for wrong in refused.split():
+        assert controller.answer(f"SETPARM @0, {number}, {wrong}") == (Reply.FAULT, "")
+        assert controller.answer(f"GETPARM(@0, {number})") == (Reply.DONE, f"{float(value):.6f}")
+
+
+def test_a_position_error_threshold_of_zero_is_none():
+    axis = Axis(parameters() | {Parameter.POSITION_ERROR_THRESHOLD: 0.0})
+    axis.enable()
+    axis.step(3.0, PERIOD_S)
+    assert not axis.faults
+    assert axis.status & AxisStatus.IN_POSITION
 
 
 @spoken(always_send_eos=False)
@@ -164,7 +310,7 @@ async def test_answers_come_one_after_the_other_in_the_controllers_time(mock, sa
     loop = asyncio.get_running_loop()
     before_s = loop.time()
     writer.write(b"NONE\nAXISFAULT(@0)\nAXIS")
-    writer.write(b"STATUS(@1)\n")
+    writer.write(b"FAULT(@1)\n")
     assert await asyncio.wait_for(reader.readexactly(8), 5) == b"!\n%0\n%0\n"
     assert loop.time() - before_s >= 3 * 0.05
 
@@ -207,7 +353,7 @@ async def test_an_amplifiers_fault_disables_and_comes_back_while_its_cause_is_th
     set_fault(mock, "amplifier_fault", part="el")
     assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
     assert await say("AXISFAULT(@0)") == "%0\n"
-    assert await say("AXISSTATUS(@1)") == "%0\n"
+    assert await say("AXISSTATUS(@1)") == f"%{AT_REST}\n"
     assert await say("FAULTACK @1") == "%\n"
     assert await say("AXISFAULT(@1)") == f"%{AxisFault.AMPLIFIER}\n"
     assert await say("ENABLE @1") == "#\n"
@@ -260,16 +406,22 @@ def parameters(**update):
         Parameter.SOFTWARE_LIMIT_HIGH: 5.0,
         Parameter.DEFAULT_RAMP_RATE: 10.0,
         Parameter.ABORT_DECEL_RATE: 1000.0,
+        Parameter.FAULT_MASK: SOFTWARE_LIMITS,
+        Parameter.FAULT_MASK_DISABLE: 0,
+        Parameter.FAULT_MASK_DECEL: SOFTWARE_LIMITS,
+        HOME_SPEED: 1.0,
+        HOME_OFFSET: 0.0,
+        HOME_RAMP_RATE: 10.0,
     } | update
 
 
-def interpreter():
-    tables = [parameters(), parameters()]
+def interpreter(update=None):
+    tables = [parameters() | (update or {}), parameters()]
     return Interpreter([Axis(table) for table in tables], tables, ["X", "Y"])
 
 
-def enabled_axis():
-    axis = Axis(parameters())
+def enabled_axis(**state):
+    axis = Axis(parameters(), **state)
     assert axis.enable()
     return axis
 
@@ -304,18 +456,175 @@ def test_a_move_ends_where_it_should_and_rests(position, speed):
     assert not axis.faults
 
 
-def test_beyond_a_software_limit_it_stops_and_only_leads_back():
+LIMIT_SIDES = pytest.mark.parametrize(
+    ("outward", "fault"),
+    [(1, AxisFault.CW_SOFTWARE_LIMIT), (-1, AxisFault.CCW_SOFTWARE_LIMIT)],
+    ids=["high", "low"],
+)
+
+
+@LIMIT_SIDES
+def test_beyond_a_software_limit_it_stops_and_only_leads_back(outward, fault):
     axis = enabled_axis()
+    axis.free_run(4.0 * outward)
+    run(axis, 3.0)
+    assert axis.faults == fault
+    assert axis.command == pytest.approx(5.0 * outward, abs=0.1)
+    assert not axis.free_run(-1.0 * outward)
+    axis.acknowledge()
+    run(axis, 0.1)
+    assert not axis.faults, "at rest beyond the limit no fault appears by itself"
+    assert axis.free_run(-1.0 * outward)
+    run(axis, 1.0)
+    assert axis.command * outward < 4.8
+    assert not axis.faults
+
+
+@LIMIT_SIDES
+def test_beyond_a_software_limit_a_motion_outward_faults_again(outward, fault):
+    axis = enabled_axis()
+    axis.free_run(4.0 * outward)
+    run(axis, 3.0)
+    axis.acknowledge()
+    assert axis.free_run(1.0 * outward)
+    run(axis, PERIOD_S)
+    assert axis.faults == fault
+
+
+@LIMIT_SIDES
+def test_enabled_at_rest_beyond_a_software_limit_an_axis_is_well(outward, fault):
+    axis = Axis(parameters())
+    axis.step(6.0 * outward, PERIOD_S)
+    assert axis.enable()
+    run(axis, 0.1)
+    assert not axis.faults
+    assert axis.free_run(-1.0 * outward)
+
+
+@spoken(motors=SimulatedMotors, software_limit_units=0.05)
+async def test_on_the_wire_both_limits_are_hit_acknowledged_and_left(mock, say, *_):
+    """As epics-motor jogs, and powers an axis in fault."""
+    for at, outward, fault in (
+        ("@0", 1, AxisFault.CW_SOFTWARE_LIMIT),
+        ("@1", -1, AxisFault.CCW_SOFTWARE_LIMIT),
+    ):
+        assert await say(f"ENABLE {at}") == "%\n"
+        assert await say(f"FREERUN {at} {outward}.0") == "%\n"
+        await until(say, f"AXISFAULT({at})", lambda word, fault=fault: word == fault)
+        assert await say(f"FREERUN {at} {-outward}.0") == "#\n"
+        assert await say(f"GETPARM({at}, 2)") == "%4000.000000\n"
+        assert await say(f"AXISFAULT {at}") == f"%{fault:d}\n"
+        assert await say(f"FAULTACK {at}") == "%\n"
+        assert await say(f"ENABLE {at}") == "%\n"
+        assert await say("WAIT MODE NOWAIT") == "%\n"
+        await asyncio.sleep(5 * PERIOD_S)
+        assert await say(f"AXISFAULT({at})") == "%0\n"
+        assert await say(f"FREERUN {at} {-outward}.0") == "%\n"
+        await until(say, f"PFBKPROG({at})", lambda place, out=outward: place * out < 0.04)
+        assert await say(f"ABORT {at}") == "%\n"
+        assert await say(f"AXISFAULT({at})") == "%0\n"
+
+
+def test_the_direction_bit_is_of_the_last_motion():
+    axis = enabled_axis()
+    assert not axis.status & AxisStatus.CLOCKWISE
+    for velocity, clockwise in ((1.0, True), (-1.0, False), (1.0, True)):
+        axis.free_run(velocity)
+        run(axis, 0.3)
+        axis.abort()
+        run(axis, 0.3)
+        assert not axis.moving
+        assert bool(axis.status & AxisStatus.CLOCKWISE) is clockwise
+    axis.disable()
+    run(axis, 0.1)
+    assert axis.status & AxisStatus.CLOCKWISE
+
+
+def test_the_velocity_feedback_is_the_encoders():
+    axis = enabled_axis()
+    axis.free_run(2.0)
+    run(axis, 0.5)
+    assert axis.feedback_velocity == pytest.approx(2.0, rel=0.01)
+    axis.step(axis.feedback, 0.0)  # a command between two cycles
+    assert axis.feedback_velocity == pytest.approx(2.0, rel=0.01)
+    axis.disable()
+    for _ in range(20):
+        axis.step(axis.feedback - 0.001, PERIOD_S)  # turned by hand
+    assert axis.feedback_velocity == pytest.approx(-0.5)
+    run(axis, 0.1)
+    assert axis.feedback_velocity == 0
+
+
+@spoken(position_error_units=5.0)
+async def test_the_velocity_feedback_of_a_stuck_motor_is_zero(mock, say, *_):
+    await say("ENABLE @0")
+    await say("FREERUN @0 1.0")
+    await asyncio.sleep(0.1)
+    assert await say("VFBK(@0)") == "%0.000000\n"
+    assert mock.axes[0].velocity > 0
+
+
+@pytest.mark.parametrize("end", [Axis.abort, Axis.disable, lambda axis: axis.free_run(0.0)])
+def test_homing_that_is_ended_leaves_the_axis_unhomed(end):
+    axis = enabled_axis()
+    axis.move_to(1.0, 10.0)
+    run(axis, 2.0)
+    axis.home()
+    run(axis, 0.1)
+    assert axis.status & AxisStatus.HOMING
+    end(axis)
+    run(axis, 3.0)
+    assert not axis.status & (AxisStatus.HOMING | AxisStatus.HOMED)
+    assert axis.command > 0.5
+
+
+def test_home_is_beside_the_marker_by_the_offset():
+    axis = Axis(parameters() | {HOME_OFFSET: 0.25})
+    axis.enable()
+    encoder = 0.0
+    axis.set_program_position(7.0)
+    for goal in (1.0, None):
+        assert axis.home() if goal is None else axis.move_to(goal, 10.0)
+        for _ in range(2000):
+            encoder += axis.motor_velocity * PERIOD_S
+            axis.step(encoder, PERIOD_S)
+    assert axis.homed
+    assert encoder == pytest.approx(0.25, abs=1e-3)
+    assert axis.feedback == pytest.approx(0.0, abs=1e-3)
+    assert axis.command == axis.offset == 0.0
+
+
+def test_before_it_is_homed_no_software_limit_acts():
+    axis = enabled_axis(homed=False)
+    axis.move_to(7.0, 10.0)
+    run(axis, 3.0)
+    assert axis.command == 7.0
+    assert not axis.faults
+    assert axis.home()
+    run(axis, 10.0)
+    assert axis.homed
     axis.free_run(4.0)
     run(axis, 3.0)
     assert axis.faults == AxisFault.CW_SOFTWARE_LIMIT
-    assert axis.command == pytest.approx(5.0, abs=0.1)
-    assert not axis.free_run(-1.0)
-    axis.acknowledge()
-    assert axis.free_run(-1.0)
-    run(axis, 1.0)
-    assert axis.command < 4.8
-    assert not axis.faults
+
+
+@pytest.mark.parametrize(
+    ("masks", "fault", "ends", "powered"),
+    [
+        ((0, 0x30, 0x30), 0, False, True),
+        ((0x30, 0, 0), AxisFault.CW_SOFTWARE_LIMIT, False, True),
+        ((0x30, 0, 0x30), AxisFault.CW_SOFTWARE_LIMIT, True, True),
+        ((0x30, 0x30, 0), AxisFault.CW_SOFTWARE_LIMIT, True, False),
+    ],
+)
+def test_the_fault_masks_decide_what_a_software_limit_does(masks, fault, ends, powered):
+    axis = Axis(parameters() | dict(zip(FAULT_MASKS, masks, strict=True)))
+    axis.enable()
+    axis.free_run(4.0)
+    run(axis, 3.0)
+    assert axis.faults == fault
+    assert axis.moving is not ends
+    assert axis.enabled is powered
 
 
 def test_without_software_limits_it_runs_on():
@@ -344,7 +653,8 @@ def test_any_line_is_answered(line):
     assert "\n" not in value
 
 
-WORDS = ["FREERUN", "MOVEABS", "RAMP", "RATE", "@0", "X", "YF", "F", "1.5", "-2E1", "GETPARM", "2"]
+WORDS = ["FREERUN", "MOVEABS", "RAMP", "RATE", "GETPARM", "POSOFFSET", "SET", "IGLOBAL", "PROGRAM"]
+WORDS += ["RUN", "PERR", "@0", "X", "YF", "F", "1.5", "-2E1", "2", "32", "="]
 
 
 @given(st.lists(st.sampled_from(WORDS), max_size=6))
@@ -355,4 +665,6 @@ def test_any_order_of_known_words_is_answered(words):
 def test_words_are_the_same_however_they_are_set_apart():
     assert words_of("getparm(@0, 2)") == words_of("GETPARM @0,2") == ["GETPARM", "@0", "2"]
     assert words_of("MOVEABS X1.5 XF10") == ["MOVEABS", "X", "1.5", "XF", "10"]
-    assert words_of('PROGRAM RUN 5, "x"') == []
+    assert words_of('PROGRAM RUN 5, "x"') == ["PROGRAM", "RUN", "5", '"X"']
+    assert words_of("IGLOBAL(32) = 1") == words_of("IGLOBAL(32)=1") == ["IGLOBAL", "32", "=", "1"]
+    assert words_of('PROGRAM RUN 5, "x') == []
