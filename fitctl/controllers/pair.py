@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.model.optics import Scales, saturate_diamond
+from fitctl.model.optics import Scales, rows, saturate_diamond, transformed
 
 Floats = NDArray[np.float64]
 
 HAND_OVER_S = 10.0
 """Time constant with which the siderostat takes over what a design found the mirror holding (choice)."""
 
+_NO_EXCESS = np.zeros(2)
 INPUTS = ("error_px", "excess_px", "mirror_px", "motor_px", "target_px")
 OUTPUTS = ("mirror_px", "motor_step_px")
 
@@ -106,7 +107,10 @@ class Pair:
         self.at_rest = rest_state(design)
         self.left_at_rest = left_at_rest(design, self.at_rest)
         self.system = self._in_rad()
+        self._mirror_turn = rows(scale.mirror_turn)
+        self._siderostat_turn = rows(scale.siderostat_turn)
         self._given = np.zeros((len(self.system) + 3, 2))
+        self._inputs = self._given[: len(INPUTS)].reshape(-1)  # a view: az and el of each
         self.start(np.zeros(2), np.zeros(2), np.zeros(2))
 
     def start(self, mirror_rad: Floats, motor_rad: Floats, target_px: Floats) -> None:
@@ -130,22 +134,31 @@ class Pair:
 
     def step(self, measured: Measurement) -> PairCommand:
         """One period."""
-        given = self._given
-        given[0] = measured.error_px
-        given[1] = self.excess_px
+        given, scale = self._given, self._scale
         # The design's axes are the camera's; the stages' may be turned from them.
-        mirror_turn, siderostat_turn = self._scale.mirror_turn, self._scale.siderostat_turn
-        given[2] = mirror_turn.dot(measured.mirror_rad)
-        given[3] = siderostat_turn.dot(measured.motor_rad - self.motor_origin_rad)
-        given[4] = measured.target_px - self.target_origin_px
+        motor_az_rad, motor_el_rad = measured.motor_rad.tolist()
+        origin_az_rad, origin_el_rad = self.motor_origin_rad.tolist()
+        target_az_px, target_el_px = measured.target_px.tolist()
+        origin_az_px, origin_el_px = self.target_origin_px.tolist()
+        self._inputs[:] = (
+            *measured.error_px.tolist(),
+            *self.excess_px.tolist(),
+            *transformed(self._mirror_turn, *measured.mirror_rad.tolist()),
+            *transformed(
+                self._siderostat_turn, motor_az_rad - origin_az_rad, motor_el_rad - origin_el_rad
+            ),
+            target_az_px - origin_az_px,
+            target_el_px - origin_el_px,
+        )
         made = self.system.dot(given)  # `@` takes twice as long
         given[len(INPUTS) :] = made[len(OUTPUTS) :]
-        wanted_rad = made[0].dot(mirror_turn)
+        wanted_rad = made[0].dot(scale.mirror_turn)
         mirror_rad = saturate_diamond(wanted_rad, self._range_rad)
         # Fed back a frame later, where the camera takes nearly two: much as the error would have been
         # had the mirror followed.
-        self.excess_px = self._scale.mirror_px(wanted_rad - mirror_rad)
-        return PairCommand(mirror_rad, made[1].dot(siderostat_turn))
+        within = mirror_rad is wanted_rad
+        self.excess_px = _NO_EXCESS if within else scale.mirror_px(wanted_rad - mirror_rad)
+        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_turn))
 
     def _in_rad(self) -> Floats:
         """The design with its hand-over, but the stages in radians, as they are measured and commanded."""

@@ -11,7 +11,7 @@ from fitctl.config import Loop
 from fitctl.controllers.centroid import Star
 from fitctl.controllers.frame_counts import count_frame
 from fitctl.messages.modes import Finding, Mode, Trigger
-from fitctl.model.optics import Scales
+from fitctl.model.optics import Scales, rows, transformed
 
 
 class Following:
@@ -33,7 +33,7 @@ class Following:
         self._reach_frames = loop.coarse.reach_frames
         self._reach_fraction = loop.coarse.reach_fraction
         self._range_px = scale.mirror_px_per_rad * loop.fsm.range_rad
-        self._mirror_turn = scale.mirror_turn
+        self._to_mirror = rows(scale.mirror_turn.T)
         self.begin()
 
     def begin(self) -> None:
@@ -46,9 +46,11 @@ class Following:
         """What a frame showed, if it leads to another mode; `target_px` has shape (2,)."""
         need = math.nan
         if star is not None:
-            error_px = star.position_px - target_px
+            target_az_px, target_el_px = target_px.tolist()
             # The mirror's diamond lies along its own axes.
-            az_px, el_px = error_px.dot(self._mirror_turn).tolist()
+            az_px, el_px = transformed(
+                self._to_mirror, star.az_px - target_az_px, star.el_px - target_el_px
+            )
             need = (abs(az_px) + abs(el_px)) / self._range_px
         count_frame(self, star is not None, need, self._reach_fraction)
         if self.lost >= self._lost_frames:

@@ -69,12 +69,11 @@ class StarFinder:
         stages_px = self.estimator.stages_px(motor_rad, mirror_rad)
         star = self._looked_for(image, mode)
         if star is None and follows:
-            expected_px = self.estimator.predict_px(stages_px)
-            star = self._sensor.follow(image, *expected_px.tolist())
+            star = self._sensor.follow(image, *self.estimator.predict_px(stages_px))
         elif star is None:
             star = self._sensor.find(image)
         if star is not None and mode in TRACKING:
-            self.estimator.observe(star.position_px, stages_px)
+            self.estimator.observe((star.az_px, star.el_px), stages_px)
         return star
 
     def _looked_for(self, image: NDArray[np.uint16], mode: Mode) -> Star | None:

@@ -112,6 +112,23 @@ def rotation(angle_deg: float) -> Floats:
     return np.array([[cos, -sin], [sin, cos]])
 
 
+AzEl = tuple[float, float]
+Rows = tuple[AzEl, AzEl]
+"""A matrix of shape (2, 2), row by row, in plain floats: for one pair ten times as quick as an array."""
+
+
+def rows(matrix: Floats) -> Rows:
+    """A matrix of shape (2, 2) for :func:`transformed`."""
+    (a, b), (c, d) = matrix.tolist()
+    return (a, b), (c, d)
+
+
+def transformed(matrix: Rows, az: float, el: float) -> AzEl:
+    """A pair, by a matrix."""
+    (a, b), (c, d) = matrix
+    return a * az + b * el, c * az + d * el
+
+
 @compilable(inline=True)
 def turned(turn: Floats, az: float, el: float) -> tuple[float, float]:
     """A pair, by a matrix of shape (2, 2)."""

@@ -101,8 +101,8 @@ class Plant:
         while self._steps < wanted:
             if self._steps == self._room_until:
                 self._make_room()
-            steps, until = self._steps, min(wanted, self._room_until)
-            self._step(steps % self._block_steps, steps % self._kept, until - steps)
+            until = wanted if wanted < self._room_until else self._room_until
+            self._step(self._steps, until - self._steps)
             self._steps = until
 
     def spots_px(self, time_s: float) -> Floats:

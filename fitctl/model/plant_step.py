@@ -163,8 +163,7 @@ def advance(
     air_px: Floats,
     trace_px: Floats,
     trace_piston_m: Floats,
-    air_from: int,
-    trace_from: int,
+    first: int,
     steps: int,
 ) -> None:
     """Advance all runs by some steps; stacks go to their volts first, and stand still.
@@ -177,12 +176,14 @@ def advance(
     plays_v : array, shape (runs, 3, elements)
     origin_px : array, shape (runs, spots, 2)
     air_px : array, shape (rows, runs, spots, 2)
-        Motion that all spots share, then what each further spot has besides, from row `air_from` on.
+        Motion that all spots share, then what each further spot has besides, filled over and over again.
     trace_px, trace_piston_m : arrays, shape (rows, runs, spots, 2) and (rows, runs)
-        Receive what the steps lead to, from row `trace_from` on.
-    steps : int
+        Receive what the steps lead to, over and over again.
+    first, steps : int
+        Number of the first step since the start, and how many; no array may end within them.
     """
     c = constants[0]
+    air_from, trace_from = first % air_px.shape[0], first % trace_px.shape[0]
     for run in range(trace_px.shape[1]):
         s = state[run]
         move_stacks(c, s, plays_v[run], play_half_v, play_gain_m_per_v)
@@ -209,8 +210,8 @@ def bound_step(
     trace: PlantTrace,
     *,
     machine_code: bool | None = None,
-) -> Callable[[int, int, int], None]:
-    """:func:`advance` on a plant's own arrays: from a row of air and of trace, by some steps.
+) -> Callable[[int, int], None]:
+    """:func:`advance` on a plant's own arrays: from a step on, by some steps.
 
     Compiled where numba is installed, unless `machine_code` is False.
     """

@@ -51,6 +51,7 @@ class SimulatedAmplifiers:
         self._clock = clock
         self._motor_rad = plant.state.motor_rad[0]
         self._velocity_rad_s = plant.inputs.velocity_rad_s[0]
+        self._commanded_rad_s: AzEl = (0.0, 0.0)
         self._rad_per_count = 2 * math.pi / counts_per_rev
         self._enabled = False
 
@@ -65,7 +66,7 @@ class SimulatedAmplifiers:
     def disable(self) -> None:
         """Stand still."""
         self._enabled = False
-        self._velocity_rad_s[:] = 0.0
+        self._velocity_rad_s[:] = self._commanded_rad_s = (0.0, 0.0)
 
     def reset_fault(self) -> None:
         """There are none."""
@@ -74,8 +75,9 @@ class SimulatedAmplifiers:
         """Command and read at the present virtual time."""
         now_s = self._clock.now_s()
         self._plant.advance(now_s)
-        if self._enabled:
+        if self._enabled and velocity_rad_s != self._commanded_rad_s:
             self._velocity_rad_s[0], self._velocity_rad_s[1] = velocity_rad_s
+            self._commanded_rad_s = velocity_rad_s
         az_rad, el_rad = self._motor_rad.tolist()
         count = self._rad_per_count
         position_rad = (math.floor(az_rad / count) * count, math.floor(el_rad / count) * count)

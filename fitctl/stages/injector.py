@@ -88,7 +88,8 @@ class Injector:
 
     def drain_written(self) -> list[Injection]:
         """What was written since last asked."""
-        return [self._written.popleft() for _ in range(len(self._written))]
+        written = self._written
+        return [written.popleft() for _ in range(len(written))] if written else []
 
     def period(self) -> None:
         """One write, if an experiment runs."""

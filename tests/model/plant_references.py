@@ -24,8 +24,9 @@ def bind_reference(constants, state, air_px, trace):
     return partial(advance, constants, state, air_px, trace)
 
 
-def advance(c, state, air_px, trace, air_from, trace_from, steps):
+def advance(c, state, air_px, trace, first, steps):
     """As `fitctl.model.plant_step.advance`, with all arrays of all runs."""
+    air_from, trace_from = first % len(air_px), first % len(trace.spots_px)
     state.plays_v[:] = hysteresis.play(state.plays_v, state.stack_v[..., None], c.play_half_v)
     state.displacement_m[:] = (
         hysteresis.hysteresis_output(state.plays_v, c.play_gain_m_per_v) - c.mid_stroke_m

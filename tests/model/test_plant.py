@@ -74,7 +74,7 @@ def test_the_step_does_what_the_reference_does(machine_code, seed, runs, steps, 
         own = PlantState(runs, state.plays_v.shape[-1])
         own.rows[:], own.plays_v[:] = state.rows, state.plays_v
         trace = PlantTrace(np.zeros((steps + 3, runs, 2, 2)), np.zeros((steps + 3, runs)))
-        bind(plant.constants, own, air_px, trace)(5, 3, steps)
+        bind(plant.constants, own, air_px, trace)(steps + 6, steps)
         outcomes.append(
             (
                 *trace,
