@@ -22,6 +22,7 @@ from fitctl.messages.commands import SequenceStatus
 from fitctl.messages.telemetry import (
     LoopLimits,
     LoopState,
+    SearchAgain,
     SpotPlace,
     Telemetry,
     TrippedInterlock,
@@ -54,6 +55,9 @@ LIMITS = LoopLimits(
     spiral_pitch_sky_arcsec=50.0,
 )
 SPIRAL_S = 8.0
+STAR_LOST = SearchAgain(
+    since_s=START_S - 133.0, round_number=2, radius_sky_arcsec=107.5, pauses=False, limit_s=None
+)
 # A few rows of the shipped table of interlocks: name, quantity, reading, low, high, action, in which modes.
 WATCHED = (
     ("star_lost", "star_flux_fraction", 0.98, 0.05, None, "warn", WITH_STAR),
@@ -121,6 +125,7 @@ class FakeSupervisor:
         self.reason = "5 frames within 50 % of the range"
         self.bias_offset_urad = (0.0, 0.0)
         self.controller_file = ""
+        self.search_again: SearchAgain | None = None
 
     @property
     def time_s(self) -> float:
@@ -189,6 +194,7 @@ class FakeSupervisor:
             search_centre_sky_arcsec=(100.0, -40.0) if self.mode == "ACQUISITION" else None,
             other_spots=[SpotPlace(name="fringe", az_offset_px=-12.0, el_offset_px=0.0)],
             controller_file=self.controller_file,
+            search_again=self.search_again,
         )
 
     def _watched(self, name, quantity, value, low, high, action, modes) -> Watched:

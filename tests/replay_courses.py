@@ -93,6 +93,16 @@ def a_star_that_is_lost(simulation):
     simulation.run(3.0)
 
 
+def a_star_that_is_away_for_long(simulation):
+    """The search goes on in rounds until it is back."""
+    hold_a_star(simulation)
+    flux_dn = simulation.camera._scene._flux_dn
+    darken(simulation)
+    simulation.run(20.0)
+    simulation.camera._scene._flux_dn = flux_dn
+    until(simulation, Mode.VERNIER, limit_s=60.0)
+
+
 def nothing_that_opens(simulation):
     amplifiers = simulation.devices.loops["right"].amplifiers
     opening, amplifiers.open = amplifiers.open, failing(TIMEOUT)
@@ -197,6 +207,11 @@ COURSES = {
     "every command": (every_command, [], {"HOLD", "STOP", "RECOVER", "OFF", "IN_REACH"}),
     "another star": (another_star, [TWO_STARS], {"IN_REACH"}),
     "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),
+    "a star that is away for long": (
+        a_star_that_is_away_for_long,
+        [],
+        {"STAR_LOST", "STAR_FOUND", "IN_REACH"},
+    ),
     "a lost star": (a_star_that_is_lost, [], {"STAR_LOST", "STAR_FOUND", "IN_REACH"}),
     "nothing opens": (nothing_that_opens, [], {"STANDBY", "IN_REACH"}),
     "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),

@@ -26,7 +26,10 @@ FieldOverlap = Annotated[float, Field(ge=LEAST_OVERLAP, le=MOST_OVERLAP)]
 
 
 class Acquisition(Settings):
-    """How the star is searched for, and when it counts as found or lost."""
+    """How the star is searched for, and when it counts as found or lost.
+
+    Without ``search_again_s``, the search for a star that was followed and lost ends only on a command.
+    """
 
     search_radius_sky_arcsec: Positive
     detection_sigma: Annotated[float, Field(ge=3, le=100)]
@@ -35,6 +38,8 @@ class Acquisition(Settings):
     field_overlap: FieldOverlap
     settle_s: NonNegative
     confirm_timeout_s: Positive
+    search_again_pause_s: NonNegative
+    search_again_s: NonNegative | None = None
 
 
 class Coarse(Settings):

@@ -1,4 +1,8 @@
-"""The search for a star: a spiral about where it is expected, and a second look at what may be it."""
+"""The search for a star: a spiral about where it is expected, and a second look at what may be it.
+
+A star that was followed and lost is searched for in rounds: a pause at its last place, then a spiral about it,
+wider from round to round up to the rig's radius.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +17,11 @@ from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, look_again
+from fitctl.controllers.search_rounds import WIDEST_ROUND, round_fraction
 from fitctl.controllers.spiral import Spiral, plan_spiral
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Finding, Trigger
+from fitctl.messages.telemetry import SearchAgain
 from fitctl.model.optics import scales
 
 Floats = NDArray[np.float64]
@@ -46,6 +52,8 @@ class Search:
     ----------
     centre_rad : array, shape (2,)
         Motor angles about which the spiral runs.
+    again : bool
+        The star was followed and lost.
     """
 
     def __init__(self, rig: Rig, loop_name: str, estimator: StarEstimator) -> None:
@@ -61,8 +69,12 @@ class Search:
         self._slew_limit_s = _SLEWS * 2 * self._travel_rad / loop.siderostat.velocity_limit_rad_s
         self._plan_spiral = partial(plan_spiral, rig, loop_name)
         self._radius_sky_arcsec = self._settings.search_radius_sky_arcsec
+        self._overlap = self._settings.field_overlap
         self._plan = self._plan_spiral()
         self._spiral = Spiral(self._plan)
+        self._round = 0
+        self._pause_s = 0.0
+        self.again = False
         self._arrived = False
         self._since_s = math.nan
         self._asked = Acquire()
@@ -77,8 +89,11 @@ class Search:
         """Make the next search, and no other, as a command asks that was not refused."""
         self._asked = asked
 
-    def begin(self) -> None:
-        """A new spiral, about where the star is expected now, or as asked."""
+    def begin(self, *, again: bool = False) -> None:
+        """A new search, about where the star is expected now, or as asked.
+
+        With `again`, the star was followed until now: it is searched for in rounds, if the rig file allows it.
+        """
         asked, self._asked = self._asked, Acquire()
         if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
             offset = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
@@ -87,14 +102,23 @@ class Search:
         self._radius_sky_arcsec = (
             asked.search_radius_sky_arcsec or self._settings.search_radius_sky_arcsec
         )
-        self._plan = self._plan_spiral(
-            radius_sky_arcsec=self._radius_sky_arcsec, field_overlap=asked.field_overlap
-        )
+        self._overlap = asked.field_overlap or self._settings.field_overlap
+        self.again = again and self._settings.search_again_s != 0
         self.centre_rad = self._star_in_the_middle_rad()
-        self._spiral = Spiral(self._plan)
-        self._arrived = False
+        self._arrived = self.again  # whatever is near the last place may be the star
         self._since_s = math.nan
         self._candidate = None
+        self._begin_round(0)
+
+    def _begin_round(self, number: int) -> None:
+        """A spiral as wide as the round's; before it, a pause, if the star was lost."""
+        fraction = round_fraction(number) if self.again else 1.0
+        self._round = number
+        self._pause_s = fraction * self._settings.search_again_pause_s if self.again else 0.0
+        self._plan = self._plan_spiral(
+            radius_sky_arcsec=fraction * self._radius_sky_arcsec, field_overlap=self._overlap
+        )
+        self._spiral = Spiral(self._plan)
 
     def has_arrived(self, motor_rad: Floats) -> bool:
         """Whether the siderostat, which was at `motor_rad`, has come near the spiral's middle.
@@ -111,17 +135,14 @@ class Search:
     def evaluate(self, star: Star | None, now_s: float) -> Finding | None:
         """What a frame exposed at `now_s` showed, if it is anything to tell."""
         candidate = self._candidate
+        if math.isnan(self._since_s):
+            self._since_s = now_s
         if not self._arrived:
             return self._wait_for_siderostat(now_s)
         if candidate is None:
-            if star is not None:
-                self._candidate = Candidate(self._star_in_the_middle_rad(), now_s)
-            elif self._spiral.exhausted:
-                return Finding(
-                    Trigger.SEARCH_EXHAUSTED,
-                    f"no star within {self._radius_sky_arcsec:g} arcsec of the start; "
-                    "check shutter and pointing, then acquire again",
-                )
+            if star is None:
+                return self._evaluate_progress(now_s)
+            self._candidate = Candidate(self._star_in_the_middle_rad(), now_s)
             return None
         outcome = look_again(self._settings, candidate, star is not None, now_s)
         if outcome == CONFIRMED:
@@ -131,9 +152,50 @@ class Search:
             return Finding(None, "a candidate was not confirmed; the search goes on")
         return None
 
+    def _evaluate_progress(self, now_s: float) -> Finding | None:
+        """Whether a search without a star is over at `now_s`, or its round is."""
+        limit_s = self._settings.search_again_s
+        if self.again and limit_s is not None and now_s - self._since_s > limit_s:
+            return Finding(
+                Trigger.SEARCH_EXHAUSTED,
+                f"the star that was lost did not come back within {limit_s:g} s (search_again_s); "
+                "check shutter and pointing, then acquire again",
+            )
+        return self._end_round() if self._spiral.exhausted else None
+
+    def _end_round(self) -> Finding | None:
+        """The spiral is done: the search is over, or goes on with the next round, which is reported once."""
+        if not self.again:
+            return Finding(
+                Trigger.SEARCH_EXHAUSTED,
+                f"no star within {self._radius_sky_arcsec:g} arcsec of the start; "
+                "check shutter and pointing, then acquire again",
+            )
+        ended = self._round
+        self._begin_round(ended + 1)
+        if ended != WIDEST_ROUND:
+            return None
+        return Finding(
+            None,
+            f"no star within {self._radius_sky_arcsec:g} arcsec of its last place; the search repeats with "
+            f"pauses of {self._settings.search_again_pause_s:g} s until the star is back; "
+            "check shutter and clouds, or end the search with hold, stop or another acquire",
+        )
+
+    def state_again(self, since_s: float) -> SearchAgain | None:
+        """The search for a star that was lost at `since_s`, for consoles; None for another search."""
+        if not self.again:
+            return None
+        number = self._round
+        return SearchAgain(
+            since_s=since_s,
+            round_number=number + 1,
+            radius_sky_arcsec=round_fraction(number) * self._radius_sky_arcsec,
+            pauses=self._pause_s > 0,
+            limit_s=self._settings.search_again_s,
+        )
+
     def _wait_for_siderostat(self, now_s: float) -> Finding | None:
-        if math.isnan(self._since_s):
-            self._since_s = now_s
         if now_s - self._since_s <= self._slew_limit_s:
             return None
         return Finding(
@@ -147,6 +209,9 @@ class Search:
         if self._candidate is not None:
             return self._candidate.motor_rad
         if not self.has_arrived(motor_rad):
+            return self.centre_rad
+        if self._pause_s > 0:
+            self._pause_s -= duration_s
             return self.centre_rad
         return self.centre_rad + self._scale.motor_rad(self._spiral.advance(duration_s))
 

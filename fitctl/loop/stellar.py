@@ -194,7 +194,7 @@ class StellarLoop(Loop):
             self._end_experiment()
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
-            self._start_search(motor_rad)
+            self._start_search(motor_rad, again=source in FOLLOWING)
         elif self.mode is Mode.COARSE:
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
@@ -207,10 +207,13 @@ class StellarLoop(Loop):
         self.quantities.star_flux_dn = flux_dn
         self.search.configure(asked)
 
-    def _start_search(self, motor_rad: Floats) -> None:
-        """As asked; else about where the star is expected: on the target, or where it was last seen."""
+    def _start_search(self, motor_rad: Floats, *, again: bool) -> None:
+        """As asked; else about where the star is expected: on the target, or where it was last seen.
+
+        `again` if the loop was following the star.
+        """
         self.star_finder.estimator.expect(self.target_px, motor_rad, np.zeros(2))
-        self.search.begin()
+        self.search.begin(again=again)
 
     # ------------------------------------------------------------ control laws
 
@@ -319,6 +322,9 @@ class StellarLoop(Loop):
                 for spot in self.settings.other_spots
             ],
             controller_file=self.pointing.design.file,
+            search_again=self.search.state_again(self.mode_since_s)
+            if mode is Mode.ACQUISITION
+            else None,
         )
 
     def begin(self, stack_v: Floats | None) -> None:

@@ -103,9 +103,17 @@ TRANSITIONS: tuple[Transition, ...] = (
     *_from((Mode.OFF,), Trigger.STANDBY, Mode.STANDBY, "all devices open, checked and enabled"),
     *_from((Mode.STANDBY,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for"),
     *_from(
+        (Mode.ACQUISITION,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for; the search begins anew"
+    ),
+    *_from(
         (Mode.ACQUISITION,), Trigger.STAR_FOUND, Mode.COARSE, "star on found_frames frames in a row"
     ),
-    *_from((Mode.ACQUISITION,), Trigger.SEARCH_EXHAUSTED, Mode.STANDBY, "whole search radius seen"),
+    *_from(
+        (Mode.ACQUISITION,),
+        Trigger.SEARCH_EXHAUSTED,
+        Mode.STANDBY,
+        "whole search radius seen; for a star that was lost, search_again_s over",
+    ),
     *_from(
         (Mode.COARSE,),
         Trigger.IN_REACH,

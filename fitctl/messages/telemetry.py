@@ -52,6 +52,20 @@ class LoopLimits(msgspec.Struct, frozen=True, kw_only=True):
     spiral_pitch_sky_arcsec: float
 
 
+class SearchAgain(msgspec.Struct, frozen=True, kw_only=True):
+    """The search for a star that was followed and lost.
+
+    It goes in rounds, each a pause at the star's last place and a spiral about it. ``limit_s`` is how long it
+    lasts at most; None is until a command ends it.
+    """
+
+    since_s: float
+    round_number: int
+    radius_sky_arcsec: float
+    pauses: bool
+    limit_s: float | None
+
+
 class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
     """A spot that moves with a loop's star, and how far from it, by the rig file."""
 
@@ -82,6 +96,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     search_centre_sky_arcsec: tuple[float, float] | None = None
     other_spots: list[SpotPlace] = []
     controller_file: str = ""
+    search_again: SearchAgain | None = None
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):

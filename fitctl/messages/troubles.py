@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from fitctl.messages.modes import Mode
-from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
+FIND_STAR = "check shutter and clouds; hold, stop or another acquire ends the search"
 RECORDER_SILENT_S = 10.0  # it reports about once a second
 
 
 def troubles(telemetry: Telemetry) -> list[str]:
     """What an operator should look at, one line each; empty where all is well.
 
-    A loop that is SAFE, an interlock that is tripped, a device in fault, a recorder that says nothing,
-    records that are missing from the log.
+    A loop that is SAFE or searches for the star that it lost, an interlock that is tripped, a device in fault,
+    a recorder that says nothing, records that are missing from the log.
     """
     found = []
     for loop in telemetry.loops:
         if loop.mode == Mode.SAFE.name:
             why = "" if loop.last_change is None else f": {loop.last_change.reason}"
             found.append(f"{loop.name} is SAFE{why}")
-        found += [f"{loop.name} interlock {row.name}: {row.reason}" for row in loop.interlocks]
+        if loop.search_again is not None:
+            found.append(f"{loop.name}: {search_again_text(loop, telemetry.time_s)}; {FIND_STAR}")
+        found += [
+            f"{loop.name} interlock {row.name}: {row.reason}" for row in alarming_interlocks(loop)
+        ]
     found += [
         f"{device.device} at {device.endpoint}: {device.detail}"
         for device in telemetry.devices
@@ -27,6 +32,25 @@ def troubles(telemetry: Telemetry) -> list[str]:
     ]
     found += _of_recording(telemetry)
     return found
+
+
+def search_again_text(loop: LoopState, now_s: float) -> str:
+    """Since when the star is lost, and how far the search goes; empty if the loop does not search again."""
+    search = loop.search_again
+    if search is None:
+        return ""
+    return (
+        f"star lost {now_s - search.since_s:.0f} s ago; the loop searches again, round {search.round_number}, "
+        f"within {search.radius_sky_arcsec:.0f} arcsec of its last place"
+    )
+
+
+def alarming_interlocks(loop: LoopState) -> list[TrippedInterlock]:
+    """Tripped interlocks, without warnings that the star's light is missing while it is searched for again."""
+    if loop.search_again is None:
+        return loop.interlocks
+    of_star = {row.name for row in loop.watched if row.quantity == "star_flux_fraction"}
+    return [row for row in loop.interlocks if row.action != "warn" or row.name not in of_star]
 
 
 def _of_recording(telemetry: Telemetry) -> list[str]:

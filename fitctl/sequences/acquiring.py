@@ -73,7 +73,8 @@ def _search(step: steps.Acquire, view: View) -> None:
 def _done(step: steps.Acquire, view: View) -> Result | None:
     if view.errors:
         raise StepFailed(view.errors[0])
-    if view.mode is Mode.STANDBY and not view.marks:
+    searches_again = view.loop.search_again is not None
+    if (view.mode is Mode.STANDBY or searches_again) and not view.marks:
         _search(step, view)  # the devices are on, and no star is held
         return None
     if view.mode is Mode.OFF:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from fitctl.logging.records import DeviceHealth, ModeChange
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
+from fitctl.messages.troubles import FIND_STAR, alarming_interlocks, search_again_text
 from fitctl.tui.state import ConsoleState
 
 BELL_EVERY_S = 10.0
@@ -116,7 +117,9 @@ def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
         return
     reported = {trip.reason for loop in newest.loops for trip in loop.interlocks}
     for loop in newest.loops:
-        yield from (_interlock(loop, trip) for trip in loop.interlocks)
+        yield from (_interlock(loop, trip) for trip in alarming_interlocks(loop))
+        if loop.search_again is not None:
+            yield _star_lost(loop, loop.search_again.since_s, newest.time_s)
         change = loop.last_change
         if (
             loop.mode == "SAFE"
@@ -152,6 +155,13 @@ def _interlock(loop: LoopState, trip: TrippedInterlock) -> Alarm:
     did = _DID[trip.action]
     error = trip.action != "warn"
     return Alarm(f"{loop.name} {trip.name}", error, what, trip.since_s, did, todo + by_hand)
+
+
+def _star_lost(loop: LoopState, since_s: float, now_s: float) -> Alarm:
+    what, did = _parted(search_again_text(loop, now_s))
+    return Alarm(
+        f"{loop.name} star", True, f"{loop.name}: {what}", since_s, did, FIND_STAR, latches=False
+    )
 
 
 def _fault(loop: LoopState, change: ModeChange) -> Alarm:

@@ -13,7 +13,7 @@ from fitctl.commands.shared.printing import to_json, utc
 from fitctl.logging.records import Event
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
-from tests.fake_supervisor import FakeSupervisor
+from tests.fake_supervisor import STAR_LOST, FakeSupervisor
 
 TRIPPED = TrippedInterlock(
     name="flux_low", since_s=999.0, action="warn", reset="itself", reason="0.7; check the shutter"
@@ -69,6 +69,31 @@ def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():
         "right interlock flux_low: 0.7; check the shutter",
         f"{camera.device} at {camera.endpoint}: no frame came",
     ]
+
+
+def test_a_lost_star_is_one_trouble_as_long_as_it_is_searched_for():
+    supervisor = FakeSupervisor("ACQUISITION")
+    supervisor.search_again = STAR_LOST
+    supervisor.interlocks = [
+        msgspec.structs.replace(TRIPPED, name="star_lost"),
+        msgspec.structs.replace(TRIPPED, name="disk_space"),
+    ]
+
+    found = troubles(told(supervisor))
+
+    assert found == [
+        "right: star lost 133 s ago; the loop searches again, round 2, within 108 arcsec of its last place; "
+        "check shutter and clouds; hold, stop or another acquire ends the search",
+        "right interlock disk_space: 0.7; check the shutter",
+    ]
+
+
+def test_an_interlock_on_the_lost_star_that_holds_the_stages_is_still_named():
+    supervisor = FakeSupervisor("ACQUISITION")
+    supervisor.search_again = STAR_LOST
+    supervisor.interlocks = [msgspec.structs.replace(TRIPPED, name="star_lost", action="hold")]
+
+    assert any("interlock star_lost" in line for line in troubles(told(supervisor)))
 
 
 # ---------------------------------------------------------------- status
@@ -208,6 +233,18 @@ def test_a_line_of_text_says_what_the_mode_needs(monkeypatch, mode):
     assert ("searched" in line) == (mode == "ACQUISITION")
     assert ("RMS az" in line) == (mode == "VERNIER")
     assert "nan" not in line
+
+
+def test_a_line_of_text_says_that_the_star_was_lost(monkeypatch):
+    supervisor = FakeSupervisor("ACQUISITION")
+    supervisor.search_again = STAR_LOST
+    seconds = [
+        each
+        for each in watched(monkeypatch, supervisor.messages(23))
+        if isinstance(each, watch.Second)
+    ]
+
+    assert "searched, star lost" in watch._text(seconds[0])
 
 
 def test_each_line_of_json_says_what_it_is_of(monkeypatch):

@@ -1,10 +1,9 @@
 """Every fault of every device, by wire and by its own; the links are cut, delayed and corrupted here."""
 
-from .entry import STAYED, Entry
+from .entry import SEARCHES, STAYED, Entry
 
 HELD = (STAYED,)
 SAFE = ("SAFE",)
-SEARCHES = ("ACQUISITION",)
 SIDEROSTAT, DAC, PIEZO, CAMERA = "siderostat", "D/A at", "piezo amplifier at", "camera at"
 GOES_ON = "its last velocity goes on: its protocol has no watchdog"
 
@@ -41,6 +40,7 @@ STAR_FAULTS = (
     *held("star_dim 0.7", says="flux_low", within_s=3.0),
     Entry("", "star_fading", SEARCHES, "no star on", within_s=6.0),
     Entry("", "star_fading 0.001", SEARCHES, "no star on"),
+    Entry("", "star_dim 0.3", SEARCHES, "no star on"),
     *held("star_jump 2", "star_double"),
     # As far as the whole frame shows it: the siderostat brings it back.
     Entry("", "star_jump 12", ("COARSE",), "of the mirror's range"),
@@ -48,6 +48,10 @@ STAR_FAULTS = (
     Entry("", "background_jump", SEARCHES, "no star on"),
     # Without its brightest pixels the spot has two thirds of its light, which is above flux_range.low.
     *held("saturation", says="flux_low", within_s=3.0),
+)
+# Longer away than a first search would last: the rounds go on.
+STAR_AWAY = Entry(
+    "camera", "star_dim 0.3", SEARCHES, "the search repeats", within_s=25.0, rig="short pauses"
 )
 DAC_FAULTS = (
     *made_safe("drop", "corrupt", "disconnect", "freeze", "reboot", "watchdog_trip", says=DAC),
@@ -100,6 +104,7 @@ STRUCK = (
     ("fit-bal-analog", "right.drive", BAL_FAULTS),
 )
 
-ENTRIES = tuple(
-    entry._replace(struck=device, rig=rig) for rig, device, table in STRUCK for entry in table
+ENTRIES = (
+    *(entry._replace(struck=device, rig=rig) for rig, device, table in STRUCK for entry in table),
+    STAR_AWAY,
 )

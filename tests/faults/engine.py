@@ -6,6 +6,7 @@ from itertools import pairwise
 
 from stalls import stalls
 
+from .entry import SEARCHES
 from .strikes import strike
 
 STAYS_S = 2.0  # a mode in which the loop stays is watched for so long, if the entry has the time
@@ -73,6 +74,8 @@ def attempted(rig, entry, home, stalled):
         measured = watch(rig, entry, since_s, stalled) | measured
     rig.reach(home)
     back_s = time.monotonic() - healed_s
+    if entry.ends == SEARCHES:
+        came_back_by_itself(rig, struck_s)
     if not entry.moves:
         stood_still(rig, entry, struck_s, deaf)
     return measured | {"back_s": round(back_s, 1)}
@@ -135,6 +138,12 @@ def rests(rig, _entry, since_s, stalled):
     took_s = max(moving, default=since_s) - since_s
     assert took_s <= DEAD_SETTLE_S + stalled.total_s, took_s
     return {"took_s": round(took_s, 3)}
+
+
+def came_back_by_itself(rig, since_s):
+    """A loop that lost its star gave the search up neither while the star was away nor afterwards."""
+    changes = [c for t in rig.telemetry for c in t.mode_changes if c.time_s > since_s]
+    assert not {c.target for c in changes} & REST, changes
 
 
 def near(place, other):

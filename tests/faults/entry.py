@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 STAYED = "stays"
+SEARCHES = ("ACQUISITION",)  # the star was followed and lost
 
 
 class Entry(NamedTuple):

@@ -78,6 +78,7 @@ BY_TCP = (
 )
 SETUPS = {
     "fit-mock": Setup(),
+    "short pauses": Setup(settings=("loops.right.acquisition.search_again_pause_s=0.4",)),
     "never in reach": Setup(settings=NEVER_IN_REACH, home="COARSE"),
     "ensemble": Setup(file="ensemble"),
     "fit-bal-analog": Setup(file="fit-bal-analog"),

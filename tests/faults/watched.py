@@ -54,7 +54,8 @@ TOWARDS = {
     "OFF": {"STANDBY": Off, "SAFE": Off} | dict.fromkeys(TRACKING, Hold),
     "SAFE": dict.fromkeys(("OFF", "STANDBY", *TRACKING), Stop),
     "STANDBY": {"OFF": Standby, "SAFE": Recover} | dict.fromkeys(TRACKING, Hold),
-    "ACQUISITION": _UP,
+    # By a first search, which moves at once; the one for a lost star begins with a pause.
+    "ACQUISITION": _UP | dict.fromkeys(("COARSE", "VERNIER", "EXPERIMENT"), Hold),
     "COARSE": _UP | {"EXPERIMENT": Hold},
     "VERNIER": _UP | {"EXPERIMENT": Hold},
     "EXPERIMENT": _UP | {"VERNIER": experiment},

@@ -120,11 +120,23 @@ def test_a_radius_holds_for_one_search_only():
     simulation.command(Acquire(search_radius_sky_arcsec=10.0))
     run_until(simulation, Mode.COARSE, 10.0)
 
+    simulation.command(Hold())
     simulation.plants["right"].constants.spot_origin_px[:] += 2000.0
-    run_until(simulation, Mode.ACQUISITION, 5.0)
+    simulation.command(Acquire())
     run_until(simulation, Mode.STANDBY, 60.0)
 
     assert "no star within 215 arcsec" in loop.last_change.reason
+
+
+def test_an_acquire_during_a_search_begins_it_anew_as_asked():
+    simulation = star_at(3000.0, 0.0)
+    simulation.command(Acquire())
+    simulation.run(5.0)
+
+    assert simulation.command(Acquire(search_radius_sky_arcsec=50.0)).accepted
+    run_until(simulation, Mode.STANDBY, 10.0)
+
+    assert "no star within 50 arcsec" in simulation.mode_changes[-1].reason
 
 
 def test_a_finer_search_takes_longer():

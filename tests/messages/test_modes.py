@@ -53,6 +53,7 @@ def test_nothing_but_a_command_leaves_off_standby_or_safe_for_a_mode_that_moves(
 
 def test_usable_commands_are_those_that_have_a_row():
     assert usable_commands(Mode.STANDBY) == [Trigger.ACQUIRE, Trigger.STOP, Trigger.OFF]
+    assert usable_commands(Mode.ACQUISITION) == [Trigger.ACQUIRE, Trigger.HOLD, Trigger.STOP]
     assert usable_commands(Mode.SAFE) == [Trigger.STOP, Trigger.RECOVER, Trigger.OFF]
 
 

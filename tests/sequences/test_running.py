@@ -272,3 +272,20 @@ def test_attempts_of_a_run_are_recorded_once_each(rig):
 
     recorded = [record for record in records if type(record).__name__ == "SequenceAttempt"]
     assert recorded == attempts
+
+
+def test_a_step_that_acquires_ends_the_search_for_a_lost_star_and_begins_its_own(tried):
+    def goes_away(link):
+        link._simulation.plants["right"].constants.spot_origin_px[:] += 5000.0
+
+    run = tried()
+    run.link.meddling = [(15.0, goes_away)]
+
+    run(
+        ACQUIRE,
+        {"step": "wait", "duration_s": 15.0},
+        {**ACQUIRE, "attempts": 1, "search_radius_sky_arcsec": 40.0},
+    )
+
+    assert run.outcomes() == ["done", "done", "failed"]
+    assert "no star within 40 arcsec" in run.attempts[-1].message

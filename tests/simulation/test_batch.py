@@ -10,6 +10,7 @@ from fitctl.messages.modes import Mode
 from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.batch.records import NOT_FOUND
 from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation, simulate
 
@@ -99,6 +100,29 @@ def test_unusual_rigs_make_the_same_run(overrides):
     simulation, run = both(rig_with(*overrides), 7, 6.0)
 
     assert_same_run(simulation, run)
+
+
+# Air that carries the star out of the field, and back within a minute.
+AWAY = (
+    "plant.loops.right.air_path.gain_px=40.0",
+    "plant.loops.right.star_offset_sky_arcsec_max=5.0",
+    "loops.right.acquisition.search_again_pause_s=0.2",
+    "loops.right.acquisition.search_radius_sky_arcsec=40.0",
+)
+
+
+def test_a_star_that_is_lost_for_long_makes_the_same_run_round_by_round():
+    simulation, run = both(rig_with(*AWAY), 3, 30.0)
+
+    assert_same_run(simulation, run)
+    assert set(run.ticks["round"][run.ticks["again"] == 1]) >= {0, 1, 2, 3}
+
+
+def test_a_lost_star_that_does_not_come_back_in_time_is_simulated():
+    run = Batch(rig_with(*AWAY, "loops.right.acquisition.search_again_s=0.5")).run(3, 30.0)
+
+    assert run.ended == NOT_FOUND
+    assert run.state["again"] == 1
 
 
 TURNED = ("loops.right.siderostat.rotation_deg=-50.0", "loops.right.fsm.rotation_deg=160.0")

@@ -8,7 +8,7 @@ from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
 from fitctl.tui.dialogs import alarms_text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
 
 FAULT = (
     "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error; "
@@ -57,6 +57,22 @@ def test_a_warning_comes_says_what_to_do_and_goes_by_itself():
     assert alarm.did == "nothing was changed"
     assert not alarm.error
     watch.supervisor.interlocks = []
+    assert watch.hear() == []
+
+
+def test_a_lost_star_is_an_alarm_until_it_is_found():
+    watch = Watch(FakeSupervisor("ACQUISITION"))
+    watch.supervisor.search_again = STAR_LOST
+    watch.supervisor.interlocks = [tripped("star_lost")]
+
+    (alarm,) = watch.hear()
+
+    assert alarm.error
+    assert alarm.what == "right: star lost 133 s ago"
+    assert "searches again, round 2, within 108 arcsec" in alarm.did
+    assert "check shutter and clouds" in alarm.todo
+    assert watch.bells == 1
+    watch.supervisor.search_again, watch.supervisor.interlocks = None, []
     assert watch.hear() == []
 
 

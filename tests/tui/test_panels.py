@@ -27,7 +27,7 @@ from fitctl.tui.widgets.spectrum import Spectrum
 from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
 from tests.tui.drawn import plain, shown
 
 
@@ -195,6 +195,23 @@ def test_the_header_says_how_much_a_slow_console_missed():
     assert "missed" not in " ".join(plain(Header(state, "operate").draw(80, 3)))
     state.accept(supervisor.messages(5)[-1], state.now_s)
     assert "4 missed!" in " ".join(plain(Header(state, "operate").draw(80, 3)))
+
+
+@pytest.mark.parametrize("columns", [80, 160])
+def test_the_header_says_that_the_star_was_lost(columns):
+    supervisor = FakeSupervisor("ACQUISITION")
+    assert "star lost" not in "\n".join(plain(header(shown(supervisor)).draw(columns, 3)))
+
+    supervisor.search_again = STAR_LOST
+
+    assert "star lost" in "\n".join(plain(header(shown(supervisor)).draw(columns, 3)))
+
+
+def test_the_map_of_a_search_for_a_lost_star_is_as_wide_as_its_round():
+    supervisor = FakeSupervisor("ACQUISITION")
+    supervisor.search_again = STAR_LOST
+
+    assert "radius 107.5″" in "\n".join(plain(Traces(shown(supervisor)).draw(100, 20)))
 
 
 def test_a_long_event_is_wrapped_under_itself():

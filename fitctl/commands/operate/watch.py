@@ -41,6 +41,7 @@ class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
     ticks: int
     late_ticks: int
     star_ticks: int
+    star_lost: bool
 
 
 class Second(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", tag="second"):
@@ -165,6 +166,7 @@ def _loop(loop: LoopState, tally: Tally) -> LoopSecond:
         ticks=tally.ticks,
         late_ticks=tally.late_ticks,
         star_ticks=tally.star_ticks,
+        star_lost=loop.search_again is not None,
     )
 
 
@@ -182,7 +184,8 @@ def _text(entry: Entry) -> str:
 def _loop_text(loop: LoopSecond) -> str:
     parts = [f"{loop.name} {loop.mode:<11}"]
     if loop.mode == Mode.ACQUISITION.name:
-        parts.append(f"{loop.search_progress:4.0%} searched")
+        lost = ", star lost" if loop.star_lost else ""
+        parts.append(f"{loop.search_progress:4.0%} searched{lost}")
     elif loop.star_ticks:
         parts.append(f"RMS az {loop.rms_az_px:.4f} el {loop.rms_el_px:.4f} px")
         parts.append(f"mirror {loop.fsm_range_fraction:4.0%}")

@@ -48,6 +48,9 @@ def advance_search(s: Any, r: Any) -> None:
         siderostat_to(s, r, r.candidate.motor_rad[0], r.candidate.motor_rad[1])
     elif not has_arrived(s, r):
         siderostat_to(s, r, r.spiral_centre_rad[0], r.spiral_centre_rad[1])
+    elif r.pause_s > 0:
+        r.pause_s -= s.period_s
+        siderostat_to(s, r, r.spiral_centre_rad[0], r.spiral_centre_rad[1])
     else:
         angle = r.spiral_angle = spiral_angle_after(s.spiral, r.spiral_angle, s.period_s)
         radius_px = s.spiral.growth_px * angle

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, count_frame, look_again
+from fitctl.controllers.search_rounds import round_fraction
 from fitctl.messages.modes import Mode, Trigger, transition
 from fitctl.model.compiled import compilable
 from fitctl.model.optics import turned_back
@@ -36,7 +37,7 @@ def fire(s: Any, r: Any, trigger: int) -> None:
     r.mode, r.mode_since_s = _TARGETS[r.mode, trigger], r.now_s
     r.lost = r.in_reach = r.out_of_reach = 0
     if r.mode == ACQUISITION:
-        start_search(s, r)
+        start_search(s, r, trigger == STAR_LOST)
     elif r.mode == COARSE:
         start_coarse(s, r)
     elif r.mode == VERNIER:
@@ -50,13 +51,24 @@ def count_mode_time(r: Any) -> None:
 
 
 @compilable()
-def start_search(s: Any, r: Any) -> None:
+def start_search(s: Any, r: Any, again: bool) -> None:
     """``StellarLoop._start_search`` and ``Search.begin``."""
     if not r.star_known:
         az_px, el_px = motor_px(s, r.position_rad[0], r.position_rad[1])
         r.star_origin_px[0], r.star_origin_px[1] = s.target_px[0] - az_px, s.target_px[1] - el_px
     r.spiral_centre_rad[0], r.spiral_centre_rad[1] = star_in_the_middle_rad(s, r)
-    r.has_arrived, r.spiral_angle, r.has_candidate = 0, 0.0, 0
+    r.again = 1 if again and s.search_again_s != 0 else 0
+    r.has_arrived, r.has_candidate, r.search_since_s = r.again, 0, math.nan
+    begin_round(s, r, 0)
+
+
+@compilable()
+def begin_round(s: Any, r: Any, number: int) -> None:
+    """``Search._begin_round``."""
+    fraction = round_fraction(number) if r.again else 1.0
+    r.round, r.spiral_angle = number, 0.0
+    r.pause_s = fraction * s.search_again_pause_s if r.again else 0.0
+    r.spiral_radius_px = fraction * s.search_radius_px + s.spiral.pitch_px / 2
 
 
 @compilable()
@@ -86,6 +98,8 @@ def start_vernier(s: Any, r: Any) -> None:
 @compilable()
 def evaluate_search(s: Any, r: Any, exposed_s: float) -> bool:
     """``Search.evaluate``; False where the search has ended without a star."""
+    if math.isnan(r.search_since_s):
+        r.search_since_s = exposed_s
     if r.has_candidate:
         outcome = look_again(s.acquisition, r.candidate, r.star_visible == 1, exposed_s)
         if outcome == CONFIRMED:
@@ -96,8 +110,12 @@ def evaluate_search(s: Any, r: Any, exposed_s: float) -> bool:
         r.has_candidate, r.candidate.since_s, r.candidate.frames = 1, exposed_s, 0
         az_rad, el_rad = star_in_the_middle_rad(s, r)
         r.candidate.motor_rad[0], r.candidate.motor_rad[1] = az_rad, el_rad
-    else:
-        return s.spiral.growth_px * r.spiral_angle < s.spiral.radius_px
+    elif r.again and exposed_s - r.search_since_s > s.search_again_s:
+        return False
+    elif s.spiral.growth_px * r.spiral_angle >= r.spiral_radius_px:
+        if not r.again:
+            return False
+        begin_round(s, r, r.round + 1)
     return True
 
 

@@ -44,6 +44,11 @@ RUN = np.dtype(
         ("has_candidate", "i8"),
         ("candidate", _CANDIDATE),
         ("has_arrived", "i8"),
+        ("again", "i8"),
+        ("search_since_s", "f8"),
+        ("round", "i8"),
+        ("pause_s", "f8"),
+        ("spiral_radius_px", "f8"),
         ("spiral_angle", "f8"),
         ("spiral_centre_rad", "f8", (2,)),
         # StarEstimator, Prefilter, Mirror, Pair

@@ -59,7 +59,8 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     if truth.hot_pixels or camera.dark_file is not None:
         msg = "its pixels differ (hot pixels or a dark file), and the batch makes all pixels alike"
         raise BatchRefusalError(msg)
-    plant, fsm = truth.loops[loop_name], loop.fsm
+    plant, fsm, acquisition = truth.loops[loop_name], loop.fsm, loop.acquisition
+    again_s = acquisition.search_again_s
     scale, plan = scales(rig, loop), plan_spiral(rig, loop_name)
     target_px = np.array([loop.target_px.az, loop.target_px.el])
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
@@ -122,10 +123,13 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
                 "largest_el_px",
             ),
             "acquisition": _fields(
-                loop.acquisition, "settle_s", "confirm_timeout_s", "found_frames", "lost_frames"
+                acquisition, "settle_s", "confirm_timeout_s", "found_frames", "lost_frames"
             ),
             "coarse": _fields(loop.coarse, "reach_fraction", "reach_frames"),
-            "spiral": _fields(plan, "growth_px", "speed_px_s", "acceleration_px_s2", "radius_px"),
+            "spiral": _fields(plan, "growth_px", "speed_px_s", "acceleration_px_s2", "pitch_px"),
+            "search_radius_px": acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px,
+            "search_again_pause_s": acquisition.search_again_pause_s,
+            "search_again_s": math.inf if again_s is None else again_s,
             "near_px": NEAR * plan.field_radius_px,
             "middle_px": np.array([camera.width_px - 1, camera.height_px - 1]) / 2,
             "target_px": target_px,

@@ -35,6 +35,7 @@ from fitctl.tui.widgets.panel import Panel
 BADGE_COLUMNS = 19
 SHORTEST_NAME = 4  # columns of whoever has the instrument
 WIDE_FROM_COLUMNS = 100
+STAR_LOST = "star lost"
 ASIDE = {"SAFE", "EXPERIMENT"}
 
 
@@ -75,8 +76,10 @@ class Header(Panel):
         blank = " " * BADGE_COLUMNS
         loop = self.state.loop
         # In VERNIER it matters which design holds the star.
-        design = loop.state.controller if loop and self._mode == "VERNIER" else ""
-        rows = (blank, label, design.center(BADGE_COLUMNS))
+        below = loop.state.controller if loop and self._mode == "VERNIER" else ""
+        if loop and loop.state.search_again is not None:
+            below = STAR_LOST
+        rows = (blank, label, below.center(BADGE_COLUMNS))
         return [[text(row, PAPER, on=ground, bold=True)] for row in rows]
 
     def _status(self, columns: int, *, small_badge: bool) -> Line:
@@ -87,6 +90,8 @@ class Header(Panel):
             ground = DIM if state.stale else look.colour
             line = [text(f" {look.symbol} {self._mode} ", PAPER, on=ground, bold=True), text(" ")]
         if loop is not None and newest is not None:
+            if small_badge and loop.state.search_again is not None:
+                line += [text(STAR_LOST, ORANGE, bold=True), text(" ")]
             in_mode = duration(newest.time_s - loop.state.since_s)
             line += [text(in_mode, WHITE, bold=True), text("  ")]
             line += [text(newest.rig_name, INK, bold=True)]

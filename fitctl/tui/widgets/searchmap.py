@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 
 from fitctl.messages.telemetry import LoopLimits
@@ -23,9 +24,13 @@ def search_lines(loop: LoopView, field_px: int, columns: int, rows: int) -> list
     centre = np.array(state.search_centre_sky_arcsec)
     here = np.array([tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec])
     field_arcsec = field_px * state.sky_arcsec_per_px
-    notes = _notes(loop, state.limits, here, field_arcsec)
+    limits = state.limits
+    if state.search_again is not None:
+        radius = state.search_again.radius_sky_arcsec
+        limits = msgspec.structs.replace(limits, search_radius_sky_arcsec=radius)
+    notes = _notes(loop, limits, here, field_arcsec)
     map_columns = max(6, min(columns - NOTES_COLUMNS, 2 * rows + 4))
-    drawn = _map(loop, state.limits, centre, here, field_arcsec, map_columns, rows)
+    drawn = _map(loop, limits, centre, here, field_arcsec, map_columns, rows)
     return in_columns(drawn, map_columns + 1, notes)
 
 
