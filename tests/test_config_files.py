@@ -134,7 +134,7 @@ def test_another_driver_leaves_nothing_of_the_device_in_the_base(tmp_path):
     with pytest.raises(ConfigError) as caught:
         load_rig(based(tmp_path, device))
     missing = {line.split(": ")[1].rpartition(".")[2] for line in str(caught.value).splitlines()}
-    assert missing == {"baud_rate", "axes", "response_timeout_s"}
+    assert missing == {"baud_rate", "axes", "response_timeout_s", "software_limits_verified"}
 
 
 def test_a_base_that_is_not_there_is_named(tmp_path):
