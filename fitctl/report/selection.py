@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import FOLLOWING, Mode
 from fitctl.simulation.statistics import SETTLE_S
 
 TARGET_SETTLE_S = 2.0
@@ -82,6 +82,20 @@ def select_frames(ticks: Columns, period_s: float, requirement_px: float) -> Sel
         if counts.any()
         else float("nan"),
     )
+
+
+def searches_for_lost_star(ticks: Columns) -> list[float]:
+    """How long each search for a star that had been followed lasted, s; one at the run's end counts so far."""
+    modes, time_s = ticks["mode_number"], ticks["time_s"]
+    searching = modes == Mode.ACQUISITION
+    followed = np.isin(modes, sorted(FOLLOWING))
+    begins = (np.flatnonzero(searching[1:] & followed[:-1]) + 1).tolist()
+    ends = [int(begin + np.argmin(np.r_[searching[begin:], False])) for begin in begins]
+    last = len(modes) - 1
+    return [
+        float(time_s[min(end, last)] - time_s[begin])
+        for begin, end in zip(begins, ends, strict=True)
+    ]
 
 
 def last_marked(values: NDArray[Any], marked: NDArray[np.bool_]) -> NDArray[Any]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from fitctl.report.findings import AXES, Findings, LoopFindings
 from fitctl.report.residual import Estimate
 from fitctl.report.run import Run
+from fitctl.report.selection import searches_for_lost_star
 
 UNKNOWN = "not known"
 MOST_ROWS = 400
@@ -113,6 +114,12 @@ def key_figures(loop: LoopFindings) -> Table:
             ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks",
         ]
     )
+    lost_s = searches_for_lost_star(loop.ticks)
+    if lost_s:
+        times = f"{len(lost_s)} times, searched again for {seconds(sum(lost_s))}"
+        rows.append(
+            ["star lost, all of the run", f"{times}, at most {seconds(max(lost_s))} at once"]
+        )
     return Table("In the part that is judged", ["what", "how much"], rows)
 
 

@@ -5,7 +5,12 @@ from hypothesis import strategies as st
 from report_samples import PERIOD_S, ticks_of
 
 from fitctl.messages.modes import Mode
-from fitctl.report.selection import TARGET_SETTLE_S, regular, select_frames
+from fitctl.report.selection import (
+    TARGET_SETTLE_S,
+    regular,
+    searches_for_lost_star,
+    select_frames,
+)
 from fitctl.simulation.statistics import SETTLE_S
 
 FRAMES = 3000  # a minute
@@ -91,3 +96,17 @@ def test_missing_frames_are_bridged_by_straight_lines(missing):
     whole = regular(PERIOD_S * there, line, PERIOD_S)
 
     np.testing.assert_allclose(whole, np.column_stack([3.0 * np.arange(100), 1.0 - np.arange(100)]))
+
+
+def test_searches_for_a_lost_star_are_those_that_follow_a_mode_with_a_star():
+    modes = np.full(FRAMES, Mode.VERNIER, np.int8)
+    modes[:100] = Mode.STANDBY
+    modes[100:200] = Mode.ACQUISITION  # the first search
+    modes[500:1000] = Mode.ACQUISITION
+    modes[2000:2050] = Mode.ACQUISITION
+    modes[-10:] = Mode.ACQUISITION  # the run ends during the search
+
+    found = searches_for_lost_star(ticks_of(FRAMES, mode_number=modes))
+
+    assert found == pytest.approx([10.0, 1.0, 0.18])
+    assert searches_for_lost_star(ticks_of(0)) == []
