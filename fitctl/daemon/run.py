@@ -10,11 +10,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
+
+import zmq
 
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
@@ -25,6 +27,7 @@ from fitctl.controllers.pair import Design
 from fitctl.daemon.children import Child
 from fitctl.daemon.devices import rig_devices
 from fitctl.daemon.last_records import finish_log
+from fitctl.daemon.locks import only_master, only_supervisor
 from fitctl.daemon.machine import Machine
 from fitctl.daemon.service_manager import (
     ALIVE,
@@ -40,10 +43,11 @@ from fitctl.messages.endpoints import (
     GATEWAY_SOCKET,
     RECORDS_SOCKET,
     TELEMETRY_SOCKET,
+    file_identity,
     make_service_folder,
     service_folder,
 )
-from fitctl.processes import ended_by_signals, lock_held
+from fitctl.processes import ended_by_signals
 from fitctl.service.keyed_door import check_keyed_door
 from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
@@ -90,27 +94,6 @@ def check_log_folder(folder: Path) -> None:
         raise ConfigError(msg) from None
 
 
-@contextmanager
-def only_supervisor(folder: Path) -> Iterator[None]:
-    """Hold the rig's lock; a second supervisor on the same rig is refused.
-
-    Raises
-    ------
-    ConfigError
-        If another holds it; the text names its process.
-    """
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(lock_held(folder / "lock"))
-        except BlockingIOError as error:
-            msg = (
-                f"{folder}: another supervisor ({error.strerror}) has this rig; attach to it with "
-                "`fitctl console`, or end it first"
-            )
-            raise ConfigError(msg) from None
-        yield
-
-
 def run_supervisor(
     rig: Rig, rig_arguments: Sequence[str], on_ready: Callable[[Path], None]
 ) -> None:
@@ -127,7 +110,8 @@ def run_supervisor(
     Raises
     ------
     ConfigError
-        If the socket folder, the TCP ports or the keys cannot be used, or another supervisor has this rig.
+        If the socket folder, the TCP ports or the keys cannot be used, or another supervisor has this rig or
+        one of its devices.
     """
     service_folder(rig)  # refused before anything is made
     log_folder = Path(rig.logging.folder).expanduser()
@@ -137,6 +121,7 @@ def run_supervisor(
         ending = threading.Event()
         stack.enter_context(ended_by_signals(ending.set))
         stack.enter_context(only_supervisor(folder))
+        stack.enter_context(only_master(rig))
         check_keyed_door(rig)  # what the gateway will need
         for name in _SOCKETS:
             stack.callback((folder / name).unlink, missing_ok=True)
@@ -178,7 +163,10 @@ def run_supervisor(
             records_offered=lambda: queue.offered,
         )
 
+        keep_bound = _keeps_bound(rig, queue, folder / RECORDS_SOCKET)
+
         def housekeep() -> None:
+            keep_bound()
             queue.pump()
             record(buffer.losses(state, clock.now_s()))
             collector.collect(pointing=supervisor.pointing)
@@ -236,6 +224,7 @@ def _loop(
     ending: threading.Event,
 ) -> None:
     housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
+    report = supervisor.report_event
     try:
         while not (supervisor.shutdown_wanted or ending.is_set()):
             supervisor.step()
@@ -243,7 +232,8 @@ def _loop(
                 housekeeping_s += _HOUSEKEEPING_S
                 housekeep()
                 for child in children:
-                    executor.submit(child.check)
+                    checked = executor.submit(child.check)
+                    checked.add_done_callback(partial(_report_failure, child.name, report))
                 machine.look()
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
@@ -256,6 +246,30 @@ def _loop(
             supervisor.step()
     finally:
         supervisor.close()
+
+
+def _keeps_bound(rig: Rig, queue: RecordQueue, path: Path) -> Callable[[], None]:
+    """What makes the recorder's socket anew where its file has vanished."""
+    file = file_identity(path)
+
+    def keep_bound() -> None:
+        nonlocal file
+        if file_identity(path) != file:
+            # Where it cannot be done, the service reports it; the next second may do.
+            with suppress(ConfigError, zmq.ZMQError):
+                make_service_folder(rig)
+                queue.bind_again()
+                file = file_identity(path)
+
+    return keep_bound
+
+
+def _report_failure(
+    name: str, report: Callable[[Severity, str, str], None], checked: Future[None]
+) -> None:
+    error = None if checked.cancelled() else checked.exception()
+    if error is not None:
+        report("error", name, f"the {name} could not be checked: {type(error).__name__}: {error}")
 
 
 def run_info(rig: Rig, scheduling: str, now_s: float, designs: Mapping[str, Design]) -> RunInfo:
