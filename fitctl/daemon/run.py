@@ -47,7 +47,8 @@ from fitctl.messages.endpoints import (
     make_service_folder,
     service_folder,
 )
-from fitctl.processes import ended_by_signals
+from fitctl.messages.running import RUNNING_FILE, write_running
+from fitctl.processes import ended_by_signals, rig_arguments
 from fitctl.service.keyed_door import check_keyed_door
 from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
@@ -60,7 +61,7 @@ from fitctl.stages.realtime import (
 )
 from fitctl.supervisor.supervisor import Supervisor
 
-_SOCKETS = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET)
+_LEFT = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET, RUNNING_FILE)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
@@ -95,15 +96,16 @@ def check_log_folder(folder: Path) -> None:
 
 
 def run_supervisor(
-    rig: Rig, rig_arguments: Sequence[str], on_ready: Callable[[Path], None]
+    rig: Rig, rig_file: Path, settings: Sequence[str], on_ready: Callable[[Path], None]
 ) -> None:
     """Supervise a rig until told to shut down, by a command or a signal.
 
     Parameters
     ----------
     rig : Rig
-    rig_arguments : sequence of str
-        ``fitctl`` options that describe the same rig to the processes beside the supervisor.
+    rig_file : Path
+    settings : sequence of str
+        ``key.path=value`` texts that replaced values of the file.
     on_ready : callable
         Called with the socket folder once commands are answered.
 
@@ -123,7 +125,7 @@ def run_supervisor(
         stack.enter_context(only_supervisor(folder))
         stack.enter_context(only_master(rig))
         check_keyed_door(rig)  # what the gateway will need
-        for name in _SOCKETS:
+        for name in _LEFT:
             stack.callback((folder / name).unlink, missing_ok=True)
         clock = MonotonicClock()
         queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
@@ -138,7 +140,9 @@ def run_supervisor(
         supervisor = Supervisor(
             rig, rig_devices(rig), clock, executor, record, design_in_own_process
         )
-        children = _children(rig, rig_arguments, folder, supervisor.report_event)
+        children = _children(
+            rig, rig_arguments(rig_file, settings), folder, supervisor.report_event
+        )
         for child in children:
             stack.callback(child.end)
         machine = Machine(
@@ -163,7 +167,9 @@ def run_supervisor(
             records_offered=lambda: queue.offered,
         )
 
-        keep_bound = _keeps_bound(rig, queue, folder / RECORDS_SOCKET)
+        keep_bound = _keeps_bound(
+            rig, queue, folder, partial(write_running, folder, rig.name, rig_file, settings)
+        )
 
         def housekeep() -> None:
             keep_bound()
@@ -192,7 +198,7 @@ def run_supervisor(
 
 def _children(
     rig: Rig,
-    rig_arguments: Sequence[str],
+    same_rig: Sequence[str],
     folder: Path,
     note: Callable[[Severity, str, str], None],
 ) -> list[Child]:
@@ -203,7 +209,7 @@ def _children(
         (rig.service.tcp_address, "gateway", "gateway", "a new one is started"),
     )
     return [
-        Child(name, [command, *rig_arguments], folder / f"{command}.err", again, note)
+        Child(name, [command, *same_rig], folder / f"{command}.err", again, note)
         for wanted, name, command, again in beside
         if wanted
     ]
@@ -248,16 +254,21 @@ def _loop(
         supervisor.close()
 
 
-def _keeps_bound(rig: Rig, queue: RecordQueue, path: Path) -> Callable[[], None]:
-    """What makes the recorder's socket anew where its file has vanished."""
+def _keeps_bound(
+    rig: Rig, queue: RecordQueue, folder: Path, describe: Callable[[], None]
+) -> Callable[[], None]:
+    """What makes the recorder's socket, and the description of the rig, anew where they have vanished."""
+    path = folder / RECORDS_SOCKET
     file = file_identity(path)
+    describe()
 
     def keep_bound() -> None:
         nonlocal file
         if file_identity(path) != file:
             # Where it cannot be done, the service reports it; the next second may do.
-            with suppress(ConfigError, zmq.ZMQError):
+            with suppress(ConfigError, OSError, zmq.ZMQError):
                 make_service_folder(rig)
+                describe()
                 queue.bind_again()
                 file = file_identity(path)
 
