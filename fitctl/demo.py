@@ -20,7 +20,7 @@ import numpy as np
 
 from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.daemon.last_records import HELLO_S
-from fitctl.daemon.run import only_supervisor
+from fitctl.daemon.locks import only_supervisor
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Acquire, AnyCommand, Standby

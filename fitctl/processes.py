@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import hashlib
 import os
+import pwd
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -15,6 +20,7 @@ from typing import IO
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PARENT_CHECK_S = 0.25
+_LONGEST_NAME = 107  # sun_path, without the NUL before it
 
 
 def rig_arguments(path: Path, overrides: Sequence[str]) -> list[str]:
@@ -112,6 +118,67 @@ def lock_held(path: Path) -> Iterator[None]:
         os.ftruncate(descriptor, 0)
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def name_held(name: str) -> Iterator[None]:
+    """Hold an abstract Unix name, for as long as we live at the most.
+
+    The kernel gives it to one process of the machine, whatever its user and its environment; no file can be
+    deleted under it.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process holds it; ``strerror`` names it.
+    """
+    # Nobody is ever accepted: who connects is told who holds it (SO_PEERCRED).
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as held:
+        try:
+            held.bind(_abstract(name))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise BlockingIOError(error.errno, name_holder(name), name) from None
+        held.listen(socket.SOMAXCONN)
+        yield
+
+
+def name_holder(name: str) -> str:
+    """Process and user that hold an abstract name, for people."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as asking:
+        try:
+            asking.connect(_abstract(name))
+            found = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+        except OSError:
+            return "an unknown process"
+    pid, uid, _ = struct.unpack("3i", found)
+    try:
+        user = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        user = str(uid)
+    return f"process {pid} of user {user}"
+
+
+def names_held(prefix: str) -> list[str]:
+    """Abstract names that processes of this machine listen at, and that begin so.
+
+    Anyone can hold any name: what a name says must be checked.
+    """
+    found = []
+    for line in Path("/proc/net/unix").read_text(errors="replace").split("\n"):
+        _, at, name = line.partition(" @")
+        if at and name.startswith(prefix):
+            found.append(name)
+    return sorted(set(found))
+
+
+def _abstract(name: str) -> bytes:
+    """As the kernel has it; a long name is held by its digest."""
+    whole = os.fsencode(name)
+    if len(whole) > _LONGEST_NAME:
+        whole = b"fitctl#" + hashlib.sha256(whole).hexdigest().encode()
+    return b"\0" + whole
 
 
 def last_line(path: Path) -> str:

@@ -41,7 +41,7 @@ class Child:
         again: str,
         note: Callable[[Severity, str, str], None],
     ) -> None:
-        self._name = name
+        self.name = name
         self._arguments = arguments
         self._errors = errors
         self._again = again
@@ -65,13 +65,22 @@ class Child:
             self._again_s = now_s + self._patience_s
             self._note(
                 "error",
-                self._name,
-                f"the {self._name} {how}{': ' + why if why else ''}; {self._again}"
+                self.name,
+                f"the {self.name} {how}{': ' + why if why else ''}; {self._again}"
                 + (f" in {self._patience_s:.0f} s" if self._patience_s else ""),
             )
             self._patience_s = min(max(1.0, 2 * self._patience_s), _PATIENCE_S)
         if now_s >= self._again_s:
-            self._start()
+            try:
+                self._start()
+            except OSError as error:
+                self._again_s = now_s + max(1.0, self._patience_s)
+                self._note(
+                    "error",
+                    self.name,
+                    f"the {self.name} cannot be started: {error}; again in {max(1.0, self._patience_s):.0f} s",
+                )
+                self._patience_s = min(max(1.0, 2 * self._patience_s), _PATIENCE_S)
 
     @property
     def running(self) -> bool:

@@ -10,11 +10,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
+
+import zmq
 
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
@@ -25,6 +27,7 @@ from fitctl.controllers.pair import Design
 from fitctl.daemon.children import Child
 from fitctl.daemon.devices import rig_devices
 from fitctl.daemon.last_records import finish_log
+from fitctl.daemon.locks import only_master, only_supervisor
 from fitctl.daemon.machine import Machine
 from fitctl.daemon.service_manager import (
     ALIVE,
@@ -40,10 +43,12 @@ from fitctl.messages.endpoints import (
     GATEWAY_SOCKET,
     RECORDS_SOCKET,
     TELEMETRY_SOCKET,
+    file_identity,
     make_service_folder,
     service_folder,
 )
-from fitctl.processes import ended_by_signals, lock_held
+from fitctl.messages.running import RUNNING_FILE, write_running
+from fitctl.processes import ended_by_signals, rig_arguments
 from fitctl.service.keyed_door import check_keyed_door
 from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
@@ -56,7 +61,7 @@ from fitctl.stages.realtime import (
 )
 from fitctl.supervisor.supervisor import Supervisor
 
-_SOCKETS = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET)
+_LEFT = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET, RUNNING_FILE)
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
@@ -90,44 +95,25 @@ def check_log_folder(folder: Path) -> None:
         raise ConfigError(msg) from None
 
 
-@contextmanager
-def only_supervisor(folder: Path) -> Iterator[None]:
-    """Hold the rig's lock; a second supervisor on the same rig is refused.
-
-    Raises
-    ------
-    ConfigError
-        If another holds it; the text names its process.
-    """
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(lock_held(folder / "lock"))
-        except BlockingIOError as error:
-            msg = (
-                f"{folder}: another supervisor ({error.strerror}) has this rig; attach to it with "
-                "`fitctl console`, or end it first"
-            )
-            raise ConfigError(msg) from None
-        yield
-
-
 def run_supervisor(
-    rig: Rig, rig_arguments: Sequence[str], on_ready: Callable[[Path], None]
+    rig: Rig, rig_file: Path, settings: Sequence[str], on_ready: Callable[[Path], None]
 ) -> None:
     """Supervise a rig until told to shut down, by a command or a signal.
 
     Parameters
     ----------
     rig : Rig
-    rig_arguments : sequence of str
-        ``fitctl`` options that describe the same rig to the processes beside the supervisor.
+    rig_file : Path
+    settings : sequence of str
+        ``key.path=value`` texts that replaced values of the file.
     on_ready : callable
         Called with the socket folder once commands are answered.
 
     Raises
     ------
     ConfigError
-        If the socket folder, the TCP ports or the keys cannot be used, or another supervisor has this rig.
+        If the socket folder, the TCP ports or the keys cannot be used, or another supervisor has this rig or
+        one of its devices.
     """
     service_folder(rig)  # refused before anything is made
     log_folder = Path(rig.logging.folder).expanduser()
@@ -137,8 +123,9 @@ def run_supervisor(
         ending = threading.Event()
         stack.enter_context(ended_by_signals(ending.set))
         stack.enter_context(only_supervisor(folder))
+        stack.enter_context(only_master(rig))
         check_keyed_door(rig)  # what the gateway will need
-        for name in _SOCKETS:
+        for name in _LEFT:
             stack.callback((folder / name).unlink, missing_ok=True)
         clock = MonotonicClock()
         queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
@@ -153,7 +140,9 @@ def run_supervisor(
         supervisor = Supervisor(
             rig, rig_devices(rig), clock, executor, record, design_in_own_process
         )
-        children = _children(rig, rig_arguments, folder, supervisor.report_event)
+        children = _children(
+            rig, rig_arguments(rig_file, settings), folder, supervisor.report_event
+        )
         for child in children:
             stack.callback(child.end)
         machine = Machine(
@@ -178,7 +167,12 @@ def run_supervisor(
             records_offered=lambda: queue.offered,
         )
 
+        keep_bound = _keeps_bound(
+            rig, queue, folder, partial(write_running, folder, rig.name, rig_file, settings)
+        )
+
         def housekeep() -> None:
+            keep_bound()
             queue.pump()
             record(buffer.losses(state, clock.now_s()))
             collector.collect(pointing=supervisor.pointing)
@@ -204,7 +198,7 @@ def run_supervisor(
 
 def _children(
     rig: Rig,
-    rig_arguments: Sequence[str],
+    same_rig: Sequence[str],
     folder: Path,
     note: Callable[[Severity, str, str], None],
 ) -> list[Child]:
@@ -215,7 +209,7 @@ def _children(
         (rig.service.tcp_address, "gateway", "gateway", "a new one is started"),
     )
     return [
-        Child(name, [command, *rig_arguments], folder / f"{command}.err", again, note)
+        Child(name, [command, *same_rig], folder / f"{command}.err", again, note)
         for wanted, name, command, again in beside
         if wanted
     ]
@@ -236,6 +230,7 @@ def _loop(
     ending: threading.Event,
 ) -> None:
     housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
+    report = supervisor.report_event
     try:
         while not (supervisor.shutdown_wanted or ending.is_set()):
             supervisor.step()
@@ -243,7 +238,8 @@ def _loop(
                 housekeeping_s += _HOUSEKEEPING_S
                 housekeep()
                 for child in children:
-                    executor.submit(child.check)
+                    checked = executor.submit(child.check)
+                    checked.add_done_callback(partial(_report_failure, child.name, report))
                 machine.look()
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
@@ -256,6 +252,35 @@ def _loop(
             supervisor.step()
     finally:
         supervisor.close()
+
+
+def _keeps_bound(
+    rig: Rig, queue: RecordQueue, folder: Path, describe: Callable[[], None]
+) -> Callable[[], None]:
+    """What makes the recorder's socket, and the description of the rig, anew where they have vanished."""
+    path = folder / RECORDS_SOCKET
+    file = file_identity(path)
+    describe()
+
+    def keep_bound() -> None:
+        nonlocal file
+        if file_identity(path) != file:
+            # Where it cannot be done, the service reports it; the next second may do.
+            with suppress(ConfigError, OSError, zmq.ZMQError):
+                make_service_folder(rig)
+                describe()
+                queue.bind_again()
+                file = file_identity(path)
+
+    return keep_bound
+
+
+def _report_failure(
+    name: str, report: Callable[[Severity, str, str], None], checked: Future[None]
+) -> None:
+    error = None if checked.cancelled() else checked.exception()
+    if error is not None:
+        report("error", name, f"the {name} could not be checked: {type(error).__name__}: {error}")
 
 
 def run_info(rig: Rig, scheduling: str, now_s: float, designs: Mapping[str, Design]) -> RunInfo:

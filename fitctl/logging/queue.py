@@ -62,6 +62,7 @@ class RecordQueue:
         self._sent = 0  # how many of the kept ones, oldest first, this recorder has been sent
         self._recorder: bytes | None = None
         self._run_info: RunInfo | None = None
+        self._endpoint = endpoint
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.SNDHWM, size)
@@ -122,6 +123,18 @@ class RecordQueue:
         self._listen()
         self._forget(_STEPS_PER_OFFER)
         self._send(_STEPS_PER_OFFER)
+
+    def bind_again(self) -> None:
+        """Make the socket's file anew, which somebody has removed; a recorder that is connected stays so.
+
+        Raises
+        ------
+        zmq.ZMQError
+            If that cannot be done; the next call may succeed.
+        """
+        with contextlib.suppress(zmq.ZMQError):
+            self._socket.unbind(self._endpoint)
+        self._socket.bind(self._endpoint)
 
     def pump_while(self, going_on: Callable[[], object], timeout_s: float) -> None:
         """Hear the recorder and send whatever is there, as long as `going_on`, within the time."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -13,14 +15,23 @@ from typing import TypeVar
 import msgspec
 import zmq
 
+from fitctl.config import ConfigError
 from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply
-from fitctl.messages.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, keep_alive, tcp_endpoint
+from fitctl.messages.endpoints import (
+    COMMAND_SOCKET,
+    TELEMETRY_SOCKET,
+    keep_alive,
+    open_folder,
+    socket_in,
+    tcp_endpoint,
+)
 from fitctl.messages.keys import RemoteKey
 from fitctl.messages.telemetry import Telemetry
 
 REPLY_TIMEOUT_S = 2.0
 _REFUSED_TIMEOUT_S = 1.0
 _CLOCK_MESSAGES = 100
+_FOLDER_PERIOD_S = 0.05  # how soon a folder that comes is found
 
 _T = TypeVar("_T")
 
@@ -30,6 +41,12 @@ class Client:
 
     Telemetry is received on one thread; commands may be sent from any, each on a socket of its own, so
     that none waits behind another. A socket whose command was answered is kept for the next one.
+
+    On this machine, sockets are reached through the descriptor of a folder that was examined when it was opened
+    (:func:`~fitctl.messages.endpoints.open_folder`). In that folder only this user and root can make a
+    socket, so whoever answers is one of them, also when libzmq reconnects by itself. libzmq does not give
+    SO_PEERCRED of the other end to a client that connects, and a second connection would say nothing about
+    the first. A folder that has been made anew is examined and opened anew.
 
     Parameters
     ----------
@@ -42,7 +59,9 @@ class Client:
         self._context = zmq.Context()
         self._tags = itertools.count(1)
         self._closed = False
-        self._idle: deque[zmq.Socket[bytes]] = deque()
+        self._idle: deque[tuple[str, zmq.Socket[bytes]]] = deque()  # with the endpoint of each
+        self._folders: list[int] = []  # descriptors; the last is in use, others may still be
+        self._folder_lock = threading.Lock()
         self._ahead_s: deque[float] = deque(maxlen=_CLOCK_MESSAGES)
         self._decode_telemetry = msgspec.msgpack.Decoder(Telemetry).decode
         self._decode_reply = msgspec.msgpack.Decoder(Reply).decode
@@ -51,7 +70,9 @@ class Client:
         self._subscriber.setsockopt(zmq.RCVHWM, 200)
         self._subscriber.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
         self._subscriber.subscribe(b"")
-        self._connect(self._subscriber, TELEMETRY_SOCKET)
+        self._heard_at = ""
+        with suppress(ConnectionError):
+            self._subscribe()
 
     def now_s(self) -> float:
         """The supervisor's time.
@@ -67,9 +88,11 @@ class Client:
         Raises
         ------
         ConnectionError
-            If what came cannot be read; the next message may be readable again.
+            If what came cannot be read, and the next message may be readable again; or if the socket folder
+            could be another user's.
         """
         if not self._subscriber.poll(int(timeout_s * 1000)):
+            self._subscribe()
             return None
         telemetry = _decoded(self._decode_telemetry, self._subscriber.recv(), "telemetry")
         self._hear(telemetry.time_s)
@@ -87,7 +110,7 @@ class Client:
         if len(payload) > MAX_COMMAND_BYTES:
             text = f"{name} takes {len(payload)} bytes; a command may take {MAX_COMMAND_BYTES}: make it shorter"
             return Reply(accepted=False, text=text)
-        dealer = self._dealer()
+        endpoint, dealer = self._dealer(timeout_s)
         timeout_ms = int(timeout_s * 1000)
         try:
             # A socket that was refused since its last command has no way out; sending would wait for ever.
@@ -102,7 +125,7 @@ class Client:
         except BaseException:  # also Ctrl-C: a socket left open would hold up close()
             dealer.close()
             raise
-        self._idle.append(dealer)
+        self._idle.append((endpoint, dealer))
         if self._closed:
             self._close_idle()
         reply = _decoded(self._decode_reply, answer, f"the reply to {name}")
@@ -115,18 +138,42 @@ class Client:
         self._subscriber.close()
         self._close_idle()
         self._context.term()
+        with self._folder_lock:
+            while self._folders:
+                os.close(self._folders.pop())
 
     def _close_idle(self) -> None:
         with suppress(IndexError):  # another thread may take the last one
             while True:
-                self._idle.pop().close()
+                self._idle.pop()[1].close()
 
-    def _dealer(self) -> zmq.Socket[bytes]:
+    def _dealer(self, timeout_s: float) -> tuple[str, zmq.Socket[bytes]]:
+        """A socket for a command, and where it is connected to."""
+        endpoint = self._endpoint(COMMAND_SOCKET)
+        end_s = time.monotonic() + timeout_s
+        while not endpoint:
+            if time.monotonic() > end_s:
+                raise ConnectionError(self._why_silent(timeout_s))
+            time.sleep(_FOLDER_PERIOD_S)
+            endpoint = self._endpoint(COMMAND_SOCKET)
         with suppress(IndexError):
-            return self._idle.pop()
+            while True:
+                idle = self._idle.pop()
+                if idle[0] == endpoint:
+                    return idle
+                idle[1].close()  # of a folder that is no longer there
         dealer = self._socket(zmq.DEALER)
-        self._connect(dealer, COMMAND_SOCKET)
-        return dealer
+        dealer.connect(endpoint)
+        return endpoint, dealer
+
+    def _subscribe(self) -> None:
+        """Listen where telemetry comes from now; for the thread that receives."""
+        endpoint = self._endpoint(TELEMETRY_SOCKET)
+        if endpoint and endpoint != self._heard_at:
+            if self._heard_at:
+                self._subscriber.disconnect(self._heard_at)
+            self._subscriber.connect(endpoint)
+            self._heard_at = endpoint
 
     def _socket(self, kind: int) -> zmq.Socket[bytes]:
         new = self._context.socket(kind)
@@ -139,13 +186,30 @@ class Client:
             keep_alive(new)
         return new
 
-    def _connect(self, unconnected: zmq.Socket[bytes], which: str) -> None:
+    def _endpoint(self, which: str) -> str:
+        """Where a socket of the supervisor is now; empty while there is no folder.
+
+        Raises
+        ------
+        ConnectionError
+            If the folder could be another user's.
+        """
         where = self._where
         if isinstance(where, RemoteKey):
             port = where.command_port if which == COMMAND_SOCKET else where.telemetry_port
-            unconnected.connect(tcp_endpoint(where.host, port))
-        else:
-            unconnected.connect(f"ipc://{where / which}")
+            return tcp_endpoint(where.host, port)
+        with self._folder_lock:
+            try:
+                found = open_folder(where.absolute())
+            except OSError:
+                return ""
+            except ConfigError as error:
+                raise ConnectionError(str(error)) from None
+            if self._folders and os.path.samestat(os.fstat(found), os.fstat(self._folders[-1])):
+                os.close(found)
+            else:
+                self._folders.append(found)
+            return socket_in(self._folders[-1], which)
 
     def _hear(self, time_s: float) -> None:
         """Learn from a message how far the supervisor's clock is ahead, at least."""
@@ -175,7 +239,7 @@ class Client:
             | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
         )
         with self._socket(zmq.DEALER) as dealer, dealer.get_monitor_socket(refusals) as monitor:
-            self._connect(dealer, COMMAND_SOCKET)
+            dealer.connect(self._endpoint(COMMAND_SOCKET))
             refused = bool(monitor.poll(int(_REFUSED_TIMEOUT_S * 1000)))
             dealer.disable_monitor()
         return refused

@@ -1,10 +1,17 @@
-"""Where a supervisor's sockets are: a folder that only their owner may enter."""
+"""Where a supervisor's sockets are: a folder that only their owner may enter.
+
+The folder is the same in every session of a user: it depends on the user database and on the machine, never
+on the environment. Server and clients both refuse a folder that somebody else could have put there.
+"""
 
 from __future__ import annotations
 
+import grp
 import os
+import pwd
+import socket
 import stat
-import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import zmq
@@ -15,7 +22,10 @@ COMMAND_SOCKET = "command"
 TELEMETRY_SOCKET = "telemetry"
 RECORDS_SOCKET = "records"
 GATEWAY_SOCKET = "gateway"
-_LONGEST_SOCKET_PATH = 100  # sun_path holds 108 bytes
+_LONGEST_SOCKET_PATH = 98  # sun_path holds 108 bytes; `supervisor_name` has more before the folder
+_MOST_LINKS = 40  # as the kernel
+_TO_FOLDER = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+_MACHINE_ID = Path("/etc/machine-id")
 
 
 def service_folder(rig: Rig) -> Path:
@@ -30,6 +40,9 @@ def service_folder(rig: Rig) -> Path:
     try:
         folder = Path(given).expanduser().absolute() if given else _own_folder() / rig.name
         size = len(os.fsencode(folder / TELEMETRY_SOCKET))
+    except KeyError:
+        msg = f"service.folder: user {os.getuid()} is not in the user database; name a folder"
+        raise ConfigError(msg) from None
     except (RuntimeError, ValueError) as error:  # no such user; a NUL or half a character in it
         msg = f"service.folder: {given!r}: {error}; choose another"
         raise ConfigError(msg) from None
@@ -40,10 +53,26 @@ def service_folder(rig: Rig) -> Path:
 
 
 def _own_folder() -> Path:
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime:
-        return Path(runtime) / "fitctl"
-    return Path(tempfile.gettempdir()) / f"fitctl-{os.getuid()}"
+    """In the home folder that the user database names, with a part for this machine: homes may be shared."""
+    home = Path(pwd.getpwuid(os.getuid()).pw_dir)
+    return home / ".local/state/fitctl" / _machine()
+
+
+def _machine() -> str:
+    with suppress(OSError):
+        if (identity := _MACHINE_ID.read_text().strip()) and identity.isalnum():
+            return identity[:8]
+    return socket.gethostname()
+
+
+def supervisor_name(folder: Path) -> str:
+    """The abstract Unix name that a supervisor holds for its folder."""
+    return f"{supervisor_names()}{os.path.realpath(folder)}"
+
+
+def supervisor_names() -> str:
+    """With what the names of this user's supervisors begin; the folder follows."""
+    return f"fitctl:{os.getuid()}:"
 
 
 def tcp_endpoint(host: str, port: int) -> str:
@@ -69,17 +98,126 @@ def make_service_folder(rig: Rig) -> Path:
     Raises
     ------
     ConfigError
-        If it cannot be made, belongs to someone else or is open to others.
+        If it cannot be made, or others could have made or could replace a part of its path.
     """
     folder = service_folder(rig)
     try:
-        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.stat()
+        for part in (*reversed(folder.parents), folder):
+            with suppress(FileExistsError):
+                part.mkdir(mode=0o700)
+        os.close(open_folder(folder))
     except OSError as error:
         msg = f"service.folder: {folder} cannot be made: {error.strerror}; choose one that you may write in"
         raise ConfigError(msg) from None
-    if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-        msg = f"service.folder: {folder} must belong to you with mode 0700; remove it or choose another"
-        raise ConfigError(msg)
     return folder
+
+
+def checked_folder(rig: Rig) -> Path:
+    """The folder of a rig's sockets, which exists and can be nobody else's.
+
+    Raises
+    ------
+    ConfigError
+        If it is not so.
+    """
+    folder = service_folder(rig)
+    try:
+        os.close(open_folder(folder))
+    except OSError as error:
+        msg = f"service.folder: {folder} cannot be opened: {error.strerror}; start the supervisor first"
+        raise ConfigError(msg) from None
+    return folder
+
+
+def open_folder(folder: Path) -> int:
+    """Open a socket folder that belongs to this user alone; no part of its path can be another user's.
+
+    Each part is opened relative to the one before it, without following links, and examined once it is
+    open. So nothing can be exchanged between the examination and the use. A link is followed
+    only where root or this user made it. The descriptor is for paths (``O_PATH``): whatever is reached through
+    it (:func:`socket_in`) is in this folder, also when its name leads elsewhere later.
+
+    Parameters
+    ----------
+    folder : Path
+        Absolute.
+
+    Raises
+    ------
+    ConfigError
+        If a part belongs to, or can be replaced by, another user, or the folder is open to others.
+    OSError
+        If a part does not exist or is no folder.
+    """
+    pending = list(reversed(folder.parts[1:]))
+    at, path, links = os.open("/", _TO_FOLDER), Path("/"), 0
+    try:
+        while pending:
+            name = pending.pop()
+            part = os.open(name, _TO_FOLDER, dir_fd=at)
+            status = os.fstat(part)
+            if fault := foreign_part(path / name, status):
+                os.close(part)
+                raise ConfigError(_refused(folder, fault))
+            if not stat.S_ISLNK(status.st_mode):
+                os.close(at)
+                at, path = part, path / name
+                continue
+            target = Path(os.readlink("", dir_fd=part))
+            os.close(part)
+            if (links := links + 1) > _MOST_LINKS:
+                raise ConfigError(_refused(folder, f"{path / name} is one of too many links"))
+            pending += reversed(target.parts[1:] if target.is_absolute() else target.parts)
+            if target.is_absolute():
+                os.close(at)
+                at, path = os.open("/", _TO_FOLDER), Path("/")
+        status = os.fstat(at)
+        if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+            raise ConfigError(_refused(folder, "it must belong to you with mode 0700"))
+    except BaseException:
+        os.close(at)
+        raise
+    return at
+
+
+def _refused(folder: Path, fault: str) -> str:
+    return f"service.folder: {folder} is not safe: {fault}; remove it or choose another"
+
+
+def foreign_part(path: Path, status: os.stat_result) -> str:
+    """What allows another user to put something else at a part of a path; empty if nothing does."""
+    if status.st_uid not in {0, os.getuid()}:
+        return f"{path} belongs to user {status.st_uid}"
+    mode = status.st_mode
+    if stat.S_ISLNK(mode):
+        return ""  # only its owner can change it
+    if not stat.S_ISDIR(mode):
+        return f"{path} is no folder"
+    # In a sticky folder, such as /tmp, nobody can replace what belongs to this user or to root.
+    writable = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not _is_own_group(status.st_gid))
+    return f"others can write in {path}" if writable and not mode & stat.S_ISVTX else ""
+
+
+def _is_own_group(gid: int) -> bool:
+    """Root's group, or the group that a user has alone."""
+    if gid == 0:
+        return True
+    try:
+        user, group = pwd.getpwuid(os.getuid()), grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return group.gr_name == user.pw_name and set(group.gr_mem) <= {user.pw_name}
+
+
+def socket_in(folder: int, name: str) -> str:
+    """The ZeroMQ endpoint of a socket in a folder that :func:`open_folder` has opened."""
+    return f"ipc:///proc/self/fd/{folder}/{name}"
+
+
+def file_identity(path: Path) -> tuple[int, int] | None:
+    """Which file is at a path, None if there is none: to notice that it was removed or replaced."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino

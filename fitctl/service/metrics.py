@@ -6,13 +6,17 @@ loops need. It serves on 127.0.0.1 only, and takes no command.
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from typing import get_args, get_type_hints
+from contextlib import suppress
+from typing import Any, get_args, get_type_hints
+from wsgiref.simple_server import WSGIRequestHandler
 
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry, make_wsgi_app
+from prometheus_client.exposition import ThreadingWSGIServer
 from prometheus_client.metrics_core import (
     CounterMetricFamily,
     GaugeMetricFamily,
@@ -32,6 +36,8 @@ from fitctl.messages.troubles import troubles
 HOST = "127.0.0.1"
 STALE_S = 2.0  # nothing is told of an instrument that has been silent for so long, but that it is
 _POLL_S = 0.25
+_REQUEST_S = 5.0  # for a whole request and its answer
+_MOST_REQUESTS = 16  # at once
 STATES = get_args(get_type_hints(DeviceHealth)["state"])
 SEVERITIES = get_args(Severity)
 
@@ -122,6 +128,63 @@ class InstrumentCollector(Collector):
             )
 
 
+class _Handler(WSGIRequestHandler):
+    """Closes a connection whose request and answer take too long, however they trickle; logs nothing."""
+
+    def setup(self) -> None:
+        self._cut = threading.Timer(_REQUEST_S, self._shut)
+        self._cut.daemon = True
+        self._cut.start()
+        super().setup()
+
+    def finish(self) -> None:
+        self._cut.cancel()
+        super().finish()
+
+    def _shut(self) -> None:
+        with suppress(OSError):  # it has just ended
+            self.connection.shutdown(socket.SHUT_RDWR)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+class _Server(ThreadingWSGIServer):
+    """Answers a bounded number of requests at once; who comes beyond it is turned away."""
+
+    def __init__(self, port: int) -> None:
+        self._free = threading.BoundedSemaphore(_MOST_REQUESTS)
+        super().__init__((HOST, port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that hangs up, or was cut off, is no error of ours."""
+
+
+def _for_this_host(answer: Callable[..., Any], port: int) -> Callable[..., Any]:
+    """Refuse requests to other names: a page of another site may have its name resolved to 127.0.0.1."""
+    hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+
+    def guarded(environ: dict[str, Any], start_response: Callable[..., Any]) -> Any:
+        if environ.get("HTTP_HOST", "").lower() in hosts:
+            return answer(environ, start_response)
+        start_response("403 Forbidden", [("Content-Type", "text/plain")])
+        return [f"ask http://{HOST}:{port}/metrics\n".encode()]
+
+    return guarded
+
+
 def serve_metrics(client: Client, port: int, rig_name: str, stop: threading.Event) -> None:
     """Answer ``http://127.0.0.1:PORT/metrics`` until `stop`.
 
@@ -134,12 +197,15 @@ def serve_metrics(client: Client, port: int, rig_name: str, stop: threading.Even
     collector = InstrumentCollector()
     registry.register(collector)
     try:
-        server, thread = start_http_server(port, HOST, registry)
+        server = _Server(port)
     except OSError as error:
         msg = (
             f"service.metrics_port: {HOST}:{port}: {error.strerror}; give {rig_name} another, or 0"
         )
         raise ConfigError(msg) from None
+    server.set_app(_for_this_host(make_wsgi_app(registry), port))
+    thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread.start()
     try:
         while not stop.is_set():
             try:

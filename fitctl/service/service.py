@@ -20,6 +20,7 @@ import msgspec
 import zmq
 
 from fitctl.clock import Clock
+from fitctl.config import ConfigError
 from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
     AnyCommand,
@@ -30,7 +31,13 @@ from fitctl.messages.commands import (
     Stop,
     TakeOver,
 )
-from fitctl.messages.endpoints import COMMAND_SOCKET, GATEWAY_SOCKET, TELEMETRY_SOCKET
+from fitctl.messages.endpoints import (
+    COMMAND_SOCKET,
+    GATEWAY_SOCKET,
+    TELEMETRY_SOCKET,
+    file_identity,
+    make_service_folder,
+)
 from fitctl.messages.keys import AllowedKey
 from fitctl.service.admission import Admission, Sender
 from fitctl.service.doors import Door, local_sender, publisher_socket, router_socket
@@ -93,12 +100,16 @@ class Service(threading.Thread):
         self._keys: dict[str, AllowedKey] = {}  # by name, as the gateway last reported
         self._context = zmq.Context()
         self._local = Door(router_socket(self._context))
-        self._local.router.bind(f"ipc://{folder / COMMAND_SOCKET}")
         self._gateway = Door(router_socket(self._context, MAX_ENVELOPE_BYTES))
-        if settings.tcp_address:
-            self._gateway.router.bind(f"ipc://{folder / GATEWAY_SOCKET}")
         self._publisher = publisher_socket(self._context)
-        self._publisher.bind(f"ipc://{folder / TELEMETRY_SOCKET}")
+        self._bound = {folder / COMMAND_SOCKET: self._local.router}
+        if settings.tcp_address:
+            self._bound[folder / GATEWAY_SOCKET] = self._gateway.router
+        self._bound[folder / TELEMETRY_SOCKET] = self._publisher
+        for path, bare in self._bound.items():
+            bare.bind(f"ipc://{path}")
+        self._files = {path: file_identity(path) for path in self._bound}
+        self._unmade = ""  # why the folder cannot be made anew, as last reported
 
     def stop(self) -> None:
         """Publish once more, send what replies there are, and end."""
@@ -125,6 +136,7 @@ class Service(threading.Thread):
                 if now_s >= report_s:
                     for line in self._intake.dropped(now_s):
                         self._supervisor.report_event("warning", SOURCE, line)
+                    self._bind_again()
                     report_s = now_s + _REPORT_PERIOD_S
             self._send_replies()
             self._publish(self._clock.now_s())
@@ -132,6 +144,32 @@ class Service(threading.Thread):
             for socket in (self._local.router, self._gateway.router, self._publisher):
                 socket.close()
             self._context.term()
+
+    def _bind_again(self) -> None:
+        """Make those sockets anew whose files have vanished: a tidied folder must not make us deaf.
+
+        Connections that there are stay; clients find the new sockets by themselves.
+        """
+        gone = [path for path, file in self._files.items() if file_identity(path) != file]
+        if not gone:
+            return
+        try:
+            folder = make_service_folder(self._supervisor.rig)
+            for path in gone:
+                with suppress(zmq.ZMQError):  # it was unbound before, and could not be bound
+                    self._bound[path].unbind(f"ipc://{path}")
+                self._bound[path].bind(f"ipc://{path}")
+                self._files[path] = file_identity(path)
+        except (ConfigError, zmq.ZMQError) as error:
+            if str(error) != self._unmade:
+                self._unmade = str(error)
+                text = f"no command from this machine can arrive: the sockets have vanished, and {error}"
+                self._supervisor.report_event("error", SOURCE, text)
+            return
+        self._unmade = ""
+        names = ", ".join(path.name for path in gone)
+        text = f"sockets were removed from {folder} and are made anew: {names}"
+        self._supervisor.report_event("warning", SOURCE, text)
 
     # ------------------------------------------------------------ commands
 

@@ -170,7 +170,12 @@ class DeviceJobs:
             )
 
     def _close(self, names: list[str], with_camera: bool) -> None:
-        self._job = Job(self._submit(close_devices, names, with_camera), lambda _: None)
+        self._job = Job(self._submit(close_devices, names, with_camera), self._closed)
+
+    def _closed(self, future: Future) -> None:
+        error = future.exception()
+        if error is not None:
+            self._journal.event("error", _SOURCE, f"closing devices failed: {error_text(error)}")
 
     def _submit(
         self, work: Callable[..., Opened | None], names: list[str], with_camera: bool

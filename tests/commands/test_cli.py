@@ -8,6 +8,7 @@ import pytest
 
 from fitctl import __version__
 from fitctl.cli import COMMANDS, main
+from fitctl.config import default_rig_path
 
 
 def fitctl(*arguments, timeout_s=60):
@@ -81,7 +82,10 @@ BAD_INPUT = {
     "a command that is none": (["send", "explode"], "explode is no command"),
     "a negative duration": (["simulate", "--duration", "-3"], "duration"),
     "a negative seed": (["simulate", "--seed", "-1"], "seed"),
-    "a loop that is none": (["send", "stop", "--loop", "left"], "has right"),
+    "a loop that is none": (
+        ["send", "stop", "--loop", "left", "--rig", str(default_rig_path())],
+        "has right",
+    ),
     "a log folder that is none": (["run", "--set", "logging.folder=/dev/null/x"], "logging.folder"),
     "a servo that would swing": (
         ["check", "--set", "loops.right.siderostat.servo.rate_hz=50.0"],

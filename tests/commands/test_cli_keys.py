@@ -10,6 +10,7 @@ from served import Served
 from fitctl.cli import main
 from fitctl.config import default_rig_path
 from fitctl.messages.commands import Status, TakeOver
+from fitctl.messages.running import RunningRig
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.widgets.margins import Margins
 from tests.tui.live import notifications, until
@@ -165,6 +166,10 @@ def test_a_rig_file_that_does_not_go_with_the_key_is_one_line_and_status_2(
 def test_each_page_of_a_browser_is_the_console_that_was_asked_for(
     console, key_file, monkeypatch, rig, remote
 ):
+    runs = RunningRig(
+        name="fit-mock", file=str(default_rig_path()), settings=[], pid=1, folder="/none"
+    )
+    monkeypatch.setattr("fitctl.commands.shared.supervisor.running_rigs", lambda: [runs])
     pages = []
     served = "fitctl.commands.operate.console.serve_console"
     monkeypatch.setattr(served, lambda *page: pages.append(page))

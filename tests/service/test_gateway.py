@@ -16,7 +16,12 @@ from served import Served, rig_in, until
 from fitctl.clock import VirtualClock
 from fitctl.config import ConfigError
 from fitctl.messages.commands import Hold, Status, Stop, TakeOver
-from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, tcp_endpoint
+from fitctl.messages.endpoints import (
+    GATEWAY_SOCKET,
+    TELEMETRY_SOCKET,
+    make_service_folder,
+    tcp_endpoint,
+)
 from fitctl.messages.keys import AllowedKey, new_key, revoke_key
 from fitctl.service.envelope import Passed, Report, decode_envelope
 from fitctl.service.keyed_door import check_keyed_door
@@ -53,7 +58,7 @@ def test_an_envelope_is_no_command_on_the_socket_for_everybody(served):
 
 def test_an_envelope_is_no_command_from_the_network(served):
     anna = served.person("anna")
-    dealer = anna._dealer()
+    _, dealer = anna._dealer(5.0)
     dealer.send_multipart([b"tag", msgspec.msgpack.encode(OF_ANNA)])
 
     assert dealer.poll(5000)
@@ -181,6 +186,7 @@ main(sys.argv[1:])
 
 def test_a_gateway_that_hangs_is_ended_by_its_alarm(tmp_path):
     rig = rig_in(tmp_path, "service.tcp_address=127.0.0.1")
+    make_service_folder(rig)
     new_key(rig, "anna", "commander", "", tmp_path / "anna.key.toml")
     settings = ("tcp_address", "folder", "keys_folder", "command_port", "telemetry_port")
     given = [f"--set=service.{name}={getattr(rig.service, name)}" for name in settings]

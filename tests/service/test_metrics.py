@@ -170,3 +170,82 @@ def test_a_taken_port_is_told_in_one_line():
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=rf"service.metrics_port: {HOST}:{port}: .*another"):
             serve_metrics(Line(), port, "fit-mock", threading.Event())
+
+
+def answer_to(port, request, limit_s=20.0):
+    """All that comes back for some bytes, and after how many seconds the server has hung up."""
+    begun_s = time.monotonic()
+    with socket.create_connection((HOST, port), limit_s) as line:
+        line.sendall(request)
+        answer = b""
+        while piece := line.recv(65536):
+            answer += piece
+    return answer, time.monotonic() - begun_s
+
+
+@pytest.mark.parametrize("host", ["elsewhere.example", "127.0.0.1:1", "127.0.0.1", "\xe9"])
+def test_a_page_of_another_site_cannot_read_the_metrics_under_its_own_name(served, host):
+    request = f"GET /metrics HTTP/1.0\r\nHost: {host}\r\n\r\n".encode()
+
+    answer, _ = answer_to(served.port, request)
+
+    assert answer.split()[1] == b"403"
+    assert b"fitctl_up" not in answer
+
+
+def test_a_request_without_a_host_is_refused(served):
+    assert answer_to(served.port, b"GET /metrics HTTP/1.0\r\n\r\n")[0].split()[1] == b"403"
+
+
+def test_localhost_is_this_host(served):
+    request = f"GET /metrics HTTP/1.0\r\nHost: localhost:{served.port}\r\n\r\n".encode()
+
+    assert b"fitctl_up" in answer_to(served.port, request)[0]
+
+
+def test_a_request_that_never_ends_is_cut_off(served, monkeypatch):
+    monkeypatch.setattr("fitctl.service.metrics._REQUEST_S", 0.5)
+
+    answer, after_s = answer_to(served.port, b"GET /metrics HTTP/1.0\r\nHost: ")
+
+    assert b"fitctl_up" not in answer
+    assert after_s < 10.0
+
+
+def test_a_request_that_trickles_is_cut_off_too(served, monkeypatch):
+    """A limit to each read would never be reached."""
+    monkeypatch.setattr("fitctl.service.metrics._REQUEST_S", 0.5)
+    begun_s = time.monotonic()
+
+    def trickle(line):
+        while time.monotonic() < begun_s + 10.0:
+            line.sendall(b"x")
+            time.sleep(0.05)
+
+    with socket.create_connection((HOST, served.port), 20.0) as line:
+        line.sendall(b"GET /metrics HTTP/1.0\r\nX: ")
+        with pytest.raises((BrokenPipeError, ConnectionResetError)):
+            trickle(line)
+
+
+def test_many_who_never_ask_leave_few_threads_and_a_scrape_comes_through_after_them(
+    served, monkeypatch
+):
+    monkeypatch.setattr("fitctl.service.metrics._REQUEST_S", 1.0)
+    before = threading.active_count()
+    silent = [socket.create_connection((HOST, served.port), 20.0) for _ in range(100)]
+    try:
+        time.sleep(0.3)
+        # A request has its own thread and that of its time limit.
+        assert threading.active_count() - before <= 2 * 16
+        end_s = time.monotonic() + 20.0
+        scraped = {}
+        while not scraped and time.monotonic() < end_s:
+            try:
+                scraped = served.scrape()
+            except OSError:
+                time.sleep(0.1)
+        assert scraped
+    finally:
+        for line in silent:
+            line.close()

@@ -100,6 +100,17 @@ def test_a_stack_that_is_not_where_it_was_told_makes_the_loop_safe(vernier, monk
     assert "got 150.0 V" in events_of(vernier)[-1].message
 
 
+def test_closing_that_fails_as_a_whole_is_an_event(vernier, monkeypatch):
+    monkeypatch.setattr("fitctl.supervisor.device_jobs.close_devices", failing(OSError("boom")))
+    vernier.command(Stop())
+    vernier.run(1.0)
+    vernier.command(Off())
+    vernier.run(0.1)
+
+    assert any("closing devices failed: " in e.message for e in events_of(vernier))
+    monkeypatch.undo()
+
+
 def test_a_device_that_cannot_be_closed_keeps_no_other_from_being_closed(vernier, monkeypatch):
     devices = vernier.devices
     closed = []

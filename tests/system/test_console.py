@@ -235,28 +235,3 @@ def test_a_browser_shows_the_same_console(page, tmp_path):
     rows, columns = red.nonzero()
     assert rows.min() > 0.9 * picture.shape[0], "STOP is in the last line"
     assert columns.max() < 0.2 * picture.shape[1]
-
-
-@pytest.mark.timeout(400)
-def test_a_page_is_for_who_has_its_key_alone(page):
-    import urllib.error
-    import urllib.request
-
-    def status(address, **headers):
-        request = urllib.request.Request(address, headers=headers)
-        try:
-            with urllib.request.build_opener(urllib.request.HTTPCookieProcessor()).open(
-                request, timeout=LIMIT_S
-            ) as answer:
-                return answer.status
-        except urllib.error.HTTPError as error:
-            return error.code
-
-    base, _, query = page.partition("?")
-    assert status(page) == 200
-    assert status(base) == 403
-    assert status(f"{base}ws") == 403
-    assert status(f"{base}static/js/textual.js") == 403
-    assert status(f"{base}?{query[:-1]}x") == 403
-    assert status(page, Origin="http://elsewhere.example") == 403
-    assert status(page, Host="elsewhere.example") == 403

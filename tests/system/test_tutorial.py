@@ -2,18 +2,17 @@
 
 import contextlib
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from pathlib import Path
 
 import pytest
 from documents import blocks, commands
 
+from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.client import Client
+from fitctl.messages.endpoints import service_folder
 
 from .conftest import end
 
@@ -34,7 +33,6 @@ def of_tutorial(found):
 @pytest.fixture
 def place(tmp_path):
     """An empty folder, and an environment in which no other instrument of this user is met."""
-    runtime = tempfile.mkdtemp(prefix="fitctl-")  # a socket's path must be short
     program = tmp_path / "bin" / "fitctl"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fitctl "$@"\n')
@@ -42,13 +40,11 @@ def place(tmp_path):
     (tmp_path / "work").mkdir()
     environment = os.environ | {
         "PATH": f"{program.parent}:{os.environ['PATH']}",
-        "XDG_RUNTIME_DIR": runtime,
         "TERM": "xterm-256color",
         "COLUMNS": "120",
         "LINES": "40",
     }
-    yield tmp_path / "work", environment
-    shutil.rmtree(runtime)
+    return tmp_path / "work", environment
 
 
 class Demo:
@@ -82,8 +78,8 @@ class Demo:
         os.close(self.terminal)
 
 
-def wait_for(mode, environment, demo):
-    client = Client(Path(environment["XDG_RUNTIME_DIR"]) / "fitctl" / "fit-mock")
+def wait_for(mode, demo):
+    client = Client(service_folder(load_rig(default_rig_path())))
     try:
         end_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < end_s:
@@ -103,14 +99,14 @@ def test_every_command_of_the_tutorial_does_what_it_says(place):
     assert typed.pop(0).words == ("fitctl", "demo")
     demo = Demo(folder, environment)
     try:
-        wait_for("VERNIER", environment, demo)
+        wait_for("VERNIER", demo)
         for command in typed:
             arguments = command.words[1:]
             if arguments[0] == "log" and demo.process.poll() is None:
                 demo.press(b"q")
                 assert demo.process.wait(PATIENCE_S) == 0
             if arguments[:2] in AWAITED:
-                wait_for(AWAITED[arguments[:2]], environment, demo)
+                wait_for(AWAITED[arguments[:2]], demo)
             done = subprocess.run(
                 ["bash", "-c", " ".join(command.words)],
                 cwd=folder,

@@ -17,7 +17,7 @@ from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
 from fitctl.commands.shared.printing import progress_line
 from fitctl.commands.shared.rig import require_loop, rig_of
-from fitctl.commands.shared.supervisor import client_of
+from fitctl.commands.shared.supervisor import address, client_of, show_rig
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import (
@@ -83,7 +83,12 @@ def identify(
     if (log is not None) + simulated + mock > 1:
         msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
         raise ConfigError(msg)
+    if not (log or simulated or mock):
+        found = address("identify", rig, overrides)
+        rig, overrides = found.file, found.settings
     settings = rig_of(rig, overrides)
+    if not (log or simulated or mock):
+        show_rig(settings.name, str(rig))
     require_loop("identify", settings, loop)
     source = Source(log, simulated, mock, seed)
     stem = f"{settings.name}-{loop}-{what}"

@@ -12,9 +12,9 @@ import typer
 from fitctl.commands.operate.web import serve_console
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
-from fitctl.commands.shared.supervisor import connect
+from fitctl.commands.shared.supervisor import address, connect
 from fitctl.commands.shared.terminal import has_terminal
-from fitctl.config import ConfigError, default_rig_path
+from fitctl.config import ConfigError
 from fitctl.processes import rig_arguments
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.graphics import Graphics, graphics_of
@@ -50,10 +50,13 @@ def console(
     if not (web or "TEXTUAL_DRIVER" in os.environ or has_terminal()):
         raise ConfigError(_NO_TERMINAL)
     arguments: list[str] | None = None  # what the shipped file says is not true of a rig elsewhere
-    if rig is not None or remote is None:
-        arguments = rig_arguments(rig or default_rig_path(), overrides or ())
+    if remote is None:
+        found = address("console", rig, overrides)
+        rig, overrides = found.file, found.settings
+    if rig is not None:
+        arguments = rig_arguments(rig, overrides or ())
     remote_arguments = ["--remote", str(remote)] if remote else []
-    client = connect(rig, overrides, remote)
+    client = connect("console", rig, overrides, remote)
     if web:
         client.close()  # what is wrong with the rig is said here, not in the browser
         serve_console([*(arguments or ()), *remote_arguments], port)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from fitctl.commands.shared.options import ControllerOption, ParentOption, RigOption, SetOption
-from fitctl.commands.shared.rig import rig_of, with_controller
+from fitctl.commands.shared.rig import named_rig, rig_of, with_controller
 from fitctl.config import default_rig_path
 from fitctl.daemon.run import run_supervisor
-from fitctl.processes import end_with_parent, rig_arguments
+from fitctl.processes import end_with_parent
 from fitctl.stages.realtime import bound_memory
 
 
@@ -18,11 +18,13 @@ def run(
 ) -> None:
     """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
     bound_memory()
+    rig = named_rig(rig) or default_rig_path()
     overrides = with_controller(rig, overrides, controller)
     settings = rig_of(rig, overrides)
     end_with_parent(parent_pid)
     run_supervisor(
         settings,
-        rig_arguments(rig or default_rig_path(), overrides),
+        rig,
+        overrides,
         lambda folder: print(f"supervising {settings.name}; sockets in {folder}", flush=True),
     )

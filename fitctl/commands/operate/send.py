@@ -9,9 +9,11 @@ from typer.core import TyperCommand
 
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
-from fitctl.commands.shared.rig import require_loop, rig_of
-from fitctl.commands.shared.supervisor import connect, send_and_print
+from fitctl.commands.shared.rig import named_rig, require_loop, rig_of
+from fitctl.commands.shared.supervisor import connect, send_and_print, send_to_all
 from fitctl.messages.command_table import WORDS, command_of
+from fitctl.messages.commands import Stop
+from fitctl.messages.running import running_rigs
 
 
 class SendCommand(TyperCommand):
@@ -40,6 +42,11 @@ def send(
 ) -> None:
     """Give one command to the running supervisor of a rig."""
     wanted = command_of(command, values or [], loop)
-    if remote is None and loop:
-        require_loop("send", rig_of(rig, overrides), loop)
-    raise typer.Exit(send_and_print(connect(rig, overrides, remote), wanted, "send"))
+    if remote is None and named_rig(rig) is None and not overrides and isinstance(wanted, Stop):
+        running = running_rigs()
+        if len(running) > 1:
+            typer.echo(f"send: {len(running)} supervisors run; stopping all of them", err=True)
+            raise typer.Exit(send_to_all(running, wanted, "send"))
+    if remote is None and loop and (named_rig(rig) or overrides):
+        require_loop("send", rig_of(named_rig(rig), overrides), loop)
+    raise typer.Exit(send_and_print(connect("send", rig, overrides, remote), wanted, "send"))

@@ -22,7 +22,7 @@ from fitctl.commands.shared.options import (
 )
 from fitctl.commands.shared.printing import progress_line, to_json
 from fitctl.commands.shared.rig import rig_of
-from fitctl.commands.shared.supervisor import client_of, connect, send_and_print
+from fitctl.commands.shared.supervisor import address, client_of, connect, send_and_print, show_rig
 from fitctl.config import Rig
 from fitctl.messages.commands import SequenceControl
 from fitctl.processes import ended_by_signals, interrupt
@@ -69,9 +69,15 @@ OutOption = Annotated[
 def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Rig, Sequence]:
     from fitctl.sequences.reading import load_sequence
 
-    of_steps = [text for text in overrides or () if text.startswith("steps.")]
-    settings = rig_of(rig, [text for text in overrides or () if text not in of_steps])
+    values, of_steps = _parted(overrides)
+    settings = rig_of(rig, values)
     return settings, load_sequence(find_sequence(file), settings, of_steps)
+
+
+def _parted(overrides: list[str] | None) -> tuple[list[str], list[str]]:
+    """Overrides of the rig file, and those of the sequence."""
+    of_steps = [text for text in overrides or () if text.startswith("steps.")]
+    return [text for text in overrides or () if text not in of_steps], of_steps
 
 
 @app.command("list")
@@ -141,8 +147,16 @@ def run(
     out: OutOption = Path(),
 ) -> None:
     """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
+    from fitctl.sequences.reading import read_sequence
+
+    if remote is None:
+        read_sequence(find_sequence(file))  # what is wrong with the file is reported first
+        values, steps = _parted(overrides)
+        found = address("sequence", rig, values)
+        rig, overrides = found.file, [*found.settings, *steps]
     settings, sequence = _load(file, rig, overrides)
     client = client_of(settings, remote)
+    show_rig(settings.name, str(rig or remote))
     try:
         status = _run(settings, sequence, client, out, as_json=as_json)
     finally:
@@ -174,7 +188,7 @@ def _steer(
     overrides: list[str] | None,
     remote: Path | None,
 ) -> None:
-    client = connect(rig, overrides, remote)
+    client = connect("sequence", rig, overrides, remote)
     raise typer.Exit(send_and_print(client, SequenceControl(action=action), "sequence"))
 
 

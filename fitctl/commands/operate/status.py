@@ -30,7 +30,7 @@ def status(
 
     Exit status 0 if all is well, 1 if something is not, 3 if no supervisor answers.
     """
-    client = connect(rig, overrides, remote)
+    client = connect("status", rig, overrides, remote)
     try:
         telemetry = newest_telemetry(client)
     except ConnectionError as error:

@@ -83,7 +83,7 @@ def watch(
     ] = None,
 ) -> None:
     """Print a line a second about the running instrument, and every event as it comes."""
-    client = connect(rig, overrides, remote)
+    client = connect("watch", rig, overrides, remote)
     text = to_json if as_json else _text
     received = False
     try:

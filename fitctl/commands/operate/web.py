@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable, Sequence
 from fitctl.config import ConfigError
 
 HOST = "127.0.0.1"
-COOKIE = "fitctl-console"
 _Handler = Callable[..., Awaitable]
 
 
@@ -18,8 +17,9 @@ def serve_console(rig_arguments: Sequence[str], port: int) -> None:
     """Serve consoles by textual-serve, one process for each page, until Ctrl-C.
 
     Whoever can open the page can command the instrument. A port of loopback is open to every user and to
-    every page in a browser of this machine, so only who has the printed address is let in: its key becomes
-    a cookie that pages of other sites cannot use.
+    every page in a browser of this machine, so only who has the printed address is let in. The key is the
+    first part of every path. It is no cookie, because browsers send the cookies of one port of 127.0.0.1 to
+    all others: another user's server there would get it, and two consoles would log each other out.
 
     Raises
     ------
@@ -40,16 +40,16 @@ def serve_console(rig_arguments: Sequence[str], port: int) -> None:
         """Lets in who has the key."""
 
         async def _make_app(self) -> web.Application:
-            app = await super()._make_app()
-            app.middlewares.append(web.middleware(_guard(web, address, key)))
-            return app
+            guarded = web.Application(middlewares=[web.middleware(_guard(web, address, key))])
+            guarded.add_subapp(f"/{key}", await super()._make_app())
+            return guarded
 
         def initialize_logging(self) -> None:
             """Nothing but the address is printed."""
 
         async def on_startup(self, app: web.Application) -> None:
             """Say where."""
-            print(f"console: {address}/?key={key}", flush=True)
+            print(f"console: {address}/{key}/", flush=True)
             print("Ctrl-C ends it; each page is a console of its own.", flush=True)
 
     command = shlex.join([sys.executable, "-m", "fitctl", "console", *rig_arguments])
@@ -74,14 +74,12 @@ def _guard(web, address: str, key: str) -> _Handler:  # type: ignore[no-untyped-
 
     async def guard(request, handler):  # type: ignore[no-untyped-def]  # aiohttp's
         at_home = request.host == host and request.headers.get("Origin", address) == address
-        if at_home and secrets.compare_digest(request.query.get("key", ""), key):
-            there = web.HTTPFound("/")
-            there.set_cookie(COOKIE, key, httponly=True, samesite="Strict")
-            return there
-        if at_home and secrets.compare_digest(request.cookies.get(COOKIE, ""), key):
+        given = request.path.split("/")[1]  # of any characters, which strings are not compared with
+        if at_home and secrets.compare_digest(given.encode(errors="replace"), key.encode()):
             response = await handler(request)
             if not response.prepared:
                 response.headers["Content-Security-Policy"] = _nothing_from_elsewhere(host)
+                response.headers["Referrer-Policy"] = "no-referrer"  # the address is the key
             return response
         return web.Response(status=403, text="open the address that fitctl console --web printed\n")
 

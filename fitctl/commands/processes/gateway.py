@@ -7,7 +7,7 @@ import threading
 from fitctl.clock import MonotonicClock
 from fitctl.commands.shared.options import ParentOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
-from fitctl.messages.endpoints import service_folder
+from fitctl.messages.endpoints import checked_folder
 from fitctl.processes import end_with_parent, ended_by_signals
 from fitctl.service.gateway import Gateway, be_modest, show_life
 
@@ -21,4 +21,4 @@ def gateway(
     end_with_parent(parent_pid)
     stop = threading.Event()
     with ended_by_signals(stop.set):
-        Gateway(settings, service_folder(settings), MonotonicClock(), show_life).run(stop)
+        Gateway(settings, checked_folder(settings), MonotonicClock(), show_life).run(stop)

@@ -11,7 +11,7 @@ from fitctl.logging.recorder import record as record_messages
 from fitctl.logging.records import RecorderStatus
 from fitctl.messages.client import Client
 from fitctl.messages.commands import RecorderReport
-from fitctl.messages.endpoints import RECORDS_SOCKET, service_folder
+from fitctl.messages.endpoints import RECORDS_SOCKET, checked_folder
 from fitctl.processes import ended_by_signals
 
 _REPORT_TIMEOUT_S = 0.5
@@ -22,7 +22,7 @@ def record(
 ) -> None:
     """Record what a supervisor sends; the supervisor starts this by itself."""
     settings = rig_of(rig, overrides)
-    folder = service_folder(settings)
+    folder = checked_folder(settings)
     client = Client(folder)
 
     def report(status: RecorderStatus) -> None:

@@ -18,7 +18,7 @@ from fitctl.commands.operate.status import newest_telemetry
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import to_json
-from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
 from fitctl.config import Rig
 from fitctl.drivers.bal_analog.driver import probe_bal_analog
@@ -74,7 +74,7 @@ def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOpti
     While the rig's supervisor runs, print what it reports of its devices instead, and ask none.
     Exit status 1 if a device is missing or is not as the rig file says.
     """
-    raise typer.Exit(ask_devices(rig_of(rig, overrides), as_json=as_json))
+    raise typer.Exit(ask_devices(rig_of(named_rig(rig), overrides), as_json=as_json))
 
 
 def ask_devices(rig: Rig, *, as_json: bool) -> int:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.options import RigOption, SetOption
-from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.messages.keys import allowed_keys, new_key, revoke_key
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ def new(
     overrides: SetOption = None,
 ) -> None:
     """Allow somebody in, and write the key file that they need: whoever has it is them."""
-    settings = rig_of(rig, overrides)
+    settings = rig_of(named_rig(rig), overrides)
     path = out or Path(f"{name}.key.toml")
     key = new_key(settings, name, "viewer" if viewer else "commander", host, path)
     typer.echo(
@@ -50,7 +50,7 @@ def new(
 @app.command("list")
 def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Print whose keys are allowed, and what each may do."""
-    keys, problems = allowed_keys(rig_of(rig, overrides))
+    keys, problems = allowed_keys(rig_of(named_rig(rig), overrides))
     for key in keys.values():
         typer.echo(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
     for problem in problems:
@@ -61,5 +61,5 @@ def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
 @app.command()
 def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
     """Let a key in no more; a running supervisor drops its holder at once."""
-    revoke_key(rig_of(rig, overrides), name)
+    revoke_key(rig_of(named_rig(rig), overrides), name)
     typer.echo(f"{name} is let in no more")

@@ -14,7 +14,7 @@ RigOption = Annotated[
     typer.Option(
         "--rig",
         metavar="FILE",
-        help="Rig file; without it, the shipped fit-mock.toml.",
+        help="Rig file. Without it: FITCTL_RIG, the rig that runs, or fit-mock.toml.",
         autocompletion=completion.rigs,
     ),
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,6 +18,11 @@ def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
         If its file cannot be used.
     """
     return load_rig(path or default_rig_path(), overrides or ())
+
+
+def named_rig(path: Path | None) -> Path | None:
+    """The rig file that the options name, or else the one that ``FITCTL_RIG`` names."""
+    return path or (Path(text) if (text := os.environ.get("FITCTL_RIG")) else None)
 
 
 def with_controller(

@@ -3,18 +3,64 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import typer
 
-from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.rig import rig_of
-from fitctl.config import ConfigError, Rig
+from fitctl.commands.shared.exits import FAILED, NO_SUPERVISOR
+from fitctl.commands.shared.rig import named_rig, rig_of
+from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.client import Client
-from fitctl.messages.commands import AnyCommand
+from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import read_key_of, read_remote
+from fitctl.messages.running import RunningRig, running_rigs
+
+
+class Addressed(NamedTuple):
+    """The rig that a command addresses: its file, what replaces values of it, its supervisor if found."""
+
+    file: Path
+    settings: list[str]
+    running: RunningRig | None = None
+
+
+def address(command: str, path: Path | None, overrides: list[str] | None) -> Addressed:
+    """Find the rig that a command addresses: ``--rig``, ``FITCTL_RIG``, or the one supervisor that runs.
+
+    ``--set`` by itself changes the shipped rig file.
+
+    Raises
+    ------
+    ConfigError
+        If several run; the text names them.
+    typer.Exit
+        If none runs, with one line.
+    """
+    named = named_rig(path)
+    if named is not None or overrides:
+        return Addressed(named or default_rig_path(), overrides or [])
+    running = running_rigs()
+    if not running:
+        typer.echo(
+            f"{command}: no supervisor of yours runs on this machine; start one with fitctl run, or name a rig "
+            "with --rig or FITCTL_RIG",
+            err=True,
+        )
+        raise typer.Exit(NO_SUPERVISOR)
+    if len(running) > 1:
+        lines = "".join(f"\n  {rig.where}" for rig in running)
+        msg = f"{command}: {len(running)} supervisors run; nothing was done. Say which:{lines}"
+        raise ConfigError(msg)
+    return Addressed(Path(running[0].file), running[0].settings, running[0])
+
+
+def show_rig(name: str, where: str) -> None:
+    """Print which rig a command addresses; on the error output, so that results stay alone."""
+    typer.echo(f"rig {name}: {where}", err=True)
 
 
 def client_of(rig: Rig, remote: Path | None = None) -> Client:
@@ -28,8 +74,10 @@ def client_of(rig: Rig, remote: Path | None = None) -> Client:
     return Client(service_folder(rig) if remote is None else read_key_of(rig, remote))
 
 
-def connect(path: Path | None, overrides: list[str] | None, remote: Path | None) -> Client:
-    """A client of the rig's supervisor on this machine, or of the one that a key file is for.
+def connect(
+    command: str, path: Path | None, overrides: list[str] | None, remote: Path | None
+) -> Client:
+    """A client of the supervisor that a command addresses, here or where a key file leads; prints which.
 
     A key file is enough by itself, and no rig file is read then; one that is given must be for the same rig.
 
@@ -38,12 +86,25 @@ def connect(path: Path | None, overrides: list[str] | None, remote: Path | None)
     ConfigError
         If the rig file or the key file cannot be used, or they are for different rigs.
     """
-    if remote is None or path is not None:
-        return client_of(rig_of(path, overrides), remote)
+    if remote is None:
+        found = address(command, path, overrides)
+        if found.running is not None:
+            show_rig(found.running.name, f"{found.file} (the one that runs)")
+            return Client(Path(found.running.folder))
+        rig = rig_of(found.file, found.settings)
+        show_rig(rig.name, str(found.file))
+        return client_of(rig)
+    if path is not None:
+        rig = rig_of(path, overrides)
+        client = client_of(rig, remote)
+        show_rig(rig.name, f"{path}, by the key {remote}")
+        return client
     if overrides:
         msg = f"--remote {remote}: --set changes a rig file; give that too, with --rig, or leave out --set"
         raise ConfigError(msg)
-    return Client(read_remote(remote))
+    key = read_remote(remote)
+    show_rig(key.rig, f"at {key.host}, by the key {remote}")
+    return Client(key)
 
 
 def send_and_print(client: Client, command: AnyCommand, sender: str) -> int:
@@ -56,13 +117,34 @@ def send_and_print(client: Client, command: AnyCommand, sender: str) -> int:
     sender : str
         The command of ``fitctl`` that sends it, for its error message.
     """
+    return print_reply(_send(client, command), sender)
+
+
+def send_to_all(running: list[RunningRig], command: AnyCommand, sender: str) -> int:
+    """Send one command to several supervisors at once and print each reply; returns the exit status."""
+    with ThreadPoolExecutor(len(running)) as threads:
+        replies = list(threads.map(lambda rig: _send(Client(Path(rig.folder)), command), running))
+    statuses = []
+    for rig, reply in zip(running, replies, strict=True):
+        show_rig(rig.name, f"{rig.file} (process {rig.pid})")
+        statuses.append(print_reply(reply, sender))
+    return max(statuses)
+
+
+def _send(client: Client, command: AnyCommand) -> Reply | ConnectionError:
     try:
-        reply = client.send(command)
+        return client.send(command)
     except ConnectionError as error:
-        typer.echo(f"{sender}: {error}", err=True)
-        return FAILED
+        return error
     finally:
         client.close()
+
+
+def print_reply(reply: Reply | ConnectionError, sender: str) -> int:
+    """Print a reply, or why there is none; returns the exit status."""
+    if isinstance(reply, ConnectionError):
+        typer.echo(f"{sender}: {reply}", err=True)
+        return FAILED
     wall_minus_monotonic_s = time.time() - reply.time_s
     for event in reply.events:
         stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)

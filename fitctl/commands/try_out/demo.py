@@ -21,6 +21,7 @@ from fitctl.commands.shared.printing import progress_line, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
 from fitctl.commands.shared.terminal import has_terminal
 from fitctl.config import Rig, default_rig_path
+from fitctl.messages.endpoints import service_folder
 from fitctl.messages.telemetry import Telemetry
 from fitctl.processes import (
     end_process,
@@ -59,14 +60,28 @@ def demo(
     with ended_by_signals(interrupt):
         try:
             with demos.instrument(path, overrides, seed) as running:
+                beside = _beside(settings, path, running)
+                typer.echo(beside, err=True, nl=bool(beside))
                 if console:
                     status = _demo_with_console(path, overrides, running)
+                    typer.echo(beside, err=True, nl=bool(beside))  # the console was drawn over it
                 else:
                     status = _demo_headless(settings, running, duration, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
             typer.echo(f"demo: {error}", err=True)
             status = FAILED
     raise typer.Exit(status)
+
+
+def _beside(rig: Rig, path: Path, running: demos.Instrument) -> str:
+    """What to say where another demo or supervisor has the rig's sockets; empty if this one has them."""
+    usual = service_folder(rig)
+    if running.sockets == usual:
+        return ""
+    return (
+        f"demo: another demo or supervisor has rig {rig.name} in {usual}. This demo runs beside it; "
+        f"for commands to this one, add: --rig {path} --set service.folder={running.sockets}"
+    )
 
 
 def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.Instrument) -> int:

@@ -9,7 +9,7 @@ import typer
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.commands.shared.options import RigOption, SetOption
-from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
@@ -43,7 +43,7 @@ def set_(
 ) -> None:
     """Begin a fault."""
     wanted = SetFault(device, kind, part, value, for_s, probability)
-    _change(rig_of(rig, overrides), wanted)
+    _change(rig_of(named_rig(rig), overrides), wanted)
 
 
 @app.command("clear")
@@ -57,13 +57,13 @@ def clear(
     overrides: SetOption = None,
 ) -> None:
     """End faults."""
-    _change(rig_of(rig, overrides), ClearFaults(device, kind, part))
+    _change(rig_of(named_rig(rig), overrides), ClearFaults(device, kind, part))
 
 
 @app.command("now")
 def now(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Print what is wrong now."""
-    _change(rig_of(rig, overrides), ListFaults())
+    _change(rig_of(named_rig(rig), overrides), ListFaults())
 
 
 @app.command("kinds")

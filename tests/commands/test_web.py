@@ -1,0 +1,126 @@
+"""`fitctl console --web`: a page is for who has its key, and the key goes nowhere else."""
+
+import http.client
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from urllib.parse import urlsplit
+
+import pytest
+from served import free_port
+
+LIMIT_S = 60.0
+
+pytest.importorskip("textual_serve")
+
+
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory):
+    """Starts consoles for browsers; gives the address of each."""
+    with ExitStack() as stack:
+
+        def start():
+            server = subprocess.Popen(
+                [
+                    *(
+                        sys.executable,
+                        "-m",
+                        "fitctl",
+                        "console",
+                        "--web",
+                        "--port",
+                        str(free_port()),
+                    ),
+                    *("--set", f"service.folder={tmp_path_factory.mktemp('w') / 's'}"),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            stack.callback(server.stdout.close)
+            stack.callback(server.wait, LIMIT_S)
+            stack.callback(server.terminate)
+            address = server.stdout.readline().split()[1]
+            listens(address)  # it is printed before
+            return address
+
+        yield start
+
+
+def listens(address):
+    parts, end_s = urlsplit(address), time.monotonic() + LIMIT_S
+    while time.monotonic() < end_s:
+        try:
+            return socket.create_connection((parts.hostname, parts.port), LIMIT_S).close()
+        except ConnectionRefusedError:
+            time.sleep(0.05)
+    raise AssertionError("it does not listen")
+
+
+def ask(address, path=None, **headers):
+    """Status and headers of an answer."""
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=LIMIT_S)
+    try:
+        connection.request("GET", parts.path if path is None else path, headers=headers)
+        answer = connection.getresponse()
+        answer.read()
+        return answer.status, answer.headers
+    finally:
+        connection.close()
+
+
+@pytest.fixture(scope="module")
+def page(serve):
+    return serve()
+
+
+def test_who_has_the_address_gets_the_page_and_all_of_its_parts(page):
+    key = urlsplit(page).path
+
+    assert ask(page)[0] == 200
+    assert ask(page, f"{key}static/js/textual.js")[0] == 200
+
+
+def test_who_has_no_key_gets_nothing(page):
+    key = urlsplit(page).path.strip("/")
+
+    for path in (
+        "/",
+        "/ws",
+        "/static/js/textual.js",
+        f"/{key[:-1]}x/",
+        f"/?key={key}",
+        f"//{key}/",
+    ):
+        assert ask(page, path)[0] == 403, path
+    assert ask(page, Origin="http://elsewhere.example")[0] == 403
+    assert ask(page, Host="elsewhere.example")[0] == 403
+
+
+@pytest.mark.parametrize("key", [b"\xc3\xa9", b"%C3%A9", b"\xff\xfe", b"%ff%00", b"?key=\xc3\xa9"])
+def test_a_key_that_is_no_ascii_is_refused_and_is_no_error_of_the_server(page, key):
+    parts = urlsplit(page)
+    with socket.create_connection((parts.hostname, parts.port), LIMIT_S) as line:
+        line.sendall(b"GET /" + key + b" HTTP/1.1\r\nHost: " + parts.netloc.encode() + b"\r\n\r\n")
+        status = int(line.makefile("rb").readline().split()[1])
+
+    assert status in {400, 403}
+
+
+def test_a_browser_is_given_nothing_that_it_would_show_another_port(page):
+    """A cookie of 127.0.0.1 goes to every port there, so also to another user's server."""
+    _, headers = ask(page)
+
+    assert "Set-Cookie" not in headers
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "default-src 'self'" in headers["Content-Security-Policy"]
+
+
+def test_two_consoles_do_not_log_each_other_out(serve):
+    first, second = serve(), serve()
+
+    assert ask(first)[0] == ask(second)[0] == ask(first)[0] == 200
+    assert ask(first, urlsplit(second).path)[0] == 403
