@@ -33,6 +33,12 @@ def report(
     pdf: Annotated[
         bool, typer.Option("--pdf", help="As PDF too; needs Chromium or Chrome.")
     ] = False,
+    pdf_without_sandbox: Annotated[
+        bool,
+        typer.Option(
+            "--pdf-without-sandbox", help="As --pdf, also where Chromium has no sandbox (root)."
+        ),
+    ] = False,
     show: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     out: Annotated[
         Path | None,
@@ -65,9 +71,9 @@ def report(
     for night in nights:
         _print_verdict(night)
     typer.echo(f"written: {page}")
-    if pdf:
+    if pdf or pdf_without_sandbox:
         try:
-            print_pdf(page, page.with_suffix(".pdf"))
+            print_pdf(page, page.with_suffix(".pdf"), sandbox=not pdf_without_sandbox)
         except PdfError as error:
             typer.echo(f"report: {error}", err=True)
             raise typer.Exit(FAILED) from None
