@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from fitctl.config.base import ConfigError, Settings
 from fitctl.config.devices import DEVICE_BY_TAG
 from fitctl.config.rig import Rig
+from fitctl.text import plain
 
 _EXAMPLE = "camera.frame_rate_hz=50.0"
 
@@ -146,7 +147,7 @@ def rig_from_document(
         return Rig.model_validate(document)
     except ValidationError as error:
         lines = [
-            _explain(known.get((problem["loc"], problem["type"]), origin), problem)
+            plain(_explain(known.get((problem["loc"], problem["type"]), origin), problem))
             for problem in error.errors()
         ]
         raise ConfigError("\n".join(lines)) from None

@@ -12,7 +12,7 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import ControllerOption, JsonOption, SetOption
-from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.printing import progress_line, say, to_json
 from fitctl.commands.shared.rig import controller_overrides
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
 from fitctl.controllers.design.choose import design_for
@@ -65,10 +65,10 @@ def replay(
         result = _replayed(info, settings)
     named = ", ".join(map(str, logs))
     if as_json:
-        typer.echo(to_json(_document(named, info, settings, result)))
+        say(to_json(_document(named, info, settings, result)))
     else:
         for line in _lines(named, info, settings, result):
-            typer.echo(line)
+            say(line)
     raise typer.Exit(0 if result.same else FAILED)
 
 
@@ -149,7 +149,7 @@ def _lines(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> Iterato
         yield "the same, to the last bit"
         return
     yield from _other_designs(info, rig)
-    yield _OPEN_LOOP
+    yield from _OPEN_LOOP.splitlines()
 
 
 def _loop_lines(info: LogInfo, name: str, loop: LoopReplay) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fitctl.commands.shared.options import ControllerOption, ParentOption, RigOption, SetOption
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import rig_of, with_controller
 from fitctl.config import default_rig_path
 from fitctl.daemon.run import run_supervisor
@@ -24,5 +25,5 @@ def run(
     run_supervisor(
         settings,
         rig_arguments(rig or default_rig_path(), overrides),
-        lambda folder: print(f"supervising {settings.name}; sockets in {folder}", flush=True),
+        lambda folder: say(f"supervising {settings.name}; sockets in {folder}"),
     )

@@ -6,9 +6,8 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-import typer
-
 from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.messages.client import Client
@@ -59,14 +58,14 @@ def send_and_print(client: Client, command: AnyCommand, sender: str) -> int:
     try:
         reply = client.send(command)
     except ConnectionError as error:
-        typer.echo(f"{sender}: {error}", err=True)
+        say(f"{sender}: {error}", err=True)
         return FAILED
     finally:
         client.close()
     wall_minus_monotonic_s = time.time() - reply.time_s
     for event in reply.events:
         stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)
-        typer.echo(f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}")
+        say(f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}")
     text = reply.text or ("accepted" if reply.accepted else "refused")
-    typer.echo(text, err=not reply.accepted)
+    say(text, err=not reply.accepted)
     return 0 if reply.accepted else FAILED
