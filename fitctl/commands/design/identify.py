@@ -26,7 +26,7 @@ from fitctl.identify.experiments import (
     Identification,
     response_on_mock_bench,
 )
-from fitctl.identify.fragments import fragment_text
+from fitctl.identify.fragments import fragment_text, write_whole
 from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
 from fitctl.logging.copying import merge
 from fitctl.messages.modes import Mode
@@ -107,7 +107,7 @@ def identify(
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
         say(f"identify {what}: {error}", err=True)
         raise typer.Exit(FAILED) from None
-    _write(fragment_path, lambda: fragment_path.write_text(text, encoding="utf-8"))
+    _write(fragment_path, lambda: write_whole(fragment_path, text.encode()))
     for line in finding.lines():
         say(line)
     say(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
