@@ -14,6 +14,7 @@ from typer.exceptions import TyperException
 
 from fitctl import __version__
 from fitctl.commands.shared.exits import INTERRUPTED, UNUSABLE
+from fitctl.commands.shared.printing import say, say_lines
 from fitctl.commands.shared.welcome import welcome
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
@@ -104,7 +105,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"fitctl {__version__}")
+        say(f"fitctl {__version__}")
         raise typer.Exit
 
 
@@ -122,14 +123,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
     given = sys.argv[1:] if arguments is None else arguments
     if not given and "_FITCTL_COMPLETE" not in os.environ:
-        typer.echo(welcome(Path.cwd()))
+        say_lines(welcome(Path.cwd()))
         return
     try:
         status = app(given, prog_name="fitctl", standalone_mode=False)
     except TyperException as error:
         context = getattr(error, "ctx", None)
         command = "fitctl" if context is None else context.command_path
-        typer.echo(f"{command}: {_message(error)} (see {command} --help)", err=True)
+        say(f"{command}: {_message(error)} (see {command} --help)", err=True)
         status = UNUSABLE
     except (KeyboardInterrupt, typer.Abort):
         status = INTERRUPTED
@@ -140,7 +141,8 @@ def main(arguments: list[str] | None = None) -> None:
 
         if not isinstance(error, ConfigError | LogError):
             raise
-        typer.echo(str(error), err=True)
+        # A rig file's error has a line for each thing that is wrong; a log's is of one line.
+        (say_lines if isinstance(error, ConfigError) else say)(str(error), err=True)
         status = UNUSABLE
     sys.exit(status or 0)
 

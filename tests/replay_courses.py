@@ -3,7 +3,7 @@
 import pytest
 from simulated import TWO_STARS, darken, failing, until
 
-from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_json
+from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_log
 from fitctl.drivers.interface import DeviceMismatch, DeviceTimeout
 from fitctl.messages.commands import (
     Acquire,
@@ -36,7 +36,7 @@ SCAN = [
 
 def replayed(*paths, change=()):
     with whole_run(paths) as info, logged_files(info) as files:
-        rig = rig_from_json(info.metadata["rig"]["json"], "the log", [*files, *change])
+        rig = rig_from_log(info.metadata["rig"]["json"], "the log", [*files, *change])
         return replay(rig, read_steps(info, list(rig.loops)))
 
 

@@ -261,3 +261,38 @@ def test_a_spot_that_would_be_taken_for_the_star_is_refused():
         .loops["right"]
         .other_spots
     )
+
+
+NO_NAMES = (
+    "",
+    "Right",
+    "../up",
+    "a b",
+    "a\n",
+    "a/b",
+    "a.b",
+    "<img>",
+    'a"',
+    "1a",
+    "ä",
+    "\x1b]0;x\x07",
+    "a" * 33,
+)
+
+
+@pytest.mark.parametrize("name", NO_NAMES)
+@pytest.mark.parametrize("place", ["loops", "interlocks", "other_spots", "plant.spots"])
+def test_a_name_is_one_that_files_and_pages_can_have(place, name, rig):
+    document = rig.model_dump(mode="json")
+    loop, plant = document["loops"]["right"], document["plant"]["loops"]["right"]
+    if place == "loops":
+        document["loops"][name] = loop
+    elif place == "interlocks":
+        document["interlocks"][name] = document["interlocks"]["fsm_edge"]
+    elif place == "other_spots":
+        loop["other_spots"][0]["name"] = name
+    else:
+        plant["spots"][0]["name"] = name
+
+    with pytest.raises(ConfigError, match=r"must be 1 to 32 characters: a letter a to z"):
+        rig_from_document(document, "rig.toml")

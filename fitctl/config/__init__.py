@@ -4,7 +4,7 @@ Every key is required, so that a rig file shows everything that fitctl will use.
 :class:`ConfigError` whose lines each name the file, the key and what is allowed.
 """
 
-from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range
+from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, is_name
 from fitctl.config.devices import (
     HALF_WINDOW_PX,
     BalAnalogDevice,
@@ -40,7 +40,7 @@ from fitctl.config.mocks import (
     Mdt693Mock,
 )
 from fitctl.config.plant import AirPath, HotPixel, Hysteresis, Spot
-from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_json
+from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_log
 from fitctl.config.rig import Rig, default_rig_path
 
 __all__ = [
@@ -85,8 +85,9 @@ __all__ = [
     "Structure",
     "Vernier",
     "default_rig_path",
+    "is_name",
     "lay_over",
     "load_rig",
     "rig_from_document",
-    "rig_from_json",
+    "rig_from_log",
 ]

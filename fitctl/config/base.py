@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
 
@@ -14,6 +15,22 @@ class ConfigError(Exception):
     """A rig file that cannot be used; ``str()`` gives one line for each thing that is wrong."""
 
 
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+
+
+def is_name(text: str) -> bool:
+    """Whether a rig file may give something this name: one that is safe in file names, topics and pages."""
+    return _NAME.fullmatch(text) is not None
+
+
+def _name(text: str) -> str:
+    if not is_name(text):
+        msg = "must be 1 to 32 characters: a letter a to z, then letters, digits, _ or -"
+        raise ValueError(msg)
+    return text
+
+
+Name = Annotated[str, AfterValidator(_name)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

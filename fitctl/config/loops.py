@@ -11,6 +11,7 @@ from fitctl.config.base import (
     AxisPair,
     Count,
     Fraction,
+    Name,
     NonNegative,
     Port,
     Positive,
@@ -113,7 +114,7 @@ class Prefilter(Settings):
 class OtherSpot(Settings):
     """A spot that moves with the loop's star and is not the one to point, such as its fringe spot."""
 
-    name: Annotated[str, Field(min_length=1, max_length=20)]
+    name: Name
     offset_px: AxisPair
     flux_dn: Positive
 

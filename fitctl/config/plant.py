@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fitctl.config.base import AxisPair, NonNegative, Positive, Settings
+from fitctl.config.base import AxisPair, Name, NonNegative, Positive, Settings
 from fitctl.config.devices import Structure
 from fitctl.config.loops import AirPathModel
 
@@ -40,7 +40,7 @@ class AirPath(AirPathModel):
 class Spot(Settings):
     """One spot on the focal plane."""
 
-    name: str
+    name: Name
     offset_px: AxisPair
     flux_dn: Positive
     diameter_px: Positive

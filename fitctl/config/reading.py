@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from fitctl.config.base import ConfigError, Settings
 from fitctl.config.devices import DEVICE_BY_TAG
 from fitctl.config.rig import Rig
+from fitctl.text import plain
 
 _EXAMPLE = "camera.frame_rate_hz=50.0"
 
@@ -146,28 +147,59 @@ def rig_from_document(
         return Rig.model_validate(document)
     except ValidationError as error:
         lines = [
-            _explain(known.get((problem["loc"], problem["type"]), origin), problem)
+            plain(_explain(known.get((problem["loc"], problem["type"]), origin), problem))
             for problem in error.errors()
         ]
         raise ConfigError("\n".join(lines)) from None
 
 
-def rig_from_json(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
-    """Validate a rig that was written as JSON, such as the one in a log; overrides as in :func:`load_rig`.
+def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
+    """Validate the rig that a log holds as JSON, without the files that it names.
+
+    Anyone may have written the log, so no text in it becomes a path: the dark frame's file is left out, and a
+    controller from a file is missing unless an override names one.
+
+    Parameters
+    ----------
+    text : str
+        JSON.
+    origin : str
+        What errors call the rig.
+    overrides : sequence of str
+        As in :func:`load_rig`; these are the caller's own, and may name files.
 
     Raises
     ------
     ConfigError
-        As :func:`load_rig`; `origin` is what it calls the rig.
+        As :func:`load_rig`.
     """
     try:
         document = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         msg = f"{origin}: not JSON: {error}"
         raise ConfigError(msg) from None
+    if not isinstance(document, dict):
+        msg = f"{origin}: must be a JSON object with the rig file's tables"
+        raise ConfigError(msg)
+    for table, key in _files_of(document):
+        del table[key]
     for override in overrides:
         _override(document, override)
     return rig_from_document(document, origin)
+
+
+def _files_of(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """The tables and keys of a rig that name files to read."""
+    found = []
+    camera = document.get("camera")
+    if isinstance(camera, dict) and "dark_file" in camera:
+        found.append((camera, "dark_file"))
+    loops = document.get("loops")
+    for loop in loops.values() if isinstance(loops, dict) else ():
+        vernier = loop.get("vernier") if isinstance(loop, dict) else None
+        if isinstance(vernier, dict) and str(vernier.get("controller", "")).endswith(".json"):
+            found.append((vernier, "controller"))
+    return found
 
 
 def _override(document: dict[str, Any], text: str) -> None:
@@ -228,9 +260,13 @@ def _explain(origin: str, problem: Any) -> str:
 
 
 def _without_tags(location: Sequence[str]) -> list[str]:
-    """A place in the rig file without what pydantic adds: which kind of `device` it took it for."""
+    """A place in the rig file without what pydantic adds: which kind of `device`, and that a key is wrong."""
     pairs = zip(["", *location], location, strict=False)
-    return [part for before, part in pairs if not (before == "device" and part in DEVICE_BY_TAG)]
+    return [
+        part
+        for before, part in pairs
+        if part != "[key]" and not (before == "device" and part in DEVICE_BY_TAG)
+    ]
 
 
 def _allowed_keys(location: Sequence[str]) -> list[str]:

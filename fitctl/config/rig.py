@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fitctl.config.base import ConfigError, Settings
+from fitctl.config.base import ConfigError, Name, Settings
 from fitctl.config.devices import Camera, Optics
 from fitctl.config.interlocks import QUANTITIES, Interlock
 from fitctl.config.loops import Logging, Loop, Service, Supervisor
@@ -25,9 +25,9 @@ class Rig(Settings):
     description: str
     optics: Optics
     camera: Camera
-    loops: Annotated[dict[str, Loop], Field(min_length=1)]
+    loops: Annotated[dict[Name, Loop], Field(min_length=1)]
     supervisor: Supervisor
-    interlocks: dict[str, Interlock]
+    interlocks: dict[Name, Interlock]
     service: Service
     logging: Logging
     plant: PlantTruth | None = None

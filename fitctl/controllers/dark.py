@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fitctl.config import Camera, ConfigError
 
 Floats = NDArray[np.float64]
+_MOST_BYTES = 64 << 20
 _MOST_BAD = 0.1  # of the pixels
 _MEASURE = "measure it anew: fitctl sequence run dark"
 
@@ -94,7 +95,15 @@ def dark_bytes(path: Path) -> bytes:
         If it cannot be read.
     """
     try:
-        return path.read_bytes()
+        if not path.is_file() and path.exists():
+            msg = f"camera.dark_file {path}: is not a regular file; {_MEASURE}"
+            raise ConfigError(msg)
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            msg = f"camera.dark_file {path}: has more than {_MOST_BYTES >> 20} MiB; {_MEASURE}"
+            raise ConfigError(msg)
+        return content
     except OSError as error:
         msg = f"camera.dark_file {path}: cannot be read: {error}; {_MEASURE}"
         raise ConfigError(msg) from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -73,7 +74,10 @@ def _write_all(
     writers: dict[str, Write] = {}
     with ExitStack() as stack:
         for topic, columns in _blocks(path, topics, frames=kind != "csv"):
-            file = folder / f"{topic.strip('/').replace('/', '.')}.{kind}"
+            file = (
+                folder
+                / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', topic.strip('/').replace('/', '.'))}.{kind}"
+            )
             if topic not in writers:
                 if file.exists():
                     msg = f"{file}: exists already; give another folder with --out"

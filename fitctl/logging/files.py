@@ -6,9 +6,12 @@ import contextlib
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO
 
 import google.protobuf.message
+import lz4.frame
+import mcap.stream_reader
 import zstandard
 from mcap.exceptions import McapError
 from mcap.writer import MCAP0_MAGIC
@@ -33,10 +36,44 @@ DAMAGE = (
 MEND = "`fitctl log recover` saves what is sound into a new file"
 
 
+# A chunk is logging.chunk_bytes and a record, at most; a few kilobytes can unpack to gigabytes.
+_MOST_CHUNK_BYTES = 64 << 20
+
+
+def _too_large() -> McapError:
+    return McapError(f"a chunk unpacks to more than {_MOST_CHUNK_BYTES >> 20} MiB")
+
+
+def _unpack_zstd(data: bytes, size: int) -> bytes:
+    if max(size, zstandard.frame_content_size(data)) > _MOST_CHUNK_BYTES:
+        raise _too_large()
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+
+
+def _unpack_lz4(data: bytes) -> bytes:
+    reader = lz4.frame.LZ4FrameDecompressor()
+    unpacked: bytes = reader.decompress(data, max_length=_MOST_CHUNK_BYTES + 1)
+    if len(unpacked) > _MOST_CHUNK_BYTES:
+        raise _too_large()
+    if not reader.eof:
+        msg = "a chunk's lz4 frame is cut off"
+        raise McapError(msg)
+    return unpacked
+
+
+# The one place of the library at which every reader unpacks; it knows no limit of its own.
+vars(mcap.stream_reader).update(
+    zstandard=SimpleNamespace(decompress=_unpack_zstd), lz4=SimpleNamespace(decompress=_unpack_lz4)
+)
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[IO[bytes], bool]]:
     """The file, and whether it was finished."""
     try:
+        if not path.is_file() and path.exists():  # a device or a pipe has no end, or never begins
+            msg = f"{path}: is not a regular file; logs are *.mcap in the rig's logging.folder"
+            raise LogError(msg)
         stream = path.open("rb")
     except OSError as error:
         msg = f"{path}: cannot be opened: {error.strerror}; logs are *.mcap in the rig's logging.folder"

@@ -73,6 +73,7 @@ _FIELD_TYPES = {
 }
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _BYTES_PER_PIXEL = 2
+MOST_DARK_BYTES = 64 << 20  # of a dark frame's file: eight million pixels as float64
 _DARK = "npy_zlib_base64"  # metadata holds text only; all that copies a log copies it
 
 
@@ -129,7 +130,12 @@ def dark_npy_of(metadata: Mapping[str, Mapping[str, str]]) -> bytes | None:
     if text is None:
         return None
     try:
-        return zlib.decompress(base64.b64decode(text, validate=True))
+        unpacking = zlib.decompressobj()
+        npy = unpacking.decompress(base64.b64decode(text, validate=True), MOST_DARK_BYTES)
+        if not unpacking.eof:
+            msg = f"it is cut off, or has more than {MOST_DARK_BYTES >> 20} MiB"
+            raise ValueError(msg)
+        return npy
     except (ValueError, zlib.error) as error:
         msg = f"metadata dark: is no compressed dark frame: {error}"
         raise ValueError(msg) from None

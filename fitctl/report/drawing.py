@@ -63,6 +63,7 @@ _STYLE: Any = {
     "lines.linewidth": 1.1,
     "axes.formatter.useoffset": False,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # a name or an event with dollar signs is text
     "path.simplify_threshold": 0.5,
 }
 
@@ -73,7 +74,7 @@ class Plot(NamedTuple):
     Attributes
     ----------
     name : str
-        Of its files, without suffix.
+        Of its files, without suffix; see :attr:`stem`.
     title, caption : str
     figure : Figure
     """
@@ -82,6 +83,11 @@ class Plot(NamedTuple):
     title: str
     caption: str
     figure: Figure
+
+    @property
+    def stem(self) -> str:
+        """The name as files and identifiers in a page have it, whatever was in it."""
+        return re.sub(r"[^A-Za-z0-9_-]", "_", self.name)
 
 
 class TimeAxis(NamedTuple):
@@ -205,15 +211,15 @@ def draw(plot: Plot, folder: Path) -> str:
     """
     import matplotlib
 
-    with matplotlib.rc_context({"svg.hashsalt": plot.name}):
-        plot.figure.savefig(folder / f"{plot.name}.png", dpi=_DPI, metadata={"Software": None})
+    with matplotlib.rc_context({"svg.hashsalt": plot.stem}):
+        plot.figure.savefig(folder / f"{plot.stem}.png", dpi=_DPI, metadata={"Software": None})
         plot.figure.set_layout_engine("none")  # it is laid out: once is slow enough
         text = io.StringIO()
         plot.figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
     svg = text.getvalue()
     on_white = re.sub(r"(<svg[^>]*>)", r'\1<rect width="100%" height="100%" fill="#ffffff"/>', svg)
-    (folder / f"{plot.name}.svg").write_text(on_white, encoding="utf-8")
-    return within_page(svg[svg.index("<svg") :], plot.name, plot.title)
+    (folder / f"{plot.stem}.svg").write_text(on_white, encoding="utf-8")
+    return within_page(svg[svg.index("<svg") :], plot.stem, plot.title)
 
 
 def within_page(svg: str, name: str, title: str) -> str:

@@ -16,19 +16,32 @@ class PdfError(Exception):
     """There is no PDF: why, and what to do."""
 
 
-def print_pdf(page: Path, pdf: Path) -> None:
+def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
     """Print a page as a browser does.
+
+    Parameters
+    ----------
+    page, pdf : Path
+    sandbox : bool
+        Whether the browser confines what reads the page. The page shows text from a log, and anyone may have
+        written the log.
 
     Raises
     ------
     PdfError
-        If there is no browser, or it fails or takes too long.
+        If there is no browser, it cannot use its sandbox, or it fails or takes too long.
     """
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         msg = (
             f"no PDF: it needs Chromium or Chrome ({', '.join(BROWSERS)} on the path); or print {page} from "
             "any browser"
+        )
+        raise PdfError(msg)
+    if sandbox and os.geteuid() == 0:
+        msg = (
+            "no PDF: Chromium does not run as root with its sandbox; run fitctl as another user, or add "
+            "--pdf-without-sandbox if you trust the log"
         )
         raise PdfError(msg)
     with tempfile.TemporaryDirectory(prefix="fitctl-") as profile:
@@ -39,8 +52,7 @@ def print_pdf(page: Path, pdf: Path) -> None:
             "--no-pdf-header-footer",
             f"--user-data-dir={profile}",
             f"--print-to-pdf={pdf}",
-            # As root it refuses its sandbox; the page is our own, and has no script.
-            *(["--no-sandbox"] if os.geteuid() == 0 else []),
+            *([] if sandbox else ["--no-sandbox"]),
             page.resolve().as_uri(),
         ]
         try:
@@ -54,6 +66,9 @@ def print_pdf(page: Path, pdf: Path) -> None:
             msg = f"no PDF: {browser} cannot be started: {error.strerror}; print {page} from any browser"
             raise PdfError(msg) from None
     if done.returncode or not pdf.exists():
+        if sandbox and "No usable sandbox" in done.stderr:
+            msg = f"no PDF: {browser} cannot use its sandbox; add --pdf-without-sandbox if you trust the log"
+            raise PdfError(msg)
         last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
         msg = f"no PDF: {browser} ended with {done.returncode} and said: {last}; print {page} from any browser"
         raise PdfError(msg)

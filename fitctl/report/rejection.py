@@ -172,6 +172,9 @@ def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> 
     logged = _logged_design(gathered, loop_name)
     if logged.get("name") == name:
         return design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
+    if name not in DESIGNS:  # a text of the log, which must never become a path
+        msg = f"{name}: its matrices are not in the log"
+        raise ConfigError(msg)
     return design_for(rig, loop_name, name)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.config import ConfigError, Rig, rig_from_document
+from fitctl.config import CONTROLLERS, ConfigError, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
@@ -103,15 +104,25 @@ def _identity(log: LogInfo) -> tuple[str, ...]:
     return log.metadata["rig"].get("name", ""), *clock.values()
 
 
+def _controllers_of(log: LogInfo) -> list[str]:
+    """Overrides that name each logged design by what it is; the file that it came from is never read."""
+    overrides = []
+    for loop, text in log.metadata.get("designs", {}).items():
+        with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
+            name = json.loads(text)["name"]
+            if is_name(loop) and name in CONTROLLERS:
+                overrides.append(f"loops.{loop}.vernier.controller={name}")
+    return overrides
+
+
 def _rig_of(log: LogInfo) -> Rig:
     _identity(log)
     try:
-        document = json.loads(log.metadata["rig"]["json"])
-    except (KeyError, ValueError) as error:
-        msg = f"{log.path}: the rig file in it cannot be read ({error}); give one with --rig"
+        text = log.metadata["rig"]["json"]
+        return rig_from_log(text, f"{log.path}: rig file in it", _controllers_of(log))
+    except KeyError:
+        msg = f"{log.path}: has no rig file in it; give one with --rig"
         raise LogError(msg) from None
-    try:
-        return rig_from_document(document, f"{log.path}: rig file in it")
     except ConfigError as error:
         first, *more = str(error).splitlines()
         also = f" ({len(more)} more)" if more else ""

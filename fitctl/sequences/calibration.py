@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
 import numpy as np
 
 from fitctl.config import ConfigError, Rig
-from fitctl.identify.fragments import fragment_text
+from fitctl.identify.fragments import fragment_text, write_whole
 from fitctl.sequences.behaviour import Calibration
 
 CALIBRATING = frozenset({"dark", "plate_scale"})  # steps that measure something for the rig file
@@ -40,8 +41,10 @@ def write_calibration(calibration: Calibration, rig: Rig, folder: Path) -> Path:
     )
     try:
         for name, array in calibration.arrays.items():
-            np.save(folder / name, array)
-        path.write_text(text, encoding="utf-8")
+            npy = io.BytesIO()
+            np.save(npy, array)
+            write_whole(folder / name, npy.getvalue())
+        write_whole(path, text.encode())
     except OSError as error:
         msg = f"{path}: cannot be written: {error}; make room or name another folder with --out, and run again"
         raise ConfigError(msg) from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar
 
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 from textual.app import ComposeResult
@@ -35,7 +36,7 @@ class Reader(ModalScreen[None]):
     def compose(self) -> ComposeResult:
         """One scrolling text in a frame."""
         with VerticalScroll() as sheet:
-            sheet.border_title = self._title
+            sheet.border_title = escape(self._title)
             sheet.border_subtitle = self.HINT
             yield Static(self._content, id="text")
 
@@ -89,9 +90,9 @@ class Confirm(ModalScreen[bool]):
     def compose(self) -> ComposeResult:
         """The question, and what can be answered, for keyboard and mouse."""
         with Vertical(classes="sheet") as sheet:
-            sheet.border_title = self._title
+            sheet.border_title = escape(self._title)
             sheet.border_subtitle = "s stops"
-            yield Static(self._question)
+            yield Static(self._question, markup=False)
             yield Static(
                 "\n[@click=screen.dismiss(True)][bold reverse] y [/] yes[/]     "
                 "[@click=screen.dismiss(False)][bold reverse] n [/] no[/]"
@@ -127,7 +128,7 @@ class Ask(ModalScreen[str | None]):
     def compose(self) -> ComposeResult:
         """The field, and what is wrong with it."""
         with Vertical(classes="sheet") as sheet:
-            sheet.border_title = self._title
+            sheet.border_title = escape(self._title)
             sheet.border_subtitle = "enter takes it · esc leaves · ^s stops"
             yield Static(Text(self._prompt, DIM))
             yield Input(self._value, id="value")

@@ -16,6 +16,8 @@ from rich.segment import Segment
 from rich.style import Style
 from textual.strip import Strip
 
+from fitctl.text import plain
+
 INK = "#d7dde5"
 DIM = "#7d8896"
 FAINT = "#39424e"
@@ -75,7 +77,7 @@ def style(
 
 def text(content: str, colour: str = INK, *, on: str | None = None, bold: bool = False) -> Segment:
     """One piece of a line."""
-    return Segment(content, style(colour, on, bold=bold))
+    return Segment(plain(content), style(colour, on, bold=bold))
 
 
 @lru_cache(maxsize=256)

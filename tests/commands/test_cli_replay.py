@@ -69,46 +69,27 @@ def test_json_says_the_same_for_programs(replay, log):
     assert loop["differences"]["star_px"]["first_s"] is None
 
 
-def test_a_dark_frame_that_is_not_in_the_log_is_read_from_its_file_with_a_warning(
+def test_a_dark_frame_that_is_not_in_the_log_must_be_named_by_the_user(
     replay, tmp_path, monkeypatch
 ):
     file, log = tmp_path / "dark.npy", tmp_path / "run.mcap"
     np.save(file, np.full((40, 40), 1000.0))
     rig = load_rig(default_rig_path(), [f"camera.dark_file={file}"])
-    for keeps in (True, False):
-        with monkeypatch.context() as patched:
-            if not keeps:  # as an older fitctl did
-                patched.setattr("fitctl.daemon.run.dark_bytes", lambda _path: None)
-            simulation = LoggedSimulation(rig, log)
-        simulation.acquire()
-        simulation.run(0.5)
-        simulation.writer.close()
-        status, text, errors = replay(log)
-        warnings = [line for line in errors.splitlines() if "replaying" not in line]
+    with monkeypatch.context() as patched:  # as an older fitctl did
+        patched.setattr("fitctl.daemon.run.dark_bytes", lambda _path: None)
+        simulation = LoggedSimulation(rig, log)
+    simulation.acquire()
+    simulation.run(0.5)
+    simulation.writer.close()
 
-        assert (status, text.splitlines()[-1]) == (0, "the same, to the last bit")
-        if keeps:
-            assert warnings == []
-        else:
-            (line,) = warnings
-            assert line.startswith(f"{log}: an older fitctl recorded it, and kept only the dark")
-            assert f"{file} was read as it is today" in line
-        log.unlink()
-
-
-def test_a_dark_frame_that_is_neither_in_the_log_nor_on_the_disk_is_asked_for(
-    replay, tmp_path, monkeypatch
-):
-    file, log = tmp_path / "dark.npy", tmp_path / "run.mcap"
-    np.save(file, np.full((40, 40), 1000.0))
-    monkeypatch.setattr("fitctl.daemon.run.dark_bytes", lambda _path: None)
-    LoggedSimulation(load_rig(default_rig_path(), [f"camera.dark_file={file}"]), log).writer.close()
-    file.unlink()
     status, _, errors = replay(log)
-
     assert status == 2
     assert errors.count("\n") == 1
-    assert f"{file} is no longer there: name the one of then with --set camera.dark_file" in errors
+    assert f"the dark frame's name, {file};" in errors
+    assert "name the dark frame with --set camera.dark_file=FILE" in errors
+
+    status, text, _ = replay(log, "--set", f"camera.dark_file={file}")
+    assert (status, text.splitlines()[-1]) == (0, "the same, to the last bit")
 
 
 UNUSABLE = {

@@ -1,6 +1,7 @@
 """`fitctl report` and `fitctl plot` as a stranger meets them."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -93,7 +94,29 @@ def test_a_browser_that_fails_is_told(script, told, tmp_path, monkeypatch):
     browser(tmp_path, script)
 
     with pytest.raises(PdfError, match=told):
-        print_pdf(tmp_path / "report.html", tmp_path / "report.pdf")
+        print_pdf(tmp_path / "report.html", tmp_path / "report.pdf", sandbox=False)
+
+
+@pytest.mark.parametrize(("user", "needs"), [(0, "as root"), (1000, "cannot use its sandbox")])
+def test_the_browser_never_runs_without_its_sandbox_unless_asked(
+    user, needs, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("os.geteuid", lambda: user)
+    page, pdf, said = tmp_path / "report.html", tmp_path / "report.pdf", tmp_path / "said"
+    script = f"""
+        echo "$@" >> {said}
+        case "$*" in *--no-sandbox*) echo "%PDF" > {pdf};; *) echo "No usable sandbox!" >&2; exit 1;; esac
+    """
+    browser(tmp_path, script)
+
+    with pytest.raises(PdfError, match=f"{needs}.*--pdf-without-sandbox") as refused:
+        print_pdf(page, pdf)
+    assert "\n" not in str(refused.value)
+    assert not said.exists() or "--no-sandbox" not in said.read_text()
+
+    print_pdf(page, pdf, sandbox=False)
+    assert "--no-sandbox" in said.read_text()
 
 
 @pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
@@ -101,7 +124,7 @@ def test_a_browser_that_is_there_prints_the_page(tmp_path):
     page = tmp_path / "report.html"
     page.write_text("<!doctype html><title>t</title><p>A night.")
 
-    print_pdf(page, tmp_path / "report.pdf")
+    print_pdf(page, tmp_path / "report.pdf", sandbox=os.geteuid() != 0)
 
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
 

@@ -104,7 +104,7 @@ def test_the_dark_frame_is_that_of_the_log_whatever_its_file_holds_by_now(logged
     assert replayed(path).same
 
 
-def test_a_log_with_but_the_name_of_its_dark_frame_is_replayed_with_todays(
+def test_a_log_with_only_the_name_of_its_dark_frame_is_replayed_with_the_file_that_the_user_names(
     logged, tmp_path, monkeypatch
 ):
     file = tmp_path / "dark.npy"
@@ -112,9 +112,10 @@ def test_a_log_with_but_the_name_of_its_dark_frame_is_replayed_with_todays(
     monkeypatch.setattr("fitctl.daemon.run.dark_bytes", lambda _path: None)
     path, _ = logged(hold_a_star, f"camera.dark_file={file}")
 
-    assert replayed(path).same
+    named = [f"camera.dark_file={file}"]
+    assert replayed(path, change=named).same
     new_dark(file, 2)
-    assert replayed(path).loops["right"].differences["star_px"].ticks > 100
+    assert replayed(path, change=named).loops["right"].differences["star_px"].ticks > 100
 
 
 def test_a_design_from_a_file_is_that_of_the_log_whatever_the_file_holds_by_now(logged, tmp_path):

@@ -4,12 +4,16 @@ import json
 import re
 from html.parser import HTMLParser
 
+import msgspec
 import pytest
 from report_samples import record
 
+from fitctl.config import ConfigError
+from fitctl.daemon.run import run_info
 from fitctl.logging.records import Event
+from fitctl.logging.writer import LogWriter
 from fitctl.report.compare import make_comparison
-from fitctl.report.drawing import VARIABLES, envelope, plain_number
+from fitctl.report.drawing import VARIABLES, Plot, draw, envelope, panels, plain_number, styled
 from fitctl.report.findings import find
 from fitctl.report.make import make_report
 from fitctl.report.run import find_run
@@ -22,12 +26,14 @@ class Reader(HTMLParser):
 
     def __init__(self, page):
         super().__init__()
-        self.open, self.ids, self.references, self.text, self.scripts = [], [], [], [], 0
+        self.open, self.ids, self.references, self.text = [], [], [], []
+        self.scripts = self.images = 0
         self.feed(page)
         self.close()
 
     def handle_starttag(self, tag, attrs):
         self.scripts += tag == "script"
+        self.images += tag in {"img", "image", "iframe", "object", "embed"}
         found = dict(attrs)
         if "id" in found:
             self.ids.append(found["id"])
@@ -185,3 +191,43 @@ def test_a_trace_shows_its_extremes_however_long_it_is():
     assert len(at_s) == 900
     assert (low.min(), high.max()) == (-7.0, 5.0)
     assert at_s[high.argmax()] == pytest.approx(time_s[123_456], abs=time_s[-1] / 900)
+
+
+def test_the_page_forbids_itself_scripts_and_everything_from_elsewhere(made):
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', made[1])
+
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "script" not in policy[1]
+
+
+def test_no_text_in_a_plot_leaves_it_for_the_page_or_for_another_folder(tmp_path):
+    evil = '"><img src=x onerror="alert(1)"> $x^{$ -->'
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    with styled():
+        figure, (axes,) = panels(1, 2.0)
+        axes.set(title=evil, xlabel=evil)
+        axes.plot([0, 1], [0, 1], label=evil)
+        axes.legend()
+        svg = draw(Plot(f"../{evil}/up", evil, evil, figure), inside)
+
+    read = Reader(svg)
+    assert read.open == []
+    assert read.images == 0
+    assert "".join(read.text).count(evil) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["inside"]
+    assert len(list(inside.iterdir())) == 2
+
+
+def test_a_log_whose_rig_has_markup_for_names_is_refused(rig, tmp_path):
+    document = rig.model_dump(mode="json")
+    for table in (document["loops"], document["plant"]["loops"], document["mocks"]["loops"]):
+        table['right"><img src=x onerror=alert(1)>'] = table.pop("right")
+    info = run_info(rig, "simulated", now_s=0.0, designs={})
+    path = tmp_path / "evil.mcap"
+    with LogWriter(path, rig.logging) as log:
+        log.write(msgspec.structs.replace(info, rig_json=json.dumps(document)), 1.8e9)
+
+    with pytest.raises(ConfigError, match="must be 1 to 32 characters"):
+        find_run([path])

@@ -137,7 +137,7 @@ def foreign(path, metadata):
     ("metadata", "error", "told"),
     [
         ({}, LogError, "says of no rig what it recorded"),
-        ({"rig": {"name": "x", "json": "{"}}, LogError, "cannot be read .*--rig"),
+        ({"rig": {"name": "x", "json": "{"}}, ConfigError, "not JSON.*--rig"),
         ({"rig": {"name": "x", "json": '{"name": "x"}'}}, ConfigError, "--rig"),
     ],
 )

@@ -12,7 +12,7 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.log_time import time_ns
-from fitctl.commands.shared.printing import to_json
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
 from fitctl.logging.reading import LogInfo, log_info
@@ -54,19 +54,19 @@ def info(
     """Say what a log holds."""
     found, kept, recording = log_info(log), folder.is_kept(log), folder.in_use(log)
     if as_json:
-        typer.echo(to_json(_info_document(found, kept=kept, recording=recording)))
+        say(to_json(_info_document(found, kept=kept, recording=recording)))
         return
     unfinished = "being recorded" if recording else "cut off; `fitctl log recover` mends it"
     state = "finished" if found.finished else unfinished
-    typer.echo(f"{found.path}: {state}{'; kept' if kept else ''}")
+    say(f"{found.path}: {state}{'; kept' if kept else ''}")
     if found.counts:
         start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(found.start_s))
-        typer.echo(f"from {start}, {found.duration_s:.1f} s")
+        say(f"from {start}, {found.duration_s:.1f} s")
     else:
-        typer.echo("without any record")
+        say("without any record")
     width = max(map(len, found.counts), default=0)
     for topic, count in sorted(found.counts.items()):
-        typer.echo(f"  {topic:<{width}}  {count}")
+        say(f"  {topic:<{width}}  {count}")
 
 
 def _info_document(found: LogInfo, *, kept: bool, recording: bool) -> dict[str, object]:
@@ -90,12 +90,12 @@ def verify(logs: LogsArgument) -> None:
     for log in logs:
         verdict = verifying.verify(log)
         problems += len(verdict.problems)
-        typer.echo(
+        say(
             f"{log}: {'not whole' if verdict.problems else 'whole'}; {verdict.records} records, "
             f"{verdict.lost} lost on the way, {verdict.frames_missing} frames missing"
         )
         for problem in verdict.problems:
-            typer.echo(f"  {problem}")
+            say(f"  {problem}")
     raise typer.Exit(FAILED if problems else 0)
 
 
@@ -106,12 +106,12 @@ def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption 
         msg = f"{log}: is being recorded just now; there is nothing to mend"
         raise ConfigError(msg)
     if not verifying.verify(log).problems:
-        typer.echo(f"{log}: is whole; there is nothing to mend")
+        say(f"{log}: is whole; there is nothing to mend")
         return
     target = out or log.with_name(f"{log.stem}_recovered.mcap")
     saved = copying.recover(log, target, overwrite=overwrite)
     lost = f"{saved.damaged_chunks} damaged chunks passed over, " if saved.damaged_chunks else ""
-    typer.echo(
+    say(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
     )
 
@@ -144,7 +144,7 @@ def cut(
     records = copying.cut(
         log, target, from_ns=from_ns, to_ns=to_ns, topics=topics, overwrite=overwrite
     )
-    typer.echo(f"{target}: {records} of {sum(found.counts.values())} records")
+    say(f"{target}: {records} of {sum(found.counts.values())} records")
 
 
 @app.command()
@@ -156,7 +156,7 @@ def merge(
     """Join logs by time, such as those of one night, or what a crash tore in two."""
     records, doubles = copying.merge(logs, out, overwrite=overwrite)
     also = f"; {doubles} were in two logs" if doubles else ""
-    typer.echo(f"{out}: {records} records of {len(logs)} logs{also}")
+    say(f"{out}: {records} records of {len(logs)} logs{also}")
 
 
 @app.command()
@@ -173,7 +173,7 @@ def export(
     target = out or log.with_name(f"{log.stem}_{format_}")
     files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
     for file, rows in sorted(files.items()):
-        typer.echo(f"{file}: {rows} rows")
+        say(f"{file}: {rows} rows")
     if not files:
         msg = f"export: {log} has nothing to write as {format_}; frames need npz or parquet"
         raise ConfigError(msg)
@@ -187,7 +187,7 @@ def keep(
     """Mark logs, so that the recorder never deletes them; the mark is an empty file LOG.keep beside each."""
     for log in logs:
         folder.keep(log, kept=not undo)
-        typer.echo(f"{log}: {'no longer kept' if undo else 'kept'}")
+        say(f"{log}: {'no longer kept' if undo else 'kept'}")
 
 
 def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:

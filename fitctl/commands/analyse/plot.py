@@ -11,6 +11,7 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.log_time import time_ns
+from fitctl.commands.shared.printing import say
 from fitctl.config import ConfigError
 from fitctl.logging.reading import log_info
 from fitctl.report.quick import Series, as_figure, as_text, read_series
@@ -54,7 +55,7 @@ def plot(
     elif window:
         _show(log, series)
     else:
-        typer.echo(as_text(log, series, colours=sys.stdout.isatty()))
+        print(as_text(log, series, colours=sys.stdout.isatty()))
 
 
 def _save(log: Path, series: Sequence[Series], out: Path) -> None:
@@ -63,7 +64,7 @@ def _save(log: Path, series: Sequence[Series], out: Path) -> None:
     except OSError as error:
         msg = f"plot: --out {out}: cannot be written: {error.strerror or error}; name another file"
         raise ConfigError(msg) from None
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
 
 
 def _show(log: Path, series: Sequence[Series]) -> None:
@@ -71,7 +72,7 @@ def _show(log: Path, series: Sequence[Series]) -> None:
 
     manager = pyplot.figure().canvas.manager
     if manager is None or manager.canvas.required_interactive_framework is None:
-        typer.echo(
+        say(
             "plot: no window can be opened: matplotlib finds no display, or no toolkit such as python3-tk; "
             "leave --window away, or name a picture with --out",
             err=True,

@@ -12,13 +12,13 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import ControllerOption, JsonOption, SetOption
-from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.printing import progress_line, say, to_json
 from fitctl.commands.shared.rig import controller_overrides
-from fitctl.config import ConfigError, Rig, load_rig, rig_from_json
+from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.document import design_json
 from fitctl.logging.reading import LogInfo
-from fitctl.replay.files import dark_of_today, logged_files
+from fitctl.replay.files import logged_files, missing_dark_file
 from fitctl.replay.log import read_steps, whole_run
 from fitctl.replay.replay import replay as replay_steps
 from fitctl.replay.result import LoopReplay, ReplayResult
@@ -33,8 +33,6 @@ _OPEN_LOOP = (
     "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
     "on from where\nthe log sent them; modes and the controllers' own state go on from today's"
 )
-_OLD_DARK = "an older fitctl recorded it, and kept only the dark frame's name"
-_NAME_IT = "name the one of then with --set camera.dark_file=FILE"
 
 
 def replay(
@@ -57,20 +55,20 @@ def replay(
     """
     with whole_run(logs) as info, logged_files(info) as files:
         settings = _rig(info, files, rig, overrides or [], controller)
-        dark_file = dark_of_today(info, settings)
-        if dark_file is not None and not Path(dark_file).exists():
-            msg = f"{info.path}: {_OLD_DARK}; {dark_file} is no longer there: {_NAME_IT}"
+        dark_file = None if rig else missing_dark_file(info, settings)
+        if dark_file is not None:
+            msg = (
+                f"{info.path}: an older fitctl recorded it, and kept only the dark frame's name, {dark_file}; "
+                "no file is read because a log names it: name the dark frame with --set camera.dark_file=FILE"
+            )
             raise ConfigError(msg)
         result = _replayed(info, settings)
     named = ", ".join(map(str, logs))
-    if dark_file is not None:
-        today = f"{dark_file} was read as it is today; if it was measured anew since, {_NAME_IT}"
-        typer.echo(f"{named}: {_OLD_DARK}; {today}", err=True)
     if as_json:
-        typer.echo(to_json(_document(named, info, settings, result)))
+        say(to_json(_document(named, info, settings, result)))
     else:
         for line in _lines(named, info, settings, result):
-            typer.echo(line)
+            say(line)
     raise typer.Exit(0 if result.same else FAILED)
 
 
@@ -97,9 +95,7 @@ def _rig(
     origin = f"the rig in {info.path}"
 
     def read(changes: Sequence[str]) -> Rig:
-        return (
-            load_rig(path, changes) if path else rig_from_json(in_log, origin, [*files, *changes])
-        )
+        return load_rig(path, changes) if path else rig_from_log(in_log, origin, [*files, *changes])
 
     rig = read(overrides)
     if controller is not None:
@@ -153,7 +149,7 @@ def _lines(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> Iterato
         yield "the same, to the last bit"
         return
     yield from _other_designs(info, rig)
-    yield _OPEN_LOOP
+    yield from _OPEN_LOOP.splitlines()
 
 
 def _loop_lines(info: LogInfo, name: str, loop: LoopReplay) -> Iterator[str]:

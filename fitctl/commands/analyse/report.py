@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError
 from fitctl.report.compare import make_comparison
@@ -32,6 +33,12 @@ def report(
     ] = False,
     pdf: Annotated[
         bool, typer.Option("--pdf", help="As PDF too; needs Chromium or Chrome.")
+    ] = False,
+    pdf_without_sandbox: Annotated[
+        bool,
+        typer.Option(
+            "--pdf-without-sandbox", help="As --pdf, also where Chromium has no sandbox (root)."
+        ),
     ] = False,
     show: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     out: Annotated[
@@ -64,26 +71,26 @@ def report(
         raise ConfigError(msg) from None
     for night in nights:
         _print_verdict(night)
-    typer.echo(f"written: {page}")
-    if pdf:
+    say(f"written: {page}")
+    if pdf or pdf_without_sandbox:
         try:
-            print_pdf(page, page.with_suffix(".pdf"))
+            print_pdf(page, page.with_suffix(".pdf"), sandbox=not pdf_without_sandbox)
         except PdfError as error:
-            typer.echo(f"report: {error}", err=True)
+            say(f"report: {error}", err=True)
             raise typer.Exit(FAILED) from None
-        typer.echo(f"written: {page.with_suffix('.pdf')}")
+        say(f"written: {page.with_suffix('.pdf')}")
     if show and not webbrowser.open(page.resolve().as_uri()):
-        typer.echo(f"report: no browser could be opened; open {page} yourself", err=True)
+        say(f"report: no browser could be opened; open {page} yourself", err=True)
         raise typer.Exit(FAILED)
 
 
 def _print_verdict(night: Findings) -> None:
     for loop in night.loops.values():
-        typer.echo(
+        say(
             f"{night.run.name}, loop {loop.name}: {SIGNS[loop.verdict.word]} requirement of "
             f"{loop.requirement_px:g} px {loop.verdict.word}: {loop.verdict.why}"
         )
         for axis, found in loop.residual.items():
-            typer.echo(
+            say(
                 f"  {axis} {number(found.rms_px, '.4f', 'px RMS')}, 95 % interval {interval(found)}"
             )

@@ -12,7 +12,7 @@ import typer
 from numpy.typing import ArrayLike
 
 from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SetOption
-from fitctl.commands.shared.printing import to_json
+from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, loopshape, lqg_ltr
@@ -96,7 +96,7 @@ def design(
         vernier = _response(lqg_ltr.vernier_compensator(its_basis))
         title = "Coarse and vernier loop shapes (Fig. 9), LQG/LTR"
         save_figure(draw_loop_shapes(its_basis, vernier, title), plot)
-    typer.echo(to_json(result) if as_json else "\n".join(lines))
+    say_lines(to_json(result) if as_json else "\n".join(lines))
 
 
 # ---------------------------------------------------------------- the paper's vernier and coarse

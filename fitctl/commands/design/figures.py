@@ -10,7 +10,7 @@ import typer
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
 from fitctl.commands.shared.plant import require_plant
-from fitctl.commands.shared.printing import progress_line
+from fitctl.commands.shared.printing import progress_line, say
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError
 from fitctl.figures.make import FULL, QUICK, make
@@ -50,14 +50,14 @@ def figures(
         msg = f"figures: --out {out}: cannot be written: {error}; make room or name another folder"
         raise ConfigError(msg) from None
     except (IdentifyError, RuntimeError) as error:
-        typer.echo(f"figures: {error}", err=True)
+        say(f"figures: {error}", err=True)
         raise typer.Exit(FAILED) from None
     for plate in plates:
-        typer.echo(plate.title)
+        say(plate.title)
     for row in rows:
         nominal = row.nominal
-        typer.echo(
+        say(
             f"{row.controller:<17} {nominal.rms_px:.4f} px RMS, {nominal.ratio_to_bound:.3f} of the bound; "
             f"{row.attenuation:.1f}x at 1 Hz"
         )
-    typer.echo(f"written: {out / 'figures.md'}, {out / 'performance.md'}, and JSON beside each")
+    say(f"written: {out / 'figures.md'}, {out / 'performance.md'}, and JSON beside each")

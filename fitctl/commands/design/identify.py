@@ -15,7 +15,7 @@ import typer
 from fitctl import demo as demos
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
-from fitctl.commands.shared.printing import progress_line
+from fitctl.commands.shared.printing import progress_line, say
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.commands.shared.supervisor import address, client_of, show_rig
 from fitctl.config import ConfigError, Rig, default_rig_path
@@ -26,7 +26,7 @@ from fitctl.identify.experiments import (
     Identification,
     response_on_mock_bench,
 )
-from fitctl.identify.fragments import fragment_text
+from fitctl.identify.fragments import fragment_text, write_whole
 from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
 from fitctl.logging.copying import merge
 from fitctl.messages.modes import Mode
@@ -110,12 +110,12 @@ def identify(
             f"fitctl identify {what}", settings, finding.lines(), finding.fragment()
         )
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
-        typer.echo(f"identify {what}: {error}", err=True)
+        say(f"identify {what}: {error}", err=True)
         raise typer.Exit(FAILED) from None
-    _write(fragment_path, lambda: fragment_path.write_text(text, encoding="utf-8"))
+    _write(fragment_path, lambda: write_whole(fragment_path, text.encode()))
     for line in finding.lines():
-        typer.echo(line)
-    typer.echo(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
+        say(line)
+    say(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
 
 
 def _require_output(path: Path) -> None:

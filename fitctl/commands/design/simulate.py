@@ -18,7 +18,7 @@ from fitctl.commands.shared.options import (
     SetOption,
 )
 from fitctl.commands.shared.plant import require_plant
-from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
 from fitctl.config import Rig
 from fitctl.processes import ended_by_signals, interrupt
@@ -74,10 +74,10 @@ def _simulate_once(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> 
         progress(1.0)
     plain = {name: result._asdict() for name, result in results.items()}
     if as_json:
-        typer.echo(to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
+        say(to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
     else:
         for name, result in results.items():
-            typer.echo(_result_text(name, result))
+            say_lines(_result_text(name, result))
     return 0 if all(not math.isnan(result.vernier_s) for result in results.values()) else FAILED
 
 
@@ -104,7 +104,7 @@ def _simulate_many(
     def on_refusal(reason: str) -> None:
         nonlocal refusal
         refusal = reason
-        typer.echo(
+        say_lines(
             f"The batch simulator cannot run this rig: {reason}.\n"
             "Each run is simulated tick by tick, about a hundred times slower.",
             err=True,
@@ -118,7 +118,7 @@ def _simulate_many(
         ):
             results = run_campaign(rig, seeds, duration_s, executor, workers, progress, on_refusal)
     except CampaignError as error:
-        typer.echo(str(error), err=True)
+        say(str(error), err=True)
         return FAILED
     wall_s = time.perf_counter() - started
     summaries = summarize(results)
@@ -131,11 +131,11 @@ def _simulate_many(
             "speed_x": speed_x,
             "batch_refusal": refusal,
         }
-        typer.echo(to_json(head | {"loops": summaries}))
+        say(to_json(head | {"loops": summaries}))
     else:
         for name, summary in summaries.items():
-            typer.echo(_summary_text(name, summary))
-        typer.echo(f"{speed_x:.0f}x real time on {workers} workers, {wall_s:.1f} s in all")
+            say_lines(_summary_text(name, summary))
+        say(f"{speed_x:.0f}x real time on {workers} workers, {wall_s:.1f} s in all")
     return 0 if all(summary.held == summary.runs for summary in summaries.values()) else FAILED
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fitctl.commands.shared.options import ControllerOption, ParentOption, RigOption, SetOption
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of, with_controller
 from fitctl.config import default_rig_path
 from fitctl.daemon.run import run_supervisor
@@ -26,5 +27,5 @@ def run(
         settings,
         rig,
         overrides,
-        lambda folder: print(f"supervising {settings.name}; sockets in {folder}", flush=True),
+        lambda folder: say(f"supervising {settings.name}; sockets in {folder}"),
     )

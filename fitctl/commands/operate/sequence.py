@@ -20,7 +20,7 @@ from fitctl.commands.shared.options import (
     SeedOption,
     SetOption,
 )
-from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address, client_of, connect, send_and_print, show_rig
 from fitctl.config import Rig
@@ -98,18 +98,18 @@ def list_(
             {"file": str(path), **sequence.model_dump(exclude_none=True)}
             for path, sequence in listed.items()
         ]
-        typer.echo(to_json(documents))
+        say(to_json(documents))
         return
     width = max(len(sequence.name) for sequence in listed.values())
     for sequence in listed.values():
-        typer.echo(f"{sequence.name:<{width}}  {sequence.description}")
+        say(f"{sequence.name:<{width}}  {sequence.description}")
 
 
 @app.command()
 def check(file: SequenceArgument, rig: RigOption = None, overrides: StepSetOption = None) -> None:
     """Say what is wrong with a sequence for a rig, without the instrument."""
     settings, sequence = _load(file, rig, overrides)
-    typer.echo(f"{file}: well; {len(sequence.steps)} steps for rig {settings.name}")
+    say(f"{file}: well; {len(sequence.steps)} steps for rig {settings.name}")
 
 
 @app.command("dry-run")
@@ -133,7 +133,7 @@ def dry_run(
     link = SimulatedLink(settings, seed)
     status = _run(settings, sequence, link, out, as_json=as_json)
     if not as_json:
-        typer.echo(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")
+        say(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")
     raise typer.Exit(status)
 
 
@@ -225,14 +225,14 @@ def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json:
         failure = str(error)
     finally:
         if as_json:
-            typer.echo(as_json_text(sequence.name, failure, attempts))
+            say(as_json_text(sequence.name, failure, attempts))
         elif attempts:
-            typer.echo(attempts_text(attempts))
+            say_lines(attempts_text(attempts))
     if out is not None:
         for calibration in runner.calibrations:
             path = write_calibration(calibration, rig, out)
-            typer.echo(f"written: {path} (name it in the rig file's include list)", err=as_json)
+            say(f"written: {path} (name it in the rig file's include list)", err=as_json)
     if failure:
-        typer.echo(f"sequence {sequence.name}: {failure}", err=True)
+        say(f"sequence {sequence.name}: {failure}", err=True)
         return FAILED
     return 0

@@ -9,7 +9,7 @@ import typer
 
 from fitctl.commands.shared.exits import NO_SUPERVISOR
 from fitctl.commands.shared.options import JsonOption, RemoteOption, RigOption, SetOption
-from fitctl.commands.shared.printing import to_json, utc
+from fitctl.commands.shared.printing import say, say_lines, to_json, utc
 from fitctl.commands.shared.supervisor import connect
 from fitctl.messages.client import REPLY_TIMEOUT_S, Client
 from fitctl.messages.commands import Status
@@ -34,15 +34,15 @@ def status(
     try:
         telemetry = newest_telemetry(client)
     except ConnectionError as error:
-        typer.echo(f"status: {error}", err=True)
+        say(f"status: {error}", err=True)
         raise typer.Exit(NO_SUPERVISOR) from None
     finally:
         client.close()
     found = troubles(telemetry)
     if as_json:
-        typer.echo(to_json(status_document(telemetry, found)))
+        say(to_json(status_document(telemetry, found)))
     else:
-        typer.echo("\n".join(status_lines(telemetry, found)))
+        say_lines("\n".join(status_lines(telemetry, found)))
     raise typer.Exit(NOT_WELL if found else 0)
 
 

@@ -15,7 +15,7 @@ import typer
 
 from fitctl.commands.shared.exits import NO_SUPERVISOR
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
-from fitctl.commands.shared.printing import to_json, utc
+from fitctl.commands.shared.printing import say, to_json, utc
 from fitctl.commands.shared.supervisor import connect
 from fitctl.logging.records import Severity
 from fitctl.messages.modes import Mode
@@ -90,7 +90,7 @@ def watch(
         with ended_by_signals(interrupt):
             for entry in entries(client.receive, duration):
                 received = received or not isinstance(entry, Silence)
-                print(text(entry), flush=True)
+                say(text(entry))
     except KeyboardInterrupt:
         pass  # the ordinary end
     except BrokenPipeError:

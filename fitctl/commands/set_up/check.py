@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import typer
-
 from fitctl.commands.shared.options import RigOption, SetOption
 from fitctl.commands.shared.plant import check_plant
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import default_rig_path
 
@@ -16,4 +15,4 @@ def check(rig: RigOption = None, overrides: SetOption = None) -> None:
     settings = rig_of(rig, overrides)
     check_plant(settings)
     loops = ", ".join(settings.loops)
-    typer.echo(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
+    say(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")

@@ -11,7 +11,7 @@ import typer
 from serial.tools import list_ports
 
 from fitctl.commands.shared.options import JsonOption
-from fitctl.commands.shared.printing import to_json
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.drivers.gige.discovery import discover as discover_cameras
 from fitctl.drivers.interface import DeviceUnreachable
 
@@ -32,19 +32,19 @@ def discover(
         "can_interfaces": _can_interfaces(),
     }
     if as_json:
-        typer.echo(to_json(found))
+        say(to_json(found))
         return
     for title, entries in found.items():
-        typer.echo(title.replace("_", " ") + ("" if entries else ": none"))
+        say(title.replace("_", " ") + ("" if entries else ": none"))
         for entry in entries:
-            typer.echo("  " + "  ".join(str(value) for value in entry.values() if value))
+            say("  " + "  ".join(str(value) for value in entry.values() if value))
 
 
 def _cameras(broadcast: str, wait_s: float) -> list[dict[str, str]]:
     try:
         cameras = discover_cameras(broadcast, wait_s)
     except DeviceUnreachable as error:
-        typer.echo(f"cameras: {error}", err=True)
+        say(f"cameras: {error}", err=True)
         return []
     return [
         {"address": one.address, "mac": one.mac, "name": one.user_name, **asdict(one.identity)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from fitctl.commands.operate.status import newest_telemetry
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
-from fitctl.commands.shared.printing import to_json
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
 from fitctl.config import Rig
@@ -31,6 +32,7 @@ from fitctl.drivers.modbus_dac.probe import probe_dac
 from fitctl.drivers.probe import Probe
 from fitctl.messages.endpoints import COMMAND_SOCKET, service_folder
 from fitctl.messages.telemetry import Telemetry
+from fitctl.text import plain
 
 _WIDEST = 118
 _FIRST_REPORT_S = 3.0
@@ -89,12 +91,12 @@ def ask_devices(rig: Rig, *, as_json: bool) -> int:
         findings = reported(rig, running)
     asked = "devices" if running is None else "supervisor"
     if as_json:
-        plain = [_plain(one) for one in findings]
-        typer.echo(to_json({"rig": rig.name, "asked": asked, "devices": plain}))
+        documents = [_plain(one) for one in findings]
+        say(to_json({"rig": rig.name, "asked": asked, "devices": documents}))
     else:
         _print(rig, findings)
         if running is not None:
-            typer.echo(
+            say(
                 f"The supervisor of {rig.name} runs (process {running.pid}). This is its report: doctor has"
                 " not asked the devices, which it would disturb. To have them asked, end it first."
             )
@@ -165,19 +167,24 @@ def _plain(finding: Finding) -> dict[str, Any]:
     return finding._asdict() | {"identity": identity}
 
 
+def _cell(lines: Iterable[str]) -> str:
+    return "\n".join(map(plain, lines))
+
+
 def _print(rig: Rig, findings: list[Finding]) -> None:
     table = Table(title=f"Devices of {rig.name}", title_justify="left", show_lines=True)
     for heading in ("device", "found", "identity", "firmware", "round trip", "disagrees"):
         table.add_column(heading, justify="right" if heading == "round trip" else "left")
     for finding in findings:
         who = finding.identity
-        table.add_row(
+        cells = (
             f"{finding.device}\n({finding.driver})",
             "yes" if finding.found else "no",
-            "" if who is None else "\n".join(filter(None, (who.maker, who.model, who.serial))),
-            "" if who is None else who.firmware,
+            "" if who is None else _cell(filter(None, (who.maker, who.model, who.serial))),
+            "" if who is None else plain(who.firmware),
             "" if finding.round_trip_ms is None else f"{finding.round_trip_ms:.2f} ms",
-            "\n".join(finding.disagreements),
+            _cell(finding.disagreements),
         )
+        table.add_row(*map(Text, cells))  # as Text, or what a device says of itself could be markup
     width = min(shutil.get_terminal_size((_WIDEST, 24)).columns, _WIDEST)
     Console(width=width, highlight=False).print(table)

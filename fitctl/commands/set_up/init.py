@@ -11,6 +11,7 @@ import typer
 from serial.tools import list_ports
 
 from fitctl.commands.set_up.doctor import ask_devices as run_doctor
+from fitctl.commands.shared.printing import say, say_lines
 from fitctl.commands.shared.welcome import listed
 from fitctl.config import ConfigError, rig_from_document
 from fitctl.config.new_rig import DEVICES, MOCK, Chosen, chosen, forms, new_rig_text
@@ -61,7 +62,7 @@ def init(
     open_questions = [device for device, choice in given.items() if not choice]
     if open_questions and not mocks:
         _must_be_a_terminal(open_questions)
-        typer.echo("What hardware is there? Enter takes what stands in brackets.")
+        say("What hardware is there? Enter takes what stands in brackets.")
         _show_serial_ports()
         name = name or typer.prompt("Name of the rig", default=file.stem)
     devices = {
@@ -71,11 +72,11 @@ def init(
     rig = rig_from_document(tomllib.loads(text), str(file))
     _write(file, text)
     simulated = [device for device, (kind, _) in devices.items() if kind == MOCK]
-    typer.echo(f"{file}: written; rig {rig.name}, simulated: {', '.join(simulated) or 'nothing'}")
+    say(f"{file}: written; rig {rig.name}, simulated: {', '.join(simulated) or 'nothing'}")
     status = 0
     if ask_devices and len(simulated) < len(devices):
         status = run_doctor(rig, as_json=False)
-    typer.echo(_next(file, simulated))
+    say_lines(_next(file, simulated))
     raise typer.Exit(status)
 
 
@@ -92,7 +93,7 @@ def _must_be_a_terminal(open_questions: list[str]) -> None:
 
 def _show_serial_ports() -> None:
     for port in sorted(list_ports.comports()):
-        typer.echo(f"  {port.device}  {port.description}")
+        say(f"  {port.device}  {port.description}")
 
 
 def _ask(device: str) -> Chosen:

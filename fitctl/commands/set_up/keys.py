@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.options import RigOption, SetOption
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.messages.keys import allowed_keys, new_key, revoke_key
 
@@ -40,11 +41,9 @@ def new(
     settings = rig_of(named_rig(rig), overrides)
     path = out or Path(f"{name}.key.toml")
     key = new_key(settings, name, "viewer" if viewer else "commander", host, path)
-    typer.echo(
-        f"{path}: {key.role} {key.name} of rig {key.rig} at {key.host}; hand it over in secret"
-    )
+    say(f"{path}: {key.role} {key.name} of rig {key.rig} at {key.host}; hand it over in secret")
     if not settings.service.tcp_address:
-        typer.echo("the rig listens to nobody yet: set service.tcp_address and start it anew")
+        say("the rig listens to nobody yet: set service.tcp_address and start it anew")
 
 
 @app.command("list")
@@ -52,9 +51,9 @@ def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Print whose keys are allowed, and what each may do."""
     keys, problems = allowed_keys(rig_of(named_rig(rig), overrides))
     for key in keys.values():
-        typer.echo(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
+        say(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
     for problem in problems:
-        typer.echo(problem, err=True)
+        say(problem, err=True)
     raise typer.Exit(1 if problems else 0)
 
 
@@ -62,4 +61,4 @@ def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
 def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
     """Let a key in no more; a running supervisor drops its holder at once."""
     revoke_key(rig_of(named_rig(rig), overrides), name)
-    typer.echo(f"{name} is let in no more")
+    say(f"{name} is let in no more")

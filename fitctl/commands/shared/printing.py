@@ -8,6 +8,9 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
+import typer
+
+from fitctl.text import plain
 
 if TYPE_CHECKING:
     from fitctl.messages.telemetry import Telemetry
@@ -18,6 +21,17 @@ class ShowProgress(Protocol):
 
     def __call__(self, done: float, text: str | None = None) -> None:
         """Show it."""
+
+
+def say(line: str, *, err: bool = False) -> None:
+    """Print one line, whatever is in it: a field with line breaks or escapes cannot forge another line."""
+    typer.echo(plain(line), err=err)
+
+
+def say_lines(text: str, *, err: bool = False) -> None:
+    """Print lines of fitctl's own; text from elsewhere in them has gone through :func:`fitctl.text.plain`."""
+    for line in text.split("\n"):
+        say(line, err=err)
 
 
 def to_json(result: Any) -> str:
@@ -32,10 +46,12 @@ def progress_line(text: str, total: float = 1.0) -> Iterator[ShowProgress]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(text, total=total)
-        yield lambda done, text=None: progress.update(task, completed=done, description=text)
+        task = progress.add_task(plain(text), total=total)
+        yield lambda done, text=None: progress.update(
+            task, completed=done, description=None if text is None else plain(text)
+        )
 
 
 def utc(telemetry: Telemetry, time_s: float) -> str:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import typer
 
 from fitctl.commands.shared.exits import FAILED, NO_SUPERVISOR
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.client import Client
@@ -45,7 +46,7 @@ def address(command: str, path: Path | None, overrides: list[str] | None) -> Add
         return Addressed(named or default_rig_path(), overrides or [])
     running = running_rigs()
     if not running:
-        typer.echo(
+        say(
             f"{command}: no supervisor of yours runs on this machine; start one with fitctl run, or name a rig "
             "with --rig or FITCTL_RIG",
             err=True,
@@ -60,7 +61,7 @@ def address(command: str, path: Path | None, overrides: list[str] | None) -> Add
 
 def show_rig(name: str, where: str) -> None:
     """Print which rig a command addresses; on the error output, so that results stay alone."""
-    typer.echo(f"rig {name}: {where}", err=True)
+    say(f"rig {name}: {where}", err=True)
 
 
 def client_of(rig: Rig, remote: Path | None = None) -> Client:
@@ -143,12 +144,12 @@ def _send(client: Client, command: AnyCommand) -> Reply | ConnectionError:
 def print_reply(reply: Reply | ConnectionError, sender: str) -> int:
     """Print a reply, or why there is none; returns the exit status."""
     if isinstance(reply, ConnectionError):
-        typer.echo(f"{sender}: {reply}", err=True)
+        say(f"{sender}: {reply}", err=True)
         return FAILED
     wall_minus_monotonic_s = time.time() - reply.time_s
     for event in reply.events:
         stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)
-        typer.echo(f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}")
+        say(f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}")
     text = reply.text or ("accepted" if reply.accepted else "refused")
-    typer.echo(text, err=not reply.accepted)
+    say(text, err=not reply.accepted)
     return 0 if reply.accepted else FAILED

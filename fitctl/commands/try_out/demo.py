@@ -17,7 +17,7 @@ from fitctl.commands.shared.options import (
     SeedOption,
     SetOption,
 )
-from fitctl.commands.shared.printing import progress_line, to_json
+from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
 from fitctl.commands.shared.terminal import has_terminal
 from fitctl.config import Rig, default_rig_path
@@ -68,7 +68,7 @@ def demo(
                 else:
                     status = _demo_headless(settings, running, duration, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
-            typer.echo(f"demo: {error}", err=True)
+            say(f"demo: {error}", err=True)
             status = FAILED
     raise typer.Exit(status)
 
@@ -101,7 +101,7 @@ def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.
     thread.join(timeout=5.0)
     newest = demos.newest_telemetry(running.sockets)
     if newest is not None and newest.recorder is not None:
-        typer.echo(f"log: {newest.recorder.path}")
+        say(f"log: {newest.recorder.path}")
     return 0 if console.returncode == 0 else FAILED
 
 
@@ -116,10 +116,10 @@ def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as
     results = {name: demos.summary(rig, running, course, name) for name in rig.loops}
     if as_json:
         # One loop: its summary. Several: one for each, by name.
-        typer.echo(to_json(next(iter(results.values())) if len(results) == 1 else results))
+        say(to_json(next(iter(results.values())) if len(results) == 1 else results))
     else:
         for name, result in results.items():
-            typer.echo(_summary_text(name, result))
+            say_lines(_summary_text(name, result))
     held = all(result["judged_s"] > 0 for result in results.values())
     return 0 if held else FAILED
 

@@ -9,6 +9,7 @@ import typer
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.commands.shared.options import RigOption, SetOption
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
@@ -70,11 +71,11 @@ def now(rig: RigOption = None, overrides: SetOption = None) -> None:
 def kinds_() -> None:
     """Print what can go wrong with each device."""
     for device, table in kinds().items():
-        typer.echo(device)
+        say(device)
         for name, kind in table.items():
             value = f" [{kind.value:g} {kind.unit}]" if kind.unit else ""
             parts = f" ({', '.join(kind.parts)})" if kind.parts else ""
-            typer.echo(f"  {name:<18} {kind.text}{value}{parts}")
+            say(f"  {name:<18} {kind.text}{value}{parts}")
 
 
 def _change(rig: Rig, question: SetFault | ClearFaults | ListFaults) -> None:
@@ -97,7 +98,10 @@ def _change(rig: Rig, question: SetFault | ClearFaults | ListFaults) -> None:
     if now.error:
         msg = f"fault: {now.error}"
         raise ConfigError(msg)
-    typer.echo("\n".join(map(_line, now.active)) or "all is well")
+    for line in map(_line, now.active):
+        say(line)
+    if not now.active:
+        say("all is well")
 
 
 def _line(fault: dict[str, Any]) -> str:

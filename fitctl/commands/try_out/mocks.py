@@ -21,7 +21,7 @@ from fitctl.commands.shared.options import (
     SeedOption,
     SetOption,
 )
-from fitctl.commands.shared.printing import to_json
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError, Fault, LoopMocks, Rig
 from fitctl.logging.pictures import LoggedPictures
@@ -103,7 +103,7 @@ def _pictures(rig: Rig, log: Path) -> Picture:
         camera.height_px,
         camera.period_s,
         camera.bias_dn,
-        lambda why: typer.echo(f"mocks: {why}; it is dark from here on", err=True),
+        lambda why: say(f"mocks: {why}; it is dark from here on", err=True),
     )
 
 
@@ -143,11 +143,11 @@ async def _serve_mocks(
         msg = f"mocks: a port is taken: {error}; choose others with --set, or use --free-ports"
         raise ConfigError(msg) from None
     if as_json:
-        print(to_json(endpoints), flush=True)
+        say(to_json(endpoints))
     else:
         width = max(map(len, endpoints))
         for key, value in endpoints.items():
-            print(f"{key:<{width}}  {value}", flush=True)
+            say(f"{key:<{width}}  {value}")
     # The hardware that they stand for does not wait for what else the computer has to do.
     become_realtime(_PRIORITY)
     await ending.wait()

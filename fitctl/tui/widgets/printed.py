@@ -39,7 +39,9 @@ class Printed(Panel):
         """Run another fitctl command in place of the one before, unless that moves the stages still."""
         moving = self.moving
         if moving is not None:
-            self.notify(f"still at work: {moving.command_line}", severity="warning", timeout=4)
+            self.notify(
+                f"still at work: {moving.command_line}", severity="warning", timeout=4, markup=False
+            )
         else:
             self.show(start_job(arguments, outlives=outlives))
 

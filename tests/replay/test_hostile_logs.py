@@ -1,0 +1,123 @@
+"""No text of a log becomes a path: a log comes from whoever wrote it."""
+
+import json
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from replay_courses import hold_a_star
+
+from fitctl.cli import main
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.document import design_json
+from fitctl.logging.exporting import export
+from fitctl.logging.reading import log_info
+from fitctl.logging.records import Event
+from tests.logged_simulation import LoggedSimulation
+
+PLANTED = "planted-by-the-log"
+
+
+@pytest.fixture(scope="module")
+def opened_paths():
+    """Every path that this process opens, lists or makes, from now on."""
+    paths, on = [], [True]
+
+    def audit(event, arguments):
+        if on[0] and event in {"open", "os.mkdir", "os.listdir", "os.scandir", "os.rename"}:
+            paths.append(str(arguments[0]))
+
+    sys.addaudithook(audit)  # cannot be removed again
+    yield paths
+    on[0] = False
+
+
+def log_of(path, course, change_rig=lambda document: None, change=lambda record: record, **run):
+    """A log of a run, whose description of itself is changed afterwards."""
+
+    class Changed(LoggedSimulation):
+        def go_on_in(self, path, rig=None):
+            document = json.loads(self.info.rig_json)
+            change_rig(document)
+            self.info = msgspec.structs.replace(self.info, rig_json=json.dumps(document), **run)
+            super().go_on_in(path, rig)
+
+    simulation = Changed(load_rig(default_rig_path()), path, change)
+    course(simulation)
+    simulation.writer.close()
+    return path
+
+
+def replay_and_report(log, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    ends = []
+    for arguments in (["replay", str(log)], ["report", str(log), "--out", str(folder / "out")]):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        ends.append(end.value.code)
+    return ends
+
+
+def test_a_loop_s_name_in_the_designs_is_no_path_to_write_to(tmp_path, monkeypatch):
+    victim = tmp_path / "victim" / "notebook.json"
+    victim.parent.mkdir()
+    victim.write_text("mine")
+    name = str(victim.with_suffix(""))
+
+    def change(document):
+        document["loops"][name] = {"vernier": {"controller": "any.json"}}
+
+    log = log_of(tmp_path / "run.mcap", lambda _: None, change, designs={name: "OWNED"})
+    replay_and_report(log, tmp_path, monkeypatch)
+
+    assert victim.read_text() == "mine"
+
+
+def test_no_file_that_a_log_names_is_opened(tmp_path, monkeypatch, opened_paths):
+    folder = tmp_path / PLANTED
+    folder.mkdir()
+    np.save(folder / "dark.npy", np.full((40, 40), 1000.0))
+    text = design_json(design_for(load_rig(default_rig_path()), "right"))
+    (folder / "design.json").write_text(text)
+
+    def change(document):
+        document["camera"]["dark_file"] = str(folder / "dark.npy")
+        document["loops"]["right"]["vernier"]["controller"] = str(folder / "design.json")
+        for table, key in (
+            ("logging", "folder"),
+            ("service", "folder"),
+            ("service", "keys_folder"),
+        ):
+            document[table][key] = str(folder / key)
+
+    def course(simulation):
+        hold_a_star(simulation)
+        to = folder / "design.json"
+        message = f"controller eq20 -> {to}"
+        simulation.log(Event(time_s=1.0, severity="info", source="right", message=message))
+
+    log = log_of(tmp_path / "run.mcap", course, change)
+    del opened_paths[:]
+    replay_and_report(log, tmp_path, monkeypatch)
+
+    assert [path for path in opened_paths if PLANTED in path] == []
+
+
+def test_a_topic_is_no_path_to_export_to(tmp_path, monkeypatch):
+    from fitctl.logging import schemas
+
+    topics = {**schemas.TOPICS, Event: "/../\x1b]0;x\x07\n/planted"}
+    with monkeypatch.context() as patched:
+        patched.setattr(schemas, "TOPICS", topics)
+        event = Event(time_s=1.0, severity="info", source="right", message="hello")
+        log = log_of(tmp_path / "run.mcap", lambda simulation: simulation.log(event))
+    topic = next(topic for topic in log_info(log).counts if "planted" in topic)
+
+    (file,) = export(log, tmp_path / "out", "csv", [topic])
+
+    assert file.parent == tmp_path / "out"
+    assert file.name.isprintable()
+    assert Path(file).exists()
