@@ -38,6 +38,7 @@ _MESSAGES_A_ROUND = 8
 _HANDSHAKES_A_ROUND = 4
 _LOOK_S = 0.25
 _HUNG_S = 10
+_NO_KEY = "revoked keys"  # all of them together, where messages are counted
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
 _NO_SUPERVISOR = Reply(accepted=False, text="the supervisor takes no commands just now; try again")
 _MOST_EVENTS = 100  # lines that wait for a supervisor that takes none
@@ -68,7 +69,7 @@ def admit(
     """What becomes of a message: it is passed on for its key (None if that was revoked), or turned back."""
     if key is None:
         return _REVOKED
-    accepted = intake.accept(key.name, payload, now_s)
+    accepted = intake.accept(key.name, key.role, payload, now_s)
     if isinstance(accepted, Reply):
         return accepted
     return Passed(name=key.name, role=key.role, address=address, payload=payload)
@@ -98,7 +99,7 @@ class Gateway:
         service = rig.service
         self._clock = clock
         self._alive = alive
-        self._intake = Intake(service.commands_per_s)
+        self._intake = Intake(service.commands_per_s, rig.loops)
         self._events: deque[tuple[Severity, str]] = deque(maxlen=_MOST_EVENTS)
         self._reported: dict[str, AllowedKey] | None = None
         self._encode = msgspec.msgpack.Encoder().encode
@@ -165,7 +166,9 @@ class Gateway:
         payload, now_s = bytes(parcel.payload.buffer), self._clock.now_s()
         admitted = admit(key, address, payload, self._intake, now_s)
         if isinstance(admitted, Reply):
-            self._answer(parcel, admitted)
+            name = _NO_KEY if key is None else key.name
+            if self._intake.answers_refusal(name, now_s):
+                self._answer(parcel, admitted)
         elif not self._send(self._encode((parcel.identity, parcel.tag)), admitted):
             self._answer(parcel, _NO_SUPERVISOR)
 
