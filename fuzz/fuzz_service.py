@@ -35,7 +35,7 @@ from fitctl.service.admission import Sender
 from fitctl.service.doors import Door
 from fitctl.service.envelope import Passed, Report, decode_envelope
 from fitctl.service.gateway import admit
-from fitctl.service.intake import Intake
+from fitctl.service.intake import Intake, Limit
 from fitctl.service.service import Service, Waiting
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.simulation import Simulation
@@ -120,7 +120,9 @@ def _service() -> tuple[Service, Simulation]:
 
 
 _SERVICE, _SIMULATION = _service()
-_INTAKE = Intake(_COMMANDS_PER_S)
+_INTAKE = Intake(_COMMANDS_PER_S, _SERVICE._supervisor.loops)
+# Every refusal is to be seen here.
+_SERVICE._intake._answers = _INTAKE._answers = Limit(_COMMANDS_PER_S, _COMMANDS_PER_S)
 
 
 def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name

@@ -13,7 +13,7 @@ from fitctl.processes import end_process, last_line, start_process
 
 END_S = 5.0
 _WELL_S = 10.0  # one that lived this long is started again at once
-_PATIENCE_S = 60.0
+PATIENCE_S = 60.0
 
 
 class Child:
@@ -31,6 +31,8 @@ class Child:
         What starting it again means, for people.
     note : callable
         Takes events.
+    patience_s : float
+        The longest wait before it is started again, when it dies again and again.
     """
 
     def __init__(
@@ -40,12 +42,14 @@ class Child:
         errors: Path,
         again: str,
         note: Callable[[Severity, str, str], None],
+        patience_s: float = PATIENCE_S,
     ) -> None:
         self.name = name
         self._arguments = arguments
         self._errors = errors
         self._again = again
         self._note = note
+        self._most_patience_s = patience_s
         self._patience_s = 0.0
         self._again_s = math.inf
         self._start()
@@ -69,7 +73,7 @@ class Child:
                 f"the {self.name} {how}{': ' + why if why else ''}; {self._again}"
                 + (f" in {self._patience_s:.0f} s" if self._patience_s else ""),
             )
-            self._patience_s = min(max(1.0, 2 * self._patience_s), _PATIENCE_S)
+            self._patience_s = min(max(1.0, 2 * self._patience_s), self._most_patience_s)
         if now_s >= self._again_s:
             try:
                 self._start()

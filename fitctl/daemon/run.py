@@ -24,7 +24,7 @@ from fitctl.controllers.dark import dark_bytes
 from fitctl.controllers.design.document import design_json
 from fitctl.controllers.design.own_process import design_in_own_process
 from fitctl.controllers.pair import Design
-from fitctl.daemon.children import Child
+from fitctl.daemon.children import PATIENCE_S, Child
 from fitctl.daemon.devices import rig_devices
 from fitctl.daemon.last_records import finish_log
 from fitctl.daemon.locks import only_master, only_supervisor
@@ -62,6 +62,7 @@ from fitctl.stages.realtime import (
 from fitctl.supervisor.supervisor import Supervisor
 
 _LEFT = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET, RUNNING_FILE)
+_GATEWAY_PATIENCE_S = 2.0  # without it nobody elsewhere can give a stop
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
@@ -204,13 +205,19 @@ def _children(
 ) -> list[Child]:
     """The recorder, and then what else the rig asks for."""
     beside = (
-        (True, "recorder", "record", "a new one begins a new file"),
-        (rig.service.metrics_port, "metrics server", "metrics", "a new one is started"),
-        (rig.service.tcp_address, "gateway", "gateway", "a new one is started"),
+        (True, "recorder", "record", "a new one begins a new file", PATIENCE_S),
+        (rig.service.metrics_port, "metrics server", "metrics", "a new one is started", PATIENCE_S),
+        (
+            rig.service.tcp_address,
+            "gateway",
+            "gateway",
+            "a new one is started",
+            _GATEWAY_PATIENCE_S,
+        ),
     )
     return [
-        Child(name, [command, *same_rig], folder / f"{command}.err", again, note)
-        for wanted, name, command, again in beside
+        Child(name, [command, *same_rig], folder / f"{command}.err", again, note, patience_s)
+        for wanted, name, command, again, patience_s in beside
         if wanted
     ]
 

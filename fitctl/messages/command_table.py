@@ -113,6 +113,7 @@ COMMANDS = (
     CommandRow(commands.SequenceReport, "a commander's key", logged=False),
     CommandRow(commands.RecorderReport, "the Unix socket", logged=False),
 )
+_LOGGED_OF_REFUSED = 100  # characters of its loop, of its values and of the answer
 ROWS = {row.make: row for row in COMMANDS}
 WORDS = {row.word: row for row in COMMANDS if row.word}
 
@@ -151,15 +152,16 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
 def command_record(
     command: AnyCommand, reply: Reply, sender: str, address: str, now_s: float
 ) -> CommandRecord:
-    """What the log keeps of a command and its answer."""
+    """What the log keeps of a command and its answer; of a refused one, the beginning of each text."""
     values = {name: getattr(command, name) for name in ROWS[type(command)].fields}
+    longest = None if reply.accepted else _LOGGED_OF_REFUSED
     return CommandRecord(
         time_s=now_s,
         sender=sender,
         address=address,
         command=type(command).__name__,
-        loop=command.loop,
-        values_json=msgspec.json.encode(values).decode(),
+        loop=command.loop[:longest],
+        values_json=msgspec.json.encode(values).decode()[:longest],
         accepted=reply.accepted,
-        text=reply.text,
+        text=reply.text[:longest],
     )

@@ -205,11 +205,12 @@ def decode_command(payload: bytes) -> AnyCommand | Reply:
     try:
         command = _decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        return Reply(accepted=False, text=f"not a command: {error}")
+        return Reply(accepted=False, text=f"not a command: {str(error)[:_QUOTED]}")
     if command.version != PROTOCOL_VERSION:
         text = f"this supervisor speaks version {PROTOCOL_VERSION}, not {command.version}"
         return Reply(accepted=False, text=text)
     return command
 
 
+_QUOTED = 200  # characters of an error, which may quote what came
 _decode: Callable[[bytes], AnyCommand] = msgspec.msgpack.Decoder(AnyCommand).decode

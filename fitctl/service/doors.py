@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import pwd
 import socket
+from collections.abc import Callable
 from typing import NamedTuple
 
 import zmq
@@ -37,10 +38,15 @@ class Door:
     ----------
     router : zmq.Socket
         As from :func:`router_socket`.
+    count : callable
+        Called with each frame that came over the connection.
     """
 
-    def __init__(self, router: zmq.Socket[bytes]) -> None:
+    def __init__(
+        self, router: zmq.Socket[bytes], count: Callable[[zmq.Frame], None] = lambda _: None
+    ) -> None:
         self.router = router
+        self._count = count
         self._frames: list[zmq.Frame] = []
 
     def receive(self, messages: int) -> list[Parcel]:
@@ -54,6 +60,8 @@ class Door:
                 frame = self.router.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 break
+            if self._frames:  # the first is the identity, which libzmq has put there
+                self._count(frame)
             # One more than there may be is kept, to tell that there are too many.
             self._frames = [*self._frames[:_FRAMES], frame]
             if not frame.more:

@@ -12,7 +12,7 @@ import os
 import resource
 import signal
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -36,8 +36,11 @@ _MOST_BYTES = 512 * 2**20
 _ROUND_MS = 5
 _MESSAGES_A_ROUND = 8
 _HANDSHAKES_A_ROUND = 4
-_LOOK_S = 0.25
+_DROPPED_A_ROUND = 200  # messages that are neither passed on nor answered
+_LOOK_S = 0.1
+_MOST_DROPPED_A_LOOK = 500  # of one key, before it is refused for a while
 _HUNG_S = 10
+_NO_KEY = "revoked keys"  # all of them together, where messages are counted
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
 _NO_SUPERVISOR = Reply(accepted=False, text="the supervisor takes no commands just now; try again")
 _MOST_EVENTS = 100  # lines that wait for a supervisor that takes none
@@ -47,7 +50,7 @@ Route = tuple[bytes, bytes]
 
 
 def be_modest() -> None:
-    """Give way to every other process of the instrument, and have a limit to memory.
+    """Give way to every other process of the instrument, limit its memory, and allow many open files.
 
     Of threads that exist already it speaks to this one alone, so it is for the beginning of a process.
     """
@@ -55,6 +58,8 @@ def be_modest() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard == resource.RLIM_INFINITY or hard > _MOST_BYTES:
         resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))  # each stranger is one for a while
 
 
 def show_life() -> None:
@@ -68,7 +73,7 @@ def admit(
     """What becomes of a message: it is passed on for its key (None if that was revoked), or turned back."""
     if key is None:
         return _REVOKED
-    accepted = intake.accept(key.name, payload, now_s)
+    accepted = intake.accept(key.name, key.role, payload, now_s)
     if isinstance(accepted, Reply):
         return accepted
     return Passed(name=key.name, role=key.role, address=address, payload=payload)
@@ -98,14 +103,17 @@ class Gateway:
         service = rig.service
         self._clock = clock
         self._alive = alive
-        self._intake = Intake(service.commands_per_s)
+        self._intake = Intake(service.commands_per_s, rig.loops)
+        self._unanswered: Counter[AllowedKey] = Counter()  # messages since the last look
         self._events: deque[tuple[Severity, str]] = deque(maxlen=_MOST_EVENTS)
         self._reported: dict[str, AllowedKey] | None = None
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode_route = msgspec.msgpack.Decoder(Route).decode
         self._context = zmq.Context()
         try:
-            self._keyed = KeyedDoor(rig, self._context, partial(self._report_event, "warning"))
+            self._keyed = KeyedDoor(
+                rig, self._context, partial(self._report_event, "warning"), clock
+            )
         except BaseException:
             self._context.destroy(linger=0)
             raise
@@ -135,6 +143,12 @@ class Gateway:
                 if now_s >= look_s:
                     self._alive()
                     self._keyed.refresh()
+                    for whose in self._keyed.end_excessive():
+                        self._intake.drop(whose, "far more than is read: its connection was ended")
+                    for key, messages in self._unanswered.items():
+                        if messages > _MOST_DROPPED_A_LOOK:
+                            self._keyed.ban(key)
+                    self._unanswered.clear()
                     for line in self._intake.dropped(now_s):
                         self._report_event("warning", line)
                     look_s = now_s + _LOOK_S
@@ -153,21 +167,29 @@ class Gateway:
 
     def _pass_commands(self) -> None:
         """Take some, as long as the supervisor takes them too; the rest waits with its sender."""
-        for _ in range(_MESSAGES_A_ROUND):
-            if not self._supervisor.poll(0, zmq.POLLOUT):
+        served = 0
+        for _ in range(_DROPPED_A_ROUND):
+            if served == _MESSAGES_A_ROUND or not self._supervisor.poll(0, zmq.POLLOUT):
                 return
             for parcel in self._keyed.door.receive(1):
-                self._receive(parcel)
+                served += self._receive(parcel)
 
-    def _receive(self, parcel: Parcel) -> None:
+    def _receive(self, parcel: Parcel) -> bool:
+        """Pass one message on, or answer it; false if it was only counted."""
         key = self._keyed.key_of(parcel.payload)
         address = frame_property(parcel.payload, "Peer-Address")
         payload, now_s = bytes(parcel.payload.buffer), self._clock.now_s()
         admitted = admit(key, address, payload, self._intake, now_s)
         if isinstance(admitted, Reply):
+            name = _NO_KEY if key is None else key.name
+            if not self._intake.answers_refusal(name, now_s):
+                if key is not None:
+                    self._unanswered[key] += 1
+                return False
             self._answer(parcel, admitted)
         elif not self._send(self._encode((parcel.identity, parcel.tag)), admitted):
             self._answer(parcel, _NO_SUPERVISOR)
+        return True
 
     def _pass_replies(self) -> None:
         for _ in range(QUEUED):

@@ -1,23 +1,46 @@
-"""What is turned back before anybody asks who may command: what is no command, and what is too much.
+"""What is rejected before anybody decides who may command: what is no command, and what exceeds a limit.
 
-The service and the gateway each have an intake; what they turn back is counted, and told now and then.
+The service and the gateway each have an intake. Each counts what it rejects and reports the counts every
+few seconds, so that a flood costs neither the loop its time nor the log its room.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 from typing import NamedTuple
 
 from fitctl.messages.commands import AnyCommand, Reply, Stop, decode_command
+from fitctl.messages.keys import Role
 
 _REPORT_PERIOD_S = 5.0
+# Of one person: what is rejected beyond these is counted, neither answered nor logged one by one.
+_ANSWERED_REFUSALS_PER_S = 20.0
+_LOGGED_REFUSALS_PER_S = 1.0
+_LOGGED_REFUSALS_AT_ONCE = 10.0
 
 
 class Accepted(NamedTuple):
-    """A command; a stop is taken even when it is one too many."""
+    """A command; a stop is accepted even when it exceeds the rate."""
 
     command: AnyCommand
     over_rate: bool
+
+
+class Limit:
+    """So many a second for each name, and so many at once (a token bucket)."""
+
+    def __init__(self, per_s: float, at_once: float) -> None:
+        self._per_s = per_s
+        self._at_once = at_once
+        self._buckets: dict[str, tuple[float, float]] = {}
+
+    def within(self, name: str, now_s: float) -> bool:
+        """Count one more; whether it is within the limit."""
+        left, since_s = self._buckets.get(name, (self._at_once, now_s))
+        left = min(self._at_once, left + (now_s - since_s) * self._per_s)
+        self._buckets[name] = (max(0.0, left - 1.0), now_s)
+        return left >= 1.0
 
 
 class Intake:
@@ -27,23 +50,33 @@ class Intake:
     ----------
     commands_per_s : float
         From one person; as many may come at once.
+    loops : collection of str
+        The rig's loops: a stop for another one is not exempt from the rate.
     """
 
-    def __init__(self, commands_per_s: float) -> None:
-        self._rate = commands_per_s
+    def __init__(self, commands_per_s: float, loops: Collection[str]) -> None:
+        self._stoppable = {"", *loops}
         self._too_many = Reply(
             accepted=False,
             text=f"more than {commands_per_s:g} commands a second; wait, then try again",
         )
-        self._buckets: dict[str, tuple[float, float]] = {}
+        self._commands = Limit(commands_per_s, commands_per_s)
+        self._answers = Limit(_ANSWERED_REFUSALS_PER_S, _ANSWERED_REFUSALS_PER_S)
+        self._records = Limit(_LOGGED_REFUSALS_PER_S, _LOGGED_REFUSALS_AT_ONCE)
         self._dropped: Counter[tuple[str, str]] = Counter()
         self._report_s = 0.0
 
-    def accept(self, name: str, payload: bytes, now_s: float) -> Accepted | Reply:
-        """Somebody's message: the command in it, or why it is turned back."""
+    def accept(self, name: str, role: Role, payload: bytes, now_s: float) -> Accepted | Reply:
+        """Decode somebody's message: the command in it, or why it is rejected.
+
+        Only a stop that will be obeyed exceeds the rate: from somebody who may stop, for a loop that exists.
+        """
         command = decode_command(payload)
-        within_rate = self.within_rate(name, now_s)
-        if not within_rate and not isinstance(command, Stop):
+        within_rate = self._commands.within(name, now_s)
+        stops = (
+            isinstance(command, Stop) and role == "commander" and command.loop in self._stoppable
+        )
+        if not within_rate and not stops:
             self.drop(name, "over the rate limit")
             return self._too_many
         if isinstance(command, Reply):
@@ -51,19 +84,26 @@ class Intake:
             return command
         return Accepted(command, not within_rate)
 
-    def within_rate(self, name: str, now_s: float) -> bool:
-        """Count one message; whether its sender may send so many."""
-        left, since_s = self._buckets.get(name, (self._rate, now_s))
-        left = min(self._rate, left + (now_s - since_s) * self._rate)
-        self._buckets[name] = (max(0.0, left - 1.0), now_s)
-        return left >= 1.0
+    def answers_refusal(self, name: str, now_s: float) -> bool:
+        """Whether one more refusal of somebody's message is answered; otherwise it is counted."""
+        if self._answers.within(name, now_s):
+            return True
+        self.drop(name, "refused without an answer")
+        return False
+
+    def logs_refusal(self, name: str, now_s: float) -> bool:
+        """Whether one more refusal of somebody's command gets a record; otherwise it is counted."""
+        if self._records.within(name, now_s):
+            return True
+        self.drop(name, "refused without a record of its own")
+        return False
 
     def drop(self, name: str, why: str) -> None:
-        """Count one message that is not taken."""
+        """Count one message that is rejected."""
         self._dropped[name, why] += 1
 
     def dropped(self, now_s: float) -> list[str]:
-        """What is to be told of it now; nothing if something was told a moment ago."""
+        """The counts that are due for a report; none if the last report was a moment ago."""
         if not self._dropped or now_s < self._report_s:
             return []
         self._report_s = now_s + _REPORT_PERIOD_S

@@ -11,13 +11,21 @@ from contextlib import suppress
 import zmq
 from zmq.utils import z85
 
+from fitctl.clock import Clock
 from fitctl.config import ConfigError, Rig
 from fitctl.messages.endpoints import keep_alive, tcp_endpoint
 from fitctl.messages.keys import AllowedKey, allowed_keys, keys_signature, server_pair
 from fitctl.service.doors import Door, frame_property, publisher_socket, router_socket
+from fitctl.service.intake import Limit
+from fitctl.service.traffic import Traffic
 
 _HANDSHAKE_MS = 5000
 _ZAP_FRAMES = 7
+_MOST_UNREAD_COMMANDS_BYTES = 256 * 1024  # some sixty of the longest commands
+_MOST_FROM_SUBSCRIBER_BYTES = 64 * 1024  # one that is ours sends half a kilobyte, once
+_CONNECTIONS_PER_S = 10.0  # of one key
+_CONNECTIONS_AT_ONCE = 50.0
+_BANNED_S = 30.0
 _FREED_S = 3.0  # a gateway whose supervisor was killed has let go of its ports by then
 
 
@@ -30,7 +38,8 @@ class KeyedDoor:
     context : zmq.Context
         It answers who may come in for all of its sockets (ZAP).
     report : callable
-        Hears of key files that cannot be used.
+        Hears of key files that cannot be used, and of keys that are refused for a time.
+    clock : Clock
 
     Attributes
     ----------
@@ -46,12 +55,25 @@ class KeyedDoor:
     """
 
     def __init__(
-        self, rig: Rig, context: zmq.Context[zmq.Socket[bytes]], report: Callable[[str], None]
+        self,
+        rig: Rig,
+        context: zmq.Context[zmq.Socket[bytes]],
+        report: Callable[[str], None],
+        clock: Clock,
     ) -> None:
         self.allowed: dict[str, AllowedKey] = {}
         self._rig = rig
         self._context = context
         self._report = report
+        self._clock = clock
+        self._connections = Limit(_CONNECTIONS_PER_S, _CONNECTIONS_AT_ONCE)
+        self._banned_until_s: dict[str, float] = {}  # by public key
+        self._traffic = Traffic(
+            {
+                rig.service.command_port: _MOST_UNREAD_COMMANDS_BYTES,
+                rig.service.telemetry_port: _MOST_FROM_SUBSCRIBER_BYTES,
+            }
+        )
         self._pair = server_pair(rig)
         self._signature: object = None
         self._publisher: zmq.Socket[bytes] | None = None
@@ -60,7 +82,7 @@ class KeyedDoor:
         self.zap = context.socket(zmq.REP)
         self.zap.bind("inproc://zeromq.zap.01")
         router = self._keyed(router_socket(context))
-        self.door = Door(router)
+        self.door = Door(router, self._count)
         self._look()
         try:
             self._bind(router, rig.service.command_port)
@@ -81,10 +103,47 @@ class KeyedDoor:
                 key = z85.encode(asked[6]).decode()
             if key not in self.allowed:
                 self._look()  # it may be quite new; libzmq's clients do not ask twice
-            known = key in self.allowed
-            status = (b"200", b"OK") if known else (b"400", b"this key is not allowed")
-            user = key.encode() if known else b""
+            if key not in self.allowed:
+                status, user = (b"400", b"this key is not allowed"), b""
+            elif self._may_connect(key):
+                status, user = (b"200", b"OK"), key.encode()
+            else:  # which libzmq's clients try again
+                status, user = (b"300", b"too many connections of this key"), b""
             self.zap.send_multipart([b"1.0", asked[1], *status, user, b""])
+
+    def _may_connect(self, key: str) -> bool:
+        now_s = self._clock.now_s()
+        within_limit = self._connections.within(key, now_s)
+        return within_limit and now_s >= self._banned_until_s.get(key, 0.0)
+
+    def end_excessive(self) -> list[str]:
+        """End connections that send far more than anybody reads, and refuse their keys for a while.
+
+        Returns
+        -------
+        list of str
+            Whose they were: the name of a key, or the address where none is known.
+        """
+        whose = []
+        for public, address in self._traffic.end_excessive():
+            key = self.allowed.get(public)
+            whose.append(address if key is None else key.name)
+            if key is not None:
+                self.ban(key)
+        return whose
+
+    def ban(self, key: AllowedKey) -> None:
+        """Refuse new connections of a key for a while; those that it has may stay."""
+        now_s = self._clock.now_s()
+        if now_s >= self._banned_until_s.get(key.public, 0.0):
+            self._banned_until_s[key.public] = now_s + _BANNED_S
+            self._report(
+                f"the key {key.name} sends far more than is read; it cannot connect anew for "
+                f"{_BANNED_S:.0f} s. If this is not a mistake of a program: fitctl keys revoke {key.name}"
+            )
+
+    def _count(self, frame: zmq.Frame) -> None:
+        self._traffic.count(frame, frame_property(frame, "User-Id"))
 
     def key_of(self, payload: zmq.Frame) -> AllowedKey | None:
         """Whose message this is; None if the key has been revoked since it connected."""
@@ -141,6 +200,7 @@ class KeyedDoor:
         bare.curve_secretkey = self._pair.secret.encode()
         bare.setsockopt(zmq.ZAP_DOMAIN, b"fitctl")
         bare.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
+        bare.setsockopt(zmq.RCVHWM, 0)  # never stop input: see fitctl.service.traffic
         keep_alive(bare)
         return bare
 

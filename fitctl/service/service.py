@@ -95,7 +95,7 @@ class Service(threading.Thread):
         self._replies: SimpleQueue[tuple[Waiting, Reply, str | None]] = SimpleQueue()
         self._stops: dict[str, deque[Waiting]] = {}  # by loop: who waits with one that is under way
         self._encode = msgspec.msgpack.Encoder().encode
-        self._intake = Intake(settings.commands_per_s)
+        self._intake = Intake(settings.commands_per_s, supervisor.loops)
         self._admission = Admission(settings.lease_s)
         self._keys: dict[str, AllowedKey] = {}  # by name, as the gateway last reported
         self._context = zmq.Context()
@@ -208,9 +208,9 @@ class Service(threading.Thread):
 
     def _receive(self, waiting: Waiting, payload: bytes) -> None:
         sender, now_s = waiting.sender, self._clock.now_s()
-        accepted = self._intake.accept(sender.name, payload, now_s)
+        accepted = self._intake.accept(sender.name, sender.role, payload, now_s)
         if isinstance(accepted, Reply):
-            self._answer(waiting, accepted)
+            self._refuse(waiting, accepted, now_s)
         elif accepted.over_rate and self._joins_a_stop(waiting, accepted.command):
             self._intake.drop(sender.name, "stops besides one under way")
         else:
@@ -218,7 +218,7 @@ class Service(threading.Thread):
 
     def _joins_a_stop(self, waiting: Waiting, command: AnyCommand) -> bool:
         """Whether this stop, of too many, waits for the answer to one that is under way."""
-        if waiting.sender.role != "commander" or command.loop not in self._stops:
+        if command.loop not in self._stops:
             return False
         self._stops[command.loop].append(waiting)
         return True
@@ -229,7 +229,10 @@ class Service(threading.Thread):
         refusal = self._admission.refusal(sender, command, now_s)
         match command:
             case _ if refusal:
-                self._answer_here(waiting, command, Reply(accepted=False, text=refusal))
+                reply = Reply(accepted=False, text=refusal)
+                if ROWS[type(command)].logged and self._intake.logs_refusal(sender.name, now_s):
+                    self._record(waiting, command, reply, now_s)
+                self._refuse(waiting, reply, now_s)
             case Status():
                 text = self._status_text()
                 self._answer_here(waiting, command, Reply(accepted=True, text=text))
@@ -265,11 +268,17 @@ class Service(threading.Thread):
     def _answer_here(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
         """Answer what does not reach the supervisor, and keep who asked."""
         if ROWS[type(command)].logged:
-            sender, now_s = waiting.sender, self._clock.now_s()
-            self._supervisor.leave(
-                command_record(command, reply, sender.name, sender.address, now_s)
-            )
+            self._record(waiting, command, reply, self._clock.now_s())
         self._answer(waiting, reply)
+
+    def _refuse(self, waiting: Waiting, reply: Reply, now_s: float) -> None:
+        """Answer with a refusal, unless this sender has had too many."""
+        if self._intake.answers_refusal(waiting.sender.name, now_s):
+            self._answer(waiting, reply)
+
+    def _record(self, waiting: Waiting, command: AnyCommand, reply: Reply, now_s: float) -> None:
+        sender = waiting.sender
+        self._supervisor.leave(command_record(command, reply, sender.name, sender.address, now_s))
 
     def _status_text(self) -> str:
         return ", ".join(

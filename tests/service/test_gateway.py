@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 
 import msgspec
 import pytest
@@ -15,6 +16,7 @@ from served import Served, rig_in, until
 
 from fitctl.clock import VirtualClock
 from fitctl.config import ConfigError
+from fitctl.logging.records import CommandRecord
 from fitctl.messages.commands import Hold, Status, Stop, TakeOver
 from fitctl.messages.endpoints import (
     GATEWAY_SOCKET,
@@ -230,3 +232,45 @@ def test_without_an_address_there_are_neither_ports_nor_keys(tmp_path):
     check_keyed_door(rig_in(tmp_path))
 
     assert not (tmp_path / "keys").exists()
+
+
+# ---------------------------------------------------------------- floods by an allowed key
+
+
+@pytest.mark.parametrize("loop", ["", "right", "x" * 3900], ids=["all", "one", "nonsense"])
+def test_a_viewers_flood_of_stops_costs_the_log_a_few_short_records(served, loop):
+    sent, key = 2000, served.key("viewer", "viewer")
+    begun_s = time.monotonic()
+    with keyed_dealer(key) as dealer:
+        for _ in range(sent):
+            dealer.send_multipart([b"tag", msgspec.msgpack.encode(Stop(loop=loop))])
+        until(lambda: counted(served, "viewer: ", "over the rate limit") >= 100)
+    lasted_s = time.monotonic() - begun_s
+
+    of_viewer = [
+        record
+        for record in served.records
+        if isinstance(record, CommandRecord) and record.sender == "viewer"
+    ]
+    assert 1 <= len(of_viewer) <= 10 + lasted_s
+    assert max(len(msgspec.msgpack.encode(record)) for record in of_viewer) < 600
+    assert len([told for told in served.events() if "viewer: " in told]) <= 4 * (1 + lasted_s / 5)
+    assert served.simulation.supervisor.loops["right"].mode.name == "OFF"
+    assert served.person("anna").send(Stop()).accepted
+
+
+def keyed_dealer(key):
+    """A client that sends as fast as it can."""
+    dealer = zmq.Context.instance().socket(zmq.DEALER)
+    dealer.curve_serverkey = key.server_public.encode()
+    dealer.curve_publickey, dealer.curve_secretkey = key.public.encode(), key.secret.encode()
+    dealer.setsockopt(zmq.LINGER, 0)
+    dealer.setsockopt(zmq.SNDTIMEO, 20_000)
+    dealer.connect(tcp_endpoint(key.host, key.command_port))
+    return dealer
+
+
+def counted(served, whose, why):
+    """How many messages the events say were rejected."""
+    lines = [told for told in served.events() if told.startswith(whose) and told.endswith(why)]
+    return sum(int(line.removeprefix(whose).split(" ")[0]) for line in lines)

@@ -6,58 +6,80 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fitctl.messages.commands import Reply, Status, Stop
-from fitctl.service.intake import Accepted, Intake
+from fitctl.service.intake import Accepted, Intake, Limit
 
 STATUS, STOP = msgspec.msgpack.encode(Status()), msgspec.msgpack.encode(Stop())
 
 
 @pytest.fixture
 def intake():
-    return Intake(commands_per_s=10.0)
+    return Intake(10.0, ["right"])
 
 
 @given(st.lists(st.floats(0.0, 0.5), max_size=200))
 def test_no_more_come_in_than_the_rate_and_one_second_at_once(pauses_s):
-    intake, now_s, taken = Intake(commands_per_s=10.0), 0.0, 0
+    limit, now_s, taken = Limit(10.0, 10.0), 0.0, 0
     for pause_s in pauses_s:
         now_s += pause_s
-        taken += intake.within_rate("anna", now_s)
+        taken += limit.within("anna", now_s)
 
     assert taken <= 10 * (now_s + 1) + 1e-6
 
 
-def test_one_persons_flood_takes_nothing_from_another(intake):
+def test_one_persons_flood_takes_nothing_from_another():
+    limit = Limit(10.0, 10.0)
     for _ in range(100):
-        intake.within_rate("anna", 0.0)
+        limit.within("anna", 0.0)
 
-    assert not intake.within_rate("anna", 0.0)
-    assert intake.within_rate("bob", 0.0)
+    assert not limit.within("anna", 0.0)
+    assert limit.within("bob", 0.0)
 
 
 def test_a_stop_is_taken_even_when_it_is_one_too_many(intake):
-    taken = [intake.accept("anna", STATUS, 0.0) for _ in range(11)]
+    taken = [intake.accept("anna", "commander", STATUS, 0.0) for _ in range(11)]
 
     assert taken[:10] == [Accepted(Status(), over_rate=False)] * 10
     assert taken[10].text.startswith("more than 10 commands a second")
-    assert intake.accept("anna", STOP, 0.0) == Accepted(Stop(), over_rate=True)
+    assert intake.accept("anna", "commander", STOP, 0.0) == Accepted(Stop(), over_rate=True)
+
+
+@pytest.mark.parametrize(
+    ("role", "loop"), [("viewer", ""), ("viewer", "right"), ("commander", "no such loop")]
+)
+def test_a_stop_that_will_not_be_obeyed_is_limited_as_any_command(intake, role, loop):
+    stop = msgspec.msgpack.encode(Stop(loop=loop))
+    replies = [intake.accept("anna", role, stop, 0.0) for _ in range(12)]
+
+    assert [isinstance(reply, Reply) for reply in replies] == [False] * 10 + [True] * 2
+
+
+def test_refusals_beyond_a_limit_are_neither_answered_nor_logged_but_counted(intake):
+    answered = sum(intake.answers_refusal("anna", 0.0) for _ in range(100))
+    logged = sum(intake.logs_refusal("anna", 0.0) for _ in range(100))
+
+    assert (answered, logged) == (20, 10)
+    assert intake.dropped(0.0) == [
+        "anna: 80 messages, refused without an answer",
+        "anna: 90 messages, refused without a record of its own",
+    ]
 
 
 @given(st.binary(max_size=100))
 def test_whatever_comes_is_taken_or_told_why_not(payload):
-    taken = Intake(commands_per_s=10.0).accept("anna", payload, 0.0)
+    taken = Intake(10.0, ["right"]).accept("anna", "commander", payload, 0.0)
 
     assert isinstance(taken, Accepted) or (isinstance(taken, Reply) and not taken.accepted)
 
 
 def test_what_was_turned_back_is_told_by_whose_it_was_and_not_too_often(intake):
     for _ in range(13):
-        intake.accept("anna", STATUS, 0.0)
-    intake.accept("bob", b"garbage", 0.0)
+        intake.accept("anna", "commander", STATUS, 0.0)
+    intake.accept("bob", "viewer", b"garbage", 0.0)
 
     assert intake.dropped(0.0) == [
         "anna: 3 messages, over the rate limit",
         "bob: 1 messages, no commands",
     ]
-    intake.accept("bob", b"garbage", 1.0)
+    intake.accept("bob", "viewer", b"garbage", 1.0)
     assert intake.dropped(1.0) == []
     assert intake.dropped(10.0) == ["bob: 1 messages, no commands"]

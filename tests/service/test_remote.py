@@ -120,16 +120,31 @@ def test_where_nobody_listens_a_client_says_what_to_look_at(served):
         served.client_of(key).send(Status(), timeout_s=0.2)
 
 
-def test_without_a_key_there_is_neither_answer_nor_telemetry(served):
+def bare(_one):
+    """No security at all."""
+
+
+def with_a_password(one):
+    one.plain_username, one.plain_password = b"anna", b"anna"
+
+
+def with_an_unknown_pair(one):
+    one.curve_publickey, one.curve_secretkey = zmq.curve_keypair()
+    one.curve_serverkey = zmq.curve_keypair()[0]
+
+
+@pytest.mark.parametrize("secured", [bare, with_a_password, with_an_unknown_pair])
+def test_without_a_key_there_is_neither_answer_nor_telemetry(served, secured):
     service = served.rig.service
     with zmq.Context() as context:
         dealer, subscriber = context.socket(zmq.DEALER), context.socket(zmq.SUB)
-        for bare, port in (
+        for stranger, port in (
             (dealer, service.command_port),
             (subscriber, service.telemetry_port),
         ):
-            bare.setsockopt(zmq.LINGER, 0)
-            bare.connect(tcp_endpoint("127.0.0.1", port))
+            secured(stranger)
+            stranger.setsockopt(zmq.LINGER, 0)
+            stranger.connect(tcp_endpoint("127.0.0.1", port))
         subscriber.subscribe(b"")
         dealer.send_multipart([b"tag", msgspec.msgpack.encode(Stop())])
 
