@@ -9,6 +9,7 @@ from typer.core import TyperCommand
 
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, require_loop, rig_of
 from fitctl.commands.shared.supervisor import connect, send_and_print, send_to_all
 from fitctl.messages.command_table import WORDS, command_of
@@ -45,7 +46,7 @@ def send(
     if remote is None and named_rig(rig) is None and not overrides and isinstance(wanted, Stop):
         running = running_rigs()
         if len(running) > 1:
-            typer.echo(f"send: {len(running)} supervisors run; stopping all of them", err=True)
+            say(f"send: {len(running)} supervisors run; stopping all of them", err=True)
             raise typer.Exit(send_to_all(running, wanted, "send"))
     if remote is None and loop and (named_rig(rig) or overrides):
         require_loop("send", rig_of(named_rig(rig), overrides), loop)

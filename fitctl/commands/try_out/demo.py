@@ -61,10 +61,12 @@ def demo(
         try:
             with demos.instrument(path, overrides, seed) as running:
                 beside = _beside(settings, path, running)
-                typer.echo(beside, err=True, nl=bool(beside))
+                if beside:
+                    say(beside, err=True)
                 if console:
                     status = _demo_with_console(path, overrides, running)
-                    typer.echo(beside, err=True, nl=bool(beside))  # the console was drawn over it
+                    if beside:  # the console was drawn over it
+                        say(beside, err=True)
                 else:
                     status = _demo_headless(settings, running, duration, as_json=as_json)
         except (demos.DemoError, ConnectionError) as error:
