@@ -84,7 +84,7 @@ class Child:
                     self.name,
                     f"the {self.name} cannot be started: {error}; again in {max(1.0, self._patience_s):.0f} s",
                 )
-                self._patience_s = min(max(1.0, 2 * self._patience_s), PATIENCE_S)
+                self._patience_s = min(max(1.0, 2 * self._patience_s), self._most_patience_s)
 
     @property
     def running(self) -> bool:
