@@ -234,7 +234,7 @@ def test_keep_marks_and_unmarks(log, whole):
     ("arguments", "said"),
     [
         (["info", "none.mcap"], "none.mcap: cannot be opened: No such file"),
-        (["info", "."], ".: cannot be opened: Is a directory"),
+        (["info", "."], ".: is not a regular file"),
         (["verify", "TEXT"], "is not an MCAP log"),
         (["recover", "TEXT"], "is not an MCAP log"),
         (["recover", "."], ".: cannot be opened: Is a directory"),
