@@ -32,7 +32,7 @@ def of_tutorial(found):
 
 @pytest.fixture
 def place(tmp_path):
-    """An empty folder, and an environment in which no other instrument of this user is met."""
+    """An empty folder, and an environment that names the rig: other tests' supervisors run, too."""
     program = tmp_path / "bin" / "fitctl"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fitctl "$@"\n')
@@ -40,6 +40,7 @@ def place(tmp_path):
     (tmp_path / "work").mkdir()
     environment = os.environ | {
         "PATH": f"{program.parent}:{os.environ['PATH']}",
+        "FITCTL_RIG": str(default_rig_path()),
         "TERM": "xterm-256color",
         "COLUMNS": "120",
         "LINES": "40",
