@@ -47,6 +47,15 @@ def end(process, number=signal.SIGTERM, timeout_s=20.0):
         raise
 
 
+def absent_devices():
+    """Addresses of the mock rig's devices where nothing listens, and which no other test's supervisor has."""
+    return {
+        "loops.right.siderostat.device.channel": f"socket://127.0.0.1:{free_port()}",
+        "loops.right.fsm.dac.port": free_port(),
+        "loops.right.fsm.piezo.port": f"socket://127.0.0.1:{free_port()}",
+    }
+
+
 class Rig:
     """Mock testbed and supervisor of a test, each of which the test may kill and start again."""
 

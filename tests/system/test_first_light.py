@@ -269,7 +269,9 @@ def test_send_gives_commands_from_a_shell(rig):
             "send", command, *rig.common, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         output, error = process.communicate(timeout=30)
-        return process.returncode, (output + error).strip()
+        which, *refusal = error.splitlines()
+        assert which == f"rig fit-mock: {rig.file}"
+        return process.returncode, "\n".join([*output.splitlines(), *refusal])
 
     assert send("status") == (0, "right OFF")
     code, text = send("acquire")

@@ -21,7 +21,7 @@ from fitctl.messages.endpoints import tcp_endpoint
 from fitctl.messages.keys import new_key
 from fitctl.processes import rig_arguments
 
-from .conftest import START_S, Rig
+from .conftest import START_S, Rig, absent_devices
 
 _HEARTBEAT_MS = 2
 _ROUNDS = 40
@@ -32,7 +32,7 @@ def rig(tmp_path_factory):
     """One without devices, in OFF, with keys for anna and bob, and a client of anna's."""
     folder = tmp_path_factory.mktemp("gateway")
     rig = Rig(folder)
-    rig.endpoints = {}
+    rig.endpoints = absent_devices()
     rig.settings += [
         "interlocks.disk_space.low=0.0",
         "service.tcp_address=127.0.0.1",
@@ -158,7 +158,8 @@ def test_a_port_that_somebody_else_has_is_one_line_and_status_2(rig, tmp_path):
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        changed = [f"service.command_port={port}", f"service.folder={tmp_path / 's'}"]
+        devices = [f"{key}={value}" for key, value in absent_devices().items()]
+        changed = [f"service.command_port={port}", f"service.folder={tmp_path / 's'}", *devices]
         options = rig_arguments(rig.file, [*rig.settings, *changed])
         done = subprocess.run(
             [sys.executable, "-m", "fitctl", "run", *options],

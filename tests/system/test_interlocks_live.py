@@ -4,7 +4,7 @@ import pytest
 
 from fitctl.messages.commands import Reset
 
-from .conftest import Rig
+from .conftest import Rig, absent_devices
 
 
 @pytest.fixture
@@ -12,7 +12,7 @@ def supervisor(tmp_path):
     """One that asks for more room on the disk than there is; it needs no devices to say so."""
     rig = Rig(tmp_path)
     rig.settings.append("interlocks.disk_space.low=1e18")
-    rig.endpoints = {}
+    rig.endpoints = absent_devices()
     try:
         rig.start_supervisor()
         yield rig

@@ -13,7 +13,7 @@ from fitctl.logging.reading import log_info, read_records
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Shutdown
 
-from .conftest import START_S, end, fitctl
+from .conftest import START_S, absent_devices, end, fitctl
 
 pytestmark = pytest.mark.timeout(180)
 HELD_S = 3.0
@@ -27,6 +27,7 @@ def run_with_held_recorder(tmp_path):
         "run",
         *("--rig", default_rig_path()),
         *("--set", f"logging.folder={tmp_path / 'logs'}"),
+        *(part for key, value in absent_devices().items() for part in ("--set", f"{key}={value}")),
         *("--set", f"service.folder={sockets}"),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -17,14 +17,14 @@ from served import free_port
 
 from fitctl.messages.commands import Stop
 
-from .conftest import START_S, Rig, end, fitctl
+from .conftest import START_S, Rig, absent_devices, end, fitctl
 
 
 @pytest.fixture
 def supervisor(tmp_path):
     """One without devices: OFF, recording, and well."""
     rig = Rig(tmp_path)
-    rig.endpoints = {}
+    rig.endpoints = absent_devices()
     rig.metrics_port = free_port()
     rig.settings += [f"service.metrics_port={rig.metrics_port}", "interlocks.disk_space.low=0.0"]
     try:
@@ -112,7 +112,7 @@ def test_watching_goes_on_without_a_supervisor_ends_with_ctrl_c_and_with_its_pip
     assert "SAFE" in unread.stdout.readline()
     unread.stdout.close()
     assert unread.wait(START_S) == 0
-    assert unread.stderr.read() == ""
+    assert unread.stderr.read() == f"rig fit-mock: {supervisor.file}\n"
     unread.stderr.close()
 
 
