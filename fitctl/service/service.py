@@ -272,8 +272,9 @@ class Service(threading.Thread):
         self._answer(waiting, reply)
 
     def _refuse(self, waiting: Waiting, reply: Reply, now_s: float) -> None:
-        """Answer with a refusal, unless this sender has had too many."""
-        if self._intake.answers_refusal(waiting.sender.name, now_s):
+        """Answer with a refusal, unless a sender elsewhere has had too many."""
+        sender = waiting.sender
+        if sender.is_local or self._intake.answers_refusal(sender.name, now_s):
             self._answer(waiting, reply)
 
     def _record(self, waiting: Waiting, command: AnyCommand, reply: Reply, now_s: float) -> None:

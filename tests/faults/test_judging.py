@@ -18,11 +18,14 @@ def place(time_s, motor_rad=0.0, stack_v=BIAS):
     return Place(time_s, [motor_rad, 0.0], stack_v)
 
 
-def rig(*places, changes=(), numbers=()):
+def rig(*places, changes=(), numbers=(), skipped=0):
     """A rig as far as judges look at it."""
     message = SimpleNamespace(
         mode_changes=[SimpleNamespace(time_s=t, target=mode) for t, mode in changes],
-        ticks=[SimpleNamespace(number=number) for number in numbers],
+        ticks=[
+            SimpleNamespace(number=number, frames_skipped=skipped * (number == max(numbers)))
+            for number in numbers
+        ],
         timing=[],
     )
     return SimpleNamespace(places=list(places), telemetry=[message])
@@ -52,10 +55,11 @@ def test_only_modes_of_rest_are_judged():
         stood_still(rig(*moving, changes=[(0.5, "SAFE")]), ENTRY, struck_s=0.0, deaf=False)
 
 
-def test_frames_without_a_tick_are_excused_by_a_stall_only():
+def test_frames_without_a_tick_are_excused_by_a_stall_or_counted_as_skipped():
     stalled = Stalls()
     gap = rig(numbers=[1, 2, 3, 10, 11])
     with pytest.raises(AssertionError, match="6 frames without a tick"):
         ticks_went_on(gap, stalled)
+    ticks_went_on(rig(numbers=[1, 2, 3, 10, 11], skipped=6), stalled)
     stalled.total_s = 0.12
     ticks_went_on(gap, stalled)
