@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Generic, Protocol, TypeVar
 
@@ -29,7 +30,7 @@ _Link = TypeVar("_Link", bound=_Closable)
 _Settings = TypeVar("_Settings", bound=Settings)
 
 
-class LinkedAmplifiers(Generic[_Link, _Settings]):
+class LinkedAmplifiers(ABC, Generic[_Link, _Settings]):
     """Both axes' amplifiers on one link, which is None while they are closed.
 
     Parameters
@@ -46,9 +47,9 @@ class LinkedAmplifiers(Generic[_Link, _Settings]):
         self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         self._link: _Link | None = None
 
+    @abstractmethod
     def disable(self) -> None:
         """Take power from both axes."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Disable if possible and disconnect; safe to call twice and after a failure."""

@@ -21,7 +21,7 @@ _WANTED: dict[str, Literal["run", "pause", "stop"]] = {
 
 
 class SequenceBoard:
-    """What the newest sequence detail; at most one is under way.
+    """The newest sequence's status; at most one sequence is under way.
 
     Reports and orders come from the loop's thread; :meth:`status` may be asked from any.
 
