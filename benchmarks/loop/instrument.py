@@ -17,7 +17,7 @@ from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.bound import bound
 from fitctl.logging.records import Tick
-from fitctl.mocks.bench import ResidualQuestion, ask_bench
+from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 
 LOOP = "right"
 _SETTLE_S = 3.0
@@ -85,7 +85,7 @@ def _true_residual_px(rig: Rig, running: demo.Instrument, ticks: list[Tick]) -> 
     target, end_s = rig.loops[LOOP].target_px, ticks[-1].mid_exposure_s
     start_s = max(ticks[0].mid_exposure_s, end_s - demo.JUDGED_S)
     question = ResidualQuestion(LOOP, start_s, end_s, target.az, target.el)
-    residual = ask_bench(running.bench_port, question)
+    residual = ask_bench(running.bench_port, question, Residual)
     return max(residual.az_rms_px, residual.el_rms_px)
 
 
