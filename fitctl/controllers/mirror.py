@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Fsm
-from fitctl.model.hysteresis import inverse_volts, play, raised_displacement
+from fitctl.model.hysteresis import (
+    hysteresis_output,
+    inverse_model,
+    inverse_state,
+    play,
+    raised_displacement,
+)
 from fitctl.model.optics import mirror_from_stacks, stack_matrix
 
 Floats = NDArray[np.float64]
@@ -42,6 +48,10 @@ class Mirror:
             self.gains_m_per_v = np.asarray(known.gains_m_per_v)
             # Where stacks rest that came up from zero to their bias: the mirror's zero.
             self.zero_m = raised_displacement(fsm.bias_v, self.half_width_v, self.gains_m_per_v)
+            self._slopes_m_per_v = np.cumsum(self.gains_m_per_v, axis=-1)
+            self._inverse_half_m, self._inverse_v_per_m = inverse_model(
+                self.half_width_v, self.gains_m_per_v
+            )
             self._zero_rad = mirror_from_stacks(self.zero_m, fsm.stack_radius_m)
             per_m = mirror_from_stacks(np.eye(3), fsm.stack_radius_m).T
             self._rad_per_play_v = (per_m[..., None] * self.gains_m_per_v).reshape(2, -1)
@@ -57,6 +67,10 @@ class Mirror:
         self.stack_v = np.array(stack_v, dtype=float)
         if self.hysteresis_known:
             self._plays_v = play(self._plays_v, self.stack_v[:, None], self.half_width_v)
+            # Here, after the D/A has its voltages, and not between a frame and them.
+            self._inverse_plays_m = inverse_state(
+                self._plays_v, self.gains_m_per_v, self._slopes_m_per_v
+            )
 
     @property
     def angles_rad(self) -> Floats:
@@ -82,8 +96,9 @@ class Mirror:
         By Eq. 1, or by the exact inverse of the identified hysteresis where asked for and known.
         """
         if hysteresis_inverse and self.hysteresis_known:
-            wanted_m = self.zero_m + self.stack_matrix @ mirror_rad
-            volts = inverse_volts(self._plays_v, self.half_width_v, self.gains_m_per_v, wanted_m)
+            wanted_m = self.zero_m + self.stack_matrix.dot(mirror_rad)
+            plays_m = play(self._inverse_plays_m, wanted_m[:, None], self._inverse_half_m)
+            volts = hysteresis_output(plays_m, self._inverse_v_per_m)
         else:
             volts = self._stack_v_per_rad.dot(mirror_rad) + self._fsm.bias_v  # `@` takes longer
         full_scale_v = self._fsm.dac.full_scale_v

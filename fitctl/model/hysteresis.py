@@ -144,35 +144,21 @@ def inverse_model(half_width_v: Floats, gains: Floats) -> tuple[Floats, Floats]:
     return half_width_m, np.diff(1.0 / slopes, prepend=0.0)
 
 
-def inverse_state(plays_v: Floats, gains: Floats) -> Floats:
-    """Plays of the inverse operator, metres, that belong to the model's plays; both shape (..., n)."""
-    slopes = np.cumsum(gains, axis=-1)
-    moved_m = np.cumsum(gains * plays_v, axis=-1)
-    return slopes * plays_v + moved_m[..., -1:] - moved_m
+def inverse_state(plays_v: Floats, gains: Floats, slopes: Floats) -> Floats:
+    """Plays of the inverse operator, metres, that belong to the model's plays; all of shape (..., n).
 
-
-def inverse_volts(plays_v: Floats, half_width_v: Floats, gains: Floats, wanted_m: Floats) -> Floats:
-    """The voltage at which stacks with a memory reach a displacement, exactly.
+    Met with a wanted displacement by :func:`play`, they give by :func:`hysteresis_output` and the inverse
+    model's gains the voltage at which stacks with a memory reach it, exactly.
 
     Parameters
     ----------
-    plays_v : array, shape (..., n)
-        The model's plays as they are now; they are not changed.
-    half_width_v : array, shape (n,)
-        Ascending, the first zero.
-    gains : array, shape (..., n)
-        All their partial sums (the slopes) positive.
-    wanted_m : array, shape (...)
-        In the model's own metres: zero for a relaxed stack.
-
-    Returns
-    -------
-    array, shape (...)
-        Not limited to what a D/A can give.
+    plays_v : array
+        As they are now; they are not changed.
+    gains, slopes : arrays
+        Of the model; slopes are the partial sums of its gains.
     """
-    half_width_m, gains_v_per_m = inverse_model(half_width_v, gains)
-    plays_m = play(inverse_state(plays_v, gains), wanted_m[..., None], half_width_m)
-    return np.vecdot(plays_m, gains_v_per_m)
+    moved_m = np.cumsum(gains * plays_v, axis=-1)
+    return slopes * plays_v + moved_m[..., -1:] - moved_m
 
 
 def swept_stroke(half_width_v: Floats, gains: Floats, full_scale_v: float) -> float:

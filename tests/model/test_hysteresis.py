@@ -12,7 +12,6 @@ from fitctl.model.hysteresis import (
     hysteresis_output,
     inverse_model,
     inverse_state,
-    inverse_volts,
     play,
     stack_gains,
 )
@@ -209,13 +208,20 @@ stack_histories = st.lists(
 )
 
 
+def inverse_volts(plays_v, gains, wanted_m):
+    """The voltages at which stacks reach a displacement."""
+    half_width_m, gains_v_per_m = inverse_model(HALF_WIDTH_V, gains)
+    plays_m = inverse_state(plays_v, gains, np.cumsum(gains, axis=-1))
+    return hysteresis_output(play(plays_m, wanted_m[..., None], half_width_m), gains_v_per_m)
+
+
 @given(stack_histories, wanted, st.sampled_from([STACKS_GAINS, np.tile(FALLING_GAINS, (3, 1))]))
 def test_stacks_at_the_inverse_voltage_are_where_they_shall_be(history, wanted_m, gains):
     plays = np.zeros((3, HALF_WIDTH_V.size))
     for voltage in history:
         plays = play(plays, voltage, HALF_WIDTH_V)
 
-    found_v = inverse_volts(plays, HALF_WIDTH_V, gains, wanted_m)
+    found_v = inverse_volts(plays, gains, wanted_m)
 
     reached_m = hysteresis_output(play(plays, found_v[:, None], HALF_WIDTH_V), gains)
     assert reached_m == pytest.approx(wanted_m, abs=1e-18)
@@ -226,12 +232,13 @@ def test_the_inverse_is_a_model_of_plays_with_a_memory_of_its_own(wishes):
     half_width_m, gains_v_per_m = inverse_model(HALF_WIDTH_V, STACKS_GAINS)
     stacks = own = np.zeros((3, HALF_WIDTH_V.size))
     for wanted_m in wishes:
-        found_v = inverse_volts(stacks, HALF_WIDTH_V, STACKS_GAINS, wanted_m)
+        found_v = inverse_volts(stacks, STACKS_GAINS, wanted_m)
         stacks = play(stacks, found_v[:, None], HALF_WIDTH_V)
         own = play(own, wanted_m[:, None], half_width_m)
 
         assert hysteresis_output(own, gains_v_per_m) == pytest.approx(found_v, abs=1e-9)
-        assert inverse_state(stacks, STACKS_GAINS) == pytest.approx(own, abs=1e-18)
+        slopes = np.cumsum(STACKS_GAINS, axis=-1)
+        assert inverse_state(stacks, STACKS_GAINS, slopes) == pytest.approx(own, abs=1e-18)
 
 
 def test_the_inverse_of_the_inverse_is_the_model():
@@ -243,5 +250,5 @@ def test_the_inverse_of_the_inverse_is_the_model():
 def test_to_stay_costs_no_voltage():
     plays = states([3.0, 8.0, 4.2])[-1]
     here_m = hysteresis_output(plays, STACKS_GAINS[0])
-    found_v = inverse_volts(plays, HALF_WIDTH_V, STACKS_GAINS[0], np.asarray(here_m))
+    found_v = inverse_volts(plays, STACKS_GAINS[0], np.asarray(here_m))
     assert found_v == pytest.approx(4.2)

@@ -62,7 +62,7 @@ def held_rad(s: Any, r: Any) -> tuple[float, float]:
 
 @compilable()
 def inverse_volts(s: Any, w: Any, stack: int, wanted_m: float) -> float:
-    """:func:`fitctl.model.hysteresis.inverse_volts` of one stack."""
+    """``Mirror.volts_for`` of one stack, by the inverse operator."""
     moved_m = 0.0
     for play in range(s.known_plays):
         moved_m += s.known_gains[stack, play] * w.known_plays_v[stack, play]
