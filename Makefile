@@ -37,13 +37,12 @@ $(READY): requirements/dev.lock pyproject.toml
 demo: $(READY)  ## Run the whole instrument on mock devices
 	@$(BIN)/fitctl demo $(ARGS)
 
-# Type checks run beside the tests that judge no real time; the whole instrument runs when they have ended.
+# Type checks run beside the tests.
 BESIDE := $(MAKE) --no-print-directory --jobs 2 --output-sync=target
 
-test: lint contract  ## Lint, import contract, types, tests
-	@echo "Types and tests, about nine minutes ..."
+test: lint contract  ## Lint, import contract, types, all tests but those with a target of their own
+	@echo "Types and tests, about five minutes ..."
 	@$(BESIDE) types test-parts
-	@$(MAKE) --no-print-directory test-instrument
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -62,11 +61,13 @@ else
 	@$(MAKE) --no-print-directory test-parts test-instrument
 endif
 
-test-instrument: $(READY)
-	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system
-
+# Many tests wait for a time limit: four workers on two cores.
 test-parts: $(READY)
-	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system
+	$(BIN)/pytest --numprocesses 4 --dist loadfile --ignore tests/system
+
+# Nothing may run beside it: it judges real time.
+test-instrument: $(READY)  ## The whole instrument in real time, as processes on real wires
+	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system $(ARGS)
 
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
