@@ -114,6 +114,7 @@ class SiderostatServo:
         self._history: deque[ServoReading] = deque(maxlen=round(HISTORY_S / self.period_s))
         self._blind_s = 1.0 / siderostat.servo.gain_per_s  # an older reading would make it swing
         self._read_s = -math.inf
+        self._blind = False
         self._timely_s = 0.0
         self._missed_readings = 0
         self._drained = (0, 0)  # missed and skipped, as last asked
@@ -244,6 +245,8 @@ class SiderostatServo:
         if self._stopped or not self.enabled:
             self._servo.reset(reading.position_rad)
             return
+        if self._blind and now_s - reading.time_s <= self._blind_s:
+            self._go_on_from(reading.position_rad)
         following_rad = self._servo.following_error_rad(reading.position_rad)
         self._following_rad.append(following_rad)
         if following_rad <= self._settings.following_error_limit_rad:
@@ -261,8 +264,16 @@ class SiderostatServo:
         if is_new and wanted_rad is not None:
             self._servo.move_to(wanted_rad)
         if now_s - self._read_s > self._blind_s:
-            return _STILL  # blind motors stand still, and the reference waits for them
+            self._blind = True
+            return _STILL
         return self._servo.step(self._position_rad)
+
+    def _go_on_from(self, position_rad: AzEl) -> None:
+        """Go to the set-point from here: a drive that hears nothing turns on at its last velocity."""
+        self._blind = False
+        self._servo.reset(position_rad)
+        if self._applied_rad is not None:
+            self._servo.move_to(self._applied_rad)
 
     def _accept_reading(self, reading: ServoReading, now_s: float) -> None:
         self._read_s = reading.time_s

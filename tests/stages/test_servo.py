@@ -152,6 +152,28 @@ def test_motors_that_cannot_be_seen_are_told_to_stand_still(servo, amplifiers):
     assert amplifiers.position_rad[0] == pytest.approx(0.9, abs=2e-3)
 
 
+@pytest.mark.parametrize("stood_still_s", [0.2, 0.4])
+def test_motors_that_turned_on_while_this_computer_stood_still_are_no_following_error(
+    servo, amplifiers, stood_still_s
+):
+    """A drive goes on at its last velocity until it misses the heartbeat."""
+    servo.hold(servo.position_rad)
+    servo.move_to(np.array([6.0, 0.0]))
+    run(servo, 20)
+    velocity_rad_s = amplifiers.commands[-1][0]
+    assert velocity_rad_s > 50.0
+    amplifiers.clock.sleep_until(amplifiers.clock.now_s() + stood_still_s)
+    amplifiers.position_rad = (amplifiers.position_rad[0] + velocity_rad_s * stood_still_s, 0.0)
+    run(servo, 1)
+    assert amplifiers.commands[-1] == (0.0, 0.0)
+
+    run(servo, 200)
+
+    assert servo.fault is None
+    assert servo.read_state().following_rad < 0.8
+    assert amplifiers.position_rad[0] == pytest.approx(6.0, abs=2e-3)
+
+
 @pytest.mark.parametrize(("late_s", "period_s"), [(0.1, 0.002), (0.2, 0.5)])
 def test_readings_too_old_to_servo_by_are_no_readings(servo, amplifiers, late_s, period_s):
     """Late on a wire that is asked again meanwhile, or on one whose every answer is waited for."""
