@@ -55,6 +55,7 @@ class Mirror:
             self._zero_rad = mirror_from_stacks(self.zero_m, fsm.stack_radius_m)
             per_m = mirror_from_stacks(np.eye(3), fsm.stack_radius_m).T
             self._rad_per_play_v = (per_m[..., None] * self.gains_m_per_v).reshape(2, -1)
+        self._inverts = False  # the inverse was asked for last
         self.assume(np.full(3, fsm.bias_v))
 
     def assume(self, stack_v: Floats) -> None:
@@ -67,10 +68,15 @@ class Mirror:
         self.stack_v = np.array(stack_v, dtype=float)
         if self.hysteresis_known:
             self._plays_v = play(self._plays_v, self.stack_v[:, None], self.half_width_v)
-            # Here, after the D/A has its voltages, and not between a frame and them.
-            self._inverse_plays_m = inverse_state(
-                self._plays_v, self.gains_m_per_v, self._slopes_m_per_v
-            )
+            if (
+                self._inverts
+            ):  # here, after the D/A has its voltages, and not between a frame and them
+                self._prepare_inverse()
+
+    def _prepare_inverse(self) -> None:
+        self._inverse_plays_m = inverse_state(
+            self._plays_v, self.gains_m_per_v, self._slopes_m_per_v
+        )
 
     @property
     def angles_rad(self) -> Floats:
@@ -95,7 +101,11 @@ class Mirror:
 
         By Eq. 1, or by the exact inverse of the identified hysteresis where asked for and known.
         """
-        if hysteresis_inverse and self.hysteresis_known:
+        inverts = hysteresis_inverse and self.hysteresis_known
+        if inverts and not self._inverts:
+            self._prepare_inverse()
+        self._inverts = inverts
+        if inverts:
             wanted_m = self.zero_m + self.stack_matrix.dot(mirror_rad)
             plays_m = play(self._inverse_plays_m, wanted_m[:, None], self._inverse_half_m)
             volts = hysteresis_output(plays_m, self._inverse_v_per_m)
