@@ -340,6 +340,13 @@ class StellarLoop(Loop):
             self._report_event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
             )
+        elif self.servo.turned_on_rad:
+            turned_arcsec = self.servo.turned_on_rad * self._scale.motor_sky_arcsec_per_rad
+            self._report_event(
+                "warning",
+                f"the siderostat turned on by {turned_arcsec:.0f} arcsec on the sky while its amplifiers did not "
+                "answer; the star's place is kept, and acquire goes back there",
+            )
 
     def release(self) -> None:
         """Send the D/A nothing more."""

@@ -38,6 +38,7 @@ _READ_AT = operator.itemgetter(0)  # of a reading: when
 _STILL = (0.0, 0.0)
 FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
+_SPEED_MARGIN = 1.2  # of a motor that turns on, over its last velocity command
 
 
 class ServoTiming(NamedTuple):
@@ -120,6 +121,8 @@ class SiderostatServo:
         self._drained = (0, 0)  # missed and skipped, as last asked
         self._followed_s = 0.0
         self.encoders_jumped = False
+        self.turned_on_rad = 0.0
+        self._last_rad_s = _STILL
         self._disabling = False
         self.late_s: deque[float] = deque(maxlen=4096)
         self.skipped = 0
@@ -225,13 +228,15 @@ class SiderostatServo:
 
     def _exchange(self) -> None:
         asked_s = self._clock.now_s()
-        reading = self._amplifiers.exchange(self._velocity_rad_s(asked_s))
+        velocity_rad_s = self._velocity_rad_s(asked_s)
+        reading = self._amplifiers.exchange(velocity_rad_s)
         now_s = self._clock.now_s()
         self.round_trip_s = now_s - asked_s
         if reading is None:
             self._missed_readings += 1
         else:
             self._accept_reading(reading, now_s)
+            self._last_rad_s = velocity_rad_s
         if now_s - self._timely_s > self._settings.reading_timeout_s:
             raise self._no_reading()
         if reading is None:
@@ -326,18 +331,34 @@ class SiderostatServo:
         return identity
 
     def _find_position(self) -> None:
-        """Read the encoders before power is on: nothing is ever servoed about a place never read."""
-        knew, (last_az_rad, last_el_rad) = bool(self._history), self._position_rad
+        """Read the encoders before power is on: nothing is ever servoed about a place never read.
+
+        A drive that stopped answering may have turned on at its last velocity, and its encoders still count from
+        the same zero. Any other difference means that they count from elsewhere now.
+        """
+        knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
         self._history.clear()
         deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
         while (reading := self._amplifiers.exchange(_STILL)) is None:
             if self._clock.now_s() > deadline_s:
                 raise self._no_reading()
         self._accept_reading(reading, self._clock.now_s())
-        az_rad, el_rad = reading.position_rad
         self._servo.reset(reading.position_rad)
-        jump_rad = max(abs(az_rad - last_az_rad), abs(el_rad - last_el_rad))
-        self.encoders_jumped = knew and jump_rad > _ENCODER_JUMP_RAD
+        turned_rad = [now - last for now, last in zip(reading.position_rad, last_rad, strict=True)]
+        far = knew and max(map(abs, turned_rad)) > _ENCODER_JUMP_RAD
+        # After a loss of power they begin at zero, and no motor turns.
+        at_zero = max(map(abs, reading.position_rad)) < _ENCODER_JUMP_RAD
+        turned_on = not at_zero and all(
+            min(0.0, most_rad) - _ENCODER_JUMP_RAD <= rad <= max(0.0, most_rad) + _ENCODER_JUMP_RAD
+            for rad, most_rad in zip(
+                turned_rad,
+                [_SPEED_MARGIN * rad_s * (reading.time_s - last_s) for rad_s in self._last_rad_s],
+                strict=True,
+            )
+        )
+        self._last_rad_s = _STILL
+        self.encoders_jumped = far and not turned_on
+        self.turned_on_rad = max(map(abs, turned_rad)) if far and turned_on else 0.0
 
     def _disable(self) -> None:
         self._stopped = True

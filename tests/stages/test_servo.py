@@ -278,6 +278,34 @@ def test_encoders_that_jumped_while_nobody_looked_are_noticed(servo, amplifiers)
     assert servo.encoders_jumped
 
 
+@pytest.mark.parametrize(
+    ("found_rad", "jumped"),
+    [
+        (100.0, False),  # 60 rad/s for up to 2 s
+        (-100.0, True),  # the other way
+        (200.0, True),  # faster than it was commanded
+        (0.0, True),  # power came back
+    ],
+)
+def test_motors_that_turned_on_unwatched_are_not_encoders_that_jumped(
+    servo, amplifiers, found_rad, jumped
+):
+    servo.hold(servo.position_rad)
+    servo.move_to(np.array([5.0, 0.0]))
+    run(servo, 30)
+    amplifiers.surprise = DeviceTimeout("amplifiers", "here", "an answer", "none")
+    run(servo, 1)
+    assert servo.fault is not None
+    amplifiers.surprise = None
+    amplifiers.clock.sleep_until(amplifiers.clock.now_s() + 2.0)
+    amplifiers.position_rad = (found_rad, 0.0)
+    servo.open()
+
+    assert servo.encoders_jumped == jumped
+    assert (servo.turned_on_rad > 90.0) != jumped
+    assert servo.position_rad == pytest.approx([found_rad, 0.0])
+
+
 def test_a_reversal_at_full_speed_is_no_following_error(servo, amplifiers):
     servo.hold(servo.position_rad)
     for target in (1.0, 2.0, 0.0, 2.0, 0.0):
