@@ -344,8 +344,8 @@ class StellarLoop(Loop):
             turned_arcsec = self.servo.turned_on_rad * self._scale.motor_sky_arcsec_per_rad
             self._report_event(
                 "warning",
-                f"the siderostat turned on by {turned_arcsec:.0f} arcsec on the sky while its amplifiers did not "
-                "answer; the star's place is kept, and acquire goes back there",
+                f"the siderostat turned on by {turned_arcsec:.0f} arcsec on the sky while its amplifiers did "
+                "not answer; the star's place is kept, and acquire goes back there",
             )
 
     def release(self) -> None:
