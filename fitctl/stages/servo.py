@@ -333,7 +333,7 @@ class SiderostatServo:
     def _find_position(self) -> None:
         """Read the encoders before power is on: nothing is ever servoed about a place never read.
 
-        A drive that stopped answering may have turned on at its last velocity; its encoders still count from the
+        A drive that stopped answering may have turned on at its last velocity; its encoders count on from the
         same zero. Any other difference means that they count from elsewhere now.
         """
         knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
