@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import re
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
@@ -12,6 +14,8 @@ from typing import NamedTuple
 
 from fitctl.config import Logging
 from fitctl.logging.errors import LogError
+
+_DAY_S = 86_400.0
 
 
 def new_log_path(folder: Path, rig_name: str, start: datetime) -> Path:
@@ -102,7 +106,8 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> Prun
     """Delete what is too old or too much of one rig's logs, the oldest first.
 
     Only files that a recorder named count and go. Of these, the ones in use and the ones that are kept
-    count, but stay. One that cannot be deleted keeps none of the others.
+    count, but stay. One that cannot be deleted keeps none of the others. Age deletes one file a pass, and
+    does not count a pause longer than `retain_days`: a clock that is wrong by as much looks the same.
 
     Parameters
     ----------
@@ -117,21 +122,28 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> Prun
     -------
     Pruned
     """
-    name = re.compile(re.escape(rig_name) + r"_\d{8}T\d{6}Z(_\d+)?\.mcap")
-    logs = []
-    for path in folder.glob("*.mcap"):
-        with contextlib.suppress(FileNotFoundError):  # somebody else deletes too
-            if name.fullmatch(path.name):
-                status = path.stat()
-                logs.append((status.st_mtime, path, status.st_size))
-    total_bytes = sum(size for *_, size in logs)
-    oldest_s = (now - timedelta(days=settings.retain_days)).timestamp()
+    logs = sorted(_logs_of(folder, rig_name))
+    total_bytes = sum(log.size_bytes for log in logs)
+    kept_bytes = 0
+    retain_s = timedelta(days=settings.retain_days).total_seconds()
+    ages_s, pause_s = _ages_s([log.written_s for log in logs], now.timestamp(), retain_s)
     pruned = Pruned([], [])
-    for written_s, path, size in sorted(logs):
-        if written_s >= oldest_s and total_bytes <= settings.retain_bytes:
+    if logs and ages_s[0] <= retain_s < now.timestamp() - logs[0].written_s:
+        pruned.refused.append(
+            f"{folder}: no log was written for {pause_s / _DAY_S:.0f} days, or the computer's clock is wrong; "
+            "logs from before are not deleted because of their age: check the clock"
+        )
+    by_age = 1
+    for log, age_s in zip(logs, ages_s, strict=True):
+        too_old = by_age > 0 and age_s > retain_s
+        if not too_old and total_bytes <= settings.retain_bytes:
             break
+        path = log.path
         try:
-            if is_kept(path) or in_use(path):
+            if is_kept(path):
+                kept_bytes += log.size_bytes
+                continue
+            if in_use(path):
                 continue
             path.unlink(missing_ok=True)
         except LogError as error:
@@ -141,6 +153,60 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> Prun
                 f"{path}: is due for deletion, but cannot be deleted: {error.strerror}"
             )
         else:
-            total_bytes -= size
+            by_age -= too_old
+            total_bytes -= log.size_bytes
             pruned.deleted.append(path)
+    if kept_bytes and total_bytes > settings.retain_bytes:
+        pruned.refused.append(
+            f"{folder}: logs marked with `fitctl log keep` have {kept_bytes} bytes, so all logs together "
+            f"exceed logging.retain_bytes = {settings.retain_bytes}; move some, or unmark them"
+        )
     return pruned
+
+
+class _Log(NamedTuple):
+    """A recorder's file; `written_s` is the later of its name's time and its last write."""
+
+    written_s: float
+    path: Path
+    size_bytes: int
+
+
+def _logs_of(folder: Path, rig_name: str) -> Iterator[_Log]:
+    name = re.compile(re.escape(rig_name) + r"_(\d{8}T\d{6})Z(_\d+)?\.mcap")
+    for path in folder.glob("*.mcap"):
+        found = name.fullmatch(path.name)
+        with contextlib.suppress(FileNotFoundError):  # somebody else deletes too
+            if found:
+                status = path.stat()
+                yield _Log(max(status.st_mtime, _start_s(found[1])), path, status.st_size)
+
+
+def _start_s(stamp: str) -> float:
+    """Seconds since 1970 of the time in a log's name; -inf for digits that are no time."""
+    try:
+        return datetime.strptime(stamp, "%Y%m%dT%H%M%S").replace(tzinfo=UTC).timestamp()
+    except ValueError:
+        return -math.inf
+
+
+def _ages_s(
+    written_s: Sequence[float], now_s: float, longest_pause_s: float
+) -> tuple[list[float], float]:
+    """Ages of logs, given the oldest first, and the longest pause that they do not count.
+
+    A single log before a pause counts it: one log is no evidence that the clock is wrong, and its deletion
+    costs no other.
+    """
+    ages_s = []
+    age_s = longest_s = 0.0
+    after_s = now_s
+    for number, before_s in reversed(list(enumerate(written_s))):
+        pause_s = after_s - min(before_s, after_s)
+        if pause_s > longest_pause_s and number > 0:
+            longest_s = max(longest_s, pause_s)
+        else:
+            age_s += pause_s
+        ages_s.append(age_s)
+        after_s = min(before_s, after_s)
+    return ages_s[::-1], longest_s

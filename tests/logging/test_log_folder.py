@@ -83,7 +83,7 @@ def aged(folder, name, age_days, size):
 
 
 def name_of(number, rig="bench"):
-    return f"{rig}_20261101T0000{number:02d}Z.mcap"
+    return f"{rig}_20200101T0000{number:02d}Z.mcap"
 
 
 def limits(retain_bytes, retain_days):
@@ -104,7 +104,9 @@ def test_the_oldest_go_until_the_rest_fits_but_never_one_in_use_or_kept(
 ):
     folder = tmp_path_factory.mktemp("retention")
     paths, safe, streams = [], set(), []
-    for number, (age, size, kept, used) in enumerate(logs):
+    age = 0
+    for number, (days_before, size, kept, used) in enumerate(logs):
+        age += min(days_before, retain_days)
         path = folder / name_of(number)
         if used:
             streams.append(LogWriter(path, SETTINGS))
@@ -117,7 +119,11 @@ def test_the_oldest_go_until_the_rest_fits_but_never_one_in_use_or_kept(
             safe.add(path)
         paths.append((age, path, path.stat().st_size))
     try:
-        deleted = prune(folder, "bench", limits(retain_bytes, retain_days), NOW).deleted
+        deleted = [
+            path
+            for _ in logs  # age deletes one file a pass
+            for path in prune(folder, "bench", limits(retain_bytes, retain_days), NOW).deleted
+        ]
         left = [(age, path, size) for age, path, size in paths if path.exists()]
     finally:
         for stream in streams:
@@ -143,16 +149,16 @@ def test_only_what_a_recorder_of_this_rig_named_is_deleted(tmp_path):
         aged(tmp_path, name, 400, 10)
         for name in (
             name_of(1, "other"),
-            "bench_20261101T000001Z_recovered.mcap",
+            "bench_20200101T000001Z_recovered.mcap",
             "bench_best_night.mcap",
-            "bench_20261101T000001Z.csv",
+            "bench_20200101T000001Z.csv",
         )
     ]
     mine = [
         aged(tmp_path, name_of(1), 400, 10),
-        aged(tmp_path, "bench_20261101T000001Z_2.mcap", 399, 10),
+        aged(tmp_path, "bench_20200101T000001Z_2.mcap", 399, 10),
     ]
-    assert prune(tmp_path, "bench", SETTINGS, NOW).deleted == mine
+    assert prune(tmp_path, "bench", limits(1, 365), NOW).deleted == mine
     assert all(path.exists() for path in others)
 
 
@@ -168,6 +174,60 @@ def test_a_kept_log_stays_until_it_is_no_longer_kept(tmp_path):
 def test_a_log_that_is_not_there_cannot_be_kept(tmp_path):
     with pytest.raises(LogError, match=r"a\.mcap: no such log"):
         keep(tmp_path / "a.mcap", kept=True)
+
+
+def test_a_clock_that_is_400_days_ahead_costs_no_log(tmp_path):
+    """Neither at once nor in the nights that are recorded with it."""
+    logs = [aged(tmp_path, name_of(day), day, 10) for day in range(40)]
+    ahead = NOW + timedelta(days=400)
+    pruned = prune(tmp_path, "bench", SETTINGS, ahead)
+    assert pruned.deleted == []
+    assert pruned.refused == [
+        f"{tmp_path}: no log was written for 400 days, or the computer's clock is wrong; "
+        "logs from before are not deleted because of their age: check the clock"
+    ]
+    for night in range(1, 30):
+        aged(tmp_path, f"bench_20210101T0000{night:02d}Z.mcap", -400 - night, 10)
+        assert prune(tmp_path, "bench", SETTINGS, ahead + timedelta(days=night)).deleted == []
+    assert prune(tmp_path, "bench", SETTINGS, NOW + timedelta(days=30)).deleted == []
+    assert all(path.exists() for path in logs)
+
+
+def test_a_log_s_name_is_evidence_of_its_time_too(tmp_path):
+    """A copy may have lost its time of modification."""
+    copied = aged(tmp_path, "bench_20261120T000001Z.mcap", 20_000, 10)
+    assert prune(tmp_path, "bench", SETTINGS, NOW).deleted == []
+    no_time = aged(tmp_path, "bench_99999999T999999Z.mcap", 400, 10)
+    assert prune(tmp_path, "bench", SETTINGS, NOW).deleted == [no_time]
+    assert copied.exists()
+
+
+def test_after_a_long_pause_old_logs_go_once_new_ones_have_aged_too(tmp_path):
+    old = [aged(tmp_path, name_of(number), 700 - number, 10) for number in (1, 2, 3)]
+    for month in range(13):
+        aged(tmp_path, f"bench_202001{month + 1:02d}T000000Z.mcap", 30 * month, 10)
+    passes = [prune(tmp_path, "bench", limits(10**9, 300), NOW) for _ in range(3)]
+    assert [one.deleted for one in passes] == [[path] for path in old]
+
+
+def test_age_deletes_one_log_a_pass(tmp_path):
+    logs = [aged(tmp_path, name_of(number), 369 - number, 10) for number in range(4)]
+    aged(tmp_path, name_of(5), 180, 10)
+    passes = [prune(tmp_path, "bench", SETTINGS, NOW).deleted for _ in range(5)]
+    assert passes == [[path] for path in logs] + [[]]
+
+
+def test_kept_logs_that_fill_the_room_are_said(tmp_path):
+    kept = aged(tmp_path, name_of(1), 3, 100)
+    keep(kept, kept=True)
+    other = aged(tmp_path, name_of(2), 2, 10)
+    assert prune(tmp_path, "bench", limits(110, 365), NOW).refused == []
+    pruned = prune(tmp_path, "bench", limits(99, 365), NOW)
+    assert pruned.deleted == [other]
+    assert pruned.refused == [
+        f"{tmp_path}: logs marked with `fitctl log keep` have 100 bytes, so all logs together "
+        "exceed logging.retain_bytes = 99; move some, or unmark them"
+    ]
 
 
 def test_a_new_recording_clears_away_and_says_so_in_the_log(tmp_path):
@@ -207,7 +267,7 @@ def test_one_log_that_cannot_be_deleted_keeps_none_of_the_others(tmp_path, monke
         unlink(path, **options)
 
     monkeypatch.setattr("fitctl.logging.folder.Path.unlink", refuse)
-    pruned = prune(tmp_path, "bench", SETTINGS, NOW)
+    pruned = prune(tmp_path, "bench", limits(1, 365), NOW)
     assert pruned.deleted == [gone]
     assert [why.partition(": ")[0] for why in pruned.refused] == [str(folder), str(stuck)]
 
