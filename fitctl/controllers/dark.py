@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Camera, ConfigError
+from fitctl.files import read_regular
 
 Floats = NDArray[np.float64]
 _MOST_BYTES = 64 << 20
@@ -95,17 +96,9 @@ def dark_bytes(path: Path) -> bytes:
         If it cannot be read.
     """
     try:
-        if not path.is_file() and path.exists():
-            msg = f"camera.dark_file {path}: is not a regular file; {_MEASURE}"
-            raise ConfigError(msg)
-        with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            msg = f"camera.dark_file {path}: has more than {_MOST_BYTES >> 20} MiB; {_MEASURE}"
-            raise ConfigError(msg)
-        return content
+        return read_regular(path, _MOST_BYTES)
     except OSError as error:
-        msg = f"camera.dark_file {path}: cannot be read: {error}; {_MEASURE}"
+        msg = f"camera.dark_file {path}: cannot be read: {error.strerror}; {_MEASURE}"
         raise ConfigError(msg) from None
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import heapq
 import os
-import tempfile
 import zlib
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
@@ -22,6 +21,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
+from fitctl.files import replaced_whole
 from fitctl.logging.errors import LogError
 from fitctl.logging.files import DAMAGE, opened
 from fitctl.logging.folder import in_use
@@ -113,26 +113,15 @@ class _Target:
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
         """Write inside; after an error no file is left."""
-        temporary = None
         try:
-            with tempfile.NamedTemporaryFile(
-                dir=self.path.parent, prefix=".", suffix=".part", delete=False
-            ) as file:
-                temporary = Path(file.name)
+            with replaced_whole(self.path) as file:
                 self._mcap = Writer(file, enable_data_crcs=True, use_summary_offsets=False)
                 self._mcap.start(library="fitctl")
                 yield
                 self._mcap.finish()
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.chmod(0o644)
-            temporary.replace(self.path)
         except OSError as error:
             msg = f"{self.path}: cannot be written: {error.strerror or error}; make room, or give another --out"
             raise LogError(msg) from error
-        finally:
-            if temporary is not None:
-                temporary.unlink(missing_ok=True)
 
     def add(self, entry: _Copied | Metadata) -> None:
         """Copy one entry; metadata that is there already is not added again."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ import zstandard
 from mcap.exceptions import McapError
 from mcap.writer import MCAP0_MAGIC
 
+from fitctl.files import open_regular
 from fitctl.logging.errors import LogError
 
 # What a torn or damaged file makes the reader, its decompressors (lz4: RuntimeError) and protobuf (a schema
@@ -71,10 +73,7 @@ vars(mcap.stream_reader).update(
 def opened(path: Path) -> Iterator[tuple[IO[bytes], bool]]:
     """The file, and whether it was finished."""
     try:
-        if not path.is_file() and path.exists():  # a device or a pipe has no end, or never begins
-            msg = f"{path}: is not a regular file; logs are *.mcap in the rig's logging.folder"
-            raise LogError(msg)
-        stream = path.open("rb")
+        stream = open_regular(path)
     except OSError as error:
         msg = f"{path}: cannot be opened: {error.strerror}; logs are *.mcap in the rig's logging.folder"
         raise LogError(msg) from error
@@ -83,7 +82,7 @@ def opened(path: Path) -> Iterator[tuple[IO[bytes], bool]]:
             msg = f"{path}: is not an MCAP log; name a file that fitctl recorded"
             raise LogError(msg)
         start = stream.tell()
-        stream.seek(max(start, path.stat().st_size - len(MCAP0_MAGIC)))
+        stream.seek(max(start, os.fstat(stream.fileno()).st_size - len(MCAP0_MAGIC)))
         finished = stream.read() == MCAP0_MAGIC
         stream.seek(0)
         yield stream, finished

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fitctl.config import Logging
+from fitctl.files import open_regular
 from fitctl.logging.errors import LogError
 
 _DAY_S = 86_400.0
@@ -48,7 +49,7 @@ def in_use(path: Path) -> bool:
         If there is something of that name that cannot be opened.
     """
     try:
-        stream = path.open("rb")
+        stream = open_regular(path)
     except FileNotFoundError:
         return False
     except OSError as error:

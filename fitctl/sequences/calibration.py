@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.config import ConfigError, Rig
-from fitctl.identify.fragments import fragment_text, write_whole
+from fitctl.files import write_whole
+from fitctl.identify.fragments import fragment_text
 from fitctl.sequences.behaviour import Calibration
 
 CALIBRATING = frozenset({"dark", "plate_scale"})  # steps that measure something for the rig file

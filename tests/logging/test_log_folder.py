@@ -281,7 +281,7 @@ def test_recording_goes_on_where_something_else_has_an_old_logs_name(tmp_path):
         assert log.pop_notes() == [
             (
                 "warning",
-                f"{folder}: cannot be opened: Is a directory; a log is a file that may be read",
+                f"{folder}: cannot be opened: not a regular file; a log is a file that may be read",
             )
         ]
     assert len(contents(log.path)) == 1

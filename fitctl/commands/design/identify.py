@@ -19,6 +19,7 @@ from fitctl.commands.shared.printing import progress_line, say
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.commands.shared.supervisor import address, client_of, show_rig
 from fitctl.config import ConfigError, Rig, default_rig_path
+from fitctl.files import write_whole
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import (
     EXPERIMENTS,
@@ -26,7 +27,7 @@ from fitctl.identify.experiments import (
     Identification,
     response_on_mock_bench,
 )
-from fitctl.identify.fragments import fragment_text, write_whole
+from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
 from fitctl.logging.copying import merge
 from fitctl.messages.modes import Mode

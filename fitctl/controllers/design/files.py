@@ -17,8 +17,9 @@ from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Basis, basis_of
 from fitctl.controllers.design.document import FORMAT, MATRICES, design_json
 from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
+from fitctl.files import read_regular
 
-_MOST_BYTES = 1_000_000  # a hundred times a design's
+_MOST_BYTES = 1 << 20  # a hundred times a design's
 # Matrices are written with all their digits; made again on another machine they differ by rounding, and
 # by what a Riccati solution makes of that.
 _ROUNDING = 1e-6
@@ -106,10 +107,8 @@ def design_of(
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
         # As floats, since an integer of hundreds of digits fits into nothing else.
-        document = None if len(content) > _MOST_BYTES else json.loads(content, parse_int=float)
+        document = json.loads(read_regular(path, _MOST_BYTES), parse_int=float)
     except FileNotFoundError:
         msg = f"{path}: no such design file; make one with fitctl design ... --out FILE"
         raise ConfigError(msg) from None
@@ -118,7 +117,7 @@ def _document(path: Path) -> dict[str, Any]:
         raise ConfigError(msg) from None
     if not isinstance(document, dict):
         hint = "make one with fitctl design ... --out FILE"
-        raise _refusal(path, "format", FORMAT, "no JSON object, or too large a file", hint)
+        raise _refusal(path, "format", FORMAT, "no JSON object", hint)
     return document
 
 

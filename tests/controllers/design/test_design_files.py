@@ -165,7 +165,7 @@ def test_a_design_that_would_swing_is_refused():
 def test_a_file_too_large_for_a_design_is_refused(tmp_path, fit):
     path = tmp_path / "pair.json"
     path.write_text("[" + "1," * 600_000 + "1]")
-    assert "too large" in refusal(path, fit)
+    assert "more than 1 MiB" in refusal(path, fit)
 
 
 def test_designs_are_the_same_each_time(rig):
