@@ -297,8 +297,16 @@ def unpacked(data: bytes, endpoint: Endpoint) -> str:
                 if first.file_size > _XML_BYTES_MAX:
                     msg = f"{first.file_size} bytes once unpacked"
                     raise ValueError(msg)
-                data = archive.read(first)
-        return data.rstrip(b"\0").decode("utf-8-sig")
+                with archive.open(first) as packed:
+                    # One byte more, for its checksum to be compared; `archive.read` would unpack
+                    # all that there is, whatever the directory says.
+                    data = packed.read(first.file_size + 1)
+        text = data.rstrip(b"\0").decode("utf-8-sig")
+        # No camera needs one; its entities could make gigabytes of a few kilobytes, or name files.
+        if "<!DOCTYPE" in text:
+            msg = "it declares a document type"
+            raise ValueError(msg)
+        return text
     except Exception as error:  # a damaged archive can raise any of a dozen kinds
         raise endpoint.error(
             DeviceProtocolError,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 import zipfile
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +13,7 @@ from fitctl.drivers.gige import protocol as p
 from fitctl.drivers.gige.features import Features, unpacked
 from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.interface import DeviceMismatch, DeviceProtocolError
+from fitctl.mocks.gige import memory
 
 XML_ADDRESS = 0x10000
 
@@ -76,14 +79,59 @@ def test_a_description_that_cannot_be_unpacked_is_named(content: bytes, why: str
         Features(Memory(f"Local:camera.zip;{XML_ADDRESS:X};{len(content):X}", content))
 
 
-def test_an_archive_that_unpacks_to_an_absurd_size_is_refused_packed() -> None:
+def bomb(size: int) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as writer:
-        writer.writestr("a.xml", bytes(17 << 20))
-    content = buffer.getvalue()
+        writer.writestr("a.xml", bytes(size))
+    return buffer.getvalue()
+
+
+def lying(size: int) -> bytes:
+    """An archive whose directory gives its file 100 bytes."""
+    content = bomb(size)
+    return content.replace(size.to_bytes(4, "little"), (100).to_bytes(4, "little"))
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [(bomb(300 << 20), "314572800 bytes once unpacked"), (lying(300 << 20), "Bad CRC-32")],
+    ids=["honest", "lying"],
+)
+def test_an_archive_that_unpacks_to_an_absurd_size_takes_no_memory(
+    content: bytes, why: str
+) -> None:
     assert len(content) < 1 << 20
-    with pytest.raises(DeviceProtocolError, match="17825792 bytes once unpacked"):
-        Features(Memory(f"Local:camera.zip;{XML_ADDRESS:X};{len(content):X}", content))
+    tracemalloc.start()
+    try:
+        with pytest.raises(DeviceProtocolError, match=why):
+            Features(Memory(f"Local:camera.zip;{XML_ADDRESS:X};{len(content):X}", content))
+        assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    finally:
+        tracemalloc.stop()
+
+
+DESCRIPTION = Path(memory.__file__).with_name("fit_camera.xml").read_text()
+EXPANDING = "".join(f'<!ENTITY e{n} "{10 * f"&e{n - 1};"}">' for n in range(1, 9))
+
+
+@pytest.mark.parametrize(
+    "declaration",
+    [
+        f'[<!ENTITY e0 "{100 * "x"}">{EXPANDING}]',
+        '[<!ENTITY e8 SYSTEM "file:///etc/hostname">]',
+        'SYSTEM "http://127.0.0.1:9/camera.dtd"',
+        '[<!ENTITY e8 "harmless">]',
+    ],
+    ids=["expanding entities", "a file", "another host", "harmless"],
+)
+def test_a_description_that_declares_a_document_type_is_refused(declaration: str) -> None:
+    head, rest = DESCRIPTION.split("?>", 1)
+    hostile = f"{head}?><!DOCTYPE RegisterDescription {declaration}>" + rest.replace(
+        'ToolTip="Mock pointing camera"', 'ToolTip="&e8;"'
+    )
+    content = hostile.encode()
+    with pytest.raises(DeviceProtocolError, match="declares a document type"):
+        Features(Memory(f"Local:camera.xml;{XML_ADDRESS:X};{len(content):X}", content))
 
 
 def test_a_description_may_have_a_byte_order_mark_and_zeros_after_it() -> None:
