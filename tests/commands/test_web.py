@@ -100,6 +100,47 @@ def test_who_has_no_key_gets_nothing(page):
     assert ask(page, Host="elsewhere.example")[0] == 403
 
 
+def upgraded(address, **headers):
+    """Status of an answer to a browser that opens the console's WebSocket."""
+    parts = urlsplit(address)
+    given = {
+        "Host": parts.netloc,
+        "Origin": f"http://{parts.netloc}",
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+    } | headers
+    lines = "".join(f"{name}: {value}\r\n" for name, value in given.items())
+    with socket.create_connection((parts.hostname, parts.port), LIMIT_S) as line:
+        line.sendall(f"GET {parts.path}ws?width=80&height=24 HTTP/1.1\r\n{lines}\r\n".encode())
+        return int(line.makefile("rb").readline().split()[1])
+
+
+def test_a_page_of_another_site_opens_no_socket_even_with_the_key(page):
+    port = urlsplit(page).port
+    for origin in (
+        "http://elsewhere.example",
+        f"http://localhost:{port}",
+        f"https://127.0.0.1:{port}",
+        "http://127.0.0.1:1",
+        "null",
+    ):
+        assert upgraded(page, Origin=origin) == 403, origin
+
+
+def test_a_name_that_was_rebound_to_this_machine_opens_no_socket_even_with_the_key(page):
+    """The page of that name is of the same origin to its browser, which sends the name as Host."""
+    port = urlsplit(page).port
+    for name in (f"elsewhere.example:{port}", f"localhost:{port}", "127.0.0.1"):
+        assert upgraded(page, Host=name, Origin=f"http://{name}") == 403, name
+        assert upgraded(page, Host=name) == 403, name
+
+
+def test_the_console_s_own_page_opens_its_socket(page):
+    assert upgraded(page) == 101
+
+
 @pytest.mark.parametrize("key", [b"\xc3\xa9", b"%C3%A9", b"\xff\xfe", b"%ff%00", b"?key=\xc3\xa9"])
 def test_a_key_that_is_no_ascii_is_refused_and_is_no_error_of_the_server(page, key):
     parts = urlsplit(page)
