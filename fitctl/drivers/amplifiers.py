@@ -5,21 +5,18 @@ from __future__ import annotations
 import contextlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Generic, Protocol, TypeVar
 
 from fitctl.config import Siderostat
 from fitctl.config.base import Settings
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import AzEl, DeviceError, DeviceFault, DeviceUnreachable
+from fitctl.drivers.plausibility import MotionCheck
 
 DEVICE = "siderostat amplifiers"
 """What errors call the device."""
 AXES = ("azimuth", "elevation")
-
-SLACK = 1.5
-"""Factor on what a motor can turn between two readings at its velocity limit."""
-_MARGIN_RAD = 0.05
 
 
 class _Closable(Protocol):
@@ -108,25 +105,13 @@ class LinkedAmplifiers(ABC, Generic[_Link, _Settings]):
             max(-limit_rad_s, min(limit_rad_s, el_rad_s)),
         )
 
-    def _check_turned(
-        self,
-        before: Sequence[float],
-        now: Sequence[float],
-        since_s: float,
-        *,
-        rad_per_count: float | None = None,
-    ) -> None:
-        """Raise DeviceFault if a motor cannot have turned so far in that time.
-
-        Angles are in rad, or in encoder counts if `rad_per_count` is given.
-        """
-        unit, digits = ("rad", 2) if rad_per_count is None else ("counts", 0)
-        most = (_MARGIN_RAD + SLACK * self._velocity_limit_rad_s * since_s) / (rad_per_count or 1.0)
-        for name, earlier, later in zip(AXES, before, now, strict=True):
-            if abs(later - earlier) > most:
-                raise self._endpoint.error(
-                    DeviceFault,
-                    f"{name} to turn at most {most:.{digits}f} {unit} in {since_s:.3f} s",
-                    f"{later - earlier:.{digits}f}",
-                    "check the encoder, its cable and its counter, then recover",
-                )
+    def _check_jumped(self, motion: MotionCheck, rad_per_unit: float) -> None:
+        """Raise DeviceFault if an encoder made a jump that no motor could."""
+        if motion.jumped is not None:
+            steps = zip(AXES, motion.jumped, strict=True)
+            raise self._endpoint.error(
+                DeviceFault,
+                "encoders that move as their motors can",
+                ", ".join(f"{axis} moved by {step * rad_per_unit:.3f} rad" for axis, step in steps),
+                "look at the encoder, its cable and its counter, recover, and acquire again",
+            )

@@ -14,12 +14,13 @@ import math
 import time
 from collections import deque
 from contextlib import closing
+from typing import NamedTuple
 
 from pymodbus.pdu import ReadHoldingRegistersRequest
 from pymodbus.pdu.register_message import ReadWriteMultipleRegistersRequest
 
 from fitctl.config import BalAnalogDevice, Siderostat
-from fitctl.drivers.amplifiers import AXES, DEVICE, SLACK, LinkedAmplifiers
+from fitctl.drivers.amplifiers import AXES, DEVICE, LinkedAmplifiers
 from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
@@ -40,11 +41,20 @@ from fitctl.drivers.interface import (
     ServoReading,
 )
 from fitctl.drivers.modbus import Answer, decode_exception, decode_registers
+from fitctl.drivers.plausibility import SPEED_MARGIN, MotionCheck, Pair
 from fitctl.drivers.probe import Probe, round_trip_s
 
 _STILL = (0.0, 0.0)
 _FUNCTION = ReadWriteMultipleRegistersRequest.function_code
 _MOST_OUTSTANDING = 100
+
+
+class _Request(NamedTuple):
+    """A transaction that is not answered yet, and how fast the motors may have turned until then."""
+
+    number: int
+    sent_s: float
+    possible_counts_s: Pair
 
 
 class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
@@ -63,13 +73,14 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         super().__init__(siderostat, siderostat.device.endpoint)
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev
-        most_rad_s = SLACK * siderostat.velocity_limit_rad_s
+        most_rad_s = SPEED_MARGIN * siderostat.velocity_limit_rad_s
         self._blind_s = COUNTER_MODULUS / 2 * self._rad_per_count / most_rad_s
         self._enable = False
         self._counts: tuple[int, int] | None = None
         self._counted_s = -math.inf
         self._answered_s = 0.0
-        self._outstanding: deque[tuple[int, float]] = deque(maxlen=_MOST_OUTSTANDING)
+        self._outstanding: deque[_Request] = deque(maxlen=_MOST_OUTSTANDING)
+        self._motion = MotionCheck(siderostat.velocity_limit_rad_s / self._rad_per_count, 1.0)
 
     def open(self) -> DeviceIdentity:
         """Connect, disable both amplifiers and read their encoders.
@@ -84,6 +95,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         self.close()
         self._enable = False
         self._outstanding.clear()
+        self._motion.restart()
         self._counted_s = -math.inf
         with self._connected(ModbusLink(self._device)) as link:
             identity = link.identify()
@@ -131,7 +143,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         -------
         ServoReading or None
             The newest that has come by the end of the period; its time is midway between request and
-            answer.
+            answer. Counts that the motors cannot have reached are dropped.
 
         Raises
         ------
@@ -142,7 +154,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         DeviceRefused, DeviceProtocolError
             The station refuses, or what comes is no answer.
         DeviceFault
-            A counter reports a motion that no motor can make.
+            A counter jumped.
         ValueError
             A velocity is not finite.
         """
@@ -154,6 +166,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
             if answer is None:
                 break
             newest = self._reading_of(answer) or newest
+        self._check_jumped(self._motion, self._rad_per_count)
         if newest is None and sent_s - self._answered_s > self._device.response_timeout_s:
             raise self._silent()
         return newest
@@ -178,39 +191,48 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         sent_s = time.monotonic()
         if not self._outstanding:
             self._answered_s = sent_s
-        self._outstanding.append((link.send(request), sent_s))
+        az_rad_s, el_rad_s = wanted_rad_s
+        possible_counts_s = self._motion.command(
+            sent_s,
+            (az_rad_s / self._rad_per_count, el_rad_s / self._rad_per_count)
+            if self._enable
+            else None,
+        )
+        self._outstanding.append(_Request(link.send(request), sent_s, possible_counts_s))
         return sent_s
 
     def _settle(self) -> ServoReading:
-        """Command zero velocity and wait for the answer to that very request."""
+        """Command zero velocity and wait for the answer to that request; ask again if counts are dropped."""
         link = self._opened()
-        sent_s = self._request(link, _STILL)
-        number = self._outstanding[-1][0]
-        while (answer := link.receive(sent_s + self._device.response_timeout_s)) is not None:
+        deadline_s = self._request(link, _STILL) + self._device.response_timeout_s
+        while (answer := link.receive(deadline_s)) is not None:
+            is_newest = answer.transaction == self._outstanding[-1].number
             reading = self._reading_of(answer)
-            if reading is not None and answer.transaction == number:
+            if is_newest and reading is not None:
                 return reading
+            if is_newest:
+                self._request(link, _STILL)
         raise self._silent()
 
     # ------------------------------------------------------------ answers
     def _reading_of(self, answer: Answer) -> ServoReading | None:
-        """The reading in an answer; None if it answers no outstanding request."""
-        sent_s = next(
-            (sent for number, sent in self._outstanding if number == answer.transaction), None
-        )
-        if sent_s is None:
+        """The reading in an answer; None if it answers no outstanding request, or is not plausible."""
+        if all(request.number != answer.transaction for request in self._outstanding):
             return None
-        while self._outstanding.popleft()[0] != answer.transaction:
-            pass
+        while (request := self._outstanding.popleft()).number != answer.transaction:
+            self._motion.miss(request.possible_counts_s)
+        sent_s = request.sent_s
         now_s = self._answered_s = time.monotonic()
         self._check_unit_and_exception(answer)
         try:
             az, el, faults = decode_registers(answer.pdu, _FUNCTION, REGISTERS)
         except ValueError as error:
             raise self._opened().nonsense("three registers", str(error)) from None
-        self._counts = self._count((az, el), now_s)
-        self._counted_s = sent_s
-        az_counts, el_counts = self._counts
+        counts = self._count((az, el), now_s)
+        if not self._motion.accept(sent_s, now_s, request.possible_counts_s, counts):
+            return None
+        self._counts, self._counted_s = counts, sent_s
+        az_counts, el_counts = counts
         fault = "; ".join(
             f"{name}: fault line"
             for name, is_up in zip(AXES, lines(faults, self._device.fault_level), strict=True)
@@ -244,16 +266,12 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         near = self._counts
         if near is None:
             return signed(counters[0]), signed(counters[1])
-        az, el = unwrap(counters[0], near[0]), unwrap(counters[1], near[1])
-        if math.isinf(since_s):
-            return az, el
-        if since_s > self._blind_s:
+        if not math.isinf(since_s) and since_s > self._blind_s:
             expected = (
                 f"a reading within {self._blind_s:.2f} s, for the counters not to wrap unseen"
             )
             raise self._timeout(expected, f"one after {since_s:.2f} s")
-        self._check_turned(near, (az, el), since_s, rad_per_count=self._rad_per_count)
-        return az, el
+        return unwrap(counters[0], near[0]), unwrap(counters[1], near[1])
 
     # ------------------------------------------------------------ errors
     def _fault(self, expected: str, got: str) -> DeviceFault:

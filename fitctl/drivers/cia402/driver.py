@@ -169,7 +169,7 @@ class Cia402Amplifiers(_Base):
                 self._write(axis, protocol.CONTROLWORD, "H", protocol.CW_DISABLE_VOLTAGE)
         node.drain()
         node.error_code = 0
-        self._encoders.trust()
+        self._encoders.motion.trust()
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period: command both motors, read both encoders.
@@ -220,7 +220,7 @@ class Cia402Amplifiers(_Base):
                 break
         node.check_alive()
         self._check_status()
-        self._check_encoders()
+        self._check_jumped(encoders.motion, self._rad_per_count)
         latched = encoders.latched or late
         if latched is None:
             return None
@@ -323,15 +323,6 @@ class Cia402Amplifiers(_Base):
                 f"the TPDO with the statuswords within {_STATUS_LIMIT_S:g} s",
                 f"none for {silent_s:.2f} s",
                 "another CANopen master changed it; recover",
-            )
-
-    def _check_encoders(self) -> None:
-        if self._encoders.jumped:
-            raise self._endpoint.error(
-                DeviceFault,
-                "encoders that move as their motors can",
-                self._encoders.jumped,
-                "look at the encoder and its cable, recover, and acquire again",
             )
 
     # ------------------------------------------------------------ errors

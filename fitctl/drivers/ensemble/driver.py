@@ -38,6 +38,7 @@ from fitctl.drivers.interface import (
     DeviceMismatch,
     ServoReading,
 )
+from fitctl.drivers.plausibility import MotionCheck
 from fitctl.drivers.probe import Probe, round_trip_s
 
 _POLL_S = 0.005
@@ -62,7 +63,9 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         self._status = [0, 0]
         self._faults = [0, 0]
         self._turn = 0
-        self._last: tuple[float, AzEl] | None = None
+        self._motion = MotionCheck(
+            siderostat.velocity_limit_rad_s, 2 * math.pi / siderostat.encoder_counts_per_rev
+        )
 
     def open(self) -> DeviceIdentity:
         """Connect, check both axes and stop them; nothing moves afterwards.
@@ -79,7 +82,7 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
             for axis in range(2):
                 self._set_up(axis)
             self._command("WAIT MODE NOWAIT")
-            self._last = None
+            self._motion.restart()
         return identity
 
     def enable(self) -> None:
@@ -108,6 +111,7 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         """
         link = self._opened()
         self._sent = ["", ""]
+        self._motion.command(time.monotonic(), None)
         for command in ("ABORT", "DISABLE"):
             for axis in range(2):
                 link.command(f"{command} {self._at(axis)}")  # what it did shows in the status
@@ -132,19 +136,22 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         """One servo period: command both motors where their velocity changes, read both encoders.
 
         Of status and faults of both axes, one is read a period, in turn. Takes five to seven answers
-        of the controller; each may take `response_timeout_s`.
+        of the controller; each may take `response_timeout_s`. An answer has neither checksum nor number:
+        positions that the motors cannot have reached are dropped, and None is returned.
 
         Raises
         ------
         DeviceUnreachable, DeviceTimeout, DeviceProtocolError
             The link broke, or is out of step. A fault of an axis does not raise: the reading has it.
         DeviceFault
-            An encoder reports a motion that no motor can make.
+            An encoder jumped.
         ValueError
             A velocity is not finite.
         """
         velocity_rad_s = self._limited(velocity_rad_s)
         self._opened()
+        powered = all(status & AxisStatus.ENABLED for status in self._status)
+        possible = self._motion.command(time.monotonic(), velocity_rad_s if powered else None)
         for axis in range(2):
             self._free_run(axis, velocity_rad_s[axis])
         requested_s = time.monotonic()
@@ -152,7 +159,10 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
         read_s = time.monotonic()
         self._poll_axis(*divmod(self._turn, 2))
         self._turn = (self._turn + 1) % 4
-        self._check_plausible(requested_s, read_s, (az_rad, el_rad))
+        plausible = self._motion.accept(requested_s, read_s, possible, (az_rad, el_rad))
+        self._check_jumped(self._motion, 1.0)
+        if not plausible:
+            return None
         return ServoReading(
             time_s=(requested_s + read_s) / 2,
             position_rad=(az_rad, el_rad),
@@ -221,12 +231,6 @@ class EnsembleAmplifiers(LinkedAmplifiers[EnsembleLink, EnsembleDevice]):
 
     def _position_rad(self, axis: int) -> float:
         return self._number(f"PFBKPROG({self._at(axis)})") * self._rad_per_unit[axis]
-
-    def _check_plausible(self, requested_s: float, read_s: float, position_rad: AzEl) -> None:
-        """An ASCII answer has neither checksum nor number: check that the motors can be there."""
-        last, self._last = self._last, (requested_s, position_rad)
-        if last is not None:
-            self._check_turned(last[1], position_rad, read_s - last[0])
 
     def _is_enabled(self, axis: int) -> bool:
         self._status[axis] = self._bits(f"AXISSTATUS({self._at(axis)})")

@@ -51,7 +51,7 @@ def test_a_false_reading_is_kept_back_and_the_next_one_counts(script):
     script.read(0)
     assert script.read(2**16) is None
     assert script.read(1).counts == (1, 0)
-    assert script.encoders.jumped == ""
+    assert script.encoders.motion.jumped is None
 
 
 def test_two_false_readings_that_do_not_agree_are_both_kept_back(script):
@@ -59,24 +59,24 @@ def test_two_false_readings_that_do_not_agree_are_both_kept_back(script):
     assert script.read(2**16) is None
     assert script.read(2**20) is None
     assert script.read(1).counts == (1, 0)
-    assert script.encoders.jumped == ""
+    assert script.encoders.motion.jumped is None
 
 
 def test_an_encoder_that_stays_away_has_jumped(script):
     script.read(0, 0)
     assert script.read(0, 500) is None
     script.read(0, 501)
-    assert script.encoders.jumped == "azimuth moved by 0 counts, elevation moved by 501 counts"
-    script.encoders.trust()
+    assert script.encoders.motion.jumped == (0, 501)
+    script.encoders.motion.trust()
     assert script.read(0, 502).counts == (0, 502)
-    assert script.encoders.jumped == ""
+    assert script.encoders.motion.jumped is None
 
 
 def test_a_motor_may_go_on_at_its_limit_after_any_silence(script):
     script.read(0)
     for turn in range(1, 10):
         assert script.read(round(turn * FASTEST_COUNTS_S * 0.5), after_s=0.5) is not None
-    assert script.encoders.jumped == ""
+    assert script.encoders.motion.jumped is None
 
 
 def test_what_the_velocity_limit_allows_is_false_for_a_motor_that_is_commanded_less(script):
@@ -86,10 +86,10 @@ def test_what_the_velocity_limit_allows_is_false_for_a_motor_that_is_commanded_l
         script.read(0, commanded=(0.0, 0.0), after_s=fast)
     assert script.read(100, commanded=(0.0, 0.0), after_s=fast) is None
     assert script.read(1, commanded=(0.0, 0.0), after_s=fast).counts == (1, 0)
-    assert script.encoders.jumped == ""
+    assert script.encoders.motion.jumped is None
     assert script.read(100, commanded=(0.0, 0.0), after_s=fast) is None
     script.read(101, commanded=(0.0, 0.0), after_s=fast)
-    assert script.encoders.jumped == "azimuth moved by 100 counts, elevation moved by 0 counts"
+    assert script.encoders.motion.jumped == (100, 0)
 
 
 def test_a_motor_may_go_on_at_what_it_was_commanded_and_slow_down(script):
@@ -119,7 +119,7 @@ def test_late_answers_are_held_against_the_commands_of_their_time(script):
         encoders.latched = None
         encoders.add((place, 0))
         assert encoders.latched is not None
-    assert encoders.jumped == ""
+    assert encoders.motion.jumped is None
 
 
 def test_answers_that_never_come_leave_what_was_commanded_with_them(script):

@@ -254,13 +254,57 @@ def test_before_it_is_given_up_the_controller_is_told_to_stop_both_axes(scripted
     assert script.heard[-3:] == ["PFBKPROG(@0)", "ABORT @0", "ABORT @1"]
 
 
-def test_an_angle_that_no_motor_can_reach_in_the_time_is_an_error(scripted):
-    driver, script = scripted()
+def rested(driver):
+    """Open and at rest for so long that the motors have lost all speed."""
     driver.open()
     driver.exchange(STILL)
-    script.answers["PFBKPROG(@1)"] = "%8.25\n"
-    with pytest.raises(DeviceFault, match="elevation to turn at most"):
+    time.sleep(0.3)
+    driver.exchange(STILL)
+
+
+@pytest.mark.parametrize("false", ["%2.25\n", "%0.85\n", "%-8.25\n", "%1e300\n"])
+def test_a_false_angle_is_dropped_and_the_next_one_counts(scripted, false):
+    """0.85 and 2.25 are within what the velocity limit allows in 0.3 s, but not for a motor at rest."""
+    driver, script = scripted()
+    rested(driver)
+    time.sleep(0.3)
+    script.answers["PFBKPROG(@1)"] = false
+    assert driver.exchange(STILL) is None
+    script.answers["PFBKPROG(@1)"] = "%0.2505\n"
+    reading = driver.exchange(STILL)
+    assert reading.position_rad == pytest.approx((2.356194, -0.786969), abs=1e-6)
+
+
+def test_a_false_angle_that_comes_again_is_a_fault(scripted):
+    driver, script = scripted()
+    rested(driver)
+    script.answers["PFBKPROG(@1)"] = "%2.25\n"
+    assert driver.exchange(STILL) is None
+    with pytest.raises(
+        DeviceFault, match=r"azimuth moved by 0.000 rad, elevation moved by -6.283 rad"
+    ):
         driver.exchange(STILL)
+    driver.open()
+    assert driver.exchange(STILL).position_rad[1] == pytest.approx(-7.068583)
+
+
+def test_a_motor_may_have_turned_as_fast_as_it_was_commanded(scripted):
+    driver, script = scripted()
+    rested(driver)
+    driver.exchange((0.0, 20.0))
+    time.sleep(0.1)
+    script.answers["PFBKPROG(@1)"] = "%-0.38\n"  # 2 rad in 0.1 s
+    assert driver.exchange(STILL) is not None
+
+
+def test_an_axis_without_power_may_be_turned_by_hand(scripted):
+    driver, script = scripted()
+    rested(driver)
+    script.answers |= {"AXISSTATUS(@0)": "%2\n", "AXISSTATUS(@1)": "%2\n"}
+    driver.disable()
+    time.sleep(0.1)
+    script.answers["PFBKPROG(@1)"] = "%-0.38\n"
+    assert driver.exchange(STILL) is not None
 
 
 def test_a_refused_run_of_an_axis_without_fault_is_an_error(scripted):
