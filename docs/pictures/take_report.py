@@ -3,6 +3,7 @@
 python docs/pictures/take_report.py LOG
 """
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -17,6 +18,8 @@ SIZE = "1000,1320"
 
 def main() -> None:
     """Make the report and photograph it."""
+    # Chromium refuses to run as root, as in a container, with its sandbox. The log is ours.
+    without_sandbox = ["--no-sandbox"] if os.geteuid() == 0 else []
     picture = Path(__file__).with_name("report.png")
     with tempfile.TemporaryDirectory() as folder:
         page = make_report(find(find_run([Path(sys.argv[1])])), Path(folder))
@@ -24,7 +27,7 @@ def main() -> None:
             [  # noqa: S607
                 "chromium",
                 "--headless",
-                "--no-sandbox",
+                *without_sandbox,
                 "--hide-scrollbars",
                 f"--user-data-dir={folder}/profile",
                 f"--window-size={SIZE}",

@@ -192,7 +192,9 @@ async def seen_by_chromium(address, folder, good, limit_s):
     import matplotlib.image
 
     chromium = program("chromium", "google-chrome")
-    flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"]
+    flags = ["--headless=new", "--disable-gpu", "--window-size=1280,800"]
+    # Chromium refuses to run as root, as CI does, with its sandbox. The page is our own console.
+    flags += ["--no-sandbox"] if os.geteuid() == 0 else []
     flags += [f"--user-data-dir={folder}", "--remote-debugging-port=0"]
     browser = subprocess.Popen(
         [chromium, *flags, address], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
