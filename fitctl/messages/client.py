@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,9 +18,8 @@ from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply
 from fitctl.messages.endpoints import (
     COMMAND_SOCKET,
     TELEMETRY_SOCKET,
+    SocketFolder,
     keep_alive,
-    open_folder,
-    socket_in,
     tcp_endpoint,
 )
 from fitctl.messages.keys import RemoteKey
@@ -44,10 +41,9 @@ class Client:
     that none waits behind another. A socket whose command was answered is kept for the next one.
 
     On this machine, sockets are reached through the descriptor of a folder that was examined when it was opened
-    (:func:`~fitctl.messages.endpoints.open_folder`). In that folder only this user and root can make a
-    socket, so whoever answers is one of them, also when libzmq reconnects by itself. libzmq does not give
-    SO_PEERCRED of the other end to a client that connects, and a second connection would say nothing about
-    the first. A folder that has been made anew is examined and opened anew.
+    (:class:`~fitctl.messages.endpoints.SocketFolder`), so whoever answers is this user or root. libzmq does
+    not give SO_PEERCRED of the other end to a client that connects, and a second connection would say nothing
+    about the first. A folder that has been made anew is examined and opened anew.
 
     Parameters
     ----------
@@ -56,13 +52,11 @@ class Client:
     """
 
     def __init__(self, where: Path | RemoteKey) -> None:
-        self._where = where
+        self._where = where if isinstance(where, RemoteKey) else SocketFolder(where)
         self._context = zmq.Context()
         self._tags = itertools.count(1)
         self._closed = False
         self._idle: deque[tuple[str, zmq.Socket[bytes]]] = deque()  # with the endpoint of each
-        self._folders: list[int] = []  # descriptors; the last is in use, others may still be
-        self._folder_lock = threading.Lock()
         self._ahead_s: deque[float] = deque(maxlen=_CLOCK_MESSAGES)
         self._decode_telemetry = msgspec.msgpack.Decoder(Telemetry).decode
         self._decode_reply = msgspec.msgpack.Decoder(Reply).decode
@@ -139,9 +133,8 @@ class Client:
         self._subscriber.close()
         self._close_idle()
         self._context.term()
-        with self._folder_lock:
-            while self._folders:
-                os.close(self._folders.pop())
+        if isinstance(self._where, SocketFolder):
+            self._where.close()
 
     def _close_idle(self) -> None:
         with suppress(IndexError):  # another thread may take the last one
@@ -199,18 +192,10 @@ class Client:
         if isinstance(where, RemoteKey):
             port = where.command_port if which == COMMAND_SOCKET else where.telemetry_port
             return tcp_endpoint(where.host, port)
-        with self._folder_lock:
-            try:
-                found = open_folder(where.absolute())
-            except OSError:
-                return ""
-            except ConfigError as error:
-                raise ConnectionError(str(error)) from None
-            if self._folders and os.path.samestat(os.fstat(found), os.fstat(self._folders[-1])):
-                os.close(found)
-            else:
-                self._folders.append(found)
-            return socket_in(self._folders[-1], which)
+        try:
+            return where.endpoint(which)
+        except ConfigError as error:
+            raise ConnectionError(str(error)) from None
 
     def _hear(self, time_s: float) -> None:
         """Learn from a message how far the supervisor's clock is ahead, at least."""
@@ -220,7 +205,7 @@ class Client:
     def _why_silent(self, timeout_s: float) -> str:
         where = self._where
         if not isinstance(where, RemoteKey):
-            return f"no supervisor answers at {where} within {timeout_s:g} s; start one with: fitctl run"
+            return f"no supervisor answers at {where.path} within {timeout_s:g} s; start one with: fitctl run"
         place = f"{where.host} port {where.command_port}"
         if self._is_refused():
             return (

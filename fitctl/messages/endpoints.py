@@ -11,6 +11,7 @@ import os
 import pwd
 import socket
 import stat
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -212,6 +213,54 @@ def _is_own_group(gid: int) -> bool:
 def socket_in(folder: int, name: str) -> str:
     """The ZeroMQ endpoint of a socket in a folder that :func:`open_folder` has opened."""
     return f"ipc:///proc/self/fd/{folder}/{name}"
+
+
+class SocketFolder:
+    """A rig's socket folder by its path, examined whenever it is used and opened anew when it was made anew.
+
+    In a folder that :func:`open_folder` accepts, only this user and root can make a socket. What libzmq
+    connects to, also when it reconnects by itself, is in the folder that was examined. May be used from any
+    thread.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path : Path
+        Absolute.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.absolute()
+        self._opened: list[int] = []  # descriptors; the last is in use, others may still be
+        self._lock = threading.Lock()
+
+    def endpoint(self, name: str) -> str:
+        """The ZeroMQ endpoint of a socket in it; empty while there is no folder.
+
+        Raises
+        ------
+        ConfigError
+            If the folder could be another user's.
+        """
+        with self._lock:
+            try:
+                found = open_folder(self.path)
+            except OSError:
+                return ""
+            if self._opened and os.path.samestat(os.fstat(found), os.fstat(self._opened[-1])):
+                os.close(found)
+            else:
+                self._opened.append(found)
+            return socket_in(self._opened[-1], name)
+
+    def close(self) -> None:
+        """Close it; safe to call twice."""
+        with self._lock:
+            while self._opened:
+                os.close(self._opened.pop())
 
 
 def file_identity(path: Path) -> tuple[int, int] | None:

@@ -21,10 +21,10 @@ import msgspec
 import zmq
 
 from fitctl.clock import Clock
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
 from fitctl.logging.records import Severity
 from fitctl.messages.commands import Reply
-from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET
+from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, SocketFolder
 from fitctl.messages.keys import AllowedKey
 from fitctl.service.doors import QUEUED, Parcel, frame_property
 from fitctl.service.envelope import Passed, Report
@@ -122,11 +122,13 @@ class Gateway:
         # Nothing waits for a supervisor that is not there.
         self._supervisor.setsockopt(zmq.IMMEDIATE, 1)
         self._supervisor.setsockopt(zmq.LINGER, 0)
-        self._supervisor.connect(f"ipc://{folder / GATEWAY_SOCKET}")
         self._telemetry = self._context.socket(zmq.SUB)
         self._telemetry.setsockopt(zmq.RCVHWM, QUEUED)
         self._telemetry.subscribe(b"")
-        self._telemetry.connect(f"ipc://{folder / TELEMETRY_SOCKET}")
+        self._folder = SocketFolder(folder)
+        self._connected: dict[str, str] = {}  # endpoints, by the names of the supervisor's sockets
+        self._unsafe = ""
+        self._connect()
         ports = f"ports {service.command_port} and {service.telemetry_port}"
         self._report_event("info", f"listening at {service.tcp_address}, {ports}")
 
@@ -142,6 +144,7 @@ class Gateway:
                 now_s = self._clock.now_s()
                 if now_s >= look_s:
                     self._alive()
+                    self._connect()
                     self._keyed.refresh()
                     for whose in self._keyed.end_excessive():
                         self._intake.drop(whose, "far more than is read: its connection was ended")
@@ -164,6 +167,25 @@ class Gateway:
             self._telemetry.close()
             self._keyed.close()
             self._context.term()
+            self._folder.close()
+
+    def _connect(self) -> None:
+        """Connect to the supervisor's sockets where they are now: in a folder that can be nobody else's."""
+        for name, one in ((GATEWAY_SOCKET, self._supervisor), (TELEMETRY_SOCKET, self._telemetry)):
+            try:
+                endpoint = self._folder.endpoint(name)
+            except ConfigError as error:
+                if str(error) != self._unsafe:
+                    self._unsafe = str(error)
+                    self._report_event("error", self._unsafe)
+                return
+            before = self._connected.get(name)
+            if endpoint and endpoint != before:
+                if before is not None:
+                    one.disconnect(before)
+                one.connect(endpoint)
+                self._connected[name] = endpoint
+        self._unsafe = ""
 
     def _pass_commands(self) -> None:
         """Take some, as long as the supervisor takes them too; the rest waits with its sender."""

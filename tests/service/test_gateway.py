@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from served import Served, rig_in, until
 
-from fitctl.clock import VirtualClock
+from fitctl.clock import MonotonicClock, VirtualClock
 from fitctl.config import ConfigError
 from fitctl.logging.records import CommandRecord
 from fitctl.messages.commands import Hold, Status, Stop, TakeOver
@@ -26,6 +26,7 @@ from fitctl.messages.endpoints import (
 )
 from fitctl.messages.keys import AllowedKey, new_key, revoke_key
 from fitctl.service.envelope import Passed, Report, decode_envelope
+from fitctl.service.gateway import Gateway
 from fitctl.service.keyed_door import check_keyed_door
 
 STOP = msgspec.msgpack.encode(Stop())
@@ -203,6 +204,47 @@ def test_a_gateway_that_hangs_is_ended_by_its_alarm(tmp_path):
 
     assert done.returncode == -signal.SIGALRM
     assert not done.stderr
+
+
+@pytest.fixture
+def gateway_in(tmp_path):
+    """A rig with a gateway, and no supervisor."""
+    rig = rig_in(tmp_path, "service.tcp_address=127.0.0.1")
+    make_service_folder(rig)
+    gateway, ending = Gateway(rig, tmp_path / "s", MonotonicClock()), threading.Event()
+    thread = threading.Thread(target=gateway.run, args=[ending])
+    thread.start()
+    yield rig
+    ending.set()
+    thread.join()
+
+
+def heard_in(folder, timeout_ms):
+    """What a gateway says to whoever has its socket in a folder."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as supervisor:
+        supervisor.setsockopt(zmq.LINGER, 0)
+        supervisor.bind(f"ipc://{folder / GATEWAY_SOCKET}")
+        if not supervisor.poll(timeout_ms):
+            return None
+        return decode_envelope(supervisor.recv_multipart()[-1])
+
+
+def test_a_gateway_connects_again_only_in_a_folder_that_nobody_else_could_have_made(
+    gateway_in, tmp_path
+):
+    rig, folder = gateway_in, tmp_path / "s"
+    assert "listening at" in heard_in(folder, 20_000).events[0][1]
+    folder.rename(tmp_path / "away")
+    folder.mkdir()
+    folder.chmod(0o777)
+    new_key(rig, "anna", "commander", "", tmp_path / "anna.key.toml")  # there is something to say
+
+    assert heard_in(folder, 1500) is None
+    folder.chmod(0o700)
+    report = heard_in(folder, 20_000)
+
+    assert [key.name for key in report.keys] == ["anna"]
+    assert any("is not safe" in text for _, text in report.events)
 
 
 # ---------------------------------------------------------------- ports

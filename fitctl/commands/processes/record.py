@@ -11,7 +11,7 @@ from fitctl.logging.recorder import record as record_messages
 from fitctl.logging.records import RecorderStatus
 from fitctl.messages.client import Client
 from fitctl.messages.commands import RecorderReport
-from fitctl.messages.endpoints import RECORDS_SOCKET, checked_folder
+from fitctl.messages.endpoints import RECORDS_SOCKET, SocketFolder, checked_folder
 from fitctl.processes import ended_by_signals
 
 _REPORT_TIMEOUT_S = 0.5
@@ -24,6 +24,8 @@ def record(
     settings = rig_of(rig, overrides)
     folder = checked_folder(settings)
     client = Client(folder)
+    # Examined once: a recorder connects once, because the queue serves only one that has just announced itself.
+    sockets = SocketFolder(folder)
 
     def report(status: RecorderStatus) -> None:
         try:
@@ -35,7 +37,7 @@ def record(
     with ended_by_signals(stop.set):
         try:
             record_messages(
-                f"ipc://{folder / RECORDS_SOCKET}",
+                sockets.endpoint(RECORDS_SOCKET),
                 settings.logging,
                 rig_name=settings.name,
                 folder=Path(settings.logging.folder).expanduser(),
@@ -45,3 +47,4 @@ def record(
             )
         finally:
             client.close()
+            sockets.close()
