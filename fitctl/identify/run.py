@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from fitctl.config import Rig
+from fitctl.files import open_regular
 from fitctl.identify.errors import IdentifyError
+from fitctl.logging.folder import log_name
 from fitctl.logging.records import AnyRecord
 from fitctl.messages.client import Client
 from fitctl.messages.commands import AnyCommand, Experiment, Hold, Status
@@ -15,6 +18,7 @@ from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.model.drives import Drive, experiment_s
 from fitctl.simulation.simulation import Simulation
+from fitctl.text import plain
 
 _ACQUIRE_LIMIT_S = 120.0
 _SETTLE_S = 5.0  # in vernier, before the loop is opened: what the search left behind decays
@@ -78,7 +82,8 @@ def on_rig(
     Raises
     ------
     IdentifyError
-        If the supervisor refuses, falls silent, or the star is lost on the way.
+        If the supervisor refuses, falls silent, or the star is lost on the way; or if what it names as its
+        log is none of this rig and this user.
     ConnectionError
         If no supervisor answers.
     """
@@ -97,7 +102,30 @@ def on_rig(
     if not paths:
         msg = "the supervisor has no recorder, so there is no log to learn from; see its events"
         raise IdentifyError(msg)
+    for path in paths:
+        _require_own_log(path, rig.name)
     return list(paths)
+
+
+def _require_own_log(path: Path, rig_name: str) -> None:
+    """Check that what a message names is a log of this rig, and a regular file of this user's."""
+    why = ""
+    if not log_name(rig_name).fullmatch(path.name):
+        why = f"its name is not that of a log of rig {rig_name}"
+    else:
+        try:
+            with open_regular(path) as file:
+                owner = os.fstat(file.fileno()).st_uid
+            if owner != os.getuid():
+                why = f"it belongs to user {owner}"
+        except OSError as error:
+            why = error.strerror or str(error)
+    if why:
+        msg = (
+            f"the supervisor records to {plain(str(path))}, which is not read: {why}; if you trust the log, "
+            "name it with --log"
+        )
+        raise IdentifyError(msg)
 
 
 def _hear(client: Client, paths: dict[Path, None]) -> Telemetry | None:

@@ -40,6 +40,11 @@ def new_log_path(folder: Path, rig_name: str, start: datetime) -> Path:
     return next(path for name in names if not (path := folder / f"{name}.mcap").exists())
 
 
+def log_name(rig_name: str) -> re.Pattern[str]:
+    """What a recorder of a rig calls its logs (:func:`new_log_path`); group 1 is the time."""
+    return re.compile(re.escape(rig_name) + r"_(\d{8}T\d{6})Z(_\d+)?\.mcap")
+
+
 def in_use(path: Path) -> bool:
     """Whether some recorder has this log open; false where the folder knows no locks.
 
@@ -174,7 +179,7 @@ class _Log(NamedTuple):
 
 
 def _logs_of(folder: Path, rig_name: str) -> Iterator[_Log]:
-    name = re.compile(re.escape(rig_name) + r"_(\d{8}T\d{6})Z(_\d+)?\.mcap")
+    name = log_name(rig_name)
     for path in folder.glob("*.mcap"):
         found = name.fullmatch(path.name)
         with contextlib.suppress(FileNotFoundError):  # somebody else deletes too

@@ -1,7 +1,7 @@
 """`fitctl identify` as a stranger meets it: what is wrong is said before anything moves."""
 
+import os
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +10,7 @@ from fitctl.cli import main
 from fitctl.commands.design import identify as commands
 from fitctl.daemon.run import run_info
 from fitctl.identify import run as runs
+from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import EXPERIMENTS
 from fitctl.identify.run import on_simulation
 from fitctl.logging.writer import LogWriter
@@ -70,9 +71,10 @@ def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp
     assert found.fragment() == whole.fragment()
 
 
-def test_the_logs_of_an_experiment_are_those_that_were_written_meanwhile(rig, monkeypatch):
-    monkeypatch.setattr(runs, "_FLUSH_SLACK_S", 0.0)
-    moments = [("EXPERIMENT", "a"), ("EXPERIMENT", "b"), ("COARSE", "b"), ("COARSE", "c")]
+def experimented(rig, logs):
+    """What is found by a rig that names these logs, two of them while the experiment goes on."""
+    first, second, third = logs
+    moments = [("EXPERIMENT", first), ("EXPERIMENT", second), ("COARSE", second), ("COARSE", third)]
 
     class Rigged:
         began_s = time.monotonic()
@@ -85,11 +87,43 @@ def test_the_logs_of_an_experiment_are_those_that_were_written_meanwhile(rig, mo
             if mode == "COARSE":  # not one from before the experiment
                 time.sleep(max(0.0, self.began_s + 1.1 - time.monotonic()))
             loop = SimpleNamespace(name="right", mode=mode, last_change=None)
-            return SimpleNamespace(loops=[loop], recorder=SimpleNamespace(path=f"{log}.mcap"))
+            return SimpleNamespace(loops=[loop], recorder=SimpleNamespace(path=str(log)))
 
     drive = Drive(channel="fsm_az", shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=9.0)
-    found = runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
-    assert found == [Path("a.mcap"), Path("b.mcap"), Path("c.mcap")]
+    return runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
+
+
+@pytest.fixture
+def logs(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "_FLUSH_SLACK_S", 0.0)
+    paths = [tmp_path / f"{rig.name}_20261121T00000{number}Z.mcap" for number in range(3)]
+    for path in paths:
+        path.touch()
+    return paths
+
+
+def test_the_logs_of_an_experiment_are_those_that_were_written_meanwhile(rig, logs):
+    assert experimented(rig, logs) == logs
+
+
+def test_what_the_supervisor_names_as_its_log_is_read_only_if_it_is_a_log_of_ours(
+    rig, logs, monkeypatch
+):
+    named = logs[1]
+    named.unlink()
+    os.mkfifo(named)
+    with pytest.raises(IdentifyError, match="not a regular file"):
+        experimented(rig, logs)
+    named.unlink()
+    with pytest.raises(IdentifyError, match="No such file"):
+        experimented(rig, logs)
+    for other in ("/etc/passwd", "/dev/zero", str(named.with_name("other_20261121T000001Z.mcap"))):
+        with pytest.raises(IdentifyError, match=f"{other}, .* not that of a log of rig {rig.name}"):
+            experimented(rig, [logs[0], other, logs[2]])
+    named.touch()
+    monkeypatch.setattr(os, "getuid", lambda: 4242)
+    with pytest.raises(IdentifyError, match="it belongs to user"):
+        experimented(rig, logs)
 
 
 def test_ctrl_c_ends_the_experiment_on_the_rig(rig):
