@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from benchmarks.motors import StillMotors
 from fitctl.clock import MonotonicClock
 from fitctl.config import default_rig_path, load_rig
-from fitctl.drivers.cia402.driver import Cia402Amplifiers
+from fitctl.daemon.devices import AMPLIFIERS
+from fitctl.drivers.interface import ServoAmplifiers
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.stages.realtime import become_realtime, lock_memory, quiet_interpreter
@@ -43,7 +44,7 @@ def serve(pipe: Connection) -> None:
     run_on_time(run())
 
 
-def cycle(amplifiers: Cia402Amplifiers, rate_hz: float, duration_s: float) -> NDArray[np.float64]:
+def cycle(amplifiers: ServoAmplifiers, rate_hz: float, duration_s: float) -> NDArray[np.float64]:
     """Each period's deadline, waking, and end of exchange (nan without a reading); shape (periods, 3)."""
     clock = MonotonicClock()
     period_s = 1 / rate_hz
@@ -80,7 +81,8 @@ def late_counts(histogram: str) -> dict[int, int]:
 
 def late_us(counts: dict[int, int]) -> list[float]:
     """Median, 99 % and worst of cyclictest's wake-ups, us."""
-    total, seen, found = sum(counts.values()), 0, []
+    total, seen = sum(counts.values()), 0
+    found: list[float] = []
     for late in sorted(counts):
         seen += counts[late]
         while len(found) < len(PERCENTILES) and 100 * seen >= PERCENTILES[len(found)] * total:
@@ -111,7 +113,7 @@ def main() -> None:
                 f"loops.right.siderostat.servo.rate_hz={arguments.rate}",
             ],
         )
-        amplifiers = Cia402Amplifiers(rig.loops["right"].siderostat)
+        amplifiers = AMPLIFIERS["cia402"](rig.loops["right"].siderostat)
         amplifiers.open()
         amplifiers.enable()
         quiet_interpreter()

@@ -25,7 +25,7 @@ from benchmarks.recorder import processor_s
 from fitctl import demo
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import LoopTiming, Tick
-from fitctl.messages.commands import Acquire, Recover
+from fitctl.messages.commands import Acquire, AnyCommand, Recover
 from fitctl.messages.keys import new_key
 
 SETTLING_S = 1.0
@@ -92,7 +92,7 @@ def together(some: list[Window]) -> Window:
 def hold(running: demo.Instrument) -> None:
     """Wait until the star is held, and see that it will be."""
     deadline_s, told = time.monotonic() + HOLD_S, ""
-    towards = {"SAFE": Recover(), "STANDBY": Acquire()}
+    towards: dict[str, AnyCommand] = {"SAFE": Recover(), "STANDBY": Acquire()}
     catch_up(running)
     while time.monotonic() < deadline_s:
         telemetry = running.client.receive(0.5)
@@ -133,6 +133,7 @@ def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: f
             [sys.executable, "-m", "benchmarks.flooder", *arguments, duration],
             stdout=subprocess.PIPE,
         )
+        assert process.stdout is not None  # noqa: S101  # a pipe, as asked for
         process.stdout.readline()  # it has begun
     time.sleep(SETTLING_S)
     catch_up(running)
@@ -142,8 +143,10 @@ def one(running: demo.Instrument, kind: str, arguments: list[str], duration_s: f
     offered, sent = json.loads(process.communicate()[0]) if process else (0, 0)
     ticks = [tick for tick in course.ticks["right"] if tick.time_s >= begun_s]
     timing = [timing for timing in course.timing.values() if timing.time_s >= begun_s]
-    taken = [max(0.0, now - then) for now, then in zip(after, before, strict=True)]
-    return Window(ticks, timing, offered, sent, *taken, lasted_s)
+    supervisor_cpu_s, gateway_cpu_s = (
+        max(0.0, now - then) for now, then in zip(after, before, strict=True)
+    )
+    return Window(ticks, timing, offered, sent, supervisor_cpu_s, gateway_cpu_s, lasted_s)
 
 
 def spread(values: list[float], unit: float) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
+from typing import cast
 
 ANSWER = b"1.234\n"
 QUESTION = b"V?\n"
@@ -31,7 +32,7 @@ def udp_echo(port: int) -> None:
 
     class Echo(asyncio.DatagramProtocol):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            self.transport = transport
+            self.transport = cast(asyncio.DatagramTransport, transport)
 
         def datagram_received(self, data: bytes, address: tuple[str, int]) -> None:
             self.transport.sendto(data, address)

@@ -108,7 +108,7 @@ def mutant_of(
     room: str, path: Path, module: libcst.Module, mutation: file_mutation.Mutation
 ) -> Mutant:
     """The module's code with this mutation, and what differs."""
-    code = module.deep_replace(mutation.original_node, mutation.mutated_node).code  # type: ignore[arg-type, union-attr]
+    code = module.deep_replace(mutation.original_node, mutation.mutated_node).code
     lines = list(
         difflib.unified_diff(module.code.splitlines(), code.splitlines(), lineterm="", n=0)
     )
@@ -300,7 +300,7 @@ def main() -> None:
         "--rooms", nargs="+", default=folders, help="folders of fitctl/, or modules' folders"
     )
     given = parser.parse_args()
-    mutation_operators.append((libcst.Expr, delete_statement))  # type: ignore[attr-defined]
+    mutation_operators.append((libcst.Expr, delete_statement))
 
     started = datetime.datetime.now(datetime.UTC)
     population, mutants = sample(given.rooms, given.seed, given.count)

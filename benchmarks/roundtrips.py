@@ -32,9 +32,7 @@ from benchmarks.motors import StillMotors
 from fitctl.config import Loop, LoopMocks, default_rig_path, load_rig
 from fitctl.drivers.cia402.protocol import encode_sdo
 from fitctl.drivers.gige.protocol import Command, Register, encode_command, encode_words
-from fitctl.mocks.bal_analog.station import BalAnalogMockStation
-from fitctl.mocks.cia402.drive import Cia402DriveMock
-from fitctl.mocks.ensemble.controller import EnsembleControllerMock
+from fitctl.mocks.amplifiers import amplifier_mock
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.mdt693.server import Mdt693Mock
@@ -106,22 +104,22 @@ async def _dac_pty() -> str:
     return (await _dac()).pty_path
 
 
+async def _amplifiers(name: str, *settings: str) -> Any:
+    loop, mocks = _rig(name, *(f"mocks.loops.right.{setting}" for setting in settings))
+    return await amplifier_mock(loop.siderostat, mocks, StillMotors()).start()
+
+
 async def _drive() -> int:
-    loop, _ = _rig("fit-mock.toml")
-    return await Cia402DriveMock(loop.siderostat, StillMotors(), port=0).start()
+    return int(await _amplifiers("fit-mock.toml", "slcan_port=0"))
 
 
-async def _ensemble(**settings: float) -> int:
-    loop, mocks = _rig("ensemble.toml")
-    ours = mocks.ensemble.model_copy(update={"tcp_port": 0, **settings})
-    mock = EnsembleControllerMock(loop.siderostat, ours, StillMotors())
-    return (await mock.start()).tcp_port
+async def _ensemble(*settings: str) -> int:
+    listening = await _amplifiers("ensemble.toml", "ensemble.tcp_port=0", *settings)
+    return int(listening.tcp_port)
 
 
 async def _bal_analog() -> int:
-    loop, mocks = _rig("fit-bal-analog.toml")
-    ours = mocks.bal_analog.model_copy(update={"modbus_port": 0})
-    return await BalAnalogMockStation(loop.siderostat, ours, StillMotors()).start()
+    return int(await _amplifiers("fit-bal-analog.toml", "bal_analog.modbus_port=0"))
 
 
 async def _camera() -> int:
@@ -155,7 +153,7 @@ def every_line() -> Iterator[Line]:
     dac = loop.fsm.dac
     write = struct.pack(">BHHB6x", 16, dac.first_register, 3, 6)
     yield Line("D/A: FC 16, three channels", TCP, _dac_tcp, _adu(dac.device_id, write), _is(12))
-    bal = _rig("fit-bal-analog.toml")[0].siderostat.device
+    bal: Any = _rig("fit-bal-analog.toml")[0].siderostat.device
     both = struct.pack(
         ">BHHHHB6x", 23, bal.first_input_register, 3, bal.first_output_register, 3, 6
     )
@@ -163,8 +161,9 @@ def every_line() -> Iterator[Line]:
         "BAL station: FC 23, both axes", TCP, _bal_analog, _adu(bal.device_id, both), _is(15)
     )
     position = b"PFBKPROG(@0)\n", _ends(b"\n")
-    yield Line("Ensemble: a position", TCP, partial(_ensemble, reply_s=0.0), *position)
-    node = loop.siderostat.device.node_id
+    yield Line("Ensemble: a position", TCP, partial(_ensemble, "ensemble.reply_s=0.0"), *position)
+    drive: Any = loop.siderostat.device
+    node = drive.node_id
     upload = f"t{SDO_REQUEST + node:03x}8{encode_sdo(UPLOAD, STATUSWORD, 0).hex()}\r".encode()
     uploaded = f"t{SDO_ANSWER + node:03x}8".encode()
     yield Line(
@@ -211,7 +210,7 @@ def free_port() -> int:
 def connect(line: Line, where: int | str, stack: ExitStack) -> int:
     """A file descriptor to the device; tried again until it listens."""
     if line.wire == PTY:
-        return int(stack.enter_context(serial.Serial(str(where), BAUD_RATE)).fd)
+        return int(stack.enter_context(serial.Serial(str(where), BAUD_RATE)).fileno())
     kind = socket.SOCK_STREAM if line.wire == TCP else socket.SOCK_DGRAM
     end_s = time.monotonic() + STARTS_WITHIN_S
     while True:

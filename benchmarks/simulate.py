@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -45,7 +46,9 @@ def line(title: str, rows: np.ndarray) -> str:
 
 
 @compilable()
-def draw_normals(random: object, air: int, key: int, pixels: int, table: np.ndarray) -> float:
+def draw_normals(
+    random: np.random.Generator, air: int, key: int, pixels: int, table: np.ndarray
+) -> float:
     """As many normal deviates for the air and for pixels as given, compiled as the batch is."""
     total = 0.0
     for _ in range(air):
@@ -83,7 +86,7 @@ def main() -> None:
     for name in ("eq20", "minimum-variance"):
         vernier = [f"loops.{loop}.vernier.controller={name}" for loop in rig.loops]
         one = Batch(load_rig(default_rig_path(), vernier))
-        rows = speeds(lambda seed, one=one: one.run(seed, RUN_S), arguments.runs, RUN_S)
+        rows = speeds(partial(one.run, duration_s=RUN_S), arguments.runs, RUN_S)
         print(line(f"batch, {name}", rows), flush=True)
     rows = speeds(lambda _: simulation.run(PIECE_S), arguments.pieces, PIECE_S)
     print(line("interactive simulation, VERNIER", rows))

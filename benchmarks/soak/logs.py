@@ -6,7 +6,7 @@ import multiprocessing
 import os
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fitctl.logging.copying import recover
 from fitctl.logging.errors import LogError
@@ -112,7 +112,7 @@ def _mended_problems(path: Path) -> list[str]:
         mended.unlink(missing_ok=True)
 
 
-def _recorders_own(topic: str, message: object) -> bool:
+def _recorders_own(topic: str, message: Any) -> bool:
     """Whether the recorder made it, so that it was never in the queue."""
     if topic == TOPICS[Event]:  # the supervisor's about the recorder all begin like this
         return message.name == "recorder" and not message.message.startswith("the recorder ")

@@ -79,7 +79,11 @@ def _device_fault(
     answer = ask_bench(port, fault, FaultsNow)
     if answer.error:
         raise ValueError(answer.error)
-    return lambda: ask_bench(port, ClearFaults(), FaultsNow) and None
+
+    def heal() -> None:
+        ask_bench(port, ClearFaults(), FaultsNow)
+
+    return heal
 
 
 # ---------------------------------------------------------------- processes
