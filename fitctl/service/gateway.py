@@ -12,7 +12,7 @@ import os
 import resource
 import signal
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, SocketFo
 from fitctl.messages.keys import AllowedKey
 from fitctl.service.doors import QUEUED, Parcel, frame_property
 from fitctl.service.envelope import Passed, Report
-from fitctl.service.intake import Intake
+from fitctl.service.intake import Intake, Limit
 from fitctl.service.keyed_door import KeyedDoor
 
 _NICENESS = 10
@@ -38,7 +38,7 @@ _MESSAGES_A_ROUND = 8
 _HANDSHAKES_A_ROUND = 4
 _DROPPED_A_ROUND = 200  # messages that are neither passed on nor answered
 _LOOK_S = 0.1
-_MOST_DROPPED_A_LOOK = 500  # of one key, before it is refused for a while
+_MOST_DROPPED_PER_S = 1000.0  # of one key, and as many at once, before it is refused for a while
 _HUNG_S = 10
 _NO_KEY = "revoked keys"  # all of them together, where messages are counted
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
@@ -104,7 +104,7 @@ class Gateway:
         self._clock = clock
         self._alive = alive
         self._intake = Intake(service.commands_per_s, rig.loops)
-        self._unanswered: Counter[AllowedKey] = Counter()  # messages since the last look
+        self._unanswered = Limit(_MOST_DROPPED_PER_S, _MOST_DROPPED_PER_S)
         self._events: deque[tuple[Severity, str]] = deque(maxlen=_MOST_EVENTS)
         self._reported: dict[str, AllowedKey] | None = None
         self._encode = msgspec.msgpack.Encoder().encode
@@ -148,10 +148,6 @@ class Gateway:
                     self._keyed.refresh()
                     for whose in self._keyed.end_excessive():
                         self._intake.drop(whose, "far more than is read: its connection was ended")
-                    for key, messages in self._unanswered.items():
-                        if messages > _MOST_DROPPED_A_LOOK:
-                            self._keyed.ban(key)
-                    self._unanswered.clear()
                     for line in self._intake.dropped(now_s):
                         self._report_event("warning", line)
                     look_s = now_s + _LOOK_S
@@ -205,8 +201,8 @@ class Gateway:
         if isinstance(admitted, Reply):
             name = _NO_KEY if key is None else key.name
             if not self._intake.answers_refusal(name, now_s):
-                if key is not None:
-                    self._unanswered[key] += 1
+                if key is not None and not self._unanswered.within(name, now_s):
+                    self._keyed.ban(key)
                 return False
             self._answer(parcel, admitted)
         elif not self._send(self._encode((parcel.identity, parcel.tag)), admitted):

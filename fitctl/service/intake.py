@@ -18,10 +18,12 @@ _REPORT_PERIOD_S = 5.0
 _ANSWERED_REFUSALS_PER_S = 20.0
 _LOGGED_REFUSALS_PER_S = 1.0
 _LOGGED_REFUSALS_AT_ONCE = 10.0
+# Beside the rate of commands. Somebody who needs to stop needs one; reading a flood of them takes all the time.
+_STOPS_PER_S = 50.0
 
 
 class Accepted(NamedTuple):
-    """A command; a stop is accepted even when it exceeds the rate."""
+    """A command; a stop is accepted even when it exceeds the rate, within a limit of its own."""
 
     command: AnyCommand
     over_rate: bool
@@ -61,6 +63,7 @@ class Intake:
             text=f"more than {commands_per_s:g} commands a second; wait, then try again",
         )
         self._commands = Limit(commands_per_s, commands_per_s)
+        self._stops = Limit(_STOPS_PER_S, _STOPS_PER_S)
         self._answers = Limit(_ANSWERED_REFUSALS_PER_S, _ANSWERED_REFUSALS_PER_S)
         self._records = Limit(_LOGGED_REFUSALS_PER_S, _LOGGED_REFUSALS_AT_ONCE)
         self._dropped: Counter[tuple[str, str]] = Counter()
@@ -70,13 +73,14 @@ class Intake:
         """Decode somebody's message: the command in it, or why it is rejected.
 
         Only a stop that will be obeyed exceeds the rate: from somebody who may stop, for a loop that exists.
+        Of these stops too, no more than 50 a second are accepted from one person.
         """
         command = decode_command(payload)
         within_rate = self._commands.within(name, now_s)
         stops = (
             isinstance(command, Stop) and role == "commander" and command.loop in self._stoppable
         )
-        if not within_rate and not stops:
+        if not within_rate and not (stops and self._stops.within(name, now_s)):
             self.drop(name, "over the rate limit")
             return self._too_many
         if isinstance(command, Reply):

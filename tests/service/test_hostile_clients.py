@@ -8,13 +8,14 @@ import sys
 import time
 from contextlib import suppress
 
+import msgspec
 import psutil
 import pytest
 import zmq
 import zmq.utils.monitor
 from served import Served, until
 
-from fitctl.messages.commands import Status
+from fitctl.messages.commands import Status, Stop
 from fitctl.messages.endpoints import tcp_endpoint
 
 _LISTENS_S = 60.0
@@ -40,15 +41,20 @@ def served(tmp_path_factory):
         served.close()
 
 
-def keyed(kind, key, port):
-    """A socket of an allowed key, and the descriptor of its connection."""
-    context = zmq.Context.instance()
-    one = context.socket(kind)
+def socket_of(kind, key):
+    """A socket that has a key, and is not connected."""
+    one = zmq.Context.instance().socket(kind)
     one.curve_serverkey = key.server_public.encode()
     one.curve_publickey, one.curve_secretkey = key.public.encode(), key.secret.encode()
     one.setsockopt(zmq.LINGER, 0)
-    one.setsockopt(zmq.SNDTIMEO, 2000)
     one.setsockopt(zmq.SNDHWM, 100_000)
+    return one
+
+
+def keyed(kind, key, port):
+    """A socket of an allowed key, and the descriptor of its connection."""
+    one = socket_of(kind, key)
+    one.setsockopt(zmq.SNDTIMEO, 2000)
     one.setsockopt(zmq.HEARTBEAT_IVL, 1)
     one.setsockopt(zmq.HEARTBEAT_TIMEOUT, 60_000)  # it does not mind silence
     with one.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED) as monitor:
@@ -134,6 +140,23 @@ def test_who_is_ended_for_a_flood_is_refused_for_a_while_and_others_are_not(serv
     one.close(linger=0)
     with pytest.raises(ConnectionError):
         served.client_of(key).send(Status(), timeout_s=1.0)
+    is_well(served)
+
+
+def test_who_connects_anew_with_each_flood_of_stops_is_refused_for_a_while_and_others_are_not(
+    served,
+):
+    """Each connection stays below its limit, and hangs up; a commander's stops exceed the rate of commands."""
+    key, stop = served.key("stopper"), msgspec.msgpack.encode(Stop())
+    for _ in range(20):
+        one = socket_of(zmq.DEALER, key)
+        one.connect(tcp_endpoint(key.host, key.command_port))
+        for _ in range(500):
+            one.send_multipart([b"tag", stop])
+        one.close(linger=20_000)
+
+    told = "the key stopper sends far more than is read"
+    until(lambda: any(told in line for line in served.events()), 60.0)
     is_well(served)
 
 

@@ -43,6 +43,15 @@ def test_a_stop_is_taken_even_when_it_is_one_too_many(intake):
     assert intake.accept("anna", "commander", STOP, 0.0) == Accepted(Stop(), over_rate=True)
 
 
+def test_of_a_flood_of_stops_fifty_a_second_are_taken(intake):
+    replies = [intake.accept("anna", "commander", STOP, now_s) for now_s in [0.0] * 1000 + [1.0]]
+
+    assert [isinstance(reply, Accepted) for reply in replies] == [True] * 60 + [False] * 940 + [
+        True
+    ]
+    assert isinstance(intake.accept("bob", "commander", STOP, 0.0), Accepted)
+
+
 @pytest.mark.parametrize(
     ("role", "loop"), [("viewer", ""), ("viewer", "right"), ("commander", "no such loop")]
 )
