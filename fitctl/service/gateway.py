@@ -38,7 +38,9 @@ _MESSAGES_A_ROUND = 8
 _HANDSHAKES_A_ROUND = 4
 _DROPPED_A_ROUND = 200  # messages that are neither passed on nor answered
 _LOOK_S = 0.1
-_MOST_DROPPED_PER_S = 1000.0  # of one key, and as many at once, before it is refused for a while
+# Of one key, before it is refused for a while; low, so that a gateway short of processor time notices too.
+_MOST_DROPPED_PER_S = 100.0
+_MOST_DROPPED_AT_ONCE = 1000.0
 _HUNG_S = 10
 _NO_KEY = "revoked keys"  # all of them together, where messages are counted
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
@@ -104,7 +106,7 @@ class Gateway:
         self._clock = clock
         self._alive = alive
         self._intake = Intake(service.commands_per_s, rig.loops)
-        self._unanswered = Limit(_MOST_DROPPED_PER_S, _MOST_DROPPED_PER_S)
+        self._unanswered = Limit(_MOST_DROPPED_PER_S, _MOST_DROPPED_AT_ONCE)
         self._events: deque[tuple[Severity, str]] = deque(maxlen=_MOST_EVENTS)
         self._reported: dict[str, AllowedKey] | None = None
         self._encode = msgspec.msgpack.Encoder().encode
