@@ -23,10 +23,11 @@ from fitctl.daemon.last_records import HELLO_S
 from fitctl.daemon.locks import only_supervisor
 from fitctl.logging.records import LoopTiming, Tick
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Acquire, AnyCommand, Standby
+from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
 from fitctl.messages.endpoints import make_service_folder
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.waiting import wait_for_outcomes
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.model.optics import scales
 from fitctl.processes import (
@@ -102,7 +103,7 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
             Client(sockets), sockets, folder, bench_port, started_s, supervisor, mocks
         )
         try:
-            _wait(running, lambda _: True, "the supervisor's first telemetry")
+            _wait_for_telemetry(running)
             yield running
         finally:
             running.client.close()
@@ -121,12 +122,16 @@ def acquire(running: Instrument) -> None:
     DemoError
         If the supervisor refuses or a device fails.
     """
-    _command(running, Standby())
-    _wait(
-        running,
-        lambda telemetry: all(loop.mode == Mode.STANDBY.name for loop in telemetry.loops),
-        "STANDBY",
-    )
+    reply = _command(running, Standby())
+    try:
+        outcomes = wait_for_outcomes(running.client, reply, _START_TIMEOUT_S)
+    except ConnectionError:
+        running.check()
+        raise
+    for outcome in outcomes.values():
+        if outcome.state != "done":
+            msg = f"standby {outcome.state}: {outcome.text or 'give it more time'}"
+            raise DemoError(msg)
     _command(running, Acquire())
 
 
@@ -289,25 +294,22 @@ def _first_line(mocks: subprocess.Popen[bytes], folder: Path) -> dict[str, Any]:
     return json.loads(line)
 
 
-def _command(running: Instrument, command: AnyCommand) -> None:
+def _command(running: Instrument, command: AnyCommand) -> Reply:
     reply = running.client.send(command)
     if not reply.accepted:
         msg = f"{type(command).__name__.lower()} was refused: {reply.text}"
         raise DemoError(msg)
+    return reply
 
 
-def _wait(running: Instrument, reached: Callable[[Telemetry], bool], what: str) -> None:
+def _wait_for_telemetry(running: Instrument) -> None:
     deadline_s = time.monotonic() + _START_TIMEOUT_S
     while time.monotonic() < deadline_s:
         telemetry = running.client.receive(0.5)
         running.check()
         if telemetry is not None:
-            errors = [event.message for event in telemetry.events if event.severity == "error"]
-            if errors:
-                raise DemoError(errors[0])
-            if reached(telemetry):
-                return
-    msg = f"{what} did not come within {_START_TIMEOUT_S:g} s"
+            return
+    msg = f"the supervisor's first telemetry did not come within {_START_TIMEOUT_S:g} s"
     raise DemoError(msg)
 
 

@@ -69,6 +69,11 @@ class Client:
         with suppress(ConnectionError):
             self._subscribe()
 
+    @property
+    def folder(self) -> Path | None:
+        """The supervisor's socket folder; None for a supervisor on another machine."""
+        return None if isinstance(self._where, RemoteKey) else self._where.path
+
     def now_s(self) -> float:
         """The supervisor's time.
 

@@ -36,6 +36,8 @@ class CommandRow(NamedTuple):
         What the console asks first, where the command is laborious to undo.
     logged : bool
         Each gets a record of its own in the log; reports, which come every second, do not.
+    wait_s : float
+        How long ``fitctl send`` waits by default for its outcome; 0 for a command whose reply is its outcome.
     """
 
     make: type[AnyCommand]
@@ -45,6 +47,7 @@ class CommandRow(NamedTuple):
     label: str = ""
     question: str = ""
     logged: bool = True
+    wait_s: float = 0.0
 
     @property
     def name(self) -> str:
@@ -86,10 +89,10 @@ class CommandRow(NamedTuple):
 
 COMMANDS = (
     CommandRow(commands.Stop, "a commander's key", "stop", "s", "STOP"),
-    CommandRow(commands.Standby, "the instrument", "standby", "b", "Standby"),
-    CommandRow(commands.Acquire, "the instrument", "acquire", "a", "Acquire"),
+    CommandRow(commands.Standby, "the instrument", "standby", "b", "Standby", wait_s=60.0),
+    CommandRow(commands.Acquire, "the instrument", "acquire", "a", "Acquire", wait_s=600.0),
     CommandRow(commands.Hold, "the instrument", "hold", "h", "Hold"),
-    CommandRow(commands.Recover, "the instrument", "recover", "r", "Recover"),
+    CommandRow(commands.Recover, "the instrument", "recover", "r", "Recover", wait_s=60.0),
     CommandRow(
         commands.Off,
         "the instrument",
@@ -97,17 +100,18 @@ COMMANDS = (
         "o",
         "Off",
         question="Disable the amplifiers and let go of all devices?",
+        wait_s=60.0,
     ),
     CommandRow(commands.SetTarget, "the instrument", "target"),
     CommandRow(commands.Look, "the instrument", "look"),
     CommandRow(commands.Jog, "the instrument", "jog"),
     CommandRow(commands.SetBiasOffset, "the instrument", "bias-offset"),
-    CommandRow(commands.SetController, "the instrument", "controller"),
+    CommandRow(commands.SetController, "the instrument", "controller", wait_s=120.0),
     CommandRow(commands.Reset, "the instrument", "reset"),
     CommandRow(commands.Status, "any key", "status", logged=False),
     CommandRow(commands.RecentEvents, "any key", "events", logged=False),
     CommandRow(commands.TakeOver, "a commander's key", "take-over"),
-    CommandRow(commands.Shutdown, "the instrument", "shutdown"),
+    CommandRow(commands.Shutdown, "the instrument", "shutdown", wait_s=120.0),
     CommandRow(commands.Experiment, "the instrument"),
     CommandRow(commands.SequenceControl, "a commander's key"),
     CommandRow(commands.SequenceReport, "a commander's key", logged=False),

@@ -191,13 +191,15 @@ AnyCommand = (
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
     """The answer to every command; ``text`` says why not, and what to do.
 
-    ``events`` are those that were asked for, oldest first.
+    ``events`` are those that were asked for, oldest first. ``number`` is that of an accepted command that takes
+    time; telemetry has its outcome in each loop (:class:`fitctl.messages.telemetry.CommandOutcome`).
     """
 
     accepted: bool
     text: str = ""
     time_s: float = 0.0  # the supervisor's monotonic clock, for a client on another machine
     events: list[Event] = []
+    number: int = 0
 
 
 def decode_command(payload: bytes) -> AnyCommand | Reply:

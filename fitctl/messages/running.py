@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from fitctl.config import ConfigError
-from fitctl.messages.endpoints import open_folder, supervisor_names
+from fitctl.messages.endpoints import open_folder, supervisor_name, supervisor_names
 from fitctl.processes import names_held
 
 RUNNING_FILE = "rig.json"  # in the socket folder
@@ -71,6 +71,11 @@ def running_rigs() -> list[RunningRig]:
         if folder.is_absolute() and (running := _read(folder)) is not None:
             found.append(running)
     return found
+
+
+def supervisor_runs(folder: Path) -> bool:
+    """Whether a supervisor of this user runs with its sockets in this folder, as its lock says."""
+    return supervisor_name(folder) in names_held(supervisor_names())
 
 
 def _read(folder: Path) -> RunningRig | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Literal
+
 import msgspec
 
 from fitctl.config import Action, ResetBy
@@ -66,6 +69,39 @@ class SearchAgain(msgspec.Struct, frozen=True, kw_only=True):
     limit_s: float | None
 
 
+class CommandOutcome(msgspec.Struct, frozen=True, kw_only=True):
+    """How a command that takes time ends in one loop.
+
+    It is "under way" until it ends, once: "done", "failed", or "ended" because another command replaced it.
+
+    Attributes
+    ----------
+    number : int
+        That of the reply that accepted the command.
+    command : str
+        Its word on a command line.
+    began_s, ended_s : float
+        By the supervisor's clock; ``ended_s`` is NaN while the command is under way.
+    text : str
+        What happened. Of a failure it ends with what to do.
+    """
+
+    number: int
+    command: str
+    began_s: float
+    state: Literal["under way", "done", "failed", "ended"] = "under way"
+    ended_s: float = math.nan
+    text: str = ""
+
+
+class LoopFailure(msgspec.Struct, frozen=True, kw_only=True):
+    """What failed last in a loop, until it accepts another command; ``text`` ends with what to do."""
+
+    what: str
+    time_s: float
+    text: str
+
+
 class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
     """A spot that moves with a loop's star, and how far from it, by the rig file."""
 
@@ -78,7 +114,8 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it.
 
     ``controller_file`` is the saved design that is at work, on the supervisor's machine; it is empty when the
-    design was made from the rig's values.
+    design was made from the rig's values. ``outcomes`` are those of the
+    commands under way, and of the last that ended.
     """
 
     name: str
@@ -97,6 +134,8 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     other_spots: list[SpotPlace] = []
     controller_file: str = ""
     search_again: SearchAgain | None = None
+    outcomes: list[CommandOutcome] = []
+    last_failure: LoopFailure | None = None
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):

@@ -14,7 +14,7 @@ from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, stop_tracking
-from fitctl.sequences.view import Figures, StepFailed, View
+from fitctl.sequences.view import Figures, View
 
 _FOUND = ("found_az_sky_arcsec", "found_el_sky_arcsec", "found_flux_dn")
 
@@ -71,8 +71,7 @@ def _search(step: steps.Acquire, view: View) -> None:
 
 
 def _done(step: steps.Acquire, view: View) -> Result | None:
-    if view.errors:
-        raise StepFailed(view.errors[0])
+    view.require_no_failure()
     searches_again = view.loop.search_again is not None
     if (view.mode is Mode.STANDBY or searches_again) and not view.marks:
         _search(step, view)  # the devices are on, and no star is held

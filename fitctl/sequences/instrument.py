@@ -17,10 +17,12 @@ import msgspec
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.logging.records import SequenceAttempt
 from fitctl.messages.client import Client
+from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import AnyCommand, Reply, Status, Stop
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import RemoteKey, read_key_of
 from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.waiting import wait_for_outcomes
 from fitctl.sequences import steps
 from fitctl.sequences.calibration import write_calibration
 from fitctl.sequences.contact import Contact
@@ -157,6 +159,38 @@ class Instrument(StepMethods[Figures]):
         """Give one command of :mod:`fitctl.messages.commands`; from any thread."""
         return self._link.send(command)
 
+    def send_and_wait(self, command: AnyCommand, timeout_s: float | None = None) -> None:
+        """Give a command, and wait until what it asks for has happened; not from the thread of a step.
+
+        Parameters
+        ----------
+        command : AnyCommand
+        timeout_s : float, optional
+            By default as long as ``fitctl send --wait``.
+
+        Raises
+        ------
+        SequenceError
+            If it is refused, fails, is ended by another command or is still under way after `timeout_s`.
+        ConnectionError
+            If the supervisor does not answer.
+        """
+        row, reply = ROWS[type(command)], self.send(command)
+        name = row.word or row.name
+        if not reply.accepted:
+            msg = f"{name} was refused: {reply.text}"
+            raise SequenceError(msg)
+        if not reply.number:
+            return
+        limit_s = timeout_s or row.wait_s
+        for loop, outcome in wait_for_outcomes(self._link, reply, limit_s).items():
+            if outcome.state != "done":
+                late = f" after {limit_s:g} s" if outcome.state == "under way" else ""
+                msg = f"loop {loop}: {name} {outcome.state}{late}: {outcome.text}".removesuffix(
+                    ": "
+                )
+                raise SequenceError(msg)
+
     def telemetry(self) -> Telemetry:
         """What the instrument is doing now."""
         since_s = self._link.now_s()
@@ -275,6 +309,11 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         """Give one command of :mod:`fitctl.messages.commands`, at once, also while a step runs."""
         instrument = self._instrument
         return await self._at_once(lambda: instrument.send(command))
+
+    async def send_and_wait(self, command: AnyCommand, timeout_s: float | None = None) -> None:
+        """Give a command and wait, as :meth:`Instrument.send_and_wait`; after the step that is running."""
+        instrument = self._instrument
+        await self._in_thread(lambda: instrument.send_and_wait(command, timeout_s))
 
     async def stop(self) -> None:
         """SAFE, at once, also while a step runs: every loop."""

@@ -74,13 +74,12 @@ def open_loop(plan: Plan, name: Callable[[Any], str], evaluate: Callable[..., Re
             view.marks = [view.loop.since_s]  # when the motions began
             return None
         change = view.loop.last_change
-        ended_well = view.mode in {Mode.COARSE, Mode.VERNIER} and not view.errors
+        ended_well = view.mode in {Mode.COARSE, Mode.VERNIER}
         drives = plan(step, view.rig, view.loop_name)
         whole = view.elapsed_s >= experiment_s(drives)
         if not (ended_well and whole):
-            why = view.errors[0] if view.errors else view.why
             trigger = Trigger[change.trigger].name.lower().replace("_", " ") if change else ""
-            msg = f"the motions ended early, in {view.mode.name}, by {trigger}: {why}"
+            msg = f"the motions ended early, in {view.mode.name}, by {trigger}: {view.why}"
             raise StepFailed(msg)
         return evaluate(step, view, drives)
 

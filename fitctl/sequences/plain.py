@@ -7,7 +7,7 @@ from fitctl.messages.commands import Hold, Off, SetController, Standby
 from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import POWERED, Behaviour, Result, stop_tracking
-from fitctl.sequences.view import StepFailed, View
+from fitctl.sequences.view import View
 
 
 def _run_standby(_step: steps.Standby, view: View) -> None:
@@ -18,8 +18,7 @@ def _run_standby(_step: steps.Standby, view: View) -> None:
 
 
 def _standby_done(_step: steps.Standby, view: View) -> Result | None:
-    if view.errors:
-        raise StepFailed(view.errors[0])
+    view.require_no_failure()
     return Result({}, "") if view.mode is Mode.STANDBY else None
 
 
@@ -28,8 +27,7 @@ def _run_controller(step: steps.Controller, view: View) -> None:
 
 
 def _controller_done(step: steps.Controller, view: View) -> Result | None:
-    if view.errors:
-        raise StepFailed(view.errors[0])
+    view.require_no_failure()
     return Result({}, step.name) if view.loop.controller == step.name else None
 
 

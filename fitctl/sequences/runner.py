@@ -139,7 +139,6 @@ class Runner:
         limit_s = behaviour.own_s(step, self._rig, view.loop_name) + step.timeout_s
         view.began_s, view.paused_s = self._link.now_s(), 0.0
         view.measurements.clear()
-        view.errors.clear()
         behaviour.run(step, view)
         while True:
             paused = behaviour.pausable and self.contact.pause_wanted

@@ -97,8 +97,6 @@ class View:
         For the step's own use too: those that it keeps.
     squares : Squares
         And this: what it adds up.
-    errors : list of str
-        Error events of the supervisor since the attempt's first command.
     attempt : int
         Which one it is, from 1.
     fresh_s : float
@@ -117,7 +115,6 @@ class View:
     marks: list[float] = field(default_factory=list)
     frames: list[FrameRecord] = field(default_factory=list)
     squares: Squares = field(default_factory=Squares)
-    errors: list[str] = field(default_factory=list)
 
     @property
     def settings(self) -> Loop:
@@ -181,6 +178,19 @@ class View:
             msg = f"loop {self.loop_name} went to {self.mode.name}: {self.why}"
             raise StepFailed(msg)
 
+    def require_no_failure(self) -> None:
+        """Refuse to go on if a command of this attempt has failed.
+
+        Raises
+        ------
+        StepFailed
+            If so.
+        """
+        failure = self.loop.last_failure
+        if failure is not None and failure.time_s >= self.began_s:
+            msg = f"{failure.what} failed: {failure.text}"
+            raise StepFailed(msg)
+
     def update(self, telemetry: Telemetry, *, paused: bool) -> None:
         """Go on to the next message."""
         if paused:
@@ -188,13 +198,6 @@ class View:
         else:
             ticks = filter(self._is_mine, telemetry.ticks)
             self.measurements += [Measurement(*_fields_of(tick)) for tick in ticks]
-        self.errors += [
-            event.message
-            for event in telemetry.events
-            if event.severity == "error"
-            and event.time_s >= self.began_s
-            and event.source in {"supervisor", self.loop_name}
-        ]
         self.telemetry = telemetry
 
     def _is_mine(self, tick: Tick) -> bool:

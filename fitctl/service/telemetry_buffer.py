@@ -104,7 +104,9 @@ class TelemetryBuffer:
             wall_minus_monotonic_s=state.wall_minus_monotonic_s,
             rig_name=supervisor.rig.name,
             pid=state.pid,
-            loops=[loop.state(now_s) for loop in supervisor.loops.values()],
+            loops=[
+                supervisor.outcomes.add_to(loop.state(now_s)) for loop in supervisor.loops.values()
+            ],
             ticks=self._ticks.drain(),
             events=events,
             mode_changes=self._changes.drain(),

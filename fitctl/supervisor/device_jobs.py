@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from fitctl.drivers.interface import DeviceIdentity, Devices
-from fitctl.logging.records import DevicesOpened
+from fitctl.logging.records import DevicesOpened, Severity
 from fitctl.loop.loop import Loop
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.stages.journal import Journal, error_text
@@ -19,7 +19,17 @@ from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.power import Opened, close_devices, open_devices
 
 _CLOSE_TIMEOUT_S = 30.0
+_OPEN = "all devices open, checked and enabled"
+_OFF = "OFF: amplifiers disabled, devices closed"
+_STOPPED = "stopped while opening; devices let go"
 _SOURCE = "supervisor"  # of its events
+
+
+class Ended(Protocol):
+    """Hears how opening or closing ended: what happened, or why it failed."""
+
+    def __call__(self, text: str, /, *, failed: bool) -> None:
+        """Hear it."""
 
 
 class Job(NamedTuple):
@@ -68,14 +78,15 @@ class DeviceJobs:
         self._opening: set[str] = set()
         self._abandoned = False
         self._closed_badly: deque[tuple[str, Exception]] = deque()  # filled by the executor
+        self._faults: list[str] = []  # of the devices that are being closed
 
     @property
     def busy(self) -> bool:
         """Devices are being opened or closed."""
         return self._job is not None
 
-    def open(self, names: list[str], trigger: Trigger) -> None:
-        """Open the devices of these loops, then fire `trigger` on each."""
+    def open(self, names: list[str], trigger: Trigger, ended: Ended) -> None:
+        """Open the devices of these loops, then fire `trigger` on each; `ended` once all of that is over."""
         for name in names:
             self._loops[name].release()
         self._forget_piezos(names)
@@ -84,7 +95,7 @@ class DeviceJobs:
         with_camera = not self._camera.well
         self._camera.ready = not with_camera  # nobody asks it for frames while it is opened
         future = self._submit(open_devices, names, with_camera)
-        self._job = Job(future, partial(self._opened, names, with_camera, trigger))
+        self._job = Job(future, partial(self._opened, names, with_camera, trigger, ended))
         self.finish()
 
     def opens(self, name: str) -> bool:
@@ -95,8 +106,8 @@ class DeviceJobs:
         """Let go of what is being opened, if it is for one of these loops: a stop has the last word."""
         self._abandoned = self._abandoned or not self._opening.isdisjoint(names)
 
-    def turn_off(self, names: list[str]) -> None:
-        """OFF for these loops, and their devices let go."""
+    def turn_off(self, names: list[str], ended: Ended) -> None:
+        """OFF for these loops, and their devices let go; `ended` once they are."""
         for name in names:
             self._loops[name].release()
             self._loops[name].fire(Trigger.OFF, "operator")
@@ -104,7 +115,9 @@ class DeviceJobs:
         # The camera serves all loops; the last one out turns it off.
         with_camera = all(loop.mode is Mode.OFF for loop in self._loops.values())
         self._camera.ready = self._camera.ready and not with_camera
-        self._close(names, with_camera)
+        self._close(
+            names, with_camera, lambda faults: ended("; ".join(faults) or _OFF, failed=bool(faults))
+        )
 
     def close_all(self) -> None:
         """Disable and let go of everything, whatever state it is in, and wait for that."""
@@ -124,7 +137,12 @@ class DeviceJobs:
             job.done(job.future)
 
     def _opened(
-        self, names: list[str], with_camera: bool, trigger: Trigger, future: Future
+        self,
+        names: list[str],
+        with_camera: bool,
+        trigger: Trigger,
+        ended: Ended,
+        future: Future,
     ) -> None:
         abandoned, self._opening, self._abandoned = self._abandoned, set(), False
         error = future.exception()
@@ -132,14 +150,13 @@ class DeviceJobs:
             names, None if error else future.result(), error_text(error) if error else ""
         )
         if error is not None:
-            self._journal.event(
-                "error", _SOURCE, f"{trigger.name.lower()} failed: {error_text(error)}"
-            )
-            self._close(names, with_camera)
+            why = error_text(error)
+            self._journal.event("error", _SOURCE, f"{trigger.name.lower()} failed: {why}")
+            self._close(names, with_camera, lambda _faults: ended(why, failed=True))
             return
         if abandoned:
-            self._journal.event("warning", _SOURCE, "stopped while opening; devices let go")
-            self._close(names, with_camera)
+            self._journal.event("warning", _SOURCE, _STOPPED)
+            self._close(names, with_camera, lambda _faults: ended(_STOPPED, failed=True))
             return
         opened: Opened = future.result()
         self.identities.update(opened.identities)
@@ -151,7 +168,8 @@ class DeviceJobs:
                 self._piezos[name].begin()
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
             self._servos[name].drain_timing()
-            loop.fire(trigger, "all devices open, checked and enabled")
+            loop.fire(trigger, _OPEN)
+        ended(f"STANDBY: {_OPEN}", failed=False)
 
     def _log_opened(self, names: list[str], opened: Opened | None, error: str) -> None:
         for name in names:
@@ -169,13 +187,23 @@ class DeviceJobs:
                 )
             )
 
-    def _close(self, names: list[str], with_camera: bool) -> None:
-        self._job = Job(self._submit(close_devices, names, with_camera), self._closed)
+    def _close(
+        self, names: list[str], with_camera: bool, done: Callable[[list[str]], None]
+    ) -> None:
+        """Close devices; then `done` gets what went wrong, a text each."""
+        self._faults.clear()
+        future = self._submit(close_devices, names, with_camera)
+        self._job = Job(future, partial(self._closed, done))
 
-    def _closed(self, future: Future) -> None:
+    def _closed(self, done: Callable[[list[str]], None], future: Future) -> None:
         error = future.exception()
         if error is not None:
-            self._journal.event("error", _SOURCE, f"closing devices failed: {error_text(error)}")
+            self._note_fault("error", f"closing devices failed: {error_text(error)}")
+        done(self._faults)
+
+    def _note_fault(self, severity: Severity, text: str) -> None:
+        self._faults.append(text)
+        self._journal.event(severity, _SOURCE, text)
 
     def _submit(
         self, work: Callable[..., Opened | None], names: list[str], with_camera: bool
@@ -195,6 +223,4 @@ class DeviceJobs:
     def _report_closed_badly(self) -> None:
         while self._closed_badly:
             device, error = self._closed_badly.popleft()
-            self._journal.event(
-                "warning", _SOURCE, f"{device} did not close well: {error_text(error)}"
-            )
+            self._note_fault("warning", f"{device} did not close well: {error_text(error)}")

@@ -47,9 +47,10 @@ from fitctl.messages.modes import TRACKING, Mode, Trigger, usable_commands
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.supervisor.camera_watch import CameraWatch
-from fitctl.supervisor.device_jobs import DeviceJobs, Job
+from fitctl.supervisor.device_jobs import DeviceJobs, Ended, Job
 from fitctl.supervisor.health import camera_health, mirror_health, siderostat_health
 from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
+from fitctl.supervisor.outcomes import Outcomes
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.timing import TimingBook
@@ -110,6 +111,7 @@ class Supervisor:
         }
         self.servos = {name: loop.servo for name, loop in self.loops.items()}
         self.sequences = SequenceBoard(journal)
+        self.outcomes = Outcomes(rig.loops, clock)
         self.shutdown_wanted = False
         self._clock = clock
         self._executor = executor
@@ -196,6 +198,7 @@ class Supervisor:
             self._timing.add(tick)
             if was_safe:
                 self._make_safer(loop)
+        self.outcomes.observe(self.loops)
         for older in self._camera.older:
             self._record_frame(older)
         if frame is not None:
@@ -292,7 +295,7 @@ class Supervisor:
                 return self.sequences.control(command.action)
             case _ if type(command) in LOOP_COMMANDS:
                 why_not = LOOP_COMMANDS[type(command)](self.rig, loops, command)
-                return _refusal(why_not) if why_not else Reply(accepted=True)
+                return _refusal(why_not) if why_not else self._begin(command, names)
             case _ if type(command) in _COMMANDS:
                 return self._fire(_COMMANDS[type(command)], names, command)
         return _refusal(f"{type(command).__name__} is not for the supervisor")
@@ -307,15 +310,15 @@ class Supervisor:
             return _refusal(self._why_not(trigger, names))
         if self._device_jobs.busy and trigger is not Trigger.STOP:
             return _refusal("devices are being opened or closed; wait for the event that says so")
+        moving = self._rest_mirrors(usable) if trigger is Trigger.OFF else []
+        if moving:
+            return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
+        reply = self._begin(command, usable)
+        ended = partial(self.outcomes.end, reply.number, usable)
         if trigger in _POWER_UP:
-            self._device_jobs.open(usable, trigger)
+            self._device_jobs.open(usable, trigger, ended)
         elif trigger is Trigger.OFF:
-            moving = [name for name in usable if not self.loops[name].at_rest()]
-            for name in moving:
-                self.loops[name].rest()  # its ticks take it there
-            if moving:
-                return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
-            self._device_jobs.turn_off(usable)
+            self._device_jobs.turn_off(usable, ended)
         else:
             if trigger is Trigger.STOP:
                 self._device_jobs.abandon(usable)
@@ -323,7 +326,17 @@ class Supervisor:
                 if isinstance(command, Acquire):
                     self.loops[name].configure_search(command)
                 self.loops[name].fire(trigger, "operator")
-        return Reply(accepted=True)
+        return reply
+
+    def _rest_mirrors(self, names: list[str]) -> list[str]:
+        """Have these loops' mirrors rest, at the next ticks; those that do not rest yet."""
+        moving = [name for name in names if not self.loops[name].at_rest()]
+        for name in moving:
+            self.loops[name].rest()
+        return moving
+
+    def _begin(self, command: AnyCommand, names: list[str]) -> Reply:
+        return Reply(accepted=True, number=self.outcomes.begin(command, names))
 
     def _why_not(self, trigger: Trigger, names: list[str]) -> str:
         mode = self.loops[names[0]].mode
@@ -331,19 +344,26 @@ class Supervisor:
         return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
 
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
+        number = self.outcomes.begin(command, names)
         for name in names:
             # A design takes longer than a tick.
             future = self._executor.submit(self._design, self.rig, name, command.name)
-            self._designs.append(Job(future, partial(self._designed, name, command.name)))
+            ended = partial(self.outcomes.end, number, [name])
+            self._designs.append(Job(future, partial(self._designed, name, command.name, ended)))
         self._finish_jobs()
-        return Reply(accepted=True, text="designing; an event tells when it is at work")
+        return Reply(
+            accepted=True, number=number, text="designing; an event tells when it is at work"
+        )
 
-    def _designed(self, name: str, controller: str, future: Future) -> None:
+    def _designed(self, name: str, controller: str, ended: Ended, future: Future) -> None:
         error = future.exception()
         if error is None:
             self.loops[name].use(future.result())
+            ended(f"controller {controller} is at work", failed=False)
         else:
-            self._journal.event("error", name, f"no design {controller}: {error_text(error)}")
+            why = error_text(error)
+            self._journal.event("error", name, f"no design {controller}: {why}")
+            ended(f"no design {controller}: {why}", failed=True)
 
     # ------------------------------------------------------------ beside the ticks
 

@@ -6,11 +6,12 @@ import math
 import threading
 
 import pytest
+from simulated import failing
 
 import fitctl
 from fitctl import AsyncInstrument, Instrument
 from fitctl.config import ConfigError, default_rig_path, load_rig
-from fitctl.messages.commands import Reply, Status, Stop
+from fitctl.messages.commands import Acquire, Recover, Reply, Standby, Status, Stop
 from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import STEPS
 from fitctl.sequences.view import SequenceError
@@ -54,6 +55,25 @@ def test_stop_is_safe_and_no_step_runs_after_it():
         with pytest.raises(SequenceError, match="SAFE"):
             instrument.hold(1.0)
         assert mode(instrument) == "SAFE"
+
+
+def test_a_command_is_followed_to_its_end_and_its_failure_raises(monkeypatch):
+    with Instrument(NEAR, simulate=True) as instrument:
+        instrument.send_and_wait(Standby())
+        assert mode(instrument) == "STANDBY"
+        instrument.send_and_wait(Stop())
+        with pytest.raises(
+            SequenceError, match="acquire was refused: acquire means nothing in SAFE"
+        ):
+            instrument.send_and_wait(Acquire())
+        piezo = instrument._link._simulation.devices.loops["right"].piezo
+        with monkeypatch.context() as broken:
+            broken.setattr(piezo, "open", failing(OSError("no such port")))
+            with pytest.raises(SequenceError, match=r"loop right: recover failed: .*no such port"):
+                instrument.send_and_wait(Recover())
+        instrument.send_and_wait(Recover())
+        with pytest.raises(SequenceError, match=r"loop right: acquire under way after 0\.1 s"):
+            instrument.send_and_wait(Acquire(), timeout_s=0.1)
 
 
 def file_of(folder, *steps):

@@ -12,8 +12,9 @@ from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, require_loop, rig_of
 from fitctl.commands.shared.supervisor import connect, send_and_print, send_to_all
-from fitctl.messages.command_table import WORDS, command_of
-from fitctl.messages.commands import Stop
+from fitctl.commands.shared.terminal import has_terminal
+from fitctl.messages.command_table import ROWS, WORDS, command_of
+from fitctl.messages.commands import AnyCommand, Stop
 from fitctl.messages.running import running_rigs
 
 
@@ -40,8 +41,27 @@ def send(
         str,
         typer.Option(help="One loop by name; without it, all.", autocompletion=completion.loops),
     ] = "",
+    wait: Annotated[
+        bool | None,
+        typer.Option("--wait/--no-wait", help="Wait for what the command leads to, or do not."),
+    ] = None,
+    timeout_s: Annotated[
+        float | None,
+        typer.Option(
+            "--timeout", metavar="SECONDS", min=0.1, help="Wait so long at most; implies --wait."
+        ),
+    ] = None,
 ) -> None:
-    """Give one command to the running supervisor of a rig."""
+    """Give one command to the running supervisor of a rig.
+
+    On a terminal, a command that takes time (standby, recover, acquire, off, controller, shutdown) is followed
+    until what it asks for has happened or failed. Elsewhere, --wait does that.
+
+    Exit status: 0 if the command was accepted and, with --wait, has happened. 1 if it was refused, failed or
+    was ended by another command, or no supervisor answers. 2 for a mistake on the command line. 3 if no
+    supervisor runs. 4 if it is still under way after --timeout. 130 after Ctrl-C, which ends the waiting, not
+    the command.
+    """
     wanted = command_of(command, values or [], loop)
     if remote is None and named_rig(rig) is None and not overrides and isinstance(wanted, Stop):
         running = running_rigs()
@@ -50,4 +70,14 @@ def send(
             raise typer.Exit(send_to_all(running, wanted, "send"))
     if remote is None and loop and (named_rig(rig) or overrides):
         require_loop("send", rig_of(named_rig(rig), overrides), loop)
-    raise typer.Exit(send_and_print(connect("send", rig, overrides, remote), wanted, "send"))
+    client = connect("send", rig, overrides, remote)
+    wait_s = _wait_s(wanted, wait, timeout_s)
+    raise typer.Exit(send_and_print(client, wanted, "send", wait_s))
+
+
+def _wait_s(wanted: AnyCommand, wait: bool | None, timeout_s: float | None) -> float | None:
+    """How long to wait for the outcome; None for a command without one, or where nobody waits."""
+    usual_s = ROWS[type(wanted)].wait_s
+    if wait is None:
+        wait = timeout_s is not None or has_terminal()
+    return (timeout_s or usual_s) if wait and usual_s else None

@@ -10,15 +10,19 @@ from typing import NamedTuple
 
 import typer
 
-from fitctl.commands.shared.exits import FAILED, NO_SUPERVISOR
+from fitctl.commands.shared.exits import FAILED, INTERRUPTED, NO_SUPERVISOR, STILL_UNDER_WAY
 from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.client import Client
-from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.command_table import ROWS
+from fitctl.messages.commands import AnyCommand, Reply, Shutdown
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import read_key_of, read_remote
 from fitctl.messages.running import RunningRig, running_rigs
+from fitctl.messages.telemetry import CommandOutcome
+from fitctl.messages.waiting import wait_for_end, wait_for_outcomes
+from fitctl.processes import ended_by_signals, interrupt
 
 
 class Addressed(NamedTuple):
@@ -108,8 +112,12 @@ def connect(
     return Client(key)
 
 
-def send_and_print(client: Client, command: AnyCommand, sender: str) -> int:
+def send_and_print(
+    client: Client, command: AnyCommand, sender: str, wait_s: float | None = None
+) -> int:
     """Send one command, print the reply and close the client; returns the exit status.
+
+    With `wait_s`, the command is followed for so long, and its outcome decides the exit status.
 
     Parameters
     ----------
@@ -117,14 +125,69 @@ def send_and_print(client: Client, command: AnyCommand, sender: str) -> int:
     command : AnyCommand
     sender : str
         The command of ``fitctl`` that sends it, for its error message.
+    wait_s : float, optional
     """
-    return print_reply(_send(client, command), sender)
+    try:
+        reply = _reply(client, command)
+        status = print_reply(reply, sender)
+        if wait_s is None or isinstance(reply, ConnectionError) or not reply.accepted:
+            return status
+        return _wait_and_print(client, command, reply, sender, wait_s)
+    finally:
+        client.close()
+
+
+def _wait_and_print(
+    client: Client, command: AnyCommand, reply: Reply, sender: str, wait_s: float
+) -> int:
+    """Wait for the outcome of an accepted command, print it, a line for each loop; returns the exit status."""
+    word = ROWS[type(command)].word
+    say(f"waiting {wait_s:g} s at most; Ctrl-C ends the waiting, not the command", err=True)
+    try:
+        with ended_by_signals(interrupt):
+            if isinstance(command, Shutdown):
+                return _print_end(wait_for_end(client, wait_s), wait_s)
+            found = wait_for_outcomes(client, reply, wait_s)
+    except ConnectionError as error:
+        say(f"{sender}: {error}", err=True)
+        return FAILED
+    except KeyboardInterrupt:
+        say(f"{sender}: no longer waiting; {word} goes on. See: fitctl status", err=True)
+        return INTERRUPTED
+    for loop, outcome in found.items():
+        say(_outcome_text(loop, outcome, wait_s), err=outcome.state != "done")
+    return max(_EXITS[outcome.state] for outcome in found.values())
+
+
+def _print_end(ended: bool, wait_s: float) -> int:
+    text = "the supervisor has ended" if ended else f"the supervisor still runs after {wait_s:g} s"
+    say(text, err=not ended)
+    return 0 if ended else STILL_UNDER_WAY
+
+
+def _outcome_text(loop: str, outcome: CommandOutcome, wait_s: float) -> str:
+    took_s = outcome.ended_s - outcome.began_s
+    match outcome.state:
+        case "done":
+            return f"{loop} {outcome.text} (after {took_s:.1f} s)"
+        case "under way":
+            return (
+                f"{loop}: {outcome.command} is still under way after {wait_s:g} s, and goes on. "
+                "See: fitctl status"
+            )
+        case "failed":
+            return f"{loop}: {outcome.command} failed after {took_s:.1f} s: {outcome.text}"
+        case "ended":
+            return f"{loop}: {outcome.command} ended after {took_s:.1f} s: {outcome.text}"
+
+
+_EXITS = {"done": 0, "failed": FAILED, "ended": FAILED, "under way": STILL_UNDER_WAY}
 
 
 def send_to_all(running: list[RunningRig], command: AnyCommand, sender: str) -> int:
     """Send one command to several supervisors at once and print each reply; returns the exit status."""
     with ThreadPoolExecutor(len(running)) as threads:
-        replies = list(threads.map(lambda rig: _send(Client(Path(rig.folder)), command), running))
+        replies = list(threads.map(lambda rig: _reply_of(rig, command), running))
     statuses = []
     for rig, reply in zip(running, replies, strict=True):
         show_rig(rig.name, f"{rig.file} (process {rig.pid})")
@@ -132,13 +195,19 @@ def send_to_all(running: list[RunningRig], command: AnyCommand, sender: str) -> 
     return max(statuses)
 
 
-def _send(client: Client, command: AnyCommand) -> Reply | ConnectionError:
+def _reply_of(rig: RunningRig, command: AnyCommand) -> Reply | ConnectionError:
+    client = Client(Path(rig.folder))
+    try:
+        return _reply(client, command)
+    finally:
+        client.close()
+
+
+def _reply(client: Client, command: AnyCommand) -> Reply | ConnectionError:
     try:
         return client.send(command)
     except ConnectionError as error:
         return error
-    finally:
-        client.close()
 
 
 def print_reply(reply: Reply | ConnectionError, sender: str) -> int:
