@@ -20,6 +20,7 @@ from fitctl.logging.records import (
 )
 from fitctl.messages.commands import SequenceStatus
 from fitctl.messages.telemetry import (
+    LoopFailure,
     LoopLimits,
     LoopState,
     SearchAgain,
@@ -126,6 +127,7 @@ class FakeSupervisor:
         self.bias_offset_urad = (0.0, 0.0)
         self.controller_file = ""
         self.search_again: SearchAgain | None = None
+        self.last_failure: LoopFailure | None = None
 
     @property
     def time_s(self) -> float:
@@ -195,6 +197,7 @@ class FakeSupervisor:
             other_spots=[SpotPlace(name="fringe", az_offset_px=-12.0, el_offset_px=0.0)],
             controller_file=self.controller_file,
             search_again=self.search_again,
+            last_failure=self.last_failure,
         )
 
     def _watched(self, name, quantity, value, low, high, action, modes) -> Watched:

@@ -1,37 +1,258 @@
-"""What is not well with an instrument, read off one telemetry message: for shells and for metrics."""
+"""What is not well with an instrument, read off one telemetry message: for shells, metrics and the console.
+
+Each cause is named once, however many loops, interlocks and devices report it; and no reset is asked for that
+another command makes needless.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from fitctl.logging.records import DeviceHealth
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
 FIND_STAR = "check shutter and clouds; hold, stop or another acquire ends the search"
 RECORDER_SILENT_S = 10.0  # it reports about once a second
 
+_DID = {
+    "warn": "nothing was changed",
+    "hold": "the stages wait where they are",
+    "flatten": "the mirror goes to its bias, the siderostat waits",
+    "safe": "the loop went to SAFE",
+}
+_AFTER_FAILURE = {
+    "standby": "all devices were let go again",
+    "recover": "all devices were let go again",
+    "acquire": "the siderostat waits where it is",
+    "search": "the siderostat waits where it is",
+    "controller": "the design before it stays at work",
+    "off": "the loop is OFF",
+}
+# A quantity out of range, and those whose trips explain it: the warning about it names no cause of its own.
+_EXPLAINED_BY = {
+    "tick_period_fraction": {"dac_round_trip_s"},
+    "star_flux_fraction": {"frame_late_s"},
+    "following_error_rad": {"siderostat_rate_fraction", "amplifier_fault"},
+}
+_POWERS_UP = {Mode.SAFE.name: "recover", Mode.OFF.name: "standby"}  # and resets every interlock
 
-def troubles(telemetry: Telemetry) -> list[str]:
-    """What an operator should look at, one line each; empty where all is well.
 
-    A loop that is SAFE or searches for the star that it lost, an interlock that is tripped, a device in fault,
-    a recorder that says nothing, records that are missing from the log.
+class Trouble(NamedTuple):
+    """One thing that an operator should look at.
+
+    Attributes
+    ----------
+    key : str
+        Tells two apart, from message to message.
+    severity : str
+        A "note" makes an instrument not well, and is no alarm: somebody wanted it so.
+    what, did, todo : str
+        What is wrong, what the system did about it, and what to do. The last two may be empty.
+    since_s : float
+    loops : tuple of str
+        Which loops, where `what` does not say that.
+    is_safe : bool
+        They are SAFE.
+    number : int
+        Of what is counted: more of it is a new trouble.
+    latches : bool
+        An operator should know of it also when it is over.
     """
-    found = []
+
+    key: str
+    severity: Literal["note", "warning", "error"]
+    what: str
+    since_s: float
+    did: str = ""
+    todo: str = ""
+    loops: tuple[str, ...] = ()
+    is_safe: bool = False
+    number: int = 0
+    latches: bool = True
+
+    @property
+    def line(self) -> str:
+        """All of it, as `fitctl status` prints it; a warning changed nothing."""
+        safe = f" {'is' if len(self.loops) == 1 else 'are'} SAFE" if self.is_safe else ""
+        head = f"{', '.join(self.loops)}{safe}: " if self.loops else ""
+        did = self.did if self.severity == "error" else ""
+        return head + "; ".join(filter(None, (self.what, did, self.todo)))
+
+
+def troubles(telemetry: Telemetry) -> list[Trouble]:
+    """What an operator should look at; empty where all is well.
+
+    A loop that is SAFE or searches for the star that it lost, a command that failed, an interlock that is
+    tripped, a device in fault, a recorder that says nothing, records that are missing from the log.
+    """
+    found: dict[str, Trouble] = {}  # by cause
     for loop in telemetry.loops:
-        if loop.mode == Mode.SAFE.name:
-            why = "" if loop.last_change is None else f": {loop.last_change.reason}"
-            found.append(f"{loop.name} is SAFE{why}")
-        if loop.search_again is not None:
-            found.append(f"{loop.name}: {search_again_text(loop, telemetry.time_s)}; {FIND_STAR}")
-        found += [
-            f"{loop.name} interlock {row.name}: {row.reason}" for row in alarming_interlocks(loop)
-        ]
-    found += [
-        f"{device.device} at {device.endpoint}: {device.detail}"
-        for device in telemetry.devices
-        if device.state == "fault"
-    ]
-    found += _of_recording(telemetry)
-    return found
+        for cause, trouble in _of_loop(loop, telemetry.time_s):
+            known = found.get(cause)
+            found[cause] = trouble if known is None else _merged(known, trouble)
+    changed_s = max((loop.since_s for loop in telemetry.loops), default=0.0)
+    for device in telemetry.devices:
+        # What a device reported before the last change of mode is of the past.
+        is_now = device.state == "fault" and device.time_s >= changed_s
+        if is_now and not any(_is_of(device, cause) for cause in found):
+            found[device.device] = _of_device(telemetry, device)
+    return [*found.values(), *_of_recording(telemetry)]
+
+
+def _merged(one: Trouble, other: Trouble) -> Trouble:
+    """The same cause, reported by two loops."""
+    since_s = min(one.since_s, other.since_s)
+    return one._replace(since_s=since_s, loops=(*one.loops, *other.loops))
+
+
+def _of_loop(loop: LoopState, now_s: float) -> Iterator[tuple[str, Trouble]]:
+    """Troubles of a loop, with the cause of each; the first of each cause says most."""
+    named = set()
+    for cause, trouble in (
+        *_of_failure(loop),
+        *_of_safe(loop),
+        *_of_search(loop, now_s),
+        *_of_interlocks(loop),
+    ):
+        if cause not in named:
+            named.add(cause)
+            yield cause, trouble
+
+
+def _of_failure(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
+    failure, change = loop.last_failure, loop.last_change
+    if failure is None:
+        return
+    went_safe = loop.mode == Mode.SAFE.name and change is not None
+    if went_safe and change is not None and change.reason == failure.text:
+        return  # the loop's own fault ended the command
+    what, todo = _parted(failure.text)
+    yield (
+        _cause(failure.text),
+        Trouble(
+            f"{loop.name} {failure.what}",
+            "error",
+            f"{failure.what} failed: {what}",
+            failure.time_s,
+            _AFTER_FAILURE.get(failure.what, ""),
+            _after_failure(loop, failure.what, todo),
+            (loop.name,),
+            is_safe=went_safe,
+        ),
+    )
+
+
+def _of_safe(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
+    if loop.mode != Mode.SAFE.name:
+        return
+    change = loop.last_change
+    reason = "" if change is None else change.reason
+    what, todo = _parted(reason)
+    fault = change is not None and change.trigger == "FAULT"
+    if not fault and loop.last_failure is not None:
+        return  # a stop ended a command, whose failure says so
+    yield (
+        _cause(reason) if fault else f"{loop.name} SAFE",
+        Trouble(
+            f"{loop.name} fault",
+            "error" if fault else "note",
+            what,
+            loop.since_s,
+            "",
+            _then(todo, "recover") if fault else todo,
+            (loop.name,),
+            is_safe=True,
+        ),
+    )
+
+
+def _of_search(loop: LoopState, now_s: float) -> Iterator[tuple[str, Trouble]]:
+    search = loop.search_again
+    if search is not None:
+        what, did = _parted(search_again_text(loop, now_s))
+        yield (
+            f"{loop.name} star",
+            Trouble(
+                f"{loop.name} star",
+                "error",
+                what,
+                search.since_s,
+                did,
+                FIND_STAR,
+                (loop.name,),
+                latches=False,
+            ),
+        )
+
+
+def _of_interlocks(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
+    for trip in _alarming_interlocks(loop):
+        what, todo = _parted(trip.reason)
+        yield (
+            _cause(trip.reason),
+            Trouble(
+                f"{loop.name} {trip.name}",
+                "warning" if trip.action == "warn" else "error",
+                what,
+                trip.since_s,
+                _DID[trip.action],
+                _with_reset(loop, trip, todo),
+            ),
+        )
+
+
+def _alarming_interlocks(loop: LoopState) -> list[TrippedInterlock]:
+    """Tripped interlocks, without warnings of what is over in this mode or what another one explains."""
+    rows = {row.name: row for row in loop.watched}
+    tripped = {rows[trip.name].quantity for trip in loop.interlocks if trip.name in rows}
+    shown = []
+    for trip in loop.interlocks:
+        row = rows.get(trip.name)
+        if trip.action == "warn" and row is not None:
+            resets_later = trip.reset == "itself" and not row.judged
+            explained = _EXPLAINED_BY.get(row.quantity, set()) & tripped
+            is_star = row.quantity == "star_flux_fraction" and loop.search_again is not None
+            if resets_later or explained or is_star:
+                continue
+        shown.append(trip)
+    return shown
+
+
+def _with_reset(loop: LoopState, trip: TrippedInterlock, todo: str) -> str:
+    """What to do, and what resets the interlock, if anybody must."""
+    powers_up = _POWERS_UP.get(loop.mode)
+    if trip.action == "safe" and powers_up:
+        return _then(todo, powers_up)
+    if trip.reset == "itself":
+        return todo
+    by = f"{powers_up} resets it" if powers_up else f"then reset {trip.name}"
+    return "; ".join(filter(None, (todo, by)))
+
+
+def _after_failure(loop: LoopState, what: str, todo: str) -> str:
+    """What to do, ending with the command with which to go on."""
+    match what:
+        case "standby" | "recover":
+            return _then(todo, _POWERS_UP.get(loop.mode, what))
+        case "acquire" | "search":
+            return _then(todo, "acquire again")
+        case "off":
+            return todo or "look at the device; cut its power if it may still move"
+        case _:
+            return todo or "correct the loop's values in the rig file, or choose another design"
+
+
+def _then(todo: str, command: str) -> str:
+    """What to do, ending with a command."""
+    what = todo.removesuffix(", then recover")
+    if command in what:
+        return what
+    if not what:
+        return f"remove its cause, then {command}"
+    many = ";" in what or what.endswith("?")
+    return f"{what}{';' if many else ','} then {command}"
 
 
 def search_again_text(loop: LoopState, now_s: float) -> str:
@@ -45,22 +266,72 @@ def search_again_text(loop: LoopState, now_s: float) -> str:
     )
 
 
-def alarming_interlocks(loop: LoopState) -> list[TrippedInterlock]:
-    """Tripped interlocks, without warnings that the star's light is missing while it is searched for again."""
-    if loop.search_again is None:
-        return loop.interlocks
-    of_star = {row.name for row in loop.watched if row.quantity == "star_flux_fraction"}
-    return [row for row in loop.interlocks if row.action != "warn" or row.name not in of_star]
+def _is_of(device: DeviceHealth, cause: str) -> bool:
+    """Whether a cause is what a device reports, or another error of the same device."""
+    is_device = not cause.startswith("interlock ")
+    return cause == _cause(device.detail) or (
+        is_device and cause.endswith(f" at {device.endpoint}")
+    )
 
 
-def _of_recording(telemetry: Telemetry) -> list[str]:
-    found = []
-    recorder = telemetry.recorder
+def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
+    what, todo = _parted(device.detail)
+    loops = [loop.mode for loop in telemetry.loops if device.device.startswith(loop.name)]
+    is_safe = Mode.SAFE.name in (loops or [loop.mode for loop in telemetry.loops])
+    return Trouble(
+        device.device,
+        "error",
+        f"{device.device} at {device.endpoint}: {what}",
+        device.time_s,
+        "the loop is in SAFE" if is_safe else "it is asked again",
+        _then(todo, "recover") if is_safe else todo,
+    )
+
+
+def _of_recording(telemetry: Telemetry) -> Iterator[Trouble]:
+    recorder, lost = telemetry.recorder, telemetry.records_lost
+    go_on = "the loop goes on"
     if recorder is None:
-        found.append("nothing is recorded yet; if this stays, look at the supervisor's events")
-    elif telemetry.time_s - recorder.time_s > RECORDER_SILENT_S:
-        silent_s = telemetry.time_s - recorder.time_s
-        found.append(f"the recorder has said nothing for {silent_s:.0f} s")
-    if telemetry.records_lost:
-        found.append(f"{telemetry.records_lost} records are missing from the log of this run")
-    return found
+        is_off = all(loop.mode == Mode.OFF.name for loop in telemetry.loops)
+        yield Trouble(
+            "recorder",
+            "note" if is_off else "warning",
+            "nothing is being recorded",
+            telemetry.time_s,
+            f"{go_on}, the supervisor tries again",
+            "see the events: disk full, or logging.folder?",
+        )
+    elif (silent_s := telemetry.time_s - recorder.time_s) > RECORDER_SILENT_S:
+        yield Trouble(
+            "recorder",
+            "warning",
+            f"the recorder has said nothing for {silent_s:.0f} s",
+            recorder.time_s,
+            f"{go_on}, records wait for it",
+            "see the events, and the disk of logging.folder",
+        )
+    if lost:
+        yield Trouble(
+            "records",
+            "warning",
+            f"{lost:,} records are missing from the log of this run".replace(",", " "),
+            telemetry.time_s,
+            f"{go_on}; the gap is counted in the log",
+            "see the events for the reason",
+            number=lost,
+        )
+
+
+def _cause(reason: str) -> str:
+    """What a text names as the cause: an interlock on a part of the rig, a device, or all that happened."""
+    what, _ = _parted(reason)
+    if what.startswith("interlock "):
+        return ": ".join(what.split(": ", 2)[:2])
+    device, expected, _ = what.partition(": expected ")
+    return device if expected else what
+
+
+def _parted(reason: str) -> tuple[str, str]:
+    """What happened, and the next step, which follows in such texts."""
+    what, _, todo = reason.partition("; ")
+    return what, todo

@@ -21,7 +21,7 @@ from fitctl.supervisor.power import Opened, close_devices, open_devices
 _CLOSE_TIMEOUT_S = 30.0
 _OPEN = "all devices open, checked and enabled"
 _OFF = "OFF: amplifiers disabled, devices closed"
-_STOPPED = "stopped while opening; devices let go"
+_STOPPED = "stopped while opening; when ready, recover, or standby from OFF"
 _SOURCE = "supervisor"  # of its events
 
 
@@ -155,7 +155,7 @@ class DeviceJobs:
             self._close(names, with_camera, lambda _faults: ended(why, failed=True))
             return
         if abandoned:
-            self._journal.event("warning", _SOURCE, _STOPPED)
+            self._journal.event("warning", _SOURCE, "stopped while opening; devices let go")
             self._close(names, with_camera, lambda _faults: ended(_STOPPED, failed=True))
             return
         opened: Opened = future.result()

@@ -5,19 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fitctl.logging.records import DeviceHealth, ModeChange
-from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
-from fitctl.messages.troubles import FIND_STAR, alarming_interlocks, search_again_text
+from fitctl.messages.troubles import Trouble, troubles
 from fitctl.tui.state import ConsoleState
 
 BELL_EVERY_S = 10.0
-
-_DID = {
-    "warn": "nothing was changed",
-    "hold": "the stages wait where they are",
-    "flatten": "the mirror goes to its bias, the siderostat waits",
-    "safe": "the loop went to SAFE",
-}
 
 
 @dataclass
@@ -110,31 +101,26 @@ def _time_s(state: ConsoleState) -> float:
 
 
 def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
-    newest = state.newest
     if state.stale:
         yield _no_data(state)
-    if newest is None:
-        return
-    reported = {trip.reason for loop in newest.loops for trip in loop.interlocks}
-    for loop in newest.loops:
-        yield from (_interlock(loop, trip) for trip in alarming_interlocks(loop))
-        if loop.search_again is not None:
-            yield _star_lost(loop, loop.search_again.since_s, newest.time_s)
-        change = loop.last_change
-        if (
-            loop.mode == "SAFE"
-            and change
-            and change.trigger == "FAULT"
-            and change.reason not in reported
-        ):
-            reported.add(change.reason)
-            yield _fault(loop, change)
-    changed_s = max((loop.since_s for loop in newest.loops), default=0.0)
-    for device in newest.devices:
-        # What a device reported before the last change of mode is of the past.
-        if device.state == "fault" and device.detail not in reported and device.time_s >= changed_s:
-            yield _device(newest, device)
-    yield from _log(newest)
+    for trouble in () if state.newest is None else troubles(state.newest):
+        if trouble.severity != "note":
+            yield _alarm(trouble)
+
+
+def _alarm(trouble: Trouble) -> Alarm:
+    loops = ", ".join(trouble.loops)
+    went_safe = trouble.is_safe and not trouble.did  # which names the loops then
+    return Alarm(
+        trouble.key,
+        trouble.severity == "error",
+        f"{loops}: {trouble.what}" if loops and not went_safe else trouble.what,
+        trouble.since_s,
+        f"{loops} went to SAFE" if went_safe else trouble.did,
+        trouble.todo,
+        count=trouble.number,
+        latches=trouble.latches,
+    )
 
 
 def _no_data(state: ConsoleState) -> Alarm:
@@ -147,60 +133,3 @@ def _no_data(state: ConsoleState) -> Alarm:
         "is the supervisor running? STOP may not reach it: be ready to cut the power",
         latches=False,
     )
-
-
-def _interlock(loop: LoopState, trip: TrippedInterlock) -> Alarm:
-    what, todo = _parted(trip.reason)
-    by_hand = f"; then reset {trip.name}" if trip.reset == "hand" else ""
-    did = _DID[trip.action]
-    error = trip.action != "warn"
-    return Alarm(f"{loop.name} {trip.name}", error, what, trip.since_s, did, todo + by_hand)
-
-
-def _star_lost(loop: LoopState, since_s: float, now_s: float) -> Alarm:
-    what, did = _parted(search_again_text(loop, now_s))
-    return Alarm(
-        f"{loop.name} star", True, f"{loop.name}: {what}", since_s, did, FIND_STAR, latches=False
-    )
-
-
-def _fault(loop: LoopState, change: ModeChange) -> Alarm:
-    what, todo = _parted(change.reason)
-    did = f"{loop.name} went to SAFE"
-    return Alarm(
-        f"{loop.name} fault", True, what, change.time_s, did, todo or "mend it, then Recover"
-    )
-
-
-def _device(newest: Telemetry, device: DeviceHealth) -> Alarm:
-    what, todo = _parted(device.detail)
-    loops = [loop.mode for loop in newest.loops if device.device.startswith(loop.name)]
-    modes = loops or [loop.mode for loop in newest.loops]
-    did = "the loop is in SAFE" if "SAFE" in modes else "it is asked again"
-    return Alarm(
-        device.device,
-        True,
-        f"{device.device}: {what}",
-        device.time_s,
-        did,
-        todo or "see screen Devices, then Recover",
-    )
-
-
-def _log(newest: Telemetry) -> Iterator[Alarm]:
-    lost = newest.records_lost
-    if lost:
-        what = f"{lost:,} records lost from the log".replace(",", " ")
-        did = "the loop goes on; the gap is counted in the log"
-        todo = "see the events for the reason"
-        yield Alarm("records", False, what, newest.time_s, did, todo, count=lost)
-    if newest.recorder is None and any(loop.mode != "OFF" for loop in newest.loops):
-        did = "the loop goes on, the supervisor tries again"
-        todo = "see the events: disk full, or logging.folder?"
-        yield Alarm("recorder", False, "nothing is being recorded", newest.time_s, did, todo)
-
-
-def _parted(reason: str) -> tuple[str, str]:
-    """What happened, and the next step, with which such texts end."""
-    what, semicolon, todo = reason.rpartition("; ")
-    return (what, todo) if semicolon else (reason, "")

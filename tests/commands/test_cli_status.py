@@ -11,18 +11,26 @@ from fitctl.commands.operate import watch
 from fitctl.commands.operate.status import duration, status_document, status_lines
 from fitctl.commands.shared.printing import to_json, utc
 from fitctl.logging.records import Event
-from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
 from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
 from tests.fake_supervisor import STAR_LOST, FakeSupervisor
 
 TRIPPED = TrippedInterlock(
-    name="flux_low", since_s=999.0, action="warn", reset="itself", reason="0.7; check the shutter"
+    name="flux_low",
+    since_s=999.0,
+    action="warn",
+    reset="itself",
+    reason="interlock flux_low: star of right: 0.7 is below 0.75; check the shutter",
 )
 
 
 def told(supervisor=None, **changes):
     """A message, with some of its fields replaced."""
     return msgspec.structs.replace((supervisor or FakeSupervisor()).message(), **changes)
+
+
+def lines(message):
+    return [trouble.line for trouble in troubles(message)]
 
 
 def told_of_losses(count):
@@ -46,14 +54,14 @@ def test_an_instrument_that_is_off_is_well():
     ("trouble", "expected"),
     [
         (lambda: told(FakeSupervisor("SAFE")), "right is SAFE: "),
-        (lambda: told(recorder=None), "nothing is recorded"),
+        (lambda: told(recorder=None), "nothing is being recorded"),
         (lambda: told_of_losses(3), "3 records are missing"),
         (lambda: told(time_s=told().time_s + 1.1 * RECORDER_SILENT_S), "said nothing for 11 s"),
     ],
     ids=["safe", "no recorder", "losses", "silent recorder"],
 )
 def test_what_is_not_well_is_one_line_each(trouble, expected):
-    (line,) = troubles(trouble())
+    (line,) = lines(trouble())
 
     assert expected in line
 
@@ -63,11 +71,11 @@ def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():
     supervisor.interlocks = [TRIPPED]
     message = told(supervisor)
     camera = msgspec.structs.replace(message.devices[0], state="fault", detail="no frame came")
-    found = troubles(msgspec.structs.replace(message, devices=[camera, *message.devices[1:]]))
+    found = lines(msgspec.structs.replace(message, devices=[camera, *message.devices[1:]]))
 
     assert found == [
-        "right interlock flux_low: 0.7; check the shutter",
-        f"{camera.device} at {camera.endpoint}: no frame came",
+        TRIPPED.reason,
+        f"{camera.device} at {camera.endpoint}: no frame came; it is asked again",
     ]
 
 
@@ -76,15 +84,29 @@ def test_a_lost_star_is_one_trouble_as_long_as_it_is_searched_for():
     supervisor.search_again = STAR_LOST
     supervisor.interlocks = [
         msgspec.structs.replace(TRIPPED, name="star_lost"),
-        msgspec.structs.replace(TRIPPED, name="disk_space"),
+        msgspec.structs.replace(TRIPPED, name="disk_space", reason="interlock disk_space: full"),
     ]
 
-    found = troubles(told(supervisor))
+    found = lines(told(supervisor))
 
     assert found == [
         "right: star lost 133 s ago; the loop searches again, round 2, within 108 arcsec of its last place; "
         "check shutter and clouds; hold, stop or another acquire ends the search",
-        "right interlock disk_space: 0.7; check the shutter",
+        "interlock disk_space: full",
+    ]
+
+
+def test_a_failed_command_is_a_trouble_with_what_to_do():
+    supervisor = FakeSupervisor("OFF")
+    supervisor.last_failure = LoopFailure(
+        what="standby",
+        time_s=999.0,
+        text="piezo at ttyUSB0: expected an answer, got none; is it on?",
+    )
+
+    assert lines(told(supervisor)) == [
+        "right: standby failed: piezo at ttyUSB0: expected an answer, got none; "
+        "all devices were let go again; is it on?; then standby"
     ]
 
 
@@ -93,7 +115,7 @@ def test_an_interlock_on_the_lost_star_that_holds_the_stages_is_still_named():
     supervisor.search_again = STAR_LOST
     supervisor.interlocks = [msgspec.structs.replace(TRIPPED, name="star_lost", action="hold")]
 
-    assert any("interlock star_lost" in line for line in troubles(told(supervisor)))
+    assert any(trouble.key == "right star_lost" for trouble in troubles(told(supervisor)))
 
 
 # ---------------------------------------------------------------- status
@@ -115,10 +137,10 @@ def test_the_document_has_all_of_a_message_but_its_streams():
 
 def test_people_read_the_verdict_first_then_loops_devices_and_log():
     message = told_of_losses(3)
-    first, second, *rest = status_lines(message, troubles(message))
+    first, second, *rest = status_lines(message, lines(message))
 
     assert first == "fit-mock: not well"
-    assert second.strip() == "! 3 records are missing from the log of this run"
+    assert second.strip().startswith("! 3 records are missing from the log of this run")
     text = "\n".join(rest)
     assert "VERNIER for 2 min 13 s, controller minimum-variance" in text
     assert "0 ticks, 0 events, 0 mode changes, 0 replies" in text
@@ -245,6 +267,18 @@ def test_a_line_of_text_says_that_the_star_was_lost(monkeypatch):
     ]
 
     assert "searched, star lost" in watch._text(seconds[0])
+
+
+def test_a_line_of_text_says_which_command_failed(monkeypatch):
+    supervisor = FakeSupervisor("OFF")
+    supervisor.last_failure = LoopFailure(what="standby", time_s=999.0, text="no such port")
+    seconds = [
+        each
+        for each in watched(monkeypatch, supervisor.messages(23))
+        if isinstance(each, watch.Second)
+    ]
+
+    assert watch._text(seconds[0]).endswith("standby failed")
 
 
 def test_each_line_of_json_says_what_it_is_of(monkeypatch):

@@ -98,7 +98,7 @@ def test_an_unreadable_message_s_error_is_safe():
 
 def test_status_watch_and_replies_print_nothing_raw(capsys):
     telemetry = safe.plain_message(evil(Telemetry))
-    lines = status.status_lines(telemetry, troubles(telemetry))
+    lines = status.status_lines(telemetry, [trouble.line for trouble in troubles(telemetry)])
     assert raw("\n".join(lines)) == []
     for entry in (evil(watch.Happened), evil(watch.Silence)):
         watch.say(watch._text(entry))

@@ -6,9 +6,10 @@ import numpy as np
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceTimeout
-from fitctl.logging.records import Event
+from fitctl.logging.records import Event, RecorderStatus
 from fitctl.messages.commands import Stop
 from fitctl.messages.modes import Mode
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.simulation import Simulation
 
 ROWS = load_rig(default_rig_path()).interlocks
@@ -19,9 +20,9 @@ RESETS_WITHIN_S = 12.0
 class Bench:
     """An instrument that holds its star, and ways to strike it; :meth:`heal` takes them all back."""
 
-    def __init__(self, *overrides):
-        self.records = []
-        rig = load_rig(default_rig_path(), overrides)
+    def __init__(self, *overrides, rig=None):
+        self.records, self.buffer = [], TelemetryBuffer()
+        rig = rig or load_rig(default_rig_path(), overrides)
         self.simulation = Simulation(rig, 0, star_offset_px=(10.0, -6.0), record=self.take)
         self.supervisor, self.clock = self.simulation.supervisor, self.simulation.clock
         self.loop = self.supervisor.loops["right"]
@@ -32,7 +33,23 @@ class Bench:
         self.simulation.acquire()
         assert self.until(lambda: self.loop.mode is Mode.VERNIER, 20.0)
 
+    def telemetry(self):
+        """What consoles hear now; the recorder is well."""
+        now_s = self.clock.now_s()
+        self.buffer.recorder = RecorderStatus(
+            time_s=now_s, path="", records=1, lost=0, bytes_written=1
+        )
+        state = ServiceState(
+            pid=1,
+            wall_minus_monotonic_s=0.0,
+            scheduling="",
+            records_lost=lambda: 0,
+            records_offered=lambda: 0,
+        )
+        return self.buffer.telemetry(self.supervisor, state, now_s)
+
     def take(self, record):
+        self.buffer.add(record)
         if isinstance(record, Event):
             self.records.append(record)
 

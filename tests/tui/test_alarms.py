@@ -146,7 +146,7 @@ def test_lost_records_alarm_again_when_more_are_lost():
     watch.supervisor.records_lost = 6
     (alarm,) = watch.hear()
     assert not alarm.acknowledged
-    assert alarm.what == "6 records lost from the log"
+    assert alarm.what == "6 records are missing from the log of this run"
 
 
 def test_silence_of_the_supervisor_is_an_alarm_that_ends_with_it():

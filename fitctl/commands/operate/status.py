@@ -38,7 +38,7 @@ def status(
         raise typer.Exit(NO_SUPERVISOR) from None
     finally:
         client.close()
-    found = troubles(telemetry)
+    found = [trouble.line for trouble in troubles(telemetry)]
     if as_json:
         say(to_json(status_document(telemetry, found)))
     else:

@@ -42,6 +42,7 @@ class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
     late_ticks: int
     star_ticks: int
     star_lost: bool
+    failed: str
 
 
 class Second(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", tag="second"):
@@ -167,6 +168,7 @@ def _loop(loop: LoopState, tally: Tally) -> LoopSecond:
         late_ticks=tally.late_ticks,
         star_ticks=tally.star_ticks,
         star_lost=loop.search_again is not None,
+        failed="" if loop.last_failure is None else loop.last_failure.what,
     )
 
 
@@ -193,4 +195,6 @@ def _loop_text(loop: LoopSecond) -> str:
         parts.append(f"{loop.ticks} frames, {loop.late_ticks} late")
     if loop.interlocks:
         parts.append(f"tripped: {', '.join(loop.interlocks)}")
+    if loop.failed:
+        parts.append(f"{loop.failed} failed")
     return "  ".join(parts).rstrip()
