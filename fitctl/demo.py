@@ -91,8 +91,11 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
         mocks = _start(folder, "mocks", ["mocks", *rig_arguments(rig_path, overrides), *options])
         processes.append(mocks)
         endpoints = _first_line(mocks, folder)
+        # With the bench's port among them, so that `fitctl fault` finds these mocks by their supervisor.
         devices = [
-            f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
+            f"{key}={value}"
+            for key, value in endpoints.items()
+            if key == "mocks.bench_port" or not key.startswith("mocks.")
         ]
         sockets = stack.enter_context(_socket_folder(load_rig(rig_path, overrides), folder))
         settings = [*overrides, *devices, f"service.folder={sockets}"]

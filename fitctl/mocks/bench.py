@@ -61,7 +61,7 @@ class StagesNow(msgspec.Struct, frozen=True):
 
 
 class SetFault(_Question, frozen=True):
-    """Begin a fault; fields as in :class:`fitctl.config.Fault`."""
+    """Begin a fault; fields as in :class:`fitctl.config.Fault`. ``rig`` is whose mocks are meant, empty any."""
 
     device: str
     kind: str
@@ -69,6 +69,7 @@ class SetFault(_Question, frozen=True):
     value: float | None = None
     for_s: float | None = None
     probability: float = 1.0
+    rig: str = ""
 
 
 class ClearFaults(_Question, frozen=True):
@@ -77,17 +78,21 @@ class ClearFaults(_Question, frozen=True):
     device: str = ""
     kind: str = ""
     part: str = ""
+    rig: str = ""
 
 
 class ListFaults(_Question, frozen=True):
     """Ask what is wrong now."""
 
+    rig: str = ""
+
 
 class FaultsNow(msgspec.Struct, frozen=True):
-    """What is wrong now, or why the question could not be obeyed."""
+    """What is wrong now, or why the question could not be obeyed; and which rig's mocks these are."""
 
     active: list[dict[str, Any]]
     error: str = ""
+    rig: str = ""
 
 
 _AnyQuestion = ResidualQuestion | StagesQuestion | SetFault | ClearFaults | ListFaults
@@ -126,7 +131,9 @@ class FaultTable:
         """Obey, and say what is wrong then."""
         try:
             if isinstance(question, SetFault):
-                fault = Fault(**msgspec.structs.asdict(question))
+                fields = msgspec.structs.asdict(question)
+                del fields["rig"]
+                fault = Fault(**fields)
                 self._of(fault.device).set(fault)
             elif isinstance(question, ClearFaults):
                 names = [question.device] if question.device else list(self._devices)
@@ -155,10 +162,11 @@ class FaultTable:
 
 
 class Bench:
-    """Answers questions about the truth until stopped."""
+    """Answers questions about the truth of one rig's mocks until stopped."""
 
     def __init__(
         self,
+        rig_name: str,
         plants: Mapping[str, Plant],
         faults: FaultTable,
         started_s: float,
@@ -166,6 +174,7 @@ class Bench:
         *,
         or_any_port: bool = False,
     ) -> None:
+        self._rig_name = rig_name
         self._plants = plants
         self._faults = faults
         self._started_s = started_s
@@ -212,7 +221,10 @@ class Bench:
             return self._residual(question)
         if isinstance(question, StagesQuestion):
             return self._stages(question)
-        return self._faults.answer(question)
+        if question.rig not in {"", self._rig_name}:
+            why_not = f"these are the mocks of rig {self._rig_name}, and not of rig {question.rig}"
+            return FaultsNow([], why_not, self._rig_name)
+        return msgspec.structs.replace(self._faults.answer(question), rig=self._rig_name)
 
     def _stages(self, question: StagesQuestion) -> StagesNow:
         plant = self._plants.get(question.loop)

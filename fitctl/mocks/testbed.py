@@ -167,7 +167,12 @@ class Testbed:
         self._faults = FaultTable(devices)
         plants = {name: live.plant for name, live in self._plants.items()}
         self._bench = Bench(
-            plants, self._faults, started_s, mocks.bench_port, or_any_port=bench_at_any_port
+            rig.name,
+            plants,
+            self._faults,
+            started_s,
+            mocks.bench_port,
+            or_any_port=bench_at_any_port,
         )
         self._housekeeping: asyncio.Task | None = None
 

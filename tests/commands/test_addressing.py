@@ -5,13 +5,15 @@ import time
 from contextlib import ExitStack
 
 import pytest
-from served import Served, rig_in
+from served import Served, free_port, rig_in
 
 from fitctl.cli import main
+from fitctl.commands.try_out import fault
 from fitctl.config import default_rig_path
 from fitctl.messages import endpoints, running
 from fitctl.messages.endpoints import make_service_folder, supervisor_name
 from fitctl.messages.running import running_rigs, write_running
+from fitctl.mocks.bench import FaultsNow
 from fitctl.processes import name_held
 
 
@@ -170,6 +172,34 @@ def test_a_name_that_leads_to_another_users_folder_is_not_believed(night, tmp_pa
 
     with name_held(supervisor_name(folder)):
         assert [rig.name for rig in running_rigs()] == ["night"]
+
+
+def test_faults_go_to_the_mocks_of_the_one_that_runs(night, fitctl, monkeypatch):
+    (served,) = night("night")
+    port = free_port()
+    at = ["name=night", f"service.folder={served.folder}", f"mocks.bench_port={port}"]
+    write_running(served.folder, "night", default_rig_path(), at)
+    asked = []
+
+    def ask(at_port, question, _answer):
+        asked.append((at_port, question.rig))
+        return FaultsNow([], "", question.rig)
+
+    monkeypatch.setattr(fault, "ask_bench", ask)
+    status, out, err = fitctl("fault", "now")
+
+    assert (status, out) == (0, "all is well\n")
+    assert asked == [(port, "night")]
+    assert "rig night: " in err
+
+
+def test_where_several_run_a_fault_names_them_and_does_nothing(night, fitctl):
+    night("north", "south")
+
+    status, _, err = fitctl("fault", "set", "camera", "drop")
+
+    assert status == 2
+    assert "2 supervisors run; nothing was done" in err
 
 
 def test_the_shipped_rig_is_still_the_one_that_is_computed_with(night, fitctl):

@@ -9,6 +9,7 @@ import pytest
 
 from fitctl.cli import main
 from fitctl.commands.shared.fault_kinds import kinds
+from fitctl.config import default_rig_path
 from fitctl.mocks.faults import WIRE_FAULTS
 
 SCRIPT = """
@@ -51,8 +52,23 @@ def fault(mocks, capsys):
     return run
 
 
-def test_a_script_makes_things_go_wrong_at_their_time(fault):
-    assert fault("now") == (0, "right.mdt693 delay 0.25", "")
+def test_a_script_makes_things_go_wrong_at_their_time(fault, mocks):
+    status, out, err = fault("now")
+
+    assert (status, out) == (0, "right.mdt693 delay 0.25")
+    assert err == f"rig fit-mock: {default_rig_path()}, mocks at 127.0.0.1:{mocks}"
+
+
+@pytest.mark.parametrize("wanted", [["set", "right.dac", "drop"], ["clear"], ["now"]])
+def test_the_mocks_of_another_rig_are_left_alone(fault, wanted):
+    before = fault("now")[1]
+
+    status, out, err = fault(*wanted, "--set", "name=south")
+
+    assert (status, out) == (2, "")
+    assert "are the mocks of rig fit-mock" in err
+    assert "of rig south" in err
+    assert fault("now")[1] == before
 
 
 def test_faults_begin_are_listed_and_end(fault):
@@ -85,8 +101,9 @@ def test_a_fault_ends_after_its_time(fault):
 def test_what_cannot_be_is_one_line_and_status_2(fault, arguments, said):
     status, out, err = fault("set", *arguments)
     assert (status, out) == (2, "")
-    assert len(err.splitlines()) == 1
-    assert said in err
+    which, why = err.splitlines()
+    assert which.startswith("rig fit-mock: ")
+    assert said in why
 
 
 def test_without_mocks_it_says_so(capsys):

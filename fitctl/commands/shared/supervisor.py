@@ -45,22 +45,38 @@ def address(command: str, path: Path | None, overrides: list[str] | None) -> Add
     typer.Exit
         If none runs, with one line.
     """
-    named = named_rig(path)
-    if named is not None or overrides:
-        return Addressed(named or default_rig_path(), overrides or [])
-    running = running_rigs()
-    if not running:
+    found = _address(command, path, overrides)
+    if found is None:
         say(
             f"{command}: no supervisor of yours runs on this machine; start one with fitctl run, or name a rig "
             "with --rig or FITCTL_RIG",
             err=True,
         )
         raise typer.Exit(NO_SUPERVISOR)
+    return found
+
+
+def address_or_shipped(command: str, path: Path | None, overrides: list[str] | None) -> Addressed:
+    """As :func:`address`, but the shipped rig where no supervisor runs: for what needs none.
+
+    Raises
+    ------
+    ConfigError
+        If several run; the text names them.
+    """
+    return _address(command, path, overrides) or Addressed(default_rig_path(), [])
+
+
+def _address(command: str, path: Path | None, overrides: list[str] | None) -> Addressed | None:
+    named = named_rig(path)
+    if named is not None or overrides:
+        return Addressed(named or default_rig_path(), overrides or [])
+    running = running_rigs()
     if len(running) > 1:
         lines = "".join(f"\n  {rig.where}" for rig in running)
         msg = f"{command}: {len(running)} supervisors run; nothing was done. Say which:{lines}"
         raise ConfigError(msg)
-    return Addressed(Path(running[0].file), running[0].settings, running[0])
+    return Addressed(Path(running[0].file), running[0].settings, running[0]) if running else None
 
 
 def show_rig(name: str, where: str) -> None:

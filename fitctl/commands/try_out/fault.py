@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.commands.shared.options import RigOption, SetOption
 from fitctl.commands.shared.printing import say
-from fitctl.commands.shared.rig import named_rig, rig_of
-from fitctl.config import ConfigError, Rig
+from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.supervisor import address_or_shipped, show_rig
+from fitctl.config import ConfigError
 from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
 app = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
@@ -43,8 +46,7 @@ def set_(
     overrides: SetOption = None,
 ) -> None:
     """Begin a fault."""
-    wanted = SetFault(device, kind, part, value, for_s, probability)
-    _change(rig_of(named_rig(rig), overrides), wanted)
+    _change(rig, overrides, SetFault(device, kind, part, value, for_s, probability))
 
 
 @app.command("clear")
@@ -58,13 +60,13 @@ def clear(
     overrides: SetOption = None,
 ) -> None:
     """End faults."""
-    _change(rig_of(named_rig(rig), overrides), ClearFaults(device, kind, part))
+    _change(rig, overrides, ClearFaults(device, kind, part))
 
 
 @app.command("now")
 def now(rig: RigOption = None, overrides: SetOption = None) -> None:
     """Print what is wrong now."""
-    _change(rig_of(named_rig(rig), overrides), ListFaults())
+    _change(rig, overrides, ListFaults())
 
 
 @app.command("kinds")
@@ -78,23 +80,35 @@ def kinds_() -> None:
             say(f"  {name:<18} {kind.text}{value}{parts}")
 
 
-def _change(rig: Rig, question: SetFault | ClearFaults | ListFaults) -> None:
-    """Change or list faults of the running mocks, and print those that remain.
+def _change(
+    path: Path | None, overrides: list[str] | None, question: SetFault | ClearFaults | ListFaults
+) -> None:
+    """Change or list faults of the mocks of a rig, and print the rig and the faults that remain.
 
     Raises
     ------
     ConfigError
-        If no mocks answer, or they have no such fault.
+        If no mocks answer, they are of another rig, or they have no such fault.
     """
+    found = address_or_shipped("fault", path, overrides)
+    rig = rig_of(found.file, found.settings)
     _, mocks = rig.mock_parts()
-    if not mocks.bench_port:
+    port = mocks.bench_port
+    if not port:
         msg = "fault: mocks.bench_port is 0; give the port that the mocks printed: --set mocks.bench_port=PORT"
         raise ConfigError(msg)
     try:
-        now = ask_bench(mocks.bench_port, question, FaultsNow)
+        now = ask_bench(port, msgspec.structs.replace(question, rig=rig.name), FaultsNow)
     except ConnectionError as error:
         msg = f"fault: {error}; start fitctl mocks, or give its port: --set mocks.bench_port=PORT"
         raise ConfigError(msg) from None
+    if now.rig != rig.name:
+        msg = (
+            f"fault: nothing was changed: at 127.0.0.1:{port} are the mocks of rig {now.rig}, and {found.file} "
+            f"is of rig {rig.name}; name the rig file with --rig, or the port with --set mocks.bench_port=PORT"
+        )
+        raise ConfigError(msg)
+    show_rig(rig.name, f"{found.file}, mocks at 127.0.0.1:{port}")
     if now.error:
         msg = f"fault: {now.error}"
         raise ConfigError(msg)
