@@ -44,6 +44,12 @@ class RunningRig(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.name} (process {self.pid}): --rig {self.file} --set service.folder={self.folder}"
 
 
+def rig_of_environment() -> Path | None:
+    """The rig file that ``FITCTL_RIG`` names, if any."""
+    named = os.environ.get("FITCTL_RIG")
+    return Path(named) if named else None
+
+
 def write_running(folder: Path, name: str, file: Path, settings: Sequence[str]) -> None:
     """Leave in the socket folder what runs there; a reader finds all of it or nothing.
 
@@ -71,6 +77,27 @@ def running_rigs() -> list[RunningRig]:
         if folder.is_absolute() and (running := _read(folder)) is not None:
             found.append(running)
     return found
+
+
+def only_running_rig(asking: str) -> RunningRig | None:
+    """The one supervisor of this user that runs, None if none does.
+
+    Parameters
+    ----------
+    asking : str
+        Who asks, for the error.
+
+    Raises
+    ------
+    ConfigError
+        If several run; the text names them.
+    """
+    running = running_rigs()
+    if len(running) > 1:
+        lines = "".join(f"\n  {rig.where}" for rig in running)
+        msg = f"{asking}: {len(running)} supervisors run; nothing was done. Say which:{lines}"
+        raise ConfigError(msg)
+    return running[0] if running else None
 
 
 def supervisor_runs(folder: Path) -> bool:

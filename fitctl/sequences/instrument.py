@@ -21,6 +21,7 @@ from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import AnyCommand, Reply, Status, Stop
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import RemoteKey, read_key_of
+from fitctl.messages.running import only_running_rig, rig_of_environment
 from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.waiting import wait_for_outcomes
 from fitctl.sequences import steps
@@ -46,7 +47,9 @@ class Instrument(StepMethods[Figures]):
     Parameters
     ----------
     rig : Rig or path, optional
-        By default the shipped fit-mock rig.
+        By default the rig file that the environment variable FITCTL_RIG names, else the rig of your one
+        supervisor that runs on this machine. With `simulate`, `folder` or `remote`, the shipped fit-mock rig
+        in place of the latter.
     simulate : bool
         On the virtual clock, in this process; otherwise the rig's running supervisor works.
     folder : path, optional
@@ -59,7 +62,7 @@ class Instrument(StepMethods[Figures]):
     Raises
     ------
     ConfigError
-        If the rig file or the key file cannot be used.
+        If the rig file or the key file cannot be used, or no rig is named and several supervisors run.
     ConnectionError
         If no supervisor answers.
     """
@@ -73,7 +76,8 @@ class Instrument(StepMethods[Figures]):
         remote: Path | str | None = None,
         seed: int = 0,
     ) -> None:
-        self.rig = rig if isinstance(rig, Rig) else load_rig(Path(rig or default_rig_path()))
+        is_found = not simulate and folder is None and remote is None
+        self.rig = rig if isinstance(rig, Rig) else _load(rig, the_running=is_found)
         self._runner: Runner | None = None
         self._link: Link
         if simulate:
@@ -219,6 +223,18 @@ class Instrument(StepMethods[Figures]):
         """From another thread: end the step or the file that is running; the stages are held where they are."""
         if self._runner is not None:
             self._runner.contact.stop_wanted.set()
+
+
+def _load(path: Path | str | None, *, the_running: bool) -> Rig:
+    """The rig of a file; without one, of FITCTL_RIG, else the one that runs or the shipped one."""
+    named = Path(path) if path is not None else rig_of_environment()
+    if named is not None or not the_running:
+        return load_rig(named or default_rig_path())
+    found = only_running_rig("Instrument")
+    if found is None:
+        msg = "no supervisor of yours runs on this machine; start one with fitctl run, or name a rig file"
+        raise ConnectionError(msg)
+    return load_rig(Path(found.file), found.settings)
 
 
 def _where(rig: Rig, folder: Path | str | None, remote: Path | str | None) -> Path | RemoteKey:

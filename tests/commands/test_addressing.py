@@ -7,9 +7,10 @@ from contextlib import ExitStack
 import pytest
 from served import Served, free_port, rig_in
 
+from fitctl import Instrument
 from fitctl.cli import main
 from fitctl.commands.try_out import fault
-from fitctl.config import default_rig_path
+from fitctl.config import ConfigError, default_rig_path
 from fitctl.messages import endpoints, running
 from fitctl.messages.endpoints import make_service_folder, supervisor_name
 from fitctl.messages.running import running_rigs, write_running
@@ -209,3 +210,47 @@ def test_the_shipped_rig_is_still_the_one_that_is_computed_with(night, fitctl):
 
     assert status == 0
     assert "rig fit-mock" in out
+
+
+# ---------------------------------------------------------------- from Python
+
+
+def test_an_instrument_without_a_rig_is_the_one_that_runs(night):
+    (served,) = night("night")
+
+    with Instrument() as instrument:
+        assert instrument.rig.name == "night"
+        instrument.stop()
+
+    assert [accepted for _, accepted in served.commands("Stop")] == [True]
+
+
+def test_an_instrument_without_a_rig_names_those_that_run(night):
+    both = night("north", "south")
+
+    with pytest.raises(ConfigError, match="2 supervisors run; nothing was done") as several:
+        Instrument()
+
+    for served in both:
+        assert f"{served.rig.name} (process {os.getpid()})" in str(several.value)
+
+
+def test_an_instrument_without_a_rig_where_none_runs_says_so(night):
+    night()
+
+    with pytest.raises(ConnectionError, match="no supervisor of yours runs"):
+        Instrument()
+
+
+def test_the_environment_names_the_rig_of_an_instrument(night, monkeypatch, tmp_path):
+    night("night")
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        f'base = "{default_rig_path()}"\nname = "mine"\nservice.folder = "{tmp_path / "none"}"\n'
+    )
+    monkeypatch.setenv("FITCTL_RIG", str(file))
+
+    with pytest.raises(ConnectionError, match=f"no supervisor answers at {tmp_path / 'none'}"):
+        Instrument()
+    with Instrument(simulate=True) as instrument:
+        assert instrument.rig.name == "mine"

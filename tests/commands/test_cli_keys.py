@@ -169,7 +169,7 @@ def test_each_page_of_a_browser_is_the_console_that_was_asked_for(
     runs = RunningRig(
         name="fit-mock", file=str(default_rig_path()), settings=[], pid=1, folder="/none"
     )
-    monkeypatch.setattr("fitctl.commands.shared.supervisor.running_rigs", lambda: [runs])
+    monkeypatch.setattr("fitctl.messages.running.running_rigs", lambda: [runs])
     pages = []
     served = "fitctl.commands.operate.console.serve_console"
     monkeypatch.setattr(served, lambda *page: pages.append(page))

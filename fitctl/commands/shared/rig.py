@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+from fitctl.messages.running import rig_of_environment
 
 
 def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
@@ -22,7 +22,7 @@ def rig_of(path: Path | None, overrides: list[str] | None) -> Rig:
 
 def named_rig(path: Path | None) -> Path | None:
     """The rig file that the options name, or else the one that ``FITCTL_RIG`` names."""
-    return path or (Path(text) if (text := os.environ.get("FITCTL_RIG")) else None)
+    return path or rig_of_environment()
 
 
 def with_controller(

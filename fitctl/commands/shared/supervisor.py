@@ -19,7 +19,7 @@ from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import AnyCommand, Reply, Shutdown
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import read_key_of, read_remote
-from fitctl.messages.running import RunningRig, running_rigs
+from fitctl.messages.running import RunningRig, only_running_rig
 from fitctl.messages.telemetry import CommandOutcome
 from fitctl.messages.waiting import wait_for_end, wait_for_outcomes
 from fitctl.processes import ended_by_signals, interrupt
@@ -71,12 +71,8 @@ def _address(command: str, path: Path | None, overrides: list[str] | None) -> Ad
     named = named_rig(path)
     if named is not None or overrides:
         return Addressed(named or default_rig_path(), overrides or [])
-    running = running_rigs()
-    if len(running) > 1:
-        lines = "".join(f"\n  {rig.where}" for rig in running)
-        msg = f"{command}: {len(running)} supervisors run; nothing was done. Say which:{lines}"
-        raise ConfigError(msg)
-    return Addressed(Path(running[0].file), running[0].settings, running[0]) if running else None
+    running = only_running_rig(command)
+    return None if running is None else Addressed(Path(running.file), running.settings, running)
 
 
 def show_rig(name: str, where: str) -> None:
