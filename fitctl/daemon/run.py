@@ -10,9 +10,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -139,7 +139,13 @@ def run_supervisor(
 
         executor = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="devices"))
         supervisor = Supervisor(
-            rig, rig_devices(rig), clock, executor, record, design_in_own_process
+            rig,
+            rig_devices(rig),
+            clock,
+            executor,
+            record,
+            design_in_own_process,
+            design_executor=stack.enter_context(_designer()),
         )
         children = _children(
             rig, rig_arguments(rig_file, settings), folder, supervisor.report_event
@@ -224,6 +230,16 @@ def _children(
 
 def _modes(supervisor: Supervisor) -> str:
     return ", ".join(f"{name} {loop.mode.name}" for name, loop in supervisor.loops.items())
+
+
+@contextmanager
+def _designer() -> Iterator[ThreadPoolExecutor]:
+    """A thread for designs alone: one may take a minute, in which devices must be read, and closed if asked."""
+    designer = ThreadPoolExecutor(1, thread_name_prefix="design")
+    try:
+        yield designer
+    finally:
+        designer.shutdown(wait=False, cancel_futures=True)
 
 
 def _loop(

@@ -92,6 +92,8 @@ class Supervisor:
         Makes the design of a loop, at the start and for `SetController`.
     make_loop : callable
         Makes a loop of its name, the rig, its devices, the journal and `design`.
+    design_executor : Executor, optional
+        Makes designs beside the device work, which cannot wait for them; by default `executor`.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class Supervisor:
         record: Callable[[AnyRecord], None],
         design: Designer,
         make_loop: MakeLoop = stellar_loop,
+        design_executor: Executor | None = None,
     ) -> None:
         self.rig = rig
         journal = Journal(clock, record)
@@ -115,6 +118,7 @@ class Supervisor:
         self.shutdown_wanted = False
         self._clock = clock
         self._executor = executor
+        self._design_executor = design_executor or executor
         self._journal = journal
         self._record = record
         self._design = design
@@ -347,12 +351,14 @@ class Supervisor:
         number = self.outcomes.begin(command, names)
         for name in names:
             # A design takes longer than a tick.
-            future = self._executor.submit(self._design, self.rig, name, command.name)
+            future = self._design_executor.submit(self._design, self.rig, name, command.name)
             ended = partial(self.outcomes.end, number, [name])
             self._designs.append(Job(future, partial(self._designed, name, command.name, ended)))
         self._finish_jobs()
         return Reply(
-            accepted=True, number=number, text="designing; an event tells when it is at work"
+            accepted=True,
+            number=number,
+            text="designing; fitctl status shows the controller at work",
         )
 
     def _designed(self, name: str, controller: str, ended: Ended, future: Future) -> None:
