@@ -91,7 +91,8 @@ def troubles(telemetry: Telemetry) -> list[Trouble]:
     for loop in telemetry.loops:
         for cause, trouble in _of_loop(loop, telemetry.time_s):
             known = found.get(cause)
-            found[cause] = trouble if known is None else _merged(known, trouble)
+            # By its cause an alarm stays the same one, whatever reports it from one message to the next.
+            found[cause] = trouble._replace(key=cause) if known is None else _merged(known, trouble)
     changed_s = max((loop.since_s for loop in telemetry.loops), default=0.0)
     for device in telemetry.devices:
         # What a device reported before the last change of mode is of the past.
@@ -151,6 +152,8 @@ def _of_safe(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
     reason = "" if change is None else change.reason
     what, todo = _parted(reason)
     fault = change is not None and change.trigger == "FAULT"
+    if reason == "operator":
+        what, todo = "stopped by the operator", "recover, or off"
     if not fault and loop.last_failure is not None:
         return  # a stop ended a command, whose failure says so
     yield (

@@ -115,7 +115,7 @@ def test_an_interlock_on_the_lost_star_that_holds_the_stages_is_still_named():
     supervisor.search_again = STAR_LOST
     supervisor.interlocks = [msgspec.structs.replace(TRIPPED, name="star_lost", action="hold")]
 
-    assert any(trouble.key == "right star_lost" for trouble in troubles(told(supervisor)))
+    assert "interlock flux_low: star of right: " in lines(told(supervisor))[1]
 
 
 # ---------------------------------------------------------------- status

@@ -142,6 +142,25 @@ def test_a_device_that_fails_is_one_alarm_and_one_line_of_the_status(device):
     assert line == f"right is SAFE: {GONE}, then recover"
 
 
+def test_an_alarm_stays_the_same_one_when_the_loop_is_turned_off():
+    bench = struck("piezo_limit")
+    bench.run(3.0)
+    book = AlarmBook()
+    for command in (None, Off()):
+        if command is not None:
+            assert bench.simulation.command(command).accepted
+            bench.run(1.0)
+        message = bench.telemetry()
+        state = ConsoleState(message.time_s)
+        state.accept(message, message.time_s)
+        state.now_s = message.time_s
+        book.update(state)
+
+    (alarm,) = book.in_order
+    assert alarm.over_s is None
+    assert alarm.todo.endswith("then standby")
+
+
 def test_a_recovery_that_fails_by_the_same_device_is_still_one_alarm():
     bench = Bench()
     fail(bench, "piezo")
@@ -222,7 +241,7 @@ def test_the_operators_stop_is_no_alarm_and_one_line_of_the_status():
     bench.run(5.0)
 
     assert alarms(bench) == []
-    assert lines(bench) == ["right is SAFE: operator"]
+    assert lines(bench) == ["right is SAFE: stopped by the operator; recover, or off"]
 
 
 # ---------------------------------------------------------------- two loops on one camera
