@@ -175,23 +175,47 @@ def test_a_name_that_leads_to_another_users_folder_is_not_believed(night, tmp_pa
         assert [rig.name for rig in running_rigs()] == ["night"]
 
 
-def test_faults_go_to_the_mocks_of_the_one_that_runs(night, fitctl, monkeypatch):
-    (served,) = night("night")
-    port = free_port()
-    at = ["name=night", f"service.folder={served.folder}", f"mocks.bench_port={port}"]
-    write_running(served.folder, "night", default_rig_path(), at)
-    asked = []
+@pytest.fixture
+def asked(monkeypatch):
+    """Which benches are asked, and as which rigs; nothing is wrong with any."""
+    benches = []
 
-    def ask(at_port, question, _answer):
-        asked.append((at_port, question.rig))
+    def ask(port, question, _answer):
+        benches.append((port, question.rig))
         return FaultsNow([], "", question.rig)
 
     monkeypatch.setattr(fault, "ask_bench", ask)
+    return benches
+
+
+def with_bench(served):
+    """Its mocks listen on a port that only it knows."""
+    port, name = free_port(), served.rig.name
+    at = [f"name={name}", f"service.folder={served.folder}", f"mocks.bench_port={port}"]
+    write_running(served.folder, name, default_rig_path(), at)
+    return port
+
+
+def test_faults_go_to_the_mocks_of_the_one_that_runs(night, fitctl, asked):
+    (served,) = night("night")
+    port = with_bench(served)
+
     status, out, err = fitctl("fault", "now")
 
     assert (status, out) == (0, "all is well\n")
     assert asked == [(port, "night")]
     assert "rig night: " in err
+
+
+def test_faults_go_to_the_mocks_of_the_one_in_the_folder_that_is_given(night, fitctl, asked):
+    ports = {served.rig.name: (served, with_bench(served)) for served in night("north", "south")}
+    served, port = ports["south"]
+    at = ["--rig", str(default_rig_path()), "--set", f"service.folder={served.folder}"]
+
+    fitctl("fault", "now", *at)
+    fitctl("fault", "now", *at, "--set", "mocks.bench_port=1")
+
+    assert asked == [(port, "south"), (1, "fit-mock")]
 
 
 def test_where_several_run_a_fault_names_them_and_does_nothing(night, fitctl):

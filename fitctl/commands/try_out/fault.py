@@ -14,7 +14,9 @@ from fitctl.commands.shared.options import RigOption, SetOption
 from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address_or_shipped, show_rig
-from fitctl.config import ConfigError
+from fitctl.config import ConfigError, Rig
+from fitctl.messages.endpoints import service_folder
+from fitctl.messages.running import running_rigs
 from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
 app = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
@@ -80,6 +82,19 @@ def kinds_() -> None:
             say(f"  {name:<18} {kind.text}{value}{parts}")
 
 
+def _as_running(rig: Rig, overrides: list[str] | None) -> Rig:
+    """The rig as the supervisor in its socket folder runs it, which knows the port of a demo's mocks.
+
+    A port that is given on the command line is used as it is.
+    """
+    given = any(text.startswith("mocks.bench_port=") for text in overrides or ())
+    folder = service_folder(rig)
+    running = () if given else running_rigs()
+    return next(
+        (rig_of(Path(r.file), r.settings) for r in running if Path(r.folder) == folder), rig
+    )
+
+
 def _change(
     path: Path | None, overrides: list[str] | None, question: SetFault | ClearFaults | ListFaults
 ) -> None:
@@ -91,7 +106,7 @@ def _change(
         If no mocks answer, they are of another rig, or they have no such fault.
     """
     found = address_or_shipped("fault", path, overrides)
-    rig = rig_of(found.file, found.settings)
+    rig = _as_running(rig_of(found.file, found.settings), overrides)
     _, mocks = rig.mock_parts()
     port = mocks.bench_port
     if not port:
