@@ -45,7 +45,7 @@ class Trouble(NamedTuple):
     Attributes
     ----------
     key : str
-        Tells two apart, from message to message.
+        Its cause: from one message to the next an alarm stays the same one, whatever reports it.
     severity : str
         A "note" makes an instrument not well, and is no alarm: somebody wanted it so.
     what, did, todo : str
@@ -56,7 +56,7 @@ class Trouble(NamedTuple):
     is_safe : bool
         They are SAFE.
     number : int
-        Of what is counted: more of it is a new trouble.
+        Grows with new trouble of the same cause: records lost, or the time in ms of a failed command.
     latches : bool
         An operator should know of it also when it is over.
     """
@@ -87,12 +87,11 @@ def troubles(telemetry: Telemetry) -> list[Trouble]:
     A loop that is SAFE or searches for the star that it lost, a command that failed, an interlock that is
     tripped, a device in fault, a recorder that says nothing, records that are missing from the log.
     """
-    found: dict[str, Trouble] = {}  # by cause
+    found: dict[str, Trouble] = {}
     for loop in telemetry.loops:
-        for cause, trouble in _of_loop(loop, telemetry.time_s):
-            known = found.get(cause)
-            # By its cause an alarm stays the same one, whatever reports it from one message to the next.
-            found[cause] = trouble._replace(key=cause) if known is None else _merged(known, trouble)
+        for trouble in _of_loop(loop, telemetry.time_s):
+            known = found.get(trouble.key)
+            found[trouble.key] = trouble if known is None else _merged(known, trouble)
     changed_s = max((loop.since_s for loop in telemetry.loops), default=0.0)
     for device in telemetry.devices:
         # What a device reported before the last change of mode is of the past.
@@ -108,101 +107,91 @@ def _merged(one: Trouble, other: Trouble) -> Trouble:
     return one._replace(since_s=since_s, loops=(*one.loops, *other.loops))
 
 
-def _of_loop(loop: LoopState, now_s: float) -> Iterator[tuple[str, Trouble]]:
-    """Troubles of a loop, with the cause of each; the first of each cause says most."""
+def _of_loop(loop: LoopState, now_s: float) -> Iterator[Trouble]:
+    """Troubles of a loop, one for each cause: the first that names it says most."""
     named = set()
-    for cause, trouble in (
+    for trouble in (
         *_of_failure(loop),
         *_of_safe(loop),
         *_of_search(loop, now_s),
         *_of_interlocks(loop),
     ):
-        if cause not in named:
-            named.add(cause)
-            yield cause, trouble
+        if trouble.key not in named:
+            named.add(trouble.key)
+            yield trouble
 
 
-def _of_failure(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
+def _of_failure(loop: LoopState) -> Iterator[Trouble]:
     failure, change = loop.last_failure, loop.last_change
     if failure is None:
         return
-    went_safe = loop.mode == Mode.SAFE.name and change is not None
-    if went_safe and change is not None and change.reason == failure.text:
+    is_safe = loop.mode == Mode.SAFE.name
+    if is_safe and change is not None and change.reason == failure.text:
         return  # the loop's own fault ended the command
     what, todo = _parted(failure.text)
-    yield (
+    yield Trouble(
         _cause(failure.text),
-        Trouble(
-            f"{loop.name} {failure.what}",
-            "error",
-            f"{failure.what} failed: {what}",
-            failure.time_s,
-            _AFTER_FAILURE.get(failure.what, ""),
-            _after_failure(loop, failure.what, todo),
-            (loop.name,),
-            is_safe=went_safe,
-        ),
+        "error",
+        f"{failure.what} failed: {what}",
+        failure.time_s,
+        _AFTER_FAILURE.get(failure.what, ""),
+        _after_failure(loop, failure.what, todo),
+        (loop.name,),
+        is_safe=is_safe,
+        number=round(1e3 * failure.time_s),
     )
 
 
-def _of_safe(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
+def _of_safe(loop: LoopState) -> Iterator[Trouble]:
     if loop.mode != Mode.SAFE.name:
         return
     change = loop.last_change
     reason = "" if change is None else change.reason
-    what, todo = _parted(reason)
     fault = change is not None and change.trigger == "FAULT"
-    if reason == "operator":
-        what, todo = "stopped by the operator", "recover, or off"
     if not fault and loop.last_failure is not None:
         return  # a stop ended a command, whose failure says so
-    yield (
+    what, todo = _parted(reason)
+    if reason == "operator":
+        what, todo = "stopped by the operator", "recover, or off"
+    yield Trouble(
         _cause(reason) if fault else f"{loop.name} SAFE",
-        Trouble(
-            f"{loop.name} fault",
-            "error" if fault else "note",
-            what,
-            loop.since_s,
-            "",
-            _then(todo, "recover") if fault else todo,
-            (loop.name,),
-            is_safe=True,
-        ),
+        "error" if fault else "note",
+        what,
+        loop.since_s,
+        "",
+        _then(todo, "recover") if fault else todo,
+        (loop.name,),
+        is_safe=True,
     )
 
 
-def _of_search(loop: LoopState, now_s: float) -> Iterator[tuple[str, Trouble]]:
+def _of_search(loop: LoopState, now_s: float) -> Iterator[Trouble]:
     search = loop.search_again
-    if search is not None:
-        what, did = _parted(search_again_text(loop, now_s))
-        yield (
-            f"{loop.name} star",
-            Trouble(
-                f"{loop.name} star",
-                "error",
-                what,
-                search.since_s,
-                did,
-                FIND_STAR,
-                (loop.name,),
-                latches=False,
-            ),
-        )
+    if search is None:
+        return
+    what, did = _parted(search_again_text(loop, now_s))
+    yield Trouble(
+        f"{loop.name} star",
+        "error",
+        what,
+        search.since_s,
+        did,
+        FIND_STAR,
+        (loop.name,),
+        latches=False,
+    )
 
 
-def _of_interlocks(loop: LoopState) -> Iterator[tuple[str, Trouble]]:
+def _of_interlocks(loop: LoopState) -> Iterator[Trouble]:
     for trip in _alarming_interlocks(loop):
         what, todo = _parted(trip.reason)
-        yield (
+        yield Trouble(
             _cause(trip.reason),
-            Trouble(
-                f"{loop.name} {trip.name}",
-                "warning" if trip.action == "warn" else "error",
-                what,
-                trip.since_s,
-                _DID[trip.action],
-                _with_reset(loop, trip, todo),
-            ),
+            "warning" if trip.action == "warn" else "error",
+            what,
+            trip.since_s,
+            _DID[trip.action],
+            _with_reset(loop, trip, todo),
         )
 
 

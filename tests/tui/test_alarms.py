@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
 from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
 from fitctl.tui.dialogs import alarms_text
 from fitctl.tui.state import ConsoleState
@@ -129,6 +129,22 @@ def test_what_a_device_told_before_the_recovery_is_no_new_alarm():
     watch.state.accept(msgspec.structs.replace(message, loops=loops), message.time_s)
     watch.book.update(watch.state)
     assert watch.book.in_order == []
+
+
+def test_a_recovery_that_fails_alarms_again_though_its_cause_was_acknowledged():
+    watch = Watch(failed())
+    watch.hear()
+    watch.book.acknowledge()
+    watch.supervisor.last_failure = LoopFailure(
+        what="recover", time_s=START_S + 9.0, text=FAULT + "."
+    )
+    bells = watch.bells
+
+    (alarm,) = watch.hear()
+
+    assert alarm.what.startswith("right: recover failed: siderostat right at")
+    assert not alarm.acknowledged
+    assert watch.bells == bells + 1
 
 
 def test_stop_by_the_operator_is_no_alarm():
