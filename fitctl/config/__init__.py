@@ -6,12 +6,14 @@ Every key is required, so that a rig file shows everything that fitctl will use.
 
 from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, is_name
 from fitctl.config.devices import (
+    AIN_RANGES_V,
     HALF_WINDOW_PX,
     BalAnalogDevice,
     Camera,
     Cia402Device,
     EnsembleDevice,
     Fsm,
+    LabJackT7Device,
     Mdt693Device,
     ModbusDacDevice,
     Siderostat,
@@ -36,6 +38,7 @@ from fitctl.config.mocks import (
     EnsembleMock,
     Fault,
     GigeMock,
+    LabJackMock,
     LoopMocks,
     Mdt693Mock,
 )
@@ -44,6 +47,7 @@ from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_fro
 from fitctl.config.rig import Rig, default_rig_path
 
 __all__ = [
+    "AIN_RANGES_V",
     "ARCSEC_PER_RAD",
     "CONTROLLERS",
     "HALF_WINDOW_PX",
@@ -69,6 +73,8 @@ __all__ = [
     "HotPixel",
     "Hysteresis",
     "Interlock",
+    "LabJackMock",
+    "LabJackT7Device",
     "Logging",
     "Loop",
     "LoopMocks",

@@ -130,6 +130,28 @@ class BalAnalogMock(Settings):
     ]
 
 
+class LabJackMock(Settings):
+    """Settings of the mock LabJack T7.
+
+    Attributes
+    ----------
+    modbus_port : int
+    serial_number : int
+    firmware : float
+        What the device reports as its version.
+    pro : bool
+        It has the high-resolution converter, resolution indices 9 to 12.
+    overhead_s : float
+        From a request to its answer, beside the time that conversions take.
+    """
+
+    modbus_port: Port
+    serial_number: Count
+    firmware: Positive
+    pro: bool
+    overhead_s: NonNegative
+
+
 class LoopMocks(Settings):
     """Where the mock devices of one loop listen, and how they are."""
 

@@ -239,13 +239,60 @@ class PiezoAmplifier(Protocol):
         ...
 
 
+class DiodeReading(NamedTuple):
+    """One sample of the four photodiodes.
+
+    Attributes
+    ----------
+    time_s : float
+        Host's monotonic time of sampling: midway between the request and its answer's arrival, so wrong by
+        at most half the round trip. The device converts its inputs one after the other within that time.
+    volts : tuple of four floats
+        Of the photodiodes az+, az-, el+ and el-, as measured: ambient light and noise are in them.
+    """
+
+    time_s: float
+    volts: tuple[float, float, float, float]
+
+
+class Photodiodes(Protocol):
+    """The metrology sensor's four photodiodes behind their A/D converter."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect, check who answers, write the converter's settings and read them back.
+
+        Raises DeviceMismatch where they are not as the rig file says.
+        """
+        ...
+
+    def send_request(self) -> None:
+        """Ask for one sample of all four; returns as soon as the request is on its way."""
+        ...
+
+    def receive(self) -> DiodeReading | None:
+        """The newest sample that has arrived, without waiting; None: none since the last call.
+
+        Samples that arrived before it are dropped, and so is one that is older than the last returned.
+        Raises DeviceTimeout when a request has gone without an answer for the device's time limit.
+        """
+        ...
+
+    def close(self) -> None:
+        """Disconnect; safe to call twice and after a failure."""
+        ...
+
+
 @dataclass(frozen=True)
 class LoopDevices:
-    """What one loop acts through; a loop without a mirror has neither D/A nor piezo amplifier."""
+    """What one loop senses and acts through.
+
+    A loop without a mirror has neither D/A nor piezo amplifier; a metrology loop alone has photodiodes.
+    """
 
     amplifiers: ServoAmplifiers
     dac: MirrorDac | None = None
     piezo: PiezoAmplifier | None = None
+    photodiodes: Photodiodes | None = None
 
 
 @dataclass(frozen=True)
