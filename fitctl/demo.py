@@ -206,7 +206,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
     errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
     truth = _truth(rig, running, loop_name, start_s, end_s)
     step_s = rig.mock_parts()[0].step_s
-    arcsec = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
+    arcsec = scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px
     timing = [t for (name, _), t in course.timing.items() if name == loop_name]
     last = course.last
     return {
@@ -229,7 +229,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
 def _truth(rig: Rig, running: Instrument, name: str, start_s: float, end_s: float) -> Residual:
     if not start_s < end_s:
         return Residual(math.nan, math.nan, 0)
-    target = rig.loops[name].target_px
+    target = rig.stellar_loops[name].target_px
     return ask_bench(
         running.bench_port, ResidualQuestion(name, start_s, end_s, target.az, target.el), Residual
     )

@@ -4,7 +4,8 @@ Every key is required, so that a rig file shows everything that fitctl will use.
 :class:`ConfigError` whose lines each name the file, the key and what is allowed.
 """
 
-from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, is_name
+from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, Settings, is_name
+from fitctl.config.collector import Collector, CollectorGeometry, CollectorMotion, Fringes
 from fitctl.config.devices import (
     AIN_RANGES_V,
     HALF_WINDOW_PX,
@@ -27,11 +28,13 @@ from fitctl.config.loops import (
     MOST_OVERLAP,
     AirPathModel,
     ControllerName,
+    Feedforward,
     Logging,
     Loop,
     LqgLtr,
     Vernier,
 )
+from fitctl.config.metrology import BeamSensor, MetrologyLoop
 from fitctl.config.mocks import (
     BalAnalogMock,
     DacMock,
@@ -41,10 +44,12 @@ from fitctl.config.mocks import (
     LabJackMock,
     LoopMocks,
     Mdt693Mock,
+    MetrologyMocks,
+    SiderostatMocks,
 )
-from fitctl.config.plant import AirPath, HotPixel, Hysteresis, Spot
+from fitctl.config.plant import AirPath, HotPixel, Hysteresis, LinkAir, MetrologyPlant, Spot
 from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_log
-from fitctl.config.rig import Rig, default_rig_path
+from fitctl.config.rig import AnyLoop, Rig, default_rig_path
 
 __all__ = [
     "AIN_RANGES_V",
@@ -57,17 +62,24 @@ __all__ = [
     "Action",
     "AirPath",
     "AirPathModel",
+    "AnyLoop",
     "AxisPair",
     "BalAnalogDevice",
     "BalAnalogMock",
+    "BeamSensor",
     "Camera",
     "Cia402Device",
+    "Collector",
+    "CollectorGeometry",
+    "CollectorMotion",
     "ConfigError",
     "ControllerName",
     "DacMock",
     "EnsembleDevice",
     "EnsembleMock",
     "Fault",
+    "Feedforward",
+    "Fringes",
     "Fsm",
     "GigeMock",
     "HotPixel",
@@ -75,17 +87,23 @@ __all__ = [
     "Interlock",
     "LabJackMock",
     "LabJackT7Device",
+    "LinkAir",
     "Logging",
     "Loop",
     "LoopMocks",
     "LqgLtr",
     "Mdt693Device",
     "Mdt693Mock",
+    "MetrologyLoop",
+    "MetrologyMocks",
+    "MetrologyPlant",
     "ModbusDacDevice",
     "Range",
     "ResetBy",
     "Rig",
+    "Settings",
     "Siderostat",
+    "SiderostatMocks",
     "Spot",
     "StackHysteresis",
     "Structure",

@@ -4,9 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, Tag
 
-from fitctl.config.base import Count, Finite, Fraction, NonNegative, Port, Positive, Settings
+from fitctl.config.base import (
+    BY_KIND,
+    METROLOGY,
+    STELLAR,
+    Count,
+    Finite,
+    Fraction,
+    NonNegative,
+    Port,
+    Positive,
+    Settings,
+    of_kind,
+)
 
 
 class DacMock(Settings):
@@ -152,17 +164,36 @@ class LabJackMock(Settings):
     overhead_s: NonNegative
 
 
-class LoopMocks(Settings):
-    """Where the mock devices of one loop listen, and how they are."""
+class C887Mock(Settings):
+    """Settings of the mock hexapod controller."""
+
+    tcp_port: Port
+
+
+class SiderostatMocks(Settings):
+    """Where the mock amplifiers of one siderostat listen, and how they are."""
 
     slcan_port: Port
-    modbus_port: Port
-    mdt693_port: Port
     drive_command_timeout_s: Positive
     ensemble: EnsembleMock | None = None  # where siderostat.device is one
     bal_analog: BalAnalogMock | None = None  # likewise
+
+
+class LoopMocks(SiderostatMocks):
+    """Where the mock devices of one stellar loop listen, and how they are."""
+
+    kind: Literal["stellar"] = "stellar"
+    modbus_port: Port
+    mdt693_port: Port
     dac: DacMock
     mdt693: Mdt693Mock
+
+
+class MetrologyMocks(SiderostatMocks):
+    """Where the mock devices of one metrology loop listen, and how they are."""
+
+    kind: Literal["metrology"]
+    labjack: LabJackMock
 
 
 class Fault(Settings):
@@ -201,5 +232,25 @@ class Mocks(Settings):
     gvcp_port: Port
     bench_port: Port
     camera: GigeMock
-    loops: Annotated[dict[str, LoopMocks], Field(min_length=1)]
+    loops: Annotated[
+        dict[
+            str,
+            Annotated[
+                Annotated[LoopMocks, Tag(STELLAR)] | Annotated[MetrologyMocks, Tag(METROLOGY)],
+                BY_KIND,
+            ],
+        ],
+        Field(min_length=1),
+    ]
+    hexapod: C887Mock | None = None  # where the rig has a collector
     faults: list[Fault] = Field(default_factory=list)
+
+    @property
+    def stellar_loops(self) -> dict[str, LoopMocks]:
+        """Those of kind stellar."""
+        return of_kind(self.loops, LoopMocks)
+
+    @property
+    def metrology_loops(self) -> dict[str, MetrologyMocks]:
+        """Those of kind metrology."""
+        return of_kind(self.loops, MetrologyMocks)

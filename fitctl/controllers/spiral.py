@@ -69,7 +69,7 @@ def plan_spiral(
     Its pitch follows from the field of view, its speed from the frame rate, the motors and the blur of
     a spot: not more than one window half in one exposure.
     """
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     scale = scales(rig, loop)
     camera, acquisition = rig.camera, loop.acquisition
     # The 7x7 window must fit, and its centre may be half a pixel off the spot's.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from fitctl.config import Rig, Siderostat
+from fitctl.config import AnyLoop, MetrologyLoop, Rig, Siderostat
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
@@ -29,12 +29,16 @@ def rig_devices(rig: Rig) -> Devices:
     """Drivers for every device that the rig file names; none is opened yet."""
     return Devices(
         camera=CAMERAS[rig.camera.device.driver](rig.camera),
-        loops={
-            name: LoopDevices(
-                amplifiers=AMPLIFIERS[loop.siderostat.device.driver](loop.siderostat),
-                dac=DACS[loop.fsm.dac.driver](loop.fsm.dac),
-                piezo=PIEZOS[loop.fsm.piezo.driver](loop.fsm.piezo),
-            )
-            for name, loop in rig.loops.items()
-        },
+        loops={name: _loop_devices(loop) for name, loop in rig.loops.items()},
+    )
+
+
+def _loop_devices(loop: AnyLoop) -> LoopDevices:
+    amplifiers = AMPLIFIERS[loop.siderostat.device.driver](loop.siderostat)
+    if isinstance(loop, MetrologyLoop):
+        return LoopDevices(amplifiers)
+    return LoopDevices(
+        amplifiers,
+        dac=DACS[loop.fsm.dac.driver](loop.fsm.dac),
+        piezo=PIEZOS[loop.fsm.piezo.driver](loop.fsm.piezo),
     )

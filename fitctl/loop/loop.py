@@ -12,8 +12,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Loop as LoopSettings
-from fitctl.config import Rig
+from fitctl.config import AnyLoop, Rig
 from fitctl.drivers.interface import Frame
 from fitctl.logging.records import FailingDevice, ModeChange, Severity, Tick
 from fitctl.loop.interlocks import Interlocks
@@ -54,7 +53,7 @@ class Loop(ABC):
 
     def __init__(self, name: str, rig: Rig, siderostat: SiderostatStage, journal: Journal) -> None:
         self.name = name
-        self.settings: LoopSettings = rig.loops[name]
+        self.settings: AnyLoop = rig.loops[name]
         self.siderostat = siderostat
         self.servo = siderostat.servo
         self.mode = Mode.OFF

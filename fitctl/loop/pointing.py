@@ -37,7 +37,7 @@ class Pointing:
     """
 
     def __init__(self, rig: Rig, loop_name: str, target_px: Floats, design: Design) -> None:
-        loop, period_s = rig.loops[loop_name], rig.camera.period_s
+        loop, period_s = rig.stellar_loops[loop_name], rig.camera.period_s
         self._scale = scales(rig, loop)
         self._range_rad = loop.fsm.range_rad
         self.prefilter = Prefilter(loop.prefilter.time_constant_s, period_s, target_px)

@@ -26,7 +26,7 @@ class Quantities:
     """
 
     def __init__(self, rig: Rig, loop_name: str) -> None:
-        loop = rig.loops[loop_name]
+        loop = rig.stellar_loops[loop_name]
         self.readings: dict[str, Reading] = {}
         self._period_s = rig.camera.period_s
         self._delay_s = rig.camera.frame_delay_s
@@ -131,7 +131,7 @@ class Quantities:
 
 def places(rig: Rig, loop_name: str) -> dict[str, str]:
     """Each part of the rig by name and endpoint, as errors of devices call it."""
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     return {
         "camera": f"camera at {rig.camera.device.endpoint}",
         "mirror": f"mirror {loop_name}",

@@ -43,7 +43,7 @@ class StarFinder:
         target_px: Floats,
         report_event: Callable[[Severity, str], None],
     ) -> None:
-        loop = rig.loops[loop_name]
+        loop = rig.stellar_loops[loop_name]
         self.estimator = StarEstimator(scales(rig, loop), target_px)
         self.look_at_px: tuple[float, float] | None = None
         self._sensor = StarSensor(rig.camera, loop)

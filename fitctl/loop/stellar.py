@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import Loop as LoopSettings
 from fitctl.config import Rig
 from fitctl.controllers.centroid import Star
 from fitctl.controllers.pair import Design, Designer
@@ -63,6 +64,7 @@ class StellarLoop(Loop):
         design: Design,
     ) -> None:
         super().__init__(name, rig, siderostat, journal)
+        self.settings: LoopSettings = rig.stellar_loops[name]
         self.mirror = mirror
         self.target_px = np.array([self.settings.target_px.az, self.settings.target_px.el])
         scale = scales(rig, self.settings)
@@ -375,7 +377,7 @@ def stellar_loop(
         msg = f"loop {name}: a stellar loop needs the D/A of its mirror"
         raise ValueError(msg)
     servo = SiderostatServo(
-        name, rig.loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
+        name, rig.stellar_loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
     )
     mirror = MirrorStage(rig, name, devices.dac, journal.clock)
     siderostat = SiderostatStage(rig, name, servo)
@@ -383,7 +385,7 @@ def stellar_loop(
 
 
 def _limits(rig: Rig, name: str) -> LoopLimits:
-    loop = rig.loops[name]
+    loop = rig.stellar_loops[name]
     return LoopLimits(
         fsm_range_rad=loop.fsm.range_rad,
         siderostat_travel_sky_arcsec=loop.siderostat.travel_sky_arcsec,

@@ -92,7 +92,7 @@ class LoopTestbed:
     """Mock devices of one loop: amplifiers, D/A and piezo amplifier, wired to its plant."""
 
     def __init__(self, rig: Rig, name: str, mocks: LoopMocks, live: LivePlant) -> None:
-        loop = rig.loops[name]
+        loop = rig.stellar_loops[name]
         gain = loop.fsm.piezo.gain
         self.drive_name = loop.siderostat.device.driver
         self.drive = amplifier_mock(loop.siderostat, mocks, live)
@@ -143,12 +143,12 @@ class Testbed:
             for index, name in enumerate(rig.loops)
         }
         self._loops = {
-            name: LoopTestbed(rig, name, mocks.loops[name], live)
+            name: LoopTestbed(rig, name, mocks.stellar_loops[name], live)
             for name, live in self._plants.items()
         }
         self._scene = Scene(
             rig.camera,
-            [spot for name in rig.loops for spot in truth.loops[name].spots],
+            [spot for loop in truth.stellar_loops.values() for spot in loop.spots],
             truth.hot_pixels,
         )
         self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,10 +92,7 @@ def scales(rig: Rig, loop: Loop) -> Scales:
     pixel_size_m = rig.camera.pixel_size_m
     siderostat = loop.siderostat
     sky_px_per_rad = rig.optics.compressor_ratio * rig.optics.focal_length_m / pixel_size_m
-    # The siderostat is a mirror: its beam turns by twice its own angle.
-    motor_sky = (
-        2 * siderostat.ball_screw_m_per_rad / siderostat.spur_gear_ratio / siderostat.lever_arm_m
-    )
+    motor_sky = motor_sky_rad_per_rad(siderostat)
     return Scales(
         sky_px_per_rad=sky_px_per_rad,
         motor_sky_rad_per_rad=motor_sky,
@@ -104,6 +102,11 @@ def scales(rig: Rig, loop: Loop) -> Scales:
         mirror_turn=rotation(loop.fsm.rotation_deg),
         pixel_size_m=pixel_size_m,
     )
+
+
+def motor_sky_rad_per_rad(siderostat: Siderostat[Any]) -> float:
+    """Siderostat motor to beam on the sky: it is a mirror, whose beam turns by twice its own angle."""
+    return 2 * siderostat.ball_screw_m_per_rad / siderostat.spur_gear_ratio / siderostat.lever_arm_m
 
 
 def rotation(angle_deg: float) -> Floats:

@@ -50,7 +50,7 @@ class Plant:
         history_s: float | None = None,
     ) -> None:
         truth, _ = rig.mock_parts()
-        plant = truth.loops[loop_name]
+        plant = truth.stellar_loops[loop_name]
         runs, spots = len(seeds), len(plant.spots)
         streams = [run_randomness(seed, spots) for seed in seeds]
         if star_offset_px is None:

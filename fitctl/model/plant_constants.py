@@ -78,7 +78,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         If no stack has the hysteresis that the rig asks for.
     """
     truth, _ = rig.mock_parts()
-    loop, plant = rig.loops[loop_name], truth.loops[loop_name]
+    loop, plant = rig.stellar_loops[loop_name], truth.stellar_loops[loop_name]
     scale = scales(rig, loop)
     lag_s = 1 / (2 * np.pi * plant.amplifier_bandwidth_hz)
     try:

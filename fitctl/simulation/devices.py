@@ -92,7 +92,7 @@ class SimulatedMirror:
     """D/A and piezo amplifier in one: volts, quantized and limited, on the plant's stacks."""
 
     def __init__(self, plant: Plant, clock: VirtualClock, rig: Rig, loop_name: str) -> None:
-        fsm = rig.loops[loop_name].fsm
+        fsm = rig.stellar_loops[loop_name].fsm
         self._plant = plant
         self._clock = clock
         self._stack_v = plant.inputs.stack_v[0]
@@ -141,7 +141,7 @@ class SimulatedCamera:
         self._plants = plants
         self._scene = Scene(
             rig.camera,
-            [spot for name in plants for spot in truth.loops[name].spots],
+            [spot for loop in truth.stellar_loops.values() for spot in loop.spots],
             truth.hot_pixels,
         )
         self._pixel_key = next(iter(plants.values())).pixel_keys[0]

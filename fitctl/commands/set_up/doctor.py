@@ -21,7 +21,7 @@ from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
-from fitctl.config import Rig
+from fitctl.config import Loop, Rig
 from fitctl.drivers.bal_analog.driver import probe_bal_analog
 from fitctl.drivers.cia402.configure import probe_drive
 from fitctl.drivers.ensemble.driver import probe_ensemble
@@ -158,8 +158,9 @@ def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:
     yield "camera", rig.camera.device.driver, rig.camera
     for name, loop in rig.loops.items():
         yield f"{name} siderostat", loop.siderostat.device.driver, loop.siderostat
-        yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
-        yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
+        if isinstance(loop, Loop):
+            yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
+            yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
 
 
 def _plain(finding: Finding) -> dict[str, Any]:
