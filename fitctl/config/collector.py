@@ -7,25 +7,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fitctl.config.base import Finite, Name, NonNegative, Positive, Settings, TimeoutS
+from fitctl.config.base import Finite, Name, NonNegative, Positive, Settings
+from fitctl.config.devices import C887Device
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Motion = Literal["still", "drift", "sine", "random", "file"]
 _NEARLY = 1e-6
-
-
-class C887Device(Settings):
-    """Where a PI C-887 answers."""
-
-    driver: Literal["c887"]
-    host: str
-    port: Annotated[int, Field(ge=1, le=65535)]
-    response_timeout_s: TimeoutS
-
-    @property
-    def endpoint(self) -> str:
-        """Where it is, for people."""
-        return f"{self.host}:{self.port}"
 
 
 class CollectorGeometry(Settings):

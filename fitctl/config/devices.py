@@ -310,6 +310,68 @@ class LabJackT7Device(Settings):
         return f"{self.host}:{self.port}"
 
 
+Ends = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
+class HexapodTravel(Settings):
+    """How far a hexapod's axes may go: low and high end of each, zero between them."""
+
+    x_mm: Ends
+    y_mm: Ends
+    z_mm: Ends
+    u_deg: Ends
+    v_deg: Ends
+    w_deg: Ends
+
+    @property
+    def ends(self) -> list[tuple[float, float]]:
+        """Low and high end of X, Y, Z, U, V and W."""
+        each = (self.x_mm, self.y_mm, self.z_mm, self.u_deg, self.v_deg, self.w_deg)
+        return [(low, high) for low, high in each]
+
+    @model_validator(mode="after")
+    def _includes_zero(self) -> HexapodTravel:
+        for name, (low, high) in zip(type(self).model_fields, self.ends, strict=True):
+            if not low < 0 < high:
+                msg = f"{name} must be a negative end and a positive one, such as [-10.0, 10.0]"
+                raise ValueError(msg)
+        return self
+
+
+class C887Device(Settings):
+    """A PI C-887 controller with a hexapod, spoken to in GCS 2.0.
+
+    Attributes
+    ----------
+    port : str
+        A serial port, or ``socket://host:50000``.
+    baud_rate : int
+        Of a serial port.
+    stage : str
+        What the controller's answer to ``CST?`` must contain, such as ``M-850``; empty: anything.
+    travel : HexapodTravel
+        Where the rig may send the platform, within what the controller allows.
+    velocity_limit_mm_s : float
+        Of the platform.
+    response_timeout_s, reference_timeout_s : float
+        For one answer, and for a whole reference move.
+    """
+
+    driver: Literal["c887"]
+    port: str
+    baud_rate: Count
+    stage: str
+    travel: HexapodTravel
+    velocity_limit_mm_s: Positive
+    response_timeout_s: TimeoutS
+    reference_timeout_s: Annotated[float, Field(gt=0, le=600)]
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return self.port
+
+
 class Structure(Settings):
     """Lightly damped modes of the mirror's mount."""
 

@@ -19,6 +19,7 @@ from fitctl.config.base import (
     Settings,
     of_kind,
 )
+from fitctl.config.devices import HexapodTravel
 
 
 class DacMock(Settings):
@@ -165,9 +166,41 @@ class LabJackMock(Settings):
 
 
 class C887Mock(Settings):
-    """Settings of the mock hexapod controller."""
+    """Settings of the mock hexapod controller.
+
+    Attributes
+    ----------
+    tcp_port : int
+    baud_rate : int
+        Of the pty; a client with another one is not understood.
+    stage, serial_number, firmware : str
+        What it reports.
+    travel : HexapodTravel
+        Of each axis while all others are at zero.
+    velocity_limit_mm_s, velocity_limit_deg_s : float
+        Of the platform; ``VLS`` lowers both in proportion.
+    acceleration_mm_s2, acceleration_deg_s2 : float
+    referenced : bool
+        Whether it has been referenced before fitctl connects.
+    reference_s : float
+        How long a reference move takes.
+    reply_s : float
+        From a command to its answer.
+    """
 
     tcp_port: Port
+    baud_rate: Count
+    stage: str
+    serial_number: str
+    firmware: str
+    travel: HexapodTravel
+    velocity_limit_mm_s: Positive
+    velocity_limit_deg_s: Positive
+    acceleration_mm_s2: Positive
+    acceleration_deg_s2: Positive
+    referenced: bool
+    reference_s: NonNegative
+    reply_s: NonNegative
 
 
 class SiderostatMocks(Settings):

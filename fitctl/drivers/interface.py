@@ -282,6 +282,71 @@ class Photodiodes(Protocol):
         ...
 
 
+class Pose(NamedTuple):
+    """Where a hexapod's platform is: its pivot point in mm, its rotations in degrees."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    z_mm: float = 0.0
+    u_deg: float = 0.0
+    v_deg: float = 0.0
+    w_deg: float = 0.0
+
+
+class HexapodReading(NamedTuple):
+    """What the hexapod's controller reports.
+
+    Attributes
+    ----------
+    time_s : float
+        Host's monotonic time at which the pose was read: midway between question and answer.
+    pose : Pose
+        Measured; of no meaning while the hexapod is not referenced.
+    moving, referenced : bool
+        Some axis moves; all axes know where they are.
+    error : str
+        Empty, or the error that the controller had latched, which reading it has cleared.
+    """
+
+    time_s: float
+    pose: Pose
+    moving: bool
+    referenced: bool
+    error: str
+
+
+class Hexapod(Protocol):
+    """The hexapod under the collector bench; slow, never inside the tick."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect and check the device and its travel against the rig file; nothing moves."""
+        ...
+
+    def reference(self) -> None:
+        """Start a reference move and wait until it has ended; the platform moves."""
+        ...
+
+    def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
+        """Start a move, or give a running one a new target; returns when the controller has accepted it.
+
+        The velocity can change only while the platform stands still. Raises DeviceRefused where the pose
+        is out of reach or the hexapod is not referenced; a move that runs goes on then.
+        """
+        ...
+
+    def pose(self) -> HexapodReading:
+        """Where it is, and how it fares."""
+        ...
+
+    def stop(self) -> None:
+        """Stop every motion at once, where it is; may be called from any thread, also during another call."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; a move that runs goes on. Safe to call twice and after a failure."""
+        ...
+
+
 @dataclass(frozen=True)
 class LoopDevices:
     """What one loop senses and acts through.
@@ -297,7 +362,8 @@ class LoopDevices:
 
 @dataclass(frozen=True)
 class Devices:
-    """Everything that a rig has."""
+    """Everything that a rig has; the hexapod only where a collector moves."""
 
     camera: CameraDriver
     loops: dict[str, LoopDevices]
+    hexapod: Hexapod | None = None
