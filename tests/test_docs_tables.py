@@ -3,13 +3,21 @@
 import time
 import tomllib
 
+import pytest
 from documents import ROOT, between, blocks, table
 
 from fitctl.commands.shared.fault_kinds import kinds as fault_kinds
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.command_table import COMMANDS as COMMAND_ROWS
-from fitctl.messages.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
+from fitctl.messages.modes import (
+    COMMANDS,
+    MEANING,
+    METROLOGY_TRANSITIONS,
+    TRANSITIONS,
+    Mode,
+    mermaid,
+)
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.service.metrics import InstrumentCollector
@@ -25,15 +33,17 @@ def test_the_table_of_modes_is_that_of_the_code():
     )
 
 
-def test_the_table_of_transitions_is_that_of_the_code():
+@pytest.mark.parametrize(
+    ("name", "transitions"),
+    [("transitions", TRANSITIONS), ("metrology transitions", METROLOGY_TRANSITIONS)],
+)
+def test_the_table_of_transitions_is_that_of_the_code(name, transitions):
     rows = [
         [row.source.name, cause(row.trigger), row.target.name, row.condition]
-        for row in sorted(TRANSITIONS, key=lambda row: row.source)
+        for row in sorted(transitions, key=lambda row: row.source)
     ]
 
-    assert between("operating.md", "transitions") == table(
-        ["from", "what", "leads to", "when"], rows
-    )
+    assert between("operating.md", name) == table(["from", "what", "leads to", "when"], rows)
 
 
 def cause(trigger):
@@ -44,7 +54,7 @@ def cause(trigger):
 def test_the_diagram_of_modes_is_that_of_the_code():
     diagrams = [b.text.strip() for b in blocks("mermaid") if b.document.name == "operating.md"]
 
-    assert diagrams == [mermaid()]
+    assert diagrams == [mermaid(), mermaid(METROLOGY_TRANSITIONS)]
 
 
 def test_the_console_keys_are_those_of_the_console():

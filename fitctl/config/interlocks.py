@@ -8,7 +8,9 @@ from pydantic import Field, field_validator, model_validator
 
 from fitctl.config.base import Finite, NonNegative, Positive, Settings
 
-ModeName = Literal["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT"]
+ModeName = Literal[
+    "OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT", "LOCKED"
+]
 Action = Literal["warn", "hold", "flatten", "safe"]
 ResetBy = Literal["hand", "itself"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.records import ModeChange
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import STELLAR_MODES, Mode
 from fitctl.model.plant import Plant
 
 Floats = NDArray[np.float64]
@@ -60,9 +60,11 @@ def pair(values: Floats) -> dict[str, float]:
     return {"az": float(values[0]), "el": float(values[1])}
 
 
-def mode_times(changes: Iterable[ModeChange], end_s: float) -> dict[str, float]:
-    """Seconds spent in each mode."""
-    times = dict.fromkeys((mode.name for mode in Mode), 0.0)
+def mode_times(
+    changes: Iterable[ModeChange], end_s: float, modes: Iterable[Mode] = STELLAR_MODES
+) -> dict[str, float]:
+    """Seconds spent in each mode of a kind of loop."""
+    times = dict.fromkeys((mode.name for mode in modes), 0.0)
     mode, since_s = Mode.OFF.name, 0.0
     for change in changes:
         times[mode] += change.time_s - since_s
