@@ -89,5 +89,5 @@ class Pointing:
             return None
         error_px = observation.star.position_px - command_px
         return self.pair.step(
-            Measurement(error_px, command_px, observation.mirror_rad, observation.motor_rad)
+            Measurement(error_px, command_px, observation.mirror_rad, observation.beam_rad)
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 
 from fitctl.config import Action, ResetBy
@@ -11,7 +13,9 @@ from fitctl.logging.records import (
     FrameRecord,
     LoopTiming,
     Losses,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     PiezoReading,
     RecorderStatus,
     Tick,
@@ -78,7 +82,9 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it.
 
     ``controller_file`` is the saved design that is at work, on the supervisor's machine; it is empty when the
-    design was made from the rig's values.
+    design was made from the rig's values. ``kind`` is the loop's in the rig file; a metrology loop's
+    ``requirement_px`` is its requirement on the beam in the camera's pixels. ``waits_for`` is what the loop
+    waits for while it holds its stages where they are, for people; empty while it waits for nothing.
     """
 
     name: str
@@ -97,6 +103,8 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     other_spots: list[SpotPlace] = []
     controller_file: str = ""
     search_again: SearchAgain | None = None
+    kind: Literal["stellar", "metrology"] = "stellar"
+    waits_for: str = ""
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
@@ -126,6 +134,8 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     scheduling: str
     running_sequence: SequenceStatus | None = None
     commander: str = ""
+    metrology_ticks: list[MetrologyTick] = []
+    overlaps: list[Overlap] = []
 
     @property
     def records_lost(self) -> int:

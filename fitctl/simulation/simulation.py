@@ -163,7 +163,7 @@ def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResu
     start_s = vernier_s + SETTLE_S
     judged = [t for t in ticks if t.time_s >= start_s and t.star_visible]
     true_px = true_residual_rms(
-        simulation.plants[name], simulation.supervisor.loops[name].target_px, start_s, end_s
+        simulation.plants[name], simulation.supervisor.stellar_loops[name].target_px, start_s, end_s
     )
     measured = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
     return SimulationResult(

@@ -8,6 +8,7 @@ from fitctl.config import Rig
 from fitctl.drivers.interface import CameraCounts, DeviceIdentity
 from fitctl.logging.records import CAMERA, DeviceHealth
 from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.supervisor.piezo import PiezoWatch
 
@@ -73,6 +74,18 @@ def mirror_health(
             fault=bool(piezo.error),
         ),
     ]
+
+
+def photodiode_health(loop: MetrologyLoop, identities: Identities, now_s: float) -> DeviceHealth:
+    """The A/D converter of a metrology loop's photodiodes."""
+    return _health(
+        f"{loop.name} photodiodes",
+        loop.settings.sensor.device.endpoint,
+        loop.sampled,
+        "sampled every tick" if loop.sampled else "not sampled",
+        identities,
+        now_s,
+    )
 
 
 def _health(

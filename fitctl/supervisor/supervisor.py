@@ -27,6 +27,8 @@ from fitctl.logging.records import (
     Severity,
 )
 from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop, metrology_loop
+from fitctl.loop.overlap import OverlapMeter
 from fitctl.loop.stellar import StellarLoop, stellar_loop
 from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
@@ -43,13 +45,18 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import TRACKING, Mode, Trigger, usable_commands
+from fitctl.messages.modes import POINTING, Mode, Trigger
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.device_jobs import DeviceJobs, Job
-from fitctl.supervisor.health import camera_health, mirror_health, siderostat_health
-from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
+from fitctl.supervisor.health import (
+    camera_health,
+    mirror_health,
+    photodiode_health,
+    siderostat_health,
+)
+from fitctl.supervisor.loop_commands import LOOP_COMMANDS, obey_loop_command, why_no_search
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.sequence_board import SequenceBoard
 from fitctl.supervisor.timing import TimingBook
@@ -63,7 +70,16 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
-MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], StellarLoop]
+MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], Loop]
+
+
+def loop_of_kind(
+    name: str, rig: Rig, devices: LoopDevices, journal: Journal, design: Designer
+) -> Loop:
+    """A loop of the kind that the rig file says, on its devices."""
+    if name in rig.metrology_loops:
+        return metrology_loop(name, rig, devices, journal)
+    return stellar_loop(name, rig, devices, journal, design)
 
 
 class Posted(NamedTuple):
@@ -101,13 +117,20 @@ class Supervisor:
         executor: Executor,
         record: Callable[[AnyRecord], None],
         design: Designer,
-        make_loop: MakeLoop = stellar_loop,
+        make_loop: MakeLoop = loop_of_kind,
     ) -> None:
         self.rig = rig
         journal = Journal(clock, record)
         self.loops = {
             name: make_loop(name, rig, devices.loops[name], journal, design) for name in rig.loops
         }
+        for loop in self.loops.values():
+            loop.join(self.loops)
+        # A stellar loop uses what the metrology loop of its link has decided in the same step.
+        self._in_order = sorted(
+            self.loops.values(), key=lambda loop: loop.name not in rig.metrology_loops
+        )
+        self._overlap = None if rig.fringes is None else OverlapMeter(rig, self.loops)
         self.servos = {name: loop.servo for name, loop in self.loops.items()}
         self.sequences = SequenceBoard(journal)
         self.shutdown_wanted = False
@@ -123,7 +146,7 @@ class Supervisor:
         self._reported_s = clock.now_s()
         self.piezos = {
             name: PiezoWatch(loop, piezo, executor, journal)
-            for name, loop in self.loops.items()
+            for name, loop in self.stellar_loops.items()
             if (piezo := devices.loops[name].piezo) is not None
         }
         self._camera = CameraWatch(rig, devices.camera, clock, self._camera_failed)
@@ -165,6 +188,11 @@ class Supervisor:
         self._quantities.append(reading)
 
     @property
+    def stellar_loops(self) -> dict[str, StellarLoop]:
+        """The loops that point a star."""
+        return {name: loop for name, loop in self.loops.items() if isinstance(loop, StellarLoop)}
+
+    @property
     def periodic(self) -> list[Periodic]:
         """What runs at a pace of its own, beside the frames."""
         return [work for loop in self.loops.values() for work in loop.periodic]
@@ -181,7 +209,7 @@ class Supervisor:
         self._obey_posted()
         self._record_left()
         lost = self._camera.counts.lost if self._camera.ready else 0
-        loops = self.loops.values()
+        loops = self._in_order
         were_safe = [loop.mode is Mode.SAFE for loop in loops]
         for loop in loops:
             loop.sense(frame, lost, self._camera.skipped)
@@ -196,6 +224,8 @@ class Supervisor:
             self._timing.add(tick)
             if was_safe:
                 self._make_safer(loop)
+        if frame is not None and self._overlap is not None and self.pointing:
+            self._record(self._overlap.measure(frame))
         for older in self._camera.older:
             self._record_frame(older)
         if frame is not None:
@@ -227,8 +257,8 @@ class Supervisor:
 
     @property
     def pointing(self) -> bool:
-        """A loop has a star or looks for one."""
-        return any(loop.mode in TRACKING for loop in self.loops.values())
+        """A loop has its star or its beam, or looks for it."""
+        return any(loop.mode in POINTING for loop in self.loops.values())
 
     def at_rest(self) -> bool:
         """Every stage that can still be commanded is where it may be left without power."""
@@ -242,7 +272,7 @@ class Supervisor:
         self._record_left()
 
     def _camera_failed(self, error: DeviceError) -> None:
-        for loop in self.loops.values():
+        for loop in self.stellar_loops.values():
             loop.device_failed(CAMERA, error)
 
     def _record_left(self) -> None:
@@ -291,7 +321,7 @@ class Supervisor:
             case SequenceControl():
                 return self.sequences.control(command.action)
             case _ if type(command) in LOOP_COMMANDS:
-                why_not = LOOP_COMMANDS[type(command)](self.rig, loops, command)
+                why_not = obey_loop_command(self.rig, loops, command)
                 return _refusal(why_not) if why_not else Reply(accepted=True)
             case _ if type(command) in _COMMANDS:
                 return self._fire(_COMMANDS[type(command)], names, command)
@@ -302,7 +332,7 @@ class Supervisor:
             why_not = why_no_search(self.rig, [self.loops[name] for name in names], command)
             if why_not:
                 return _refusal(why_not)
-        usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
+        usable = [name for name in names if trigger in self.loops[name].usable_commands]
         if not usable:
             return _refusal(self._why_not(trigger, names))
         if self._device_jobs.busy and trigger is not Trigger.STOP:
@@ -319,18 +349,20 @@ class Supervisor:
         else:
             if trigger is Trigger.STOP:
                 self._device_jobs.abandon(usable)
-            for name in usable:
-                if isinstance(command, Acquire):
-                    self.loops[name].configure_search(command)
-                self.loops[name].fire(trigger, "operator")
+            for loop in self._in_order:
+                if loop.name in usable:
+                    loop.obey(trigger, command)
         return Reply(accepted=True)
 
     def _why_not(self, trigger: Trigger, names: list[str]) -> str:
-        mode = self.loops[names[0]].mode
-        can = ", ".join(t.name.lower() for t in usable_commands(mode))
+        loop = self.loops[names[0]]
+        mode, can = loop.mode, ", ".join(t.name.lower() for t in loop.usable_commands)
         return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
 
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
+        names = [name for name in names if name in self.stellar_loops]
+        if not names:
+            return _refusal(f"loop {command.loop} holds a metrology beam and has no design")
         for name in names:
             # A design takes longer than a tick.
             future = self._executor.submit(self._design, self.rig, name, command.name)
@@ -341,7 +373,7 @@ class Supervisor:
     def _designed(self, name: str, controller: str, future: Future) -> None:
         error = future.exception()
         if error is None:
-            self.loops[name].use(future.result())
+            self.stellar_loops[name].use(future.result())
         else:
             self._journal.event("error", name, f"no design {controller}: {error_text(error)}")
 
@@ -381,7 +413,9 @@ class Supervisor:
         )
         for name, loop in self.loops.items():
             self._record(siderostat_health(loop, identities, now_s))
-            if name in self.piezos:
+            if isinstance(loop, MetrologyLoop):
+                self._record(photodiode_health(loop, identities, now_s))
+            elif isinstance(loop, StellarLoop) and name in self.piezos:
                 piezo = self.piezos[name]
                 loop.quantities.record_piezo_error(piezo.error, now_s)
                 for row in mirror_health(loop, piezo, identities, now_s):
