@@ -78,7 +78,8 @@ def coverage(rig: Rig, loop_name: str, seed: int, minutes: int) -> float:
     noise_px = centroid_noise_px(rig.camera, rig.stellar_loops[loop_name].star_flux_dn, 7)
     held = 0
     for number in range(1, minutes + 1):
-        plant = Plant(rig, loop_name, [seed + number], history_s=RECOMMENDED_S + 1.0)
+        whole = Plant(rig, [seed + number], history_s=RECOMMENDED_S + 1.0)
+        plant = whole.stellar_loops[loop_name]
         plant.advance(RECOMMENDED_S)
         frame_s = np.arange(1, round(RECOMMENDED_S / period_s)) * period_s
         star_px = np.array([plant.spots_px(time_s)[0, 0] for time_s in frame_s])

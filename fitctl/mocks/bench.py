@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from fitctl.config import Fault
 from fitctl.mocks.faults import Faults, UnknownFault, check_fault
 from fitctl.model.plant import Plant
+from fitctl.model.stellar_part import StellarPart
 
 _MAX_QUESTION_BYTES = 1024
 _TIMEOUT_MS = 5000
@@ -53,7 +54,7 @@ class StagesQuestion(_Question, frozen=True):
 
 
 class StagesNow(msgspec.Struct, frozen=True):
-    """Motor angles, and the stacks' volts in the D/A's scale: az, el; stack 1 to 3."""
+    """Motor angles, and the stacks' volts in the D/A's scale, where it has them: az, el; stack 1 to 3."""
 
     motor_rad: list[float]
     stack_v: list[float]
@@ -159,14 +160,14 @@ class Bench:
 
     def __init__(
         self,
-        plants: Mapping[str, Plant],
+        plant: Plant,
         faults: FaultTable,
         started_s: float,
         port: int,
         *,
         or_any_port: bool = False,
     ) -> None:
-        self._plants = plants
+        self._plant = plant
         self._faults = faults
         self._started_s = started_s
         self._port = port
@@ -215,19 +216,19 @@ class Bench:
         return self._faults.answer(question)
 
     def _stages(self, question: StagesQuestion) -> StagesNow:
-        plant = self._plants.get(question.loop)
-        if plant is None:
+        part = self._plant.loops.get(question.loop)
+        if part is None:
             return StagesNow([], [], f"no loop is named {question.loop}")
-        state = plant.state
-        return StagesNow(state.motor_rad[0].tolist(), state.stack_v[0].tolist())
+        stack_v = part.state.stack_v[0].tolist() if isinstance(part, StellarPart) else []
+        return StagesNow(part.state.motor_rad[0].tolist(), stack_v)
 
     def _residual(self, question: ResidualQuestion) -> Residual:
         if not np.all(np.isfinite([question.start_s, question.end_s])):
             return Residual(np.nan, np.nan, 0, "start_s and end_s must be times")
-        plant = self._plants.get(question.loop)
-        if plant is None:
+        part = self._plant.stellar_loops.get(question.loop)
+        if part is None:
             return Residual(np.nan, np.nan, 0, f"no loop is named {question.loop}")
-        track_px = plant.history_px(
+        track_px = part.history_px(
             question.start_s - self._started_s, question.end_s - self._started_s
         )[:, 0, 0, :]
         if len(track_px) == 0:

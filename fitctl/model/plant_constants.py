@@ -56,6 +56,7 @@ class PlantConstants:
     mode_gain: Floats
     participation: float
     air: AirConstants
+    sky_px_per_rad: float
     motor_px_per_rad: float
     mirror_px_per_rad: float
     siderostat_turn: Floats
@@ -107,6 +108,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         mode_gain=gain,
         participation=plant.structure.participation,
         air=air_constants(plant.air_path, truth.step_s),
+        sky_px_per_rad=scale.sky_px_per_rad,
         motor_px_per_rad=scale.motor_px_per_rad,
         mirror_px_per_rad=scale.mirror_px_per_rad,
         siderostat_turn=scale.siderostat_turn,

@@ -19,12 +19,15 @@ from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import AnyRecord, ModeChange, Tick
 from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
 from fitctl.messages.modes import Mode
+from fitctl.model.metrology.part import MetrologyPart
 from fitctl.model.plant import Plant
 from fitctl.simulation.devices import (
     InlineExecutor,
     SimulatedAmplifiers,
     SimulatedCamera,
     SimulatedMirror,
+    SimulatedPhotodiodes,
+    simulated_hexapod,
 )
 from fitctl.simulation.statistics import (
     SETTLE_S,
@@ -68,31 +71,33 @@ class Simulation:
         self.rig = rig
         self.clock = VirtualClock()
         offset = None if star_offset_px is None else np.asarray(star_offset_px)[None]
-        self.plants = {
-            # Each loop's plant gets a seed of its own from the run's.
-            name: Plant(
-                rig, name, [seed + 1000 * index], star_offset_px=offset, history_s=history_s
-            )
-            for index, name in enumerate(rig.loops)
-        }
-        self.camera = SimulatedCamera(rig, self.clock, self.plants)
-        loops = {}
-        for name, plant in self.plants.items():
-            mirror = SimulatedMirror(plant, self.clock, rig, name)
-            counts = rig.loops[name].siderostat.encoder_counts_per_rev
-            loops[name] = LoopDevices(
-                SimulatedAmplifiers(plant, self.clock, counts), dac=mirror, piezo=mirror
-            )
+        self.plant = Plant(rig, [seed], star_offset_px=offset, history_s=history_s)
+        self.plants = self.plant.stellar_loops
+        self.camera = SimulatedCamera(rig, self.clock, self.plant)
+        self.hexapod = simulated_hexapod(self.plant, self.clock, rig)
         self.ticks: list[Tick] = []
         self.mode_changes: list[ModeChange] = []
         self._on_record = record
-        self.devices = Devices(self.camera, loops)
+        loops = {name: self._loop_devices(name) for name in rig.loops}
+        self.devices = Devices(self.camera, loops, self.hexapod)
         self.supervisor = Supervisor(
             rig, self.devices, self.clock, InlineExecutor(), self._receive, design_for
         )
         self.camera.on_servo_period = [
             (work.period_s, work.period) for work in self.supervisor.periodic
         ]
+
+    def _loop_devices(self, name: str) -> LoopDevices:
+        part, counts = (
+            self.plant.loops[name],
+            self.rig.loops[name].siderostat.encoder_counts_per_rev,
+        )
+        amplifiers = SimulatedAmplifiers(part, self.clock, counts)
+        if isinstance(part, MetrologyPart):
+            photodiodes = SimulatedPhotodiodes(part, self.clock, self.rig, name)
+            return LoopDevices(amplifiers, photodiodes=photodiodes)
+        mirror = SimulatedMirror(part, self.clock, self.rig, name)
+        return LoopDevices(amplifiers, dac=mirror, piezo=mirror)
 
     def _receive(self, record: AnyRecord) -> None:
         if isinstance(record, Tick):
@@ -141,8 +146,7 @@ def simulate(
     `on_progress` is called about ten times a second of real time with the part done.
     """
     simulation = Simulation(rig, seed, history_s=duration_s + 1.0)  # all of it is judged
-    for plant in simulation.plants.values():
-        plant.advance(plant.constants.step_s)  # compiles, before the time is taken
+    simulation.plant.advance(simulation.plant.step_s)  # compiles, before the time is taken
     started = shown = time.perf_counter()
     simulation.acquire()
     while simulation.clock.now_s() < duration_s:
@@ -151,7 +155,7 @@ def simulate(
             shown = time.perf_counter()
             on_progress(simulation.clock.now_s() / duration_s)
     speed_x = simulation.clock.now_s() / (time.perf_counter() - started)
-    return {name: _result(simulation, name, speed_x) for name in rig.loops}
+    return {name: _result(simulation, name, speed_x) for name in rig.stellar_loops}
 
 
 def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResult:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fitctl.logging.records import ModeChange
 from fitctl.messages.modes import STELLAR_MODES, Mode
-from fitctl.model.plant import Plant
+from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]
 SETTLE_S = 10.0  # after vernier is reached, before its residual counts
@@ -34,14 +34,16 @@ class SimulationResult(NamedTuple):
     speed_x: float
 
 
-def true_residual_rms(plant: Plant, target_px: Floats, start_s: float, end_s: float) -> Floats:
+def true_residual_rms(
+    plant: StellarPart, target_px: Floats, start_s: float, end_s: float
+) -> Floats:
     """RMS distance of the pointing spot from `target_px` in continuous time, shape (2,); nan if empty."""
     if not start_s < end_s:
         return np.full(2, math.nan)
     return rms(plant.history_px(start_s, end_s)[:, 0, 0, :] - target_px)
 
 
-def piston_rms_m(plant: Plant, start_s: float, end_s: float) -> float:
+def piston_rms_m(plant: StellarPart, start_s: float, end_s: float) -> float:
     """RMS of the mirror's piston (Eq. 4) about its mean; nan if the time is empty."""
     if not start_s < end_s:
         return math.nan

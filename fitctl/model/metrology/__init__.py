@@ -1,0 +1,1 @@
+"""The metrology loop's hardware: photodiodes, link, and the collector bench at its end."""
