@@ -46,6 +46,7 @@ from fitctl.stages.siderostat import SiderostatStage
 Floats = NDArray[np.float64]
 IN_REACH = 3.0  # times the requirement: nearer to the centre than this, the beam is held (choice)
 OUT_OF_REACH = 20.0  # times the requirement: farther, it is pulled in again (choice)
+_STEP_PART = 0.3  # of the servo's following error limit: the farthest that one tick moves its set-point
 _MOST_TICK_S = 0.1  # a longer wait between two ticks counts as this: the law was not made for it
 _NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 _NO_SAMPLE = DiodeReading(math.nan, (math.nan,) * 4)
@@ -108,6 +109,7 @@ class MetrologyLoop(Loop):
         self._photodiode_error: DeviceError | None = None
         self._asked = Acquire()
         self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
+        self._most_step_rad = _STEP_PART * settings.siderostat.servo.following_error_limit_rad
         self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._period_s = rig.camera.period_s
         self._sky_arcsec_per_px = ARCSEC_PER_RAD / sky_px_per_rad(rig)
@@ -267,7 +269,9 @@ class MetrologyLoop(Loop):
         return beam.place_m / self.settings.sensor.link_length_m
 
     def _turn_beam(self, step_rad: Floats) -> None:
-        self.siderostat.move_by(step_rad / self._motor_sky)
+        motor_rad = step_rad / self._motor_sky
+        # A beam that is far off asks for more than the servo can follow without a following error.
+        self.siderostat.move_by(np.clip(motor_rad, -self._most_step_rad, self._most_step_rad))
 
     # ------------------------------------------------------------ for the supervisor
 
