@@ -78,7 +78,7 @@ def test_a_rig_survives_its_own_document():
         ({"loops.metrology.sensor.ambient_v": [0.0, 0.0, 0.0]},
          "loops.metrology.sensor.ambient_v: List should have at least 4 items"),
         ({"loops.metrology.sensor.on_axis_v": 10.0},
-         "loops.metrology.sensor: on_axis_v and ambient_v give 10 V with the beam on the centre"),
+         "loops.metrology.sensor: on_axis_v and ambient_v give 10.03 V with the beam on the centre"),
         ({"loops.metrology.hold.second_integrator_hz": 0.6},
          "loops.metrology.hold: second_integrator_hz may be at most half of crossover_hz, 0.5"),
         ({"collector.geometry.link": [2.0, 0.0, 0.0]},
