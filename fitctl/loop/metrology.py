@@ -46,7 +46,9 @@ from fitctl.stages.siderostat import SiderostatStage
 Floats = NDArray[np.float64]
 IN_REACH = 3.0  # times the requirement: nearer to the centre than this, the beam is held (choice)
 OUT_OF_REACH = 20.0  # times the requirement: farther, it is pulled in again (choice)
-_STEP_PART = 0.3  # of the servo's following error limit: the farthest that one tick moves its set-point
+_PULL_IN = (
+    0.5  # of the motors' velocity limit: faster, a beam that is far off is not pulled in (choice)
+)
 _MOST_TICK_S = 0.1  # a longer wait between two ticks counts as this: the law was not made for it
 _NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 _NO_SAMPLE = DiodeReading(math.nan, (math.nan,) * 4)
@@ -109,7 +111,7 @@ class MetrologyLoop(Loop):
         self._photodiode_error: DeviceError | None = None
         self._asked = Acquire()
         self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
-        self._most_step_rad = _STEP_PART * settings.siderostat.servo.following_error_limit_rad
+        self._pull_in_rad_s = _PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
         self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._period_s = rig.camera.period_s
         self._sky_arcsec_per_px = ARCSEC_PER_RAD / sky_px_per_rad(rig)
@@ -258,7 +260,10 @@ class MetrologyLoop(Loop):
     def _pull_in(self, sensed: _Sensed, duration_s: float) -> None:
         error_rad = self._error_rad(sensed.beam)
         if error_rad is not None:
-            self._turn_beam(self.hold.pull_in(error_rad, duration_s))
+            step_rad = self.hold.pull_in(error_rad, duration_s)
+            # No faster than the siderostat follows, or the set-point would run away from it.
+            most_rad = self._pull_in_rad_s * duration_s
+            self._turn_beam(step_rad * min(1.0, most_rad / max(np.abs(step_rad).max(), 1e-12)))
 
     def _hold_beam(self, sensed: _Sensed, duration_s: float) -> None:
         self._turn_beam(self.hold.step(self._error_rad(sensed.beam), duration_s))
@@ -269,9 +274,7 @@ class MetrologyLoop(Loop):
         return beam.place_m / self.settings.sensor.link_length_m
 
     def _turn_beam(self, step_rad: Floats) -> None:
-        motor_rad = step_rad / self._motor_sky
-        # A beam that is far off asks for more than the servo can follow without a following error.
-        self.siderostat.move_by(np.clip(motor_rad, -self._most_step_rad, self._most_step_rad))
+        self.siderostat.move_by(step_rad / self._motor_sky)
 
     # ------------------------------------------------------------ for the supervisor
 

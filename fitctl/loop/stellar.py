@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import HALF_WINDOW_PX, Rig
 from fitctl.config import Loop as LoopSettings
-from fitctl.config import Rig
 from fitctl.controllers.centroid import Star
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
@@ -290,21 +290,23 @@ class StellarLoop(Loop):
             loop = self.link.loop
             return f"the link of {loop.name}, which is in {loop.mode.name}"
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
-            # Two stars that are both searched for cannot be told apart.
-            busy = [other.name for other in self.others if other.searches_first]
+            # Two stars that are both searched for look alike, and a star that is found comes to the middle.
+            busy = [other.name for other in self.others if other.is_acquiring]
             if busy:
-                return f"the search of {', '.join(busy)} to end"
+                return f"{', '.join(busy)}, whose star is on its way to its target"
         return ""
 
     @property
-    def searches_first(self) -> bool:
-        """The loop is searching for a star that it has not followed before."""
-        return (
-            self.mode is Mode.ACQUISITION
-            and self._search_due is None
-            and not self.search.again
-            and not self.waits_for
-        )
+    def is_acquiring(self) -> bool:
+        """Its star is searched for, and was not followed before, or is not yet near its target."""
+        if self.waits_for:
+            return False
+        if self.mode is Mode.ACQUISITION:
+            return self._search_due is None and not self.search.again
+        place_px = self.place_px
+        if self.mode is not Mode.COARSE or place_px is None:
+            return False
+        return float(np.abs(self.target_px - place_px).max()) > HALF_WINDOW_PX
 
     def _evaluate_waiting(self, observation: Observation) -> None:
         """Wait where the stages are, or go on, and report which."""
