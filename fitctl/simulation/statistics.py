@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import j1
 
+from fitctl.config import Fringes
 from fitctl.logging.records import ModeChange
 from fitctl.messages.modes import STELLAR_MODES, Mode
 from fitctl.model.stellar_part import StellarPart
@@ -32,6 +34,41 @@ class SimulationResult(NamedTuple):
     mode_times: dict[str, float]
     frames: int
     speed_x: float
+
+
+class MetrologyResult(NamedTuple):
+    """What a simulated run gave for a metrology loop; RMS of the beam's angle over `judged_s`.
+
+    Of the beam from the centre of the photodiodes, in the plant, the air of the path included.
+    """
+
+    acquired_s: float
+    locked_s: float
+    rms_arcsec: dict[str, float]
+    judged_s: float
+    mode_times: dict[str, float]
+    samples: int
+    speed_x: float
+
+
+class RigResult(NamedTuple):
+    """What a simulated run gave: each loop's, and the mean visibility that the stars' true tilt left.
+
+    The visibility is nan where the rig has no fringes, or its two loops did not hold their stars at one time.
+    """
+
+    loops: dict[str, SimulationResult | MetrologyResult]
+    visibility: float
+    speed_x: float
+
+
+def mean_visibility(tilt_rad: Floats, fringes: Fringes) -> float:
+    """The mean of the visibility over tilts on the sky, shape (n, 2); nan without any."""
+    if len(tilt_rad) == 0:
+        return math.nan
+    x = math.pi * fringes.aperture_m / fringes.wavelength_m * np.hypot(*tilt_rad.T)
+    x = np.maximum(x, 1e-9)
+    return float(np.mean(np.abs(2 * j1(x) / x)))
 
 
 def true_residual_rms(
