@@ -12,6 +12,7 @@ from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
 from fitctl.drivers.gige.aravis import AravisCamera
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.interface import Devices, LoopDevices, ServoAmplifiers
+from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.drivers.mdt693.driver import Mdt693
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 
@@ -23,6 +24,7 @@ AMPLIFIERS: dict[str, Callable[[Siderostat[Any]], ServoAmplifiers]] = {
 }
 DACS = {"modbus_dac": ModbusDac}
 PIEZOS = {"mdt693": Mdt693}
+PHOTODIODES = {"labjack_t7": LabJackT7}
 
 
 def rig_devices(rig: Rig) -> Devices:
@@ -36,7 +38,8 @@ def rig_devices(rig: Rig) -> Devices:
 def _loop_devices(loop: AnyLoop) -> LoopDevices:
     amplifiers = AMPLIFIERS[loop.siderostat.device.driver](loop.siderostat)
     if isinstance(loop, MetrologyLoop):
-        return LoopDevices(amplifiers)
+        device = loop.sensor.device
+        return LoopDevices(amplifiers, photodiodes=PHOTODIODES[device.driver](device))
     return LoopDevices(
         amplifiers,
         dac=DACS[loop.fsm.dac.driver](loop.fsm.dac),

@@ -2,7 +2,7 @@
 
 Nothing here knows a protocol: devices are wired to the plant as the cables would be. The D/A's outputs
 are the piezo amplifier's external inputs; the amplifier's outputs are the stacks; the drive turns the
-motors; the camera looks at the spots.
+motors; the camera looks at the spots; the photodiodes give their volts to the LabJack's inputs.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,11 @@ from fitctl.config import LoopMocks, Rig
 from fitctl.mocks.amplifiers import amplifier_mock, endpoint_keys
 from fitctl.mocks.bench import Bench, FaultTable
 from fitctl.mocks.gige.camera import GigeCameraMock
+from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
 from fitctl.model.metrology.part import BeamState
+from fitctl.model.pixel_noise import pixel_normals
 from fitctl.model.plant import Plant
 from fitctl.model.plant_step import PlantState
 from fitctl.model.scene import Scene
@@ -44,6 +47,7 @@ class LivePlant:
         self.plant = plant
         self.started_s = started_s
         self._siderostats: list[LiveSiderostat] = []
+        self._diode_samples = 0
 
     def siderostat(self, loop_name: str, command_timeout_s: float) -> LiveSiderostat:
         """The motors of one loop; `command_timeout_s` as :class:`LiveSiderostat` has it."""
@@ -68,6 +72,20 @@ class LivePlant:
     def spots_px(self, host_s: float) -> NDArray[np.float64]:
         """All spots at a recent host time, shape (spots, 2)."""
         return self.plant.spots_px(host_s - self.started_s)[0]
+
+    def diode_volts(self, loop_name: str, host_s: float) -> list[float]:
+        """Volts of one loop's photodiodes with their noise at a recent host time: az+, az-, el+, el-."""
+        self.advance()
+        part = self.plant.metrology_loops[loop_name]
+        self._diode_samples += 1
+        noise = pixel_normals(part.noise_keys[0], self._diode_samples, 4)
+        volts = part.diode_volts(host_s - self.started_s)[0] + part.sensor.noise_v * noise
+        return list(volts.tolist())
+
+    def set_laser(self, loop_name: str, power: float) -> None:
+        """Power of one loop's laser over its nominal power, from now on."""
+        self.advance()
+        self.plant.metrology_loops[loop_name].inputs.laser[:] = power
 
     def set_stack_v(self, loop_name: str, volts: Sequence[float]) -> None:
         """Stack volts of one loop in the D/A's scale, from now on."""
@@ -190,6 +208,16 @@ class Testbed:
             name: StarTestbed(rig, name, loop, self._live)
             for name, loop in mocks.stellar_loops.items()
         }
+        self._labjacks = {
+            name: LabJackT7Mock(
+                rig.metrology_loops[name].sensor.device,
+                loop.labjack,
+                partial(self._live.diode_volts, name),
+                set_laser=partial(self._live.set_laser, name),
+                seed=seed,
+            )
+            for name, loop in mocks.metrology_loops.items()
+        }
         self._scene = Scene(
             rig.camera,
             [spot for name in rig.stellar_loops for spot in truth.stellar_loops[name].spots],
@@ -204,6 +232,7 @@ class Testbed:
         devices |= {f"{name}.drive": drive.faults for name, drive in self._drives.items()}
         for name, star in self._stars.items():
             devices |= {f"{name}.dac": star.dac.faults, f"{name}.mdt693": star.piezo.faults}
+        devices |= {f"{name}.labjack": one.faults for name, one in self._labjacks.items()}
         self._faults = FaultTable(devices)
         self._bench = Bench(
             self._live.plant,
@@ -249,6 +278,11 @@ class Testbed:
                 f"mocks.loops.{name}.dac_pty": dac.pty_path,
                 f"mocks.loops.{name}.mdt693_pty": piezo.pty_path,
             }
+        for name, labjack in self._labjacks.items():
+            endpoints |= {
+                f"loops.{name}.sensor.device.host": "127.0.0.1",
+                f"loops.{name}.sensor.device.port": await labjack.start(),
+            }
         self._housekeeping = asyncio.create_task(self._keep_up())
         return endpoints
 
@@ -264,6 +298,8 @@ class Testbed:
         for star in self._stars.values():
             await star.dac.stop()
             await star.piezo.stop()
+        for labjack in self._labjacks.values():
+            await labjack.stop()
         await self._bench.stop()
 
     def _render(self, mid_exposure_s: float) -> NDArray[np.uint16]:

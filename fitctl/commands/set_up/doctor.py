@@ -27,6 +27,7 @@ from fitctl.drivers.cia402.configure import probe_drive
 from fitctl.drivers.ensemble.driver import probe_ensemble
 from fitctl.drivers.gige.probe import probe_camera
 from fitctl.drivers.interface import DeviceError, DeviceIdentity, DeviceTimeout, DeviceUnreachable
+from fitctl.drivers.labjack_t7.driver import probe_labjack
 from fitctl.drivers.mdt693.driver import probe_mdt693
 from fitctl.drivers.modbus_dac.probe import probe_dac
 from fitctl.drivers.probe import Probe
@@ -44,6 +45,7 @@ PROBES: dict[str, Callable[[Any], Probe]] = {
     "bal_analog": probe_bal_analog,
     "modbus_dac": probe_dac,
     "mdt693": probe_mdt693,
+    "labjack_t7": probe_labjack,
 }
 
 
@@ -161,6 +163,8 @@ def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:
         if isinstance(loop, Loop):
             yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
             yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
+        else:
+            yield f"{name} photodiodes", loop.sensor.device.driver, loop.sensor.device
 
 
 def _plain(finding: Finding) -> dict[str, Any]:

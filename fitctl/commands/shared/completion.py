@@ -15,7 +15,7 @@ from fitctl.commands.shared.welcome import rig_files
 from fitctl.config import CONTROLLERS, ConfigError, default_rig_path, load_rig
 from fitctl.sequences.files import shipped_sequences
 
-_OF_LOOP = ("drive", "dac", "mdt693")
+_OF_LOOP = {"stellar": ("drive", "dac", "mdt693"), "metrology": ("drive", "labjack")}
 
 
 def rigs(incomplete: str) -> list[str]:
@@ -39,9 +39,8 @@ def controllers(incomplete: str) -> list[str]:
 def devices(context: typer.Context, incomplete: str) -> list[str]:
     """Devices that can fail, of the rig that the command line names."""
     loops = _loops(context.params.get("rig"))
-    return _beginning(
-        incomplete, ["camera", *(f"{loop}.{device}" for loop in loops for device in _OF_LOOP)]
-    )
+    of_loops = [f"{name}.{device}" for name, kind in loops.items() for device in _OF_LOOP[kind]]
+    return _beginning(incomplete, ["camera", *of_loops])
 
 
 def faults(context: typer.Context, incomplete: str) -> list[str]:
@@ -55,11 +54,13 @@ def loops(context: typer.Context, incomplete: str) -> list[str]:
     return _beginning(incomplete, _loops(context.params.get("rig")))
 
 
-def _loops(rig: Path | None) -> list[str]:
+def _loops(rig: Path | None) -> dict[str, str]:
+    """Kinds of loops by name."""
     try:
-        return list(load_rig(rig or default_rig_path()).loops)
+        loops = load_rig(rig or default_rig_path()).loops
+        return {name: loop.kind for name, loop in loops.items()}
     except ConfigError:
-        return []  # Tab has no place for errors
+        return {}  # Tab has no place for errors
 
 
 def _beginning(incomplete: str, known: Iterable[str]) -> list[str]:

@@ -29,6 +29,7 @@ FAULTS = WIRE_FAULTS | {
     "unplugged": FaultKind("nothing is connected to an input: it reads about 0 V", parts=_PARTS),
     "swapped": FaultKind("the two photodiodes of an axis are exchanged", parts=tuple(_PAIRS)),
     "range_changed": FaultKind("another client sets this range of all inputs", "V", 1.0),
+    "laser_dim": FaultKind("this part of the laser's light is left", "of its light", 0.0),
 }
 _READING = {protocol.READ_HOLDING_REGISTERS, protocol.READ_INPUT_REGISTERS}
 _ADDRESS_AND_COUNT = struct.Struct(">HH")
@@ -135,6 +136,8 @@ class LabJackT7Mock:
     settings : LabJackMock
     volts : callable
         Gets a recent host time; returns what the photodiodes az+, az-, el+ and el- gave then, V.
+    set_laser : callable
+        Gets the laser's power over its nominal power, when the fault ``laser_dim`` begins or ends.
     seed : int
         Of the converter's noise.
 
@@ -149,12 +152,14 @@ class LabJackT7Mock:
         settings: LabJackMock,
         volts: Callable[[float], Sequence[float]],
         *,
+        set_laser: Callable[[float], None] = lambda _power: None,
         seed: int = 0,
     ) -> None:
         self.faults = Faults(FAULTS)
         self._wiring = device.inputs
         self._settings = settings
         self._volts = volts
+        self._set_laser = set_laser
         self._random = random.Random(seed)  # noqa: S311 - not for secrets
         self._last_error = 0
         self._held_v: dict[str, float] = {}
@@ -374,6 +379,9 @@ class LabJackT7Mock:
                 self._drifts_from_s.setdefault(part, time.monotonic())
             if self.faults.value("stuck_input", part) is None:
                 self._held_v.pop(part, None)
+        if kind == "laser_dim":
+            power = self.faults.value(kind)
+            self._set_laser(1.0 if power is None else power)
         if kind == "reboot":
             self._last_error = 0
             for setting, values in self._values.items():

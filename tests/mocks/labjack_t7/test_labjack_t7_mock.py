@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from labjack_bench import DEVICE, SETTINGS, Bench
 from mock_bench import in_a_loop
 
+from fitctl.config import Fault
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.modbus.pdu import answer
 
@@ -378,6 +379,17 @@ async def test_exchanged_photodiodes_and_one_that_is_unplugged():
         bench.mock.faults.clear()
         bench.begin("unplugged", part="AIN1")
         assert await client.volts() == pytest.approx([5.0, 0.0, 3.0, 2.0], abs=1e-3)
+
+
+@in_a_loop
+async def test_the_laser_is_dimmed_until_the_fault_ends():
+    powers = []
+    mock = LabJackT7Mock(DEVICE, SETTINGS, lambda _time_s: [0.0] * 4, set_laser=powers.append)
+    mock.faults.set(Fault(device="metrology.labjack", kind="laser_dim"))
+    mock.faults.set(Fault(device="metrology.labjack", kind="laser_dim", value=0.3))
+    mock.faults.clear()
+    assert powers == [0.0, 0.3, 1.0]
+    await mock.stop()
 
 
 @in_a_loop
