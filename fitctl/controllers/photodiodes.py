@@ -14,7 +14,7 @@ from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Volts = tuple[float, float, float, float]
@@ -148,20 +148,6 @@ class PhotodiodeArray:
         plus_v, minus_v = max(plus_v, threshold_v), max(minus_v, threshold_v)
         noise = self._noise_v * math.hypot(1.0 / plus_v, 1.0 / minus_v)
         return self.metres_per_log * math.log(plus_v / minus_v), self.metres_per_log * noise
-
-
-def diode_volts(sensor: Sensor, az_m: ArrayLike, el_m: ArrayLike) -> Floats:
-    """Volts of the four diodes without noise, shape (..., 4), of a beam centred at `az_m`, `el_m`.
-
-    A diode whose light is beyond `saturated_v` reads that.
-    """
-    az_m, el_m = np.broadcast_arrays(np.asarray(az_m, float), np.asarray(el_m, float))
-    d_m, w_m = sensor.diode_offset_m, sensor.beam_radius_m
-    along_m = np.stack([az_m, -az_m, el_m, -el_m], axis=-1)
-    # |p - r|^2 - d^2 for a diode at r, so that the centre gives on_axis_v.
-    beyond_m2 = (az_m**2 + el_m**2)[..., None] - 2.0 * d_m * along_m
-    light_v = sensor.on_axis_v * np.exp(-2.0 * beyond_m2 / w_m**2)
-    return np.minimum(light_v + np.asarray(sensor.ambient_v), sensor.saturated_v)
 
 
 def reach_m(sensor: Sensor, detection_sigma: float) -> float:

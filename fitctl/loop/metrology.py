@@ -38,7 +38,7 @@ from fitctl.messages.modes import (
     Trigger,
 )
 from fitctl.messages.telemetry import LoopLimits, LoopState
-from fitctl.model.optics import motor_sky_rad_per_rad, sky_px_per_rad
+from fitctl.model.optics import motor_sky_rad_per_rad, rotation, sky_px_per_rad
 from fitctl.stages.journal import Journal
 from fitctl.stages.servo import ServoState, SiderostatServo
 from fitctl.stages.siderostat import SiderostatStage
@@ -111,6 +111,7 @@ class MetrologyLoop(Loop):
         self._photodiode_error: DeviceError | None = None
         self._asked = Acquire()
         self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
+        self._turn = rotation(settings.siderostat.rotation_deg)
         self._pull_in_rad_s = _PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
         self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._period_s = rig.camera.period_s
@@ -274,7 +275,8 @@ class MetrologyLoop(Loop):
         return beam.place_m / self.settings.sensor.link_length_m
 
     def _turn_beam(self, step_rad: Floats) -> None:
-        self.siderostat.move_by(step_rad / self._motor_sky)
+        # The siderostat's axes may be turned from the photodiodes'.
+        self.siderostat.move_by(step_rad.dot(self._turn) / self._motor_sky)
 
     # ------------------------------------------------------------ for the supervisor
 

@@ -14,9 +14,9 @@ from fitctl.controllers.photodiodes import (
     PhotodiodeArray,
     ambient_of,
     capture_radius_m,
-    diode_volts,
     measured_radius_m,
 )
+from fitctl.model.metrology.photodiodes import diode_volts
 
 SIGMA = 6.0
 
@@ -42,7 +42,7 @@ def polar(radius_m, direction_rad):
 
 
 def read(az_m, el_m, array=ARRAY, sensor=SENSOR):
-    return array.beam(tuple(diode_volts(sensor, az_m, el_m).tolist()))
+    return array.beam(tuple(diode_volts(sensor, [az_m, el_m]).tolist()))
 
 
 @given(radius=st.floats(0.0, 0.999), direction_rad=DIRECTIONS)
@@ -100,7 +100,7 @@ def test_a_step_by_the_estimate_brings_any_captured_beam_nearer_until_it_is_meas
 @pytest.mark.parametrize("place_m", [(0.0, 0.0), (0.01, 0.0), (-0.02, 0.01), (0.03, 0.0)])
 def test_the_noise_is_that_of_many_samples(place_m):
     random = np.random.default_rng(1)
-    volts = diode_volts(SENSOR, *place_m) + SENSOR.noise_v * random.standard_normal((4000, 4))
+    volts = diode_volts(SENSOR, place_m) + SENSOR.noise_v * random.standard_normal((4000, 4))
     beams = [ARRAY.beam(tuple(row)) for row in volts.tolist()]
     stated = read(*place_m)
     for axis, name in enumerate(("az_m", "el_m")):

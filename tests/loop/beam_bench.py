@@ -6,11 +6,11 @@ import numpy as np
 
 from fitctl.clock import VirtualClock
 from fitctl.config import ARCSEC_PER_RAD, default_rig_path, load_rig
-from fitctl.controllers.photodiodes import diode_volts
 from fitctl.drivers.interface import DeviceIdentity, DiodeReading, LoopDevices, ServoReading
 from fitctl.loop.metrology import metrology_loop
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Mode, Trigger
+from fitctl.model.metrology.photodiodes import diode_volts
 from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.stages.journal import Journal
 
@@ -57,8 +57,7 @@ class Diodes:
 
     def send_request(self):
         sensor, now_s = self.bench.truth, self.bench.clock.now_s()
-        dark_v = np.array(sensor.ambient_v)
-        volts = self.light * (diode_volts(sensor, *self.bench.beam_m().tolist()) - dark_v) + dark_v
+        volts = diode_volts(sensor, self.bench.beam_m(), self.light)
         volts += sensor.noise_v * self._random.standard_normal(4)
         self._waiting.append(DiodeReading(now_s, tuple(volts.tolist())))
 
