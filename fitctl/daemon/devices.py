@@ -7,6 +7,7 @@ from typing import Any
 
 from fitctl.config import AnyLoop, MetrologyLoop, Rig, Siderostat
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
+from fitctl.drivers.c887.driver import C887Hexapod
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
 from fitctl.drivers.gige.aravis import AravisCamera
@@ -25,6 +26,7 @@ AMPLIFIERS: dict[str, Callable[[Siderostat[Any]], ServoAmplifiers]] = {
 DACS = {"modbus_dac": ModbusDac}
 PIEZOS = {"mdt693": Mdt693}
 PHOTODIODES = {"labjack_t7": LabJackT7}
+HEXAPODS = {"c887": C887Hexapod}
 
 
 def rig_devices(rig: Rig) -> Devices:
@@ -32,6 +34,9 @@ def rig_devices(rig: Rig) -> Devices:
     return Devices(
         camera=CAMERAS[rig.camera.device.driver](rig.camera),
         loops={name: _loop_devices(loop) for name, loop in rig.loops.items()},
+        hexapod=HEXAPODS[rig.collector.hexapod.driver](rig.collector.hexapod)
+        if rig.collector is not None
+        else None,
     )
 
 

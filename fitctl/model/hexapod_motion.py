@@ -20,6 +20,7 @@ Both fall with vc, and they meet at vc = v0: every T above the shortest has one 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 AXES = 6
+_REMEMBERED = 100
 _TRANSLATIONS, _ROTATIONS = slice(0, 3), slice(3, 6)
 _STRAIGHT = 1e-9  # sine of the angle between velocity and way within which they are one line
 _NO_WAY = 1e-13  # mm or degrees: below, rounding decides
@@ -96,6 +98,55 @@ class Trajectory:
         phase = np.asarray(phase, dtype=np.intp)
         axis = np.broadcast_to(np.arange(AXES), phase.shape)
         return np.maximum(times_s - self._starts_s[phase, axis], 0.0), phase, axis
+
+
+class HexapodMotion:
+    """A platform that is given targets as time goes on; its recent past stays exact.
+
+    Parameters
+    ----------
+    pose : sequence of six floats
+        Where it stands.
+    """
+
+    def __init__(self, pose: Sequence[float] | Floats = (0.0,) * AXES) -> None:
+        self._plans = deque([(-math.inf, at_rest(pose))], maxlen=_REMEMBERED)
+
+    @property
+    def target(self) -> Floats:
+        """Where it ends, shape (6,)."""
+        return self._plans[-1][1].target
+
+    @property
+    def ends_s(self) -> float:
+        """When it arrives."""
+        return self._plans[-1][1].ends_s
+
+    def move_to(
+        self, time_s: float, target: Sequence[float] | Floats, limits: MotionLimits
+    ) -> None:
+        """Go to `target` from `time_s` on; times must not go back."""
+        self._plans.append((time_s, plan_move(self._plans[-1][1], time_s, target, limits)))
+
+    def stop(self, time_s: float, limits: MotionLimits) -> None:
+        """Brake from `time_s` on."""
+        self._plans.append((time_s, plan_stop(self._plans[-1][1], time_s, limits)))
+
+    def pose_at(self, time_s: float) -> Floats:
+        """The pose at a time, shape (6,); exact unless more than a hundred plans have been made since."""
+        return self._plan_at(time_s).pose_at(time_s)
+
+    def velocity_at(self, time_s: float) -> Floats:
+        """Velocities in mm/s and degrees/s, shape (6,)."""
+        return self._plan_at(time_s).velocity_at(time_s)
+
+    def moving_at(self, time_s: float) -> tuple[bool, ...]:
+        """Which axes have not arrived yet."""
+        return self._plan_at(time_s).moving_at(time_s)
+
+    def _plan_at(self, time_s: float) -> Trajectory:
+        plans = reversed(self._plans)
+        return next((plan for since_s, plan in plans if since_s <= time_s), self._plans[0][1])
 
 
 def at_rest(pose: Sequence[float] | Floats, time_s: float = 0.0) -> Trajectory:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fitctl.model.hexapod_motion import MotionLimits, at_rest, plan_move, plan_stop
+from fitctl.model.hexapod_motion import HexapodMotion, MotionLimits, at_rest, plan_move, plan_stop
 
 LIMITS = MotionLimits(8.0, 6.0, 20.0, 15.0)
 MOST = np.array([8.0] * 3 + [6.0] * 3)
@@ -145,3 +145,17 @@ def test_targets_streamed_along_a_sine_are_followed_smoothly(rate_hz):
     fastest = 2 * math.pi * 0.05
     assert np.max(np.abs(errors)) <= fastest / rate_hz
     assert np.max(speeds) <= 2 * fastest
+
+
+@given(moves=courses)
+def test_a_motion_remembers_where_it_was_before_it_was_planned_anew(moves):
+    motion, now_s, seen = HexapodMotion(START), 0.0, []
+    for target, after_s in moves:
+        seen += [(at_s, motion.pose_at(at_s)) for at_s in (now_s, now_s + after_s * 0.7)]
+        now_s += after_s
+        motion.move_to(now_s, target, LIMITS)
+    for at_s, pose in seen:
+        assert np.allclose(motion.pose_at(at_s), pose, atol=1e-9)
+    motion.stop(now_s, LIMITS)
+    assert not any(motion.moving_at(now_s + 1.0))
+    assert np.array_equal(motion.pose_at(now_s + 1.0), motion.target)

@@ -23,6 +23,7 @@ from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
 from fitctl.config import Loop, Rig
 from fitctl.drivers.bal_analog.driver import probe_bal_analog
+from fitctl.drivers.c887.driver import probe_c887
 from fitctl.drivers.cia402.configure import probe_drive
 from fitctl.drivers.ensemble.driver import probe_ensemble
 from fitctl.drivers.gige.probe import probe_camera
@@ -46,6 +47,7 @@ PROBES: dict[str, Callable[[Any], Probe]] = {
     "modbus_dac": probe_dac,
     "mdt693": probe_mdt693,
     "labjack_t7": probe_labjack,
+    "c887": probe_c887,
 }
 
 
@@ -165,6 +167,8 @@ def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:
             yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
         else:
             yield f"{name} photodiodes", loop.sensor.device.driver, loop.sensor.device
+    if rig.collector is not None:
+        yield "hexapod", rig.collector.hexapod.driver, rig.collector.hexapod
 
 
 def _plain(finding: Finding) -> dict[str, Any]:

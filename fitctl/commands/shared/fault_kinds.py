@@ -17,6 +17,7 @@ _MOCKS = {
     "dac": "fitctl.mocks.modbus_dac.server",
     "mdt693": "fitctl.mocks.mdt693.server",
     "labjack": "fitctl.mocks.labjack_t7.server",
+    "hexapod": "fitctl.mocks.c887.server",
 }
 
 
