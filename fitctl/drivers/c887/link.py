@@ -161,8 +161,13 @@ class C887Link:
             self._turn.release()
 
     def close(self) -> None:
-        """Close the port; safe to call twice."""
-        self._port.close()
+        """Close the port, after the answer to another thread's question; safe to call twice."""
+        has_turn = self._turn.acquire(timeout=self._limit_s)
+        try:
+            self._port.close()
+        finally:
+            if has_turn:
+                self._turn.release()
 
     def refused(self, name: str, number: int) -> DeviceError:
         """The error for a command that the controller has not done."""

@@ -378,7 +378,25 @@ def test_referencing_on_request_only(mock):
     driver.close()
 
 
-@pytest.mark.parametrize("what", ["a move", "a reference move", "streaming"])
+def test_closing_ends_what_another_thread_does_with_a_typed_error(hexapod):
+    ended = []
+
+    def stream():
+        try:
+            while True:
+                hexapod.move_to(Pose(x_mm=0.1), 8.0)
+        except Exception as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=stream)
+    thread.start()
+    time.sleep(0.1)
+    hexapod.close()
+    thread.join(5)
+    assert isinstance(ended[0], DeviceUnreachable)
+
+
+@pytest.mark.parametrize("what", ["a move", "a reference move"])
 def test_a_stop_from_another_thread_acts_at_once(mock, what):
     controller = mock(referenced=what != "a reference move", reference_s=5.0)
     driver = C887Hexapod(device(f"socket://127.0.0.1:{controller.ends.tcp_port}"))
@@ -390,18 +408,12 @@ def test_a_stop_from_another_thread_acts_at_once(mock, what):
             if what == "a reference move":
                 driver.reference()
             driver.move_to(Pose(x_mm=40.0), 8.0)
-            while what == "streaming":
-                driver.move_to(Pose(x_mm=40.0), 8.0)
         except DeviceError as error:
             ended.append(error)
 
     thread = threading.Thread(target=work)
     thread.start()
     time.sleep(0.3)
-    if what == "streaming":  # whoever streams is ended first, as CollectorRunner does
-        driver.close()
-        thread.join(5)
-        driver.open()
     started_s = time.monotonic()
     driver.stop()
     assert time.monotonic() - started_s < 0.5
