@@ -2,7 +2,8 @@
 
 Nothing here knows a protocol: devices are wired to the plant as the cables would be. The D/A's outputs
 are the piezo amplifier's external inputs; the amplifier's outputs are the stacks; the drive turns the
-motors; the camera looks at the spots; the photodiodes give their volts to the LabJack's inputs.
+motors; the camera looks at the spots; the photodiodes give their volts to the LabJack's inputs; the
+hexapod carries the collector.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ from numpy.typing import NDArray
 from fitctl.config import LoopMocks, Rig
 from fitctl.mocks.amplifiers import amplifier_mock, endpoint_keys
 from fitctl.mocks.bench import Bench, FaultTable
+from fitctl.mocks.c887.platform import Platform
+from fitctl.mocks.c887.server import C887ControllerMock
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.server import Mdt693Mock
@@ -47,6 +51,8 @@ class LivePlant:
         self.plant = plant
         self.started_s = started_s
         self._siderostats: list[LiveSiderostat] = []
+        self._platform: Platform | None = None
+        self._planned_s = 0.0
         self._diode_samples = 0
 
     def siderostat(self, loop_name: str, command_timeout_s: float) -> LiveSiderostat:
@@ -55,18 +61,34 @@ class LivePlant:
         self._siderostats.append(made)
         return made
 
-    @property
     def now_s(self) -> float:
         """The plant's time that it is now."""
         return time.monotonic() - self.started_s
 
+    def carry_collector(self, platform: Platform) -> None:
+        """The collector stands on this hexapod's platform, whose time is :meth:`now_s`."""
+        self._platform = platform
+
     def advance(self) -> None:
-        """Bring the plant to now; motors stop where their last velocity command had run out."""
-        now_s = self.now_s
-        running_out = [motors for motors in self._siderostats if motors.runs_out_by(now_s)]
-        for motors in sorted(running_out, key=lambda one: one.command_ends_s):
-            self.plant.advance(motors.command_ends_s)
-            motors.velocity_rad_s[:] = 0.0
+        """Bring the plant to now.
+
+        On the way there motors stop where their last velocity command had run out, and the collector follows
+        the hexapod.
+        """
+        now_s = self.now_s()
+        changes: list[tuple[float, Callable[[], None]]] = [
+            (motors.command_ends_s, motors.run_out)
+            for motors in self._siderostats
+            if motors.runs_out_by(now_s)
+        ]
+        if self._platform is not None and self.plant.collector is not None:
+            follow = self.plant.collector.follow
+            plans = self._platform.plans_since(self._planned_s)
+            changes += [(began_s, partial(follow, plan)) for began_s, plan in plans]
+            self._planned_s = plans[-1][0] if plans else self._planned_s
+        for time_s, change in sorted(changes, key=itemgetter(0)):
+            self.plant.advance(time_s)
+            change()
         self.plant.advance(now_s)
 
     def spots_px(self, host_s: float) -> NDArray[np.float64]:
@@ -128,6 +150,10 @@ class LiveSiderostat:
         """Whether motors turn by a command that holds no longer."""
         return now_s > self.command_ends_s and bool(np.any(self.velocity_rad_s))
 
+    def run_out(self) -> None:
+        """Stop the motors."""
+        self.velocity_rad_s[:] = 0.0
+
     def position_rad(self) -> tuple[float, float]:
         """Motor angles now."""
         self._live.advance()
@@ -146,7 +172,7 @@ class LiveSiderostat:
 
     def _apply(self) -> None:
         self._live.advance()
-        self.command_ends_s = self._live.now_s + self._command_timeout_s
+        self.command_ends_s = self._live.now_s() + self._command_timeout_s
         self.velocity_rad_s[:] = np.where(self._enabled, self._commanded_rad_s, 0.0)
 
 
@@ -218,6 +244,10 @@ class Testbed:
             )
             for name, loop in mocks.metrology_loops.items()
         }
+        self._hexapod = None
+        if rig.collector is not None and mocks.hexapod is not None:
+            self._hexapod = C887ControllerMock(mocks.hexapod, self._live.now_s)
+            self._live.carry_collector(self._hexapod.platform)
         self._scene = Scene(
             rig.camera,
             [spot for name in rig.stellar_loops for spot in truth.stellar_loops[name].spots],
@@ -233,6 +263,8 @@ class Testbed:
         for name, star in self._stars.items():
             devices |= {f"{name}.dac": star.dac.faults, f"{name}.mdt693": star.piezo.faults}
         devices |= {f"{name}.labjack": one.faults for name, one in self._labjacks.items()}
+        if self._hexapod is not None:
+            devices["hexapod"] = self._hexapod.faults
         self._faults = FaultTable(devices)
         self._bench = Bench(
             self._live.plant,
@@ -283,6 +315,12 @@ class Testbed:
                 f"loops.{name}.sensor.device.host": "127.0.0.1",
                 f"loops.{name}.sensor.device.port": await labjack.start(),
             }
+        if self._hexapod is not None:
+            hexapod = await self._hexapod.start()
+            endpoints |= {
+                "collector.hexapod.port": f"socket://127.0.0.1:{hexapod.tcp_port}",
+                "mocks.hexapod_pty": hexapod.pty_path,
+            }
         self._housekeeping = asyncio.create_task(self._keep_up())
         return endpoints
 
@@ -300,6 +338,8 @@ class Testbed:
             await star.piezo.stop()
         for labjack in self._labjacks.values():
             await labjack.stop()
+        if self._hexapod is not None:
+            await self._hexapod.stop()
         await self._bench.stop()
 
     def _render(self, mid_exposure_s: float) -> NDArray[np.uint16]:

@@ -144,6 +144,10 @@ class HexapodMotion:
         """Which axes have not arrived yet."""
         return self._plan_at(time_s).moving_at(time_s)
 
+    def plans_since(self, time_s: float) -> list[tuple[float, Trajectory]]:
+        """The plans made after a time, oldest first: when each begins, and what it is."""
+        return [plan for plan in self._plans if plan[0] > time_s]
+
     def _plan_at(self, time_s: float) -> Trajectory:
         plans = reversed(self._plans)
         return next((plan for since_s, plan in plans if since_s <= time_s), self._plans[0][1])

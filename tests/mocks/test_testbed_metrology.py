@@ -12,6 +12,7 @@ import pytest
 from fitctl.commands.set_up.doctor import ask_devices
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.daemon.devices import rig_devices
+from fitctl.drivers.interface import Pose
 from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.mocks.testbed import Testbed as MockTestbed
 
@@ -21,6 +22,7 @@ FREE = [
     "mocks.gvcp_port=0",
     "mocks.bench_port=0",
     "mocks.hexapod.tcp_port=0",
+    "mocks.hexapod.reference_s=0.1",
     "mocks.loops.metrology.slcan_port=0",
     "mocks.loops.metrology.labjack.modbus_port=0",
     *(
@@ -138,6 +140,27 @@ def test_with_the_laser_off_only_the_ambient_light_is_left(running, devices):
     finally:
         running.wrong()
     assert min(sampled(devices.photodiodes)) > 10 * max(ambient_v)
+
+
+def test_a_hexapod_that_moves_carries_the_photodiodes_across_the_beam(running, devices):
+    live = running.testbed._live
+    beam = live.plant.metrology_loops[LOOP]
+    hexapod = rig_devices(running.rig).hexapod
+    hexapod.open()
+    try:
+        hexapod.reference()
+        sampled(devices.photodiodes)  # brings the plant to now
+        before_m = beam.offset_m(live.plant.time_s)[0].copy()
+        hexapod.move_to(Pose(y_mm=1.0, z_mm=-0.5), 8.0)
+        end_s = time.monotonic() + 5.0
+        while hexapod.pose().moving:
+            assert time.monotonic() < end_s
+        sampled(devices.photodiodes)
+        moved_m = beam.offset_m(live.plant.time_s)[0] - before_m
+        assert moved_m == pytest.approx([-1e-3, 0.5e-3], abs=1e-9)
+    finally:
+        hexapod.move_to(Pose(), 8.0)
+        hexapod.close()
 
 
 def test_doctor_asks_the_labjack_who_it_is(running, capsys):

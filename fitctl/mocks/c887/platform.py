@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from fitctl.config import C887Mock
 from fitctl.drivers.c887.protocol import AXES, GcsError
-from fitctl.model.hexapod_motion import Floats, HexapodMotion, MotionLimits
+from fitctl.model.hexapod_motion import Floats, HexapodMotion, MotionLimits, Trajectory
 
 ABRUPT = 10.0  # times the acceleration: #24 and STP brake so hard, HLT brakes as a move does
 _PIVOT = ("R", "S", "T")
@@ -76,6 +76,10 @@ class Platform:
         self._referenced_s: float | None = None
 
     # ------------------------------------------------------------ readings
+    def plans_since(self, time_s: float) -> list[tuple[float, Trajectory]]:
+        """How it has moved since a recent time: when each plan began, and the plan."""
+        return self._motion.plans_since(time_s)
+
     def true_pose_at(self, time_s: float) -> Floats:
         """Where it really is, shape (6,), mm and degrees; referenced or not."""
         return self._motion.pose_at(time_s)
