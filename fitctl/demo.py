@@ -18,16 +18,27 @@ from typing import Any
 
 import numpy as np
 
+from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig, load_rig
+from fitctl.daemon.devices import HEXAPODS
 from fitctl.daemon.last_records import HELLO_S
 from fitctl.daemon.locks import only_supervisor
-from fitctl.logging.records import LoopTiming, Tick
+from fitctl.drivers.interface import DeviceError, Hexapod
+from fitctl.logging.records import LoopTiming, MetrologyTick, Tick
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Acquire, AnyCommand, Standby
 from fitctl.messages.endpoints import make_service_folder
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
-from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
+from fitctl.mocks.bench import (
+    Beam,
+    BeamQuestion,
+    Residual,
+    ResidualQuestion,
+    Visibility,
+    VisibilityQuestion,
+    ask_bench,
+)
 from fitctl.model.optics import scales
 from fitctl.processes import (
     end_process,
@@ -38,8 +49,10 @@ from fitctl.processes import (
     start_process,
 )
 from fitctl.simulation.statistics import pair, rms
+from fitctl.stages.collector import CollectorDrive
 
 JUDGED_S = 30.0
+_HELD = {Mode.VERNIER.name, Mode.LOCKED.name}
 _START_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = HELLO_S + 15.0  # longer than the supervisor waits for its recorder
 
@@ -53,6 +66,7 @@ class Instrument:
     """A running mock instrument."""
 
     client: Client
+    rig: Rig
     sockets: Path
     errors: Path
     bench_port: int
@@ -67,6 +81,62 @@ class Instrument:
                 why = last_line(self.errors / f"{name}.err") or "it left no message"
                 msg = f"{name} ended with status {process.returncode}: {why}"
                 raise DemoError(msg)
+
+
+@contextmanager
+def moving_collector(running: Instrument, seed: int) -> Iterator[None]:
+    """Move the collector, where the rig has one, as its rig file says: from when all loops hold until the end.
+
+    A thread of its own drives the hexapod. It stops the hexapod when a loop goes to SAFE.
+    """
+    collector = running.rig.collector
+    if collector is None or collector.motion.kind == "still":
+        yield
+        return
+    ending = threading.Event()
+    hexapod = HEXAPODS[collector.hexapod.driver](collector.hexapod)
+    drive = CollectorDrive(collector, hexapod, MonotonicClock(), seed)
+    thread = threading.Thread(
+        target=_move_collector, args=(running, hexapod, drive, ending), name="demo-collector"
+    )
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
+
+
+def _move_collector(
+    running: Instrument, hexapod: Hexapod, drive: CollectorDrive, ending: threading.Event
+) -> None:
+    beside = Client(running.sockets)
+    try:
+        hexapod.open()
+        hexapod.reference()
+        if not _hold(beside, ending):
+            return
+        drive.start()
+        while not ending.wait(drive.period_s):
+            drive.period()
+            telemetry = beside.receive(0.0)
+            if telemetry and any(loop.mode == Mode.SAFE.name for loop in telemetry.loops):
+                break
+        drive.stop()
+    except (DeviceError, ConnectionError):
+        return  # the mocks ended, or fail as somebody asked for: the demo shows it
+    finally:
+        beside.close()
+        hexapod.close()
+
+
+def _hold(client: Client, ending: threading.Event) -> bool:
+    """Wait until all loops hold; False if it ends before."""
+    while not ending.is_set():
+        telemetry = client.receive(0.5)
+        if telemetry and all(loop.mode in _HELD for loop in telemetry.loops):
+            return True
+    return False
 
 
 @contextmanager
@@ -93,13 +163,14 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
         devices = [
             f"{key}={value}" for key, value in endpoints.items() if not key.startswith("mocks.")
         ]
-        sockets = stack.enter_context(_socket_folder(load_rig(rig_path, overrides), folder))
+        rig = load_rig(rig_path, [*overrides, *devices])
+        sockets = stack.enter_context(_socket_folder(rig, folder))
         settings = [*overrides, *devices, f"service.folder={sockets}"]
         supervisor = _start(folder, "supervisor", ["run", *rig_arguments(rig_path, settings)])
         processes.append(supervisor)
         bench_port = int(endpoints["mocks.bench_port"])
         running = Instrument(
-            Client(sockets), sockets, folder, bench_port, started_s, supervisor, mocks
+            Client(sockets), rig, sockets, folder, bench_port, started_s, supervisor, mocks
         )
         try:
             _wait(running, lambda _: True, "the supervisor's first telemetry")
@@ -151,24 +222,25 @@ def acquire_in_background(running: Instrument) -> threading.Thread:
 class Course:
     """What was seen of a run; grows with telemetry."""
 
-    ticks: dict[str, list[Tick]] = field(default_factory=dict)
+    ticks: dict[str, list[Tick | MetrologyTick]] = field(default_factory=dict)
     reached_s: dict[tuple[str, str], float] = field(default_factory=dict)
-    vernier_since_s: dict[str, float] = field(default_factory=dict)
+    held_since_s: dict[str, float] = field(default_factory=dict)
     timing: dict[tuple[str, float], LoopTiming] = field(default_factory=dict)
     last: Telemetry | None = None
 
     def add(self, telemetry: Telemetry) -> None:
         """Take one telemetry message."""
         self.last = telemetry
-        for tick in telemetry.ticks:
+        ticks: list[Tick | MetrologyTick] = [*telemetry.ticks, *telemetry.metrology_ticks]
+        for tick in ticks:
             if tick.number >= 0:
                 self.ticks.setdefault(tick.loop, []).append(tick)
         for change in telemetry.mode_changes:
             self.reached_s.setdefault((change.loop, change.target), change.time_s)
-            if change.target == Mode.VERNIER.name:
-                self.vernier_since_s[change.loop] = change.time_s
+            if change.target in _HELD:
+                self.held_since_s[change.loop] = change.time_s
             else:
-                self.vernier_since_s.pop(change.loop, None)
+                self.held_since_s.pop(change.loop, None)
         for timing in telemetry.timing:
             self.timing[timing.loop, timing.time_s] = timing
 
@@ -197,25 +269,13 @@ def watch(
 def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
     """How one loop did: the keys of ``fitctl demo --json``.
 
-    ``judged_s`` is zero unless the loop is in VERNIER at the end.
+    ``judged_s`` is zero unless the loop holds its star or its beam at the end.
     """
     ticks = course.ticks.get(loop_name, [])
-    end_s = ticks[-1].mid_exposure_s if ticks else math.nan
-    start_s = max(course.vernier_since_s.get(loop_name, math.nan), end_s - JUDGED_S)
-    judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
-    errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
-    truth = _truth(rig, running, loop_name, start_s, end_s)
-    step_s = rig.mock_parts()[0].step_s
-    arcsec = scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px
+    how_well = _star if loop_name in rig.stellar_loops else _beam
     timing = [t for (name, _), t in course.timing.items() if name == loop_name]
     last = course.last
-    return {
-        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
-        "vernier_s": _since(running, course, loop_name, Mode.VERNIER),
-        "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
-        "measured_rms_px": pair(rms(errors)),
-        "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
-        "judged_s": truth.samples * step_s,
+    return how_well(rig, running, course, loop_name) | {
         "frames": len(ticks),
         "frames_lost": ticks[-1].frames_lost if ticks else 0,
         "late_ticks": sum(tick.late for tick in ticks),
@@ -224,6 +284,68 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
         "records_lost": 0 if last is None else last.records_lost,
         "log": "" if last is None or last.recorder is None else last.recorder.path,
     }
+
+
+def _star(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
+    ticks = [tick for tick in course.ticks.get(loop_name, []) if isinstance(tick, Tick)]
+    start_s, end_s = _judged(course, loop_name)
+    judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
+    errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
+    truth = _truth(rig, running, loop_name, start_s, end_s)
+    arcsec = scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px
+    return {
+        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
+        "vernier_s": _since(running, course, loop_name, Mode.VERNIER),
+        "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
+        "measured_rms_px": pair(rms(errors)),
+        "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
+        "judged_s": truth.samples * rig.mock_parts()[0].step_s,
+    }
+
+
+def _beam(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
+    start_s, end_s = _judged(course, loop_name)
+    truth = Beam(math.nan, math.nan, 0)
+    if start_s < end_s:
+        truth = ask_bench(running.bench_port, BeamQuestion(loop_name, start_s, end_s), Beam)
+    return {
+        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
+        "locked_s": _since(running, course, loop_name, Mode.LOCKED),
+        "rms_arcsec": {"az": truth.az_rms_arcsec, "el": truth.el_rms_arcsec},
+        "judged_s": truth.samples * rig.mock_parts()[0].step_s,
+    }
+
+
+def visibility(rig: Rig, running: Instrument, course: Course) -> float:
+    """The mean visibility that the true tilt of the two stars left while both were judged, or nan."""
+    if rig.fringes is None:
+        return math.nan
+    one, other = rig.fringes.loops
+    spans = [_judged(course, name) for name in (one, other)]
+    if not all(start_s < end_s for start_s, end_s in spans):
+        return math.nan
+    start_s, end_s = max(start for start, _ in spans), min(end for _, end in spans)
+    targets = [rig.stellar_loops[name].target_px for name in (one, other)]
+    question = VisibilityQuestion(
+        loops=(one, other),
+        targets_px=((targets[0].az, targets[0].el), (targets[1].az, targets[1].el)),
+        aperture_m=rig.fringes.aperture_m,
+        wavelength_m=rig.fringes.wavelength_m,
+        start_s=start_s,
+        end_s=end_s,
+    )
+    return ask_bench(running.bench_port, question, Visibility).mean
+
+
+def _judged(course: Course, loop_name: str) -> tuple[float, float]:
+    """From when to when a loop is judged, in the host's time; nan where it does not hold at the end."""
+    ticks = course.ticks.get(loop_name, [])
+    end_s = _paced_s(ticks[-1]) if ticks else math.nan
+    return max(course.held_since_s.get(loop_name, math.nan), end_s - JUDGED_S), end_s
+
+
+def _paced_s(tick: Tick | MetrologyTick) -> float:
+    return tick.mid_exposure_s if isinstance(tick, Tick) else tick.time_s
 
 
 def _truth(rig: Rig, running: Instrument, name: str, start_s: float, end_s: float) -> Residual:

@@ -19,6 +19,7 @@ from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import AnyRecord, MetrologyTick, ModeChange, Tick
 from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
 from fitctl.messages.modes import METROLOGY_MODES, Mode
+from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.model.metrology.part import MetrologyPart
 from fitctl.model.plant import Plant
 from fitctl.simulation.devices import (
@@ -34,7 +35,6 @@ from fitctl.simulation.statistics import (
     MetrologyResult,
     RigResult,
     SimulationResult,
-    mean_visibility,
     mode_times,
     pair,
     piston_rms_m,

@@ -8,9 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j1
 
-from fitctl.config import Fringes
 from fitctl.logging.records import ModeChange
 from fitctl.messages.modes import STELLAR_MODES, Mode
 from fitctl.model.stellar_part import StellarPart
@@ -60,15 +58,6 @@ class RigResult(NamedTuple):
     loops: dict[str, SimulationResult | MetrologyResult]
     visibility: float
     speed_x: float
-
-
-def mean_visibility(tilt_rad: Floats, fringes: Fringes) -> float:
-    """The mean of the visibility over tilts on the sky, shape (n, 2); nan without any."""
-    if len(tilt_rad) == 0:
-        return math.nan
-    x = math.pi * fringes.aperture_m / fringes.wavelength_m * np.hypot(*tilt_rad.T)
-    x = np.maximum(x, 1e-9)
-    return float(np.mean(np.abs(2 * j1(x) / x)))
 
 
 def true_residual_rms(

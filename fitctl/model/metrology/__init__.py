@@ -1,1 +1,1 @@
-"""The metrology loop's hardware: photodiodes, link, and the collector bench at its end."""
+"""The metrology loop's hardware: photodiodes, link, the collector bench at its end, and the fringes."""
