@@ -14,6 +14,7 @@ from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.daemon.devices import rig_devices
 from fitctl.drivers.interface import Pose
 from fitctl.drivers.labjack_t7.driver import LabJackT7
+from fitctl.mocks.bench import Beam, BeamQuestion, Visibility, VisibilityQuestion, ask_bench
 from fitctl.mocks.testbed import Testbed as MockTestbed
 
 RIG_FILE = default_rig_path().parent / "fit-testbed.toml"
@@ -44,8 +45,9 @@ class Running:
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
         self.testbed = MockTestbed(load_rig(RIG_FILE, FREE), seed=1)
-        endpoints = self.call(self.testbed.start())
-        devices = [f"{key}={value}" for key, value in endpoints.items() if key[:5] != "mocks"]
+        self.endpoints = self.call(self.testbed.start())
+        where = self.endpoints.items()
+        devices = [f"{key}={value}" for key, value in where if key[:5] != "mocks"]
         self.rig = load_rig(RIG_FILE, [*FREE, *devices])
 
     def call(self, coroutine):
@@ -142,6 +144,13 @@ def test_with_the_laser_off_only_the_ambient_light_is_left(running, devices):
     assert min(sampled(devices.photodiodes)) > 10 * max(ambient_v)
 
 
+def go_to(hexapod, pose):
+    hexapod.move_to(pose, 8.0)
+    end_s = time.monotonic() + 5.0
+    while hexapod.pose().moving:
+        assert time.monotonic() < end_s
+
+
 def test_a_hexapod_that_moves_carries_the_photodiodes_across_the_beam(running, devices):
     live = running.testbed._live
     beam = live.plant.metrology_loops[LOOP]
@@ -151,16 +160,36 @@ def test_a_hexapod_that_moves_carries_the_photodiodes_across_the_beam(running, d
         hexapod.reference()
         sampled(devices.photodiodes)  # brings the plant to now
         before_m = beam.offset_m(live.plant.time_s)[0].copy()
-        hexapod.move_to(Pose(y_mm=1.0, z_mm=-0.5), 8.0)
-        end_s = time.monotonic() + 5.0
-        while hexapod.pose().moving:
-            assert time.monotonic() < end_s
+        go_to(hexapod, Pose(y_mm=1.0, z_mm=-0.5))
         sampled(devices.photodiodes)
         moved_m = beam.offset_m(live.plant.time_s)[0] - before_m
         assert moved_m == pytest.approx([-1e-3, 0.5e-3], abs=1e-9)
     finally:
-        hexapod.move_to(Pose(), 8.0)
+        go_to(hexapod, Pose())
         hexapod.close()
+
+
+def test_the_bench_knows_beam_and_visibility_and_where_it_does_not_says_why(running, devices):
+    port = running.endpoints["mocks.bench_port"]
+    since_s = time.monotonic()
+    time.sleep(0.2)
+    sampled(devices.photodiodes)
+    live = running.testbed._live
+    beam = ask_bench(port, BeamQuestion(LOOP, since_s, since_s + 0.15), Beam)
+    part = live.plant.metrology_loops[LOOP]
+    angle_arcsec = np.abs(part.offset_m(live.plant.time_s)[0]) / 10.0 * 206264.8
+    assert (beam.az_rms_arcsec, beam.el_rms_arcsec) == pytest.approx(tuple(angle_arcsec), rel=1e-3)
+    assert beam.samples == pytest.approx(300, abs=2)
+    targets = ((12.0, 20.0), (28.0, 20.0))
+    question = VisibilityQuestion(("left", "right"), targets, 0.15, 7e-7, since_s, since_s + 0.15)
+    assert 0.0 <= ask_bench(port, question, Visibility).mean <= 1.0
+
+    assert "start_s and end_s" in ask_bench(port, BeamQuestion(LOOP, math.inf, 1.0), Beam).error
+    assert (
+        "no metrology loop is named left" in ask_bench(port, BeamQuestion("left", 0, 1), Beam).error
+    )
+    nobody = VisibilityQuestion(("left", "nobody"), targets, 0.15, 7e-7, 0.0, 1.0)
+    assert "no two loops are named left, nobody" in ask_bench(port, nobody, Visibility).error
 
 
 def test_doctor_asks_the_labjack_who_it_is(running, capsys):
