@@ -119,6 +119,8 @@ def _move_collector(
         drive.start()
         while not ending.wait(drive.period_s):
             drive.period()
+            if drive.fault is not None:
+                return  # as below
             telemetry = beside.receive(0.0)
             if telemetry and any(loop.mode == Mode.SAFE.name for loop in telemetry.loops):
                 break

@@ -173,6 +173,8 @@ def simulate_rig(
     simulation.acquire()
     while simulation.clock.now_s() < duration_s:
         simulation.run(rig.camera.period_s)
+        if simulation.collector is not None and simulation.collector.fault is not None:
+            raise simulation.collector.fault
         if simulation.collector is not None and simulation.clock.now_s() >= motion_s:
             simulation.collector.start()
             motion_s = math.inf
