@@ -45,6 +45,7 @@ class Link:
             motor_sky_rad_per_rad(loop.settings.siderostat),
             motor_sky_rad_per_rad(settings.siderostat),
         )
+        self._zeros_lost = loop.zeros_lost
         self._settle_s = settings.acquisition.settle_s
 
     @property
@@ -55,6 +56,11 @@ class Link:
     def settled(self, now_s: float) -> bool:
         """It has held for so long that the own siderostat has undone what happened meanwhile."""
         return self.holds and now_s - self.loop.mode_since_s >= self._settle_s
+
+    def zero_was_lost(self) -> bool:
+        """The encoders count from elsewhere than when last asked: what was turned before is unknown."""
+        before, self._zeros_lost = self._zeros_lost, self.loop.zeros_lost
+        return self._zeros_lost != before
 
     def turned_rad(self, time_s: float) -> Floats:
         """From the origin, at a recent time, by the encoders."""

@@ -81,6 +81,13 @@ class MetrologyLoop(Loop):
     siderostat : SiderostatStage
     photodiodes : Photodiodes
     journal : Journal
+
+    Attributes
+    ----------
+    search : BeamSearch
+    hold : BeamHold
+    zeros_lost : int
+        How often the encoders were found to read elsewhere than before, when the devices were opened.
     """
 
     transitions = METROLOGY_TRANSITIONS
@@ -110,6 +117,7 @@ class MetrologyLoop(Loop):
         self._photodiodes = photodiodes
         self._photodiode_error: DeviceError | None = None
         self._asked = Acquire()
+        self.zeros_lost = 0
         self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
         self._turn = rotation(settings.siderostat.rotation_deg)
         self._pull_in_rad_s = _PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
@@ -284,6 +292,7 @@ class MetrologyLoop(Loop):
         """Begin anew: from now on the photodiodes are sampled."""
         super().begin(stack_v)
         self._photodiode_error = None
+        self.zeros_lost += self.servo.encoders_jumped
         self._sampled_s = self._ticked_s = self._clock.now_s()
         self._ready = True
 

@@ -310,6 +310,10 @@ class StellarLoop(Loop):
 
     def _evaluate_waiting(self, observation: Observation) -> None:
         """Wait where the stages are, or go on, and report which."""
+        if self.link is not None and self.link.zero_was_lost():
+            self._has_held = False
+            self.link.set_origin()
+            self.star_finder.estimator.forget()
         before, waits_for = self.waits_for, self._why_wait(observation.now_s)
         self.waits_for = waits_for
         if waits_for and not before:

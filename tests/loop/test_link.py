@@ -5,7 +5,7 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import Event, ModeChange, Overlap, Tick
-from fitctl.messages.commands import Acquire, Hold, Recover, Stop
+from fitctl.messages.commands import Acquire, Hold, Off, Recover, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -241,3 +241,27 @@ def test_before_both_stars_are_followed_there_is_no_visibility():
     overlaps = [record for record in testbed.records if isinstance(record, Overlap)]
     assert overlaps
     assert np.isnan([overlap.visibility for overlap in overlaps]).all()
+
+
+def test_what_was_turned_before_the_links_encoders_lost_their_zero_is_not_undone(held):
+    stood_rad = held.loop(LEFT).siderostat.setpoint_rad.copy()
+    for command in (Stop(loop=METROLOGY), Off(loop=METROLOGY)):
+        assert held.command(command).accepted
+        held.run(0.1)
+    amplifiers = held.simulation.devices.loops[METROLOGY].amplifiers
+    exchange = amplifiers.exchange
+
+    def from_another_zero(velocity_rad_s):
+        reading = exchange(velocity_rad_s)
+        az_rad, el_rad = reading.position_rad
+        return reading._replace(position_rad=(az_rad + 3.0, el_rad))
+
+    amplifiers.exchange = from_another_zero
+    for command in (Standby(loop=METROLOGY), Acquire(loop=METROLOGY)):
+        assert held.command(command).accepted
+        held.run(0.1)
+    held.until(limit_s=10.0, metrology=Mode.LOCKED)
+    held.run(0.1)
+    assert held.loop(LEFT).siderostat.setpoint_rad == pytest.approx(stood_rad, abs=0.3)
+    held.run(3.0)
+    held.until(limit_s=20.0, left=Mode.VERNIER)

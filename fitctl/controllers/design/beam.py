@@ -1,7 +1,7 @@
 """The metrology loop's two integrators against its siderostat's backlash, by describing function.
 
 As in the coarse loop, the play is behind the encoders. The first integrator alone swings with it only beyond a
-crossover that delay and servo set. The second makes a slow swing possible at any crossover, because it leaves the
+crossover that delay and servo set. The second makes a slow swing possible at any crossover: it leaves the
 play no phase at low frequencies; that swing of the motors hardly passes the play, so that the beam's is small.
 """
 
