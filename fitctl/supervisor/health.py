@@ -10,6 +10,7 @@ from fitctl.logging.records import CAMERA, DeviceHealth
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.stellar import StellarLoop
+from fitctl.supervisor.collector import HEXAPOD, CollectorWatch
 from fitctl.supervisor.piezo import PiezoWatch
 
 Identities = Mapping[str, DeviceIdentity]
@@ -85,6 +86,20 @@ def photodiode_health(loop: MetrologyLoop, identities: Identities, now_s: float)
         "sampled every tick" if loop.sampled else "not sampled",
         identities,
         now_s,
+    )
+
+
+def hexapod_health(collector: CollectorWatch, now_s: float) -> DeviceHealth:
+    """The hexapod under the collector."""
+    identity = collector.identity
+    return _health(
+        HEXAPOD,
+        collector.endpoint,
+        collector.is_open,
+        collector.detail,
+        {} if identity is None else {HEXAPOD: identity},
+        now_s,
+        fault=bool(collector.error),
     )
 
 

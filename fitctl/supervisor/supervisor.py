@@ -35,6 +35,7 @@ from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
     Hold,
+    MoveCollector,
     Off,
     Recover,
     Reply,
@@ -49,9 +50,11 @@ from fitctl.messages.modes import POINTING, Mode, Trigger
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.supervisor.camera_watch import CameraWatch
+from fitctl.supervisor.collector import CollectorWatch
 from fitctl.supervisor.device_jobs import DeviceJobs, Job
 from fitctl.supervisor.health import (
     camera_health,
+    hexapod_health,
     mirror_health,
     photodiode_health,
     siderostat_health,
@@ -153,6 +156,11 @@ class Supervisor:
         self._device_jobs = DeviceJobs(
             devices, self.loops, self.piezos, self._camera, executor, journal
         )
+        self.collector = (
+            CollectorWatch(rig.collector, devices.hexapod, clock, self.report_event)
+            if rig.collector is not None and devices.hexapod is not None
+            else None
+        )
         self._timing = TimingBook(clock, rig, self._timed)
 
     # ------------------------------------------------------------ from any thread
@@ -166,9 +174,11 @@ class Supervisor:
     ) -> None:
         """Leave a command for the next step; `reply` is called from there.
 
-        A stop takes the velocity from the siderostats here and now; the rest follows at the next step.
+        A stop takes the velocity from the siderostats, and stops the hexapod, here and now; the rest follows
+        at the next step.
         """
         if isinstance(command, Stop):
+            self._stop_collector()
             for name in self._named(command):
                 self.loops[name].servo.stop()
         self._commands.append(Posted(command, reply, sender, address))
@@ -195,7 +205,8 @@ class Supervisor:
     @property
     def periodic(self) -> list[Periodic]:
         """What runs at a pace of its own, beside the frames."""
-        return [work for loop in self.loops.values() for work in loop.periodic]
+        drives = [] if self.collector is None else [self.collector.drive]
+        return [work for loop in self.loops.values() for work in loop.periodic] + drives
 
     # ------------------------------------------------------------ once a frame
 
@@ -222,8 +233,9 @@ class Supervisor:
             if frame is not None or loop.mode is not Mode.OFF:
                 self._record(tick)
             self._timing.add(tick)
-            if was_safe:
-                self._make_safer(loop)
+            self._make_safer(loop, was_safe=was_safe)
+        if self.collector is not None:
+            self.collector.check()
         if frame is not None and self._overlap is not None and self.pointing:
             self._record(self._overlap.measure(frame))
         for older in self._camera.older:
@@ -249,7 +261,8 @@ class Supervisor:
         )
 
     def stop(self, reason: str) -> None:
-        """Every loop to SAFE."""
+        """Every loop to SAFE, and the collector stopped."""
+        self._stop_collector()
         for loop in self.loops.values():
             loop.fire(Trigger.STOP, reason)
         now_s = self._clock.now_s()
@@ -267,9 +280,15 @@ class Supervisor:
     def close(self) -> None:
         """Disable and let go of everything, whatever state it is in; nothing is asked of it any more."""
         self.shutdown_wanted = True
+        if self.collector is not None:
+            self.collector.close()
         self._device_jobs.close_all()
         self._obey_posted()
         self._record_left()
+
+    def _stop_collector(self) -> None:
+        if self.collector is not None:
+            self.collector.stop()
 
     def _camera_failed(self, error: DeviceError) -> None:
         for loop in self.stellar_loops.values():
@@ -320,12 +339,19 @@ class Supervisor:
                 return self.sequences.report(command.status)
             case SequenceControl():
                 return self.sequences.control(command.action)
-            case _ if type(command) in LOOP_COMMANDS:
-                why_not = obey_loop_command(self.rig, loops, command)
-                return _refusal(why_not) if why_not else Reply(accepted=True)
             case _ if type(command) in _COMMANDS:
                 return self._fire(_COMMANDS[type(command)], names, command)
-        return _refusal(f"{type(command).__name__} is not for the supervisor")
+            case MoveCollector():
+                why_not = (
+                    "the rig has no collector that moves"
+                    if self.collector is None
+                    else self.collector.obey(command.action)
+                )
+            case _ if type(command) in LOOP_COMMANDS:
+                why_not = obey_loop_command(self.rig, loops, command)
+            case _:
+                why_not = f"{type(command).__name__} is not for the supervisor"
+        return _refusal(why_not) if why_not else Reply(accepted=True)
 
     def _fire(self, trigger: Trigger, names: list[str], command: AnyCommand) -> Reply:
         if isinstance(command, Acquire):
@@ -379,8 +405,12 @@ class Supervisor:
 
     # ------------------------------------------------------------ beside the ticks
 
-    def _make_safer(self, loop: Loop) -> None:
-        """Without power after a while in SAFE, but never what is being given power just now."""
+    def _make_safer(self, loop: Loop, *, was_safe: bool) -> None:
+        """In SAFE the collector stops, and after a while the loop has no power, unless it is given some now."""
+        if loop.mode is Mode.SAFE and not was_safe:
+            self._stop_collector()
+        if not was_safe:
+            return
         lasted_s = self._clock.now_s() - loop.mode_since_s
         being_opened = self._device_jobs.opens(loop.name)
         if lasted_s > self.rig.supervisor.safe_disable_after_s and not being_opened:
@@ -420,6 +450,9 @@ class Supervisor:
                 loop.quantities.record_piezo_error(piezo.error, now_s)
                 for row in mirror_health(loop, piezo, identities, now_s):
                     self._record(row)
+        # Before the collector is to move, nobody has asked for the hexapod.
+        if self.collector is not None and (self.collector.is_open or self.collector.error):
+            self._record(hexapod_health(self.collector, now_s))
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)
