@@ -18,15 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig, load_rig
-from fitctl.daemon.devices import HEXAPODS
 from fitctl.daemon.last_records import HELLO_S
 from fitctl.daemon.locks import only_supervisor
-from fitctl.drivers.interface import DeviceError, Hexapod
 from fitctl.logging.records import LoopTiming, MetrologyTick, Tick
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Acquire, AnyCommand, Standby
+from fitctl.messages.commands import Acquire, AnyCommand, MoveCollector, Standby
 from fitctl.messages.endpoints import make_service_folder
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
@@ -49,7 +46,6 @@ from fitctl.processes import (
     start_process,
 )
 from fitctl.simulation.statistics import pair, rms
-from fitctl.stages.collector import CollectorDrive
 
 JUDGED_S = 30.0
 _HELD = {Mode.VERNIER.name, Mode.LOCKED.name}
@@ -84,20 +80,18 @@ class Instrument:
 
 
 @contextmanager
-def moving_collector(running: Instrument, seed: int) -> Iterator[None]:
-    """Move the collector, where the rig has one, as its rig file says: from when all loops hold until the end.
+def moving_collector(running: Instrument) -> Iterator[None]:
+    """Move the collector, where the rig has one, as its rig file says: from when all loops hold.
 
-    A thread of its own drives the hexapod. It stops the hexapod when a loop goes to SAFE.
+    A thread of its own sends the commands; what goes wrong shows as events of the supervisor.
     """
     collector = running.rig.collector
     if collector is None or collector.motion.kind == "still":
         yield
         return
     ending = threading.Event()
-    hexapod = HEXAPODS[collector.hexapod.driver](collector.hexapod)
-    drive = CollectorDrive(collector, hexapod, MonotonicClock(), seed)
     thread = threading.Thread(
-        target=_move_collector, args=(running, hexapod, drive, ending), name="demo-collector"
+        target=_move_collector, args=(running.sockets, ending), name="demo-collector"
     )
     thread.start()
     try:
@@ -107,38 +101,20 @@ def moving_collector(running: Instrument, seed: int) -> Iterator[None]:
         thread.join()
 
 
-def _move_collector(
-    running: Instrument, hexapod: Hexapod, drive: CollectorDrive, ending: threading.Event
-) -> None:
-    beside = Client(running.sockets)
+def _move_collector(sockets: Path, ending: threading.Event) -> None:
+    beside = Client(sockets)
     try:
-        hexapod.open()
-        hexapod.reference()
-        if not _hold(beside, ending):
-            return
-        drive.start()
-        while not ending.wait(drive.period_s):
-            drive.period()
-            if drive.fault is not None:
-                return  # as below
-            telemetry = beside.receive(0.0)
-            if telemetry and any(loop.mode == Mode.SAFE.name for loop in telemetry.loops):
-                break
-        drive.stop()
-    except (DeviceError, ConnectionError):
-        return  # the mocks ended, or fail as somebody asked for: the demo shows it
+        beside.send(MoveCollector(action="reference"))
+        while not ending.is_set():
+            telemetry = beside.receive(0.5)
+            holds = telemetry and all(loop.mode in _HELD for loop in telemetry.loops)
+            # Refused while the hexapod is still being referenced.
+            if holds and beside.send(MoveCollector(action="start")).accepted:
+                return
+    except ConnectionError:
+        return  # the supervisor has ended, which the demo reports
     finally:
         beside.close()
-        hexapod.close()
-
-
-def _hold(client: Client, ending: threading.Event) -> bool:
-    """Wait until all loops hold; False if it ends before."""
-    while not ending.is_set():
-        telemetry = client.receive(0.5)
-        if telemetry and all(loop.mode in _HELD for loop in telemetry.loops):
-            return True
-    return False
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import AnyRecord, MetrologyTick, ModeChange, Tick
-from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
+from fitctl.messages.commands import Acquire, AnyCommand, MoveCollector, Reply, Standby
 from fitctl.messages.modes import METROLOGY_MODES, Mode
 from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.model.metrology.part import MetrologyPart
@@ -89,16 +89,14 @@ class Simulation:
         self.supervisor = Supervisor(
             rig, self.devices, self.clock, InlineExecutor(), self._receive, design_for
         )
-        self.collector = self._collector_drive(seed)
-        periodic = [*self.supervisor.periodic, *([self.collector] if self.collector else [])]
-        self.camera.on_servo_period = [(work.period_s, work.period) for work in periodic]
-
-    def _collector_drive(self, seed: int) -> CollectorDrive | None:
-        if self.rig.collector is None or self.hexapod is None:
-            return None
-        self.hexapod.open()
-        self.hexapod.reference()
-        return CollectorDrive(self.rig.collector, self.hexapod, self.clock, seed)
+        if self.supervisor.collector is not None and rig.collector and self.hexapod is not None:
+            # A random course is the run's own.
+            self.supervisor.collector.drive = CollectorDrive(
+                rig.collector, self.hexapod, self.clock, seed
+            )
+        self.camera.on_servo_period = [
+            (work.period_s, work.period) for work in self.supervisor.periodic
+        ]
 
     def _loop_devices(self, name: str) -> LoopDevices:
         part, counts = (
@@ -144,9 +142,23 @@ class Simulation:
             If the supervisor refuses, which it has no reason to.
         """
         for command in (Standby(), Acquire()):
-            reply = self.command(command)
-            if not reply.accepted:
-                raise RuntimeError(reply.text)
+            self._command(command)
+
+    def move_collector(self) -> None:
+        """Reference the hexapod, and begin the collector's motion.
+
+        Raises
+        ------
+        RuntimeError
+            If the supervisor refuses.
+        """
+        self._command(MoveCollector(action="reference"))
+        self._command(MoveCollector(action="start"))
+
+    def _command(self, command: AnyCommand) -> None:
+        reply = self.command(command)
+        if not reply.accepted:
+            raise RuntimeError(reply.text)
 
 
 def simulate(rig: Rig, seed: int, duration_s: float) -> dict[str, SimulationResult]:
@@ -173,11 +185,11 @@ def simulate_rig(
     simulation.acquire()
     while simulation.clock.now_s() < duration_s:
         simulation.run(rig.camera.period_s)
-        if simulation.collector is not None and simulation.collector.fault is not None:
-            raise simulation.collector.fault
-        if simulation.collector is not None and simulation.clock.now_s() >= motion_s:
-            simulation.collector.start()
+        if simulation.clock.now_s() >= motion_s:
+            simulation.move_collector()
             motion_s = math.inf
+        if simulation.supervisor.collector and simulation.supervisor.collector.drive.fault:
+            raise simulation.supervisor.collector.drive.fault
         if time.perf_counter() - shown > 0.1:
             shown = time.perf_counter()
             on_progress(simulation.clock.now_s() / duration_s)

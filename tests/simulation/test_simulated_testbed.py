@@ -66,7 +66,7 @@ def test_a_seed_is_a_run():
         simulation = Simulation(load_rig(TESTBED, ["collector.motion.kind=random"]), seed)
         simulation.acquire()
         simulation.run(1.0)
-        simulation.collector.start()
+        simulation.move_collector()
         simulation.run(2.0)
         part = simulation.plant.metrology_loops["metrology"]
         return part.history_offset_m(0.0, 3.0)
@@ -130,15 +130,16 @@ def test_samples_have_the_noise_of_the_plant_and_the_steps_of_the_converter(simu
 def test_the_hexapod_goes_nowhere_before_it_is_referenced_or_beyond_its_travel():
     rig = load_rig(TESTBED)
     hexapod = Simulation(rig.model_copy(update={"fringes": None}), 1).hexapod
-    hexapod.move_to(Pose(y_mm=1.0), 8.0)  # the simulation has referenced it
+    with pytest.raises(DeviceRefused, match="a referenced hexapod"):
+        hexapod.move_to(Pose(y_mm=1.0), 8.0)
+    hexapod.reference()
+    hexapod.move_to(Pose(y_mm=1.0), 8.0)
     with pytest.raises(DeviceRefused, match=r"expected y_mm within -50 to 50, got 51"):
         hexapod.move_to(Pose(y_mm=51.0), 8.0)
-    hexapod._referenced = False
-    with pytest.raises(DeviceRefused, match="a referenced hexapod"):
-        hexapod.move_to(Pose(), 8.0)
 
 
 def test_a_hexapod_that_is_stopped_brakes(simulation):
+    simulation.hexapod.reference()
     simulation.hexapod.move_to(Pose(y_mm=40.0), 8.0)
     go_on(simulation, 1.0)
     simulation.hexapod.stop()

@@ -137,7 +137,7 @@ def test_the_supervisor_s_stop_stops_the_collector():
     simulation = Simulation(RIG, seed=1)
     assert simulation.command(Standby()).accepted
     simulation.run(0.2)
-    assert simulation.command(MoveCollector(action="start")).accepted
+    simulation.move_collector()
     simulation.run(2.0)
     assert simulation.hexapod.pose().pose.y_mm > 1.0
     assert simulation.command(Stop()).accepted

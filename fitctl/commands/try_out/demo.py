@@ -71,7 +71,7 @@ def demo(
         try:
             with (
                 demos.instrument(path, overrides, seed) as running,
-                demos.moving_collector(running, seed),
+                demos.moving_collector(running),
             ):
                 beside = _beside(settings, path, running)
                 if beside:
