@@ -200,7 +200,8 @@ def acquire_in_background(running: Instrument) -> threading.Thread:
 class Course:
     """What was seen of a run; grows with telemetry."""
 
-    ticks: dict[str, list[Tick | MetrologyTick]] = field(default_factory=dict)
+    ticks: dict[str, list[Tick]] = field(default_factory=dict)
+    beams: dict[str, list[MetrologyTick]] = field(default_factory=dict)
     reached_s: dict[tuple[str, str], float] = field(default_factory=dict)
     held_since_s: dict[str, float] = field(default_factory=dict)
     timing: dict[tuple[str, float], LoopTiming] = field(default_factory=dict)
@@ -209,10 +210,12 @@ class Course:
     def add(self, telemetry: Telemetry) -> None:
         """Take one telemetry message."""
         self.last = telemetry
-        ticks: list[Tick | MetrologyTick] = [*telemetry.ticks, *telemetry.metrology_ticks]
-        for tick in ticks:
+        for tick in telemetry.ticks:
             if tick.number >= 0:
                 self.ticks.setdefault(tick.loop, []).append(tick)
+        for beam in telemetry.metrology_ticks:
+            if beam.number >= 0:
+                self.beams.setdefault(beam.loop, []).append(beam)
         for change in telemetry.mode_changes:
             self.reached_s.setdefault((change.loop, change.target), change.time_s)
             if change.target in _HELD:
@@ -249,7 +252,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
 
     ``judged_s`` is zero unless the loop holds its star or its beam at the end.
     """
-    ticks = course.ticks.get(loop_name, [])
+    ticks = _all_ticks(course, loop_name)
     how_well = _star if loop_name in rig.stellar_loops else _beam
     timing = [t for (name, _), t in course.timing.items() if name == loop_name]
     last = course.last
@@ -265,7 +268,7 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
 
 
 def _star(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
-    ticks = [tick for tick in course.ticks.get(loop_name, []) if isinstance(tick, Tick)]
+    ticks = course.ticks.get(loop_name, [])
     start_s, end_s = _judged(course, loop_name)
     judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
     errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
@@ -317,9 +320,14 @@ def visibility(rig: Rig, running: Instrument, course: Course) -> float:
 
 def _judged(course: Course, loop_name: str) -> tuple[float, float]:
     """From when to when a loop is judged, in the host's time; nan where it does not hold at the end."""
-    ticks = course.ticks.get(loop_name, [])
+    ticks = _all_ticks(course, loop_name)
     end_s = _paced_s(ticks[-1]) if ticks else math.nan
     return max(course.held_since_s.get(loop_name, math.nan), end_s - JUDGED_S), end_s
+
+
+def _all_ticks(course: Course, loop_name: str) -> Sequence[Tick | MetrologyTick]:
+    """A loop's ticks, whatever its kind."""
+    return course.ticks.get(loop_name) or course.beams.get(loop_name, [])
 
 
 def _paced_s(tick: Tick | MetrologyTick) -> float:
