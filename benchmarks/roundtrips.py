@@ -74,7 +74,7 @@ class Line:
 
 def _rig(name: str, *settings: str) -> tuple[Loop, LoopMocks]:
     rig = load_rig(default_rig_path().with_name(name), settings)
-    return rig.loops["right"], rig.mock_parts()[1].loops["right"]
+    return rig.stellar_loops["right"], rig.mock_parts()[1].stellar_loops["right"]
 
 
 async def _mdt693(*settings: str) -> Endpoints:

@@ -21,14 +21,22 @@ import numpy as np
 from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.daemon.last_records import HELLO_S
 from fitctl.daemon.locks import only_supervisor
-from fitctl.logging.records import LoopTiming, Tick
+from fitctl.logging.records import LoopTiming, MetrologyTick, Tick
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
+from fitctl.messages.commands import Acquire, AnyCommand, MoveCollector, Reply, Standby
 from fitctl.messages.endpoints import make_service_folder
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import HOLDING, Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.waiting import wait_for_outcomes
-from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
+from fitctl.mocks.bench import (
+    Beam,
+    BeamQuestion,
+    Residual,
+    ResidualQuestion,
+    Visibility,
+    VisibilityQuestion,
+    ask_bench,
+)
 from fitctl.model.optics import scales
 from fitctl.processes import (
     end_process,
@@ -41,6 +49,7 @@ from fitctl.processes import (
 from fitctl.simulation.statistics import pair, rms
 
 JUDGED_S = 30.0
+_HELD = {mode.name for mode in HOLDING}
 _START_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = HELLO_S + 15.0  # longer than the supervisor waits for its recorder
 
@@ -54,6 +63,7 @@ class Instrument:
     """A running mock instrument."""
 
     client: Client
+    rig: Rig
     sockets: Path
     errors: Path
     bench_port: int
@@ -68,6 +78,44 @@ class Instrument:
                 why = last_line(self.errors / f"{name}.err") or "it left no message"
                 msg = f"{name} ended with status {process.returncode}: {why}"
                 raise DemoError(msg)
+
+
+@contextmanager
+def moving_collector(running: Instrument) -> Iterator[None]:
+    """Move the collector, where the rig has one, as its rig file says: from when all loops hold.
+
+    A thread of its own sends the commands; what goes wrong shows as events of the supervisor.
+    """
+    collector = running.rig.collector
+    if collector is None or collector.motion.kind == "still":
+        yield
+        return
+    ending = threading.Event()
+    thread = threading.Thread(
+        target=_move_collector, args=(running.sockets, ending), name="demo-collector"
+    )
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
+
+
+def _move_collector(sockets: Path, ending: threading.Event) -> None:
+    beside = Client(sockets)
+    try:
+        beside.send(MoveCollector(action="reference"))
+        while not ending.is_set():
+            telemetry = beside.receive(0.5)
+            holds = telemetry and all(loop.mode in _HELD for loop in telemetry.loops)
+            # Refused while the hexapod is still being referenced.
+            if holds and beside.send(MoveCollector(action="start")).accepted:
+                return
+    except ConnectionError:
+        return  # the supervisor has ended, which the demo reports
+    finally:
+        beside.close()
 
 
 @contextmanager
@@ -97,13 +145,14 @@ def instrument(rig_path: Path, overrides: Sequence[str], seed: int) -> Iterator[
             for key, value in endpoints.items()
             if key == "mocks.bench_port" or not key.startswith("mocks.")
         ]
-        sockets = stack.enter_context(_socket_folder(load_rig(rig_path, overrides), folder))
+        rig = load_rig(rig_path, [*overrides, *devices])
+        sockets = stack.enter_context(_socket_folder(rig, folder))
         settings = [*overrides, *devices, f"service.folder={sockets}"]
         supervisor = _start(folder, "supervisor", ["run", *rig_arguments(rig_path, settings)])
         processes.append(supervisor)
         bench_port = int(endpoints["mocks.bench_port"])
         running = Instrument(
-            Client(sockets), sockets, folder, bench_port, started_s, supervisor, mocks
+            Client(sockets), rig, sockets, folder, bench_port, started_s, supervisor, mocks
         )
         try:
             _wait_for_telemetry(running)
@@ -160,8 +209,9 @@ class Course:
     """What was seen of a run; grows with telemetry."""
 
     ticks: dict[str, list[Tick]] = field(default_factory=dict)
+    beams: dict[str, list[MetrologyTick]] = field(default_factory=dict)
     reached_s: dict[tuple[str, str], float] = field(default_factory=dict)
-    vernier_since_s: dict[str, float] = field(default_factory=dict)
+    held_since_s: dict[str, float] = field(default_factory=dict)
     timing: dict[tuple[str, float], LoopTiming] = field(default_factory=dict)
     last: Telemetry | None = None
 
@@ -171,12 +221,15 @@ class Course:
         for tick in telemetry.ticks:
             if tick.number >= 0:
                 self.ticks.setdefault(tick.loop, []).append(tick)
+        for beam in telemetry.metrology_ticks:
+            if beam.number >= 0:
+                self.beams.setdefault(beam.loop, []).append(beam)
         for change in telemetry.mode_changes:
             self.reached_s.setdefault((change.loop, change.target), change.time_s)
-            if change.target == Mode.VERNIER.name:
-                self.vernier_since_s[change.loop] = change.time_s
+            if change.target in _HELD:
+                self.held_since_s[change.loop] = change.time_s
             else:
-                self.vernier_since_s.pop(change.loop, None)
+                self.held_since_s.pop(change.loop, None)
         for timing in telemetry.timing:
             self.timing[timing.loop, timing.time_s] = timing
 
@@ -205,25 +258,13 @@ def watch(
 def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
     """How one loop did: the keys of ``fitctl demo --json``.
 
-    ``judged_s`` is zero unless the loop is in VERNIER at the end.
+    ``judged_s`` is zero unless the loop holds its star or its beam at the end.
     """
-    ticks = course.ticks.get(loop_name, [])
-    end_s = ticks[-1].mid_exposure_s if ticks else math.nan
-    start_s = max(course.vernier_since_s.get(loop_name, math.nan), end_s - JUDGED_S)
-    judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
-    errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
-    truth = _truth(rig, running, loop_name, start_s, end_s)
-    step_s = rig.mock_parts()[0].step_s
-    arcsec = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
+    ticks = _all_ticks(course, loop_name)
+    how_well = _star if loop_name in rig.stellar_loops else _beam
     timing = [t for (name, _), t in course.timing.items() if name == loop_name]
     last = course.last
-    return {
-        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
-        "vernier_s": _since(running, course, loop_name, Mode.VERNIER),
-        "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
-        "measured_rms_px": pair(rms(errors)),
-        "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
-        "judged_s": truth.samples * step_s,
+    return how_well(rig, running, course, loop_name) | {
         "frames": len(ticks),
         "frames_lost": ticks[-1].frames_lost if ticks else 0,
         "late_ticks": sum(tick.late for tick in ticks),
@@ -234,10 +275,77 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
     }
 
 
+def _star(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
+    ticks = course.ticks.get(loop_name, [])
+    start_s, end_s = _judged(course, loop_name)
+    judged = [t for t in ticks if t.mid_exposure_s >= start_s and t.star_visible]
+    errors = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
+    truth = _truth(rig, running, loop_name, start_s, end_s)
+    arcsec = scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px
+    return {
+        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
+        "vernier_s": _since(running, course, loop_name, Mode.VERNIER),
+        "rms_px": {"az": truth.az_rms_px, "el": truth.el_rms_px},
+        "measured_rms_px": pair(rms(errors)),
+        "rms_arcsec": {"az": truth.az_rms_px * arcsec, "el": truth.el_rms_px * arcsec},
+        "judged_s": truth.samples * rig.mock_parts()[0].step_s,
+    }
+
+
+def _beam(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
+    start_s, end_s = _judged(course, loop_name)
+    truth = Beam(math.nan, math.nan, 0)
+    if start_s < end_s:
+        truth = ask_bench(running.bench_port, BeamQuestion(loop_name, start_s, end_s), Beam)
+    return {
+        "acquired_s": _since(running, course, loop_name, Mode.COARSE),
+        "locked_s": _since(running, course, loop_name, Mode.LOCKED),
+        "rms_arcsec": {"az": truth.az_rms_arcsec, "el": truth.el_rms_arcsec},
+        "judged_s": truth.samples * rig.mock_parts()[0].step_s,
+    }
+
+
+def visibility(rig: Rig, running: Instrument, course: Course) -> float:
+    """The mean visibility that the true tilt of the two stars left while both were judged, or nan."""
+    if rig.fringes is None:
+        return math.nan
+    one, other = rig.fringes.loops
+    spans = [_judged(course, name) for name in (one, other)]
+    if not all(start_s < end_s for start_s, end_s in spans):
+        return math.nan
+    start_s, end_s = max(start for start, _ in spans), min(end for _, end in spans)
+    targets = [rig.stellar_loops[name].target_px for name in (one, other)]
+    question = VisibilityQuestion(
+        loops=(one, other),
+        targets_px=((targets[0].az, targets[0].el), (targets[1].az, targets[1].el)),
+        aperture_m=rig.fringes.aperture_m,
+        wavelength_m=rig.fringes.wavelength_m,
+        start_s=start_s,
+        end_s=end_s,
+    )
+    return ask_bench(running.bench_port, question, Visibility).mean
+
+
+def _judged(course: Course, loop_name: str) -> tuple[float, float]:
+    """From when to when a loop is judged, in the host's time; nan where it does not hold at the end."""
+    ticks = _all_ticks(course, loop_name)
+    end_s = _paced_s(ticks[-1]) if ticks else math.nan
+    return max(course.held_since_s.get(loop_name, math.nan), end_s - JUDGED_S), end_s
+
+
+def _all_ticks(course: Course, loop_name: str) -> Sequence[Tick | MetrologyTick]:
+    """A loop's ticks, whatever its kind."""
+    return course.ticks.get(loop_name) or course.beams.get(loop_name, [])
+
+
+def _paced_s(tick: Tick | MetrologyTick) -> float:
+    return tick.mid_exposure_s if isinstance(tick, Tick) else tick.time_s
+
+
 def _truth(rig: Rig, running: Instrument, name: str, start_s: float, end_s: float) -> Residual:
     if not start_s < end_s:
         return Residual(math.nan, math.nan, 0)
-    target = rig.loops[name].target_px
+    target = rig.stellar_loops[name].target_px
     return ask_bench(
         running.bench_port, ResidualQuestion(name, start_s, end_s, target.az, target.el), Residual
     )

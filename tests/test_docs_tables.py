@@ -3,13 +3,23 @@
 import time
 import tomllib
 
+import msgspec
+import pytest
 from documents import ROOT, between, blocks, table
 
 from fitctl.commands.shared.fault_kinds import kinds as fault_kinds
 from fitctl.config import default_rig_path, load_rig
+from fitctl.logging.records import MetrologyTick, Overlap
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.command_table import COMMANDS as COMMAND_ROWS
-from fitctl.messages.modes import COMMANDS, MEANING, TRANSITIONS, Mode, mermaid
+from fitctl.messages.modes import (
+    COMMANDS,
+    MEANING,
+    METROLOGY_TRANSITIONS,
+    TRANSITIONS,
+    Mode,
+    mermaid,
+)
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.service.metrics import InstrumentCollector
@@ -25,15 +35,17 @@ def test_the_table_of_modes_is_that_of_the_code():
     )
 
 
-def test_the_table_of_transitions_is_that_of_the_code():
+@pytest.mark.parametrize(
+    ("name", "transitions"),
+    [("transitions", TRANSITIONS), ("metrology transitions", METROLOGY_TRANSITIONS)],
+)
+def test_the_table_of_transitions_is_that_of_the_code(name, transitions):
     rows = [
         [row.source.name, cause(row.trigger), row.target.name, row.condition]
-        for row in sorted(TRANSITIONS, key=lambda row: row.source)
+        for row in sorted(transitions, key=lambda row: row.source)
     ]
 
-    assert between("operating.md", "transitions") == table(
-        ["from", "what", "leads to", "when"], rows
-    )
+    assert between("operating.md", name) == table(["from", "what", "leads to", "when"], rows)
 
 
 def cause(trigger):
@@ -44,7 +56,7 @@ def cause(trigger):
 def test_the_diagram_of_modes_is_that_of_the_code():
     diagrams = [b.text.strip() for b in blocks("mermaid") if b.document.name == "operating.md"]
 
-    assert diagrams == [mermaid()]
+    assert diagrams == [mermaid(), mermaid(METROLOGY_TRANSITIONS)]
 
 
 def test_the_console_keys_are_those_of_the_console():
@@ -113,13 +125,22 @@ def test_the_topics_of_a_log_are_those_of_the_schemas():
     assert between("logs.md", "topics") == table(["topic", "message", "what it is", "fields"], rows)
 
 
+def of_kind(kind):
+    """A record of a kind, of which nothing counts but that there is one."""
+    nothing = {"int": 0, "float": 0.0, "str": "one", "bool": False}
+    return kind(time_s=0.0, **{name: nothing[of] for name, of in kind.__annotations__.items()})
+
+
 def test_the_metrics_are_those_that_are_served():
     supervisor = FakeSupervisor()
     supervisor.interlocks = [
         TrippedInterlock(name="any", since_s=0.0, action="warn", reset="itself", reason="")
     ]
     collector = InstrumentCollector()
-    collector.accept(supervisor.message(), time.monotonic())
+    message = msgspec.structs.replace(
+        supervisor.message(), metrology_ticks=[of_kind(MetrologyTick)], overlaps=[of_kind(Overlap)]
+    )
+    collector.accept(message, time.monotonic())
     rows = [
         [
             f"`{family.samples[0].name}`",

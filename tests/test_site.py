@@ -45,6 +45,23 @@ def test_every_key_of_the_shipped_rig_has_a_row_with_what_is_allowed(reference):
     assert all(allowed.strip() for rows in found.values() for _, allowed in rows)
 
 
+def test_the_testbeds_own_keys_have_rows_with_what_is_allowed(reference):
+    page = reference.rig_keys()
+    for section, key, allowed in (
+        ("loops.left in fit-testbed.toml", "link", "text"),
+        ("loops.left.feedforward (optional) in fit-testbed.toml", "gain", "number"),
+        ("loops.metrology.hold in fit-testbed.toml", "crossover_hz", "number > 0"),
+        ("collector.motion in fit-testbed.toml", "kind", '`"still"`, `"drift"`'),
+        ("plant.loops.metrology in fit-testbed.toml", "link_round_trip_s", "number ≥ 0"),
+        ("mocks.loops.metrology.labjack in fit-testbed.toml", "pro", "true, false"),
+    ):
+        (text,) = re.findall(
+            rf"^## {re.escape(section)}$(.+?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL
+        )
+        assert re.search(rf"^\| `{key}` \| .+ \| {re.escape(allowed)}", text, re.MULTILINE), section
+    assert "## loops.left.siderostat in" not in page, "as in any stellar loop"
+
+
 def flat(table, prefix):
     """Names of the tables of a document, each with the keys that are no tables."""
     keys, below = [], []

@@ -82,7 +82,7 @@ def measure(rate_hz: float, duration_s: float, seed: int) -> Segment:
 
 def _true_residual_px(rig: Rig, running: demo.Instrument, ticks: list[Tick]) -> float:
     """RMS of the worst axis, from where the plant had the star; of the last 30 s at the most."""
-    target, end_s = rig.loops[LOOP].target_px, ticks[-1].mid_exposure_s
+    target, end_s = rig.stellar_loops[LOOP].target_px, ticks[-1].mid_exposure_s
     start_s = max(ticks[0].mid_exposure_s, end_s - demo.JUDGED_S)
     question = ResidualQuestion(LOOP, start_s, end_s, target.az, target.el)
     residual = ask_bench(running.bench_port, question, Residual)

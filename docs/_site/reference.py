@@ -58,14 +58,29 @@ def rig_keys() -> str:
     parts = [
         "# Rig keys",
         "Every key of a rig file, with its value in the shipped `fit-mock.toml` and what is allowed. A table "
-        "that is named optional may be left out; `plant` and `mocks` are for mocks and simulation alone. The "
+        "that is named optional may be left out; `plant` and `mocks` are for mocks and simulation alone. What "
+        "only `fit-testbed.toml` has, with several loops and a collector, follows at the end. The "
         "other siderostats have keys of their own: [Ensemble](../devices/ensemble.md), [analogue "
         "amplifiers](../devices/bal-analog.md).",
     ]
+    head = ["key", "shipped", "allowed", "what it is"]
+    known = set()
     for section, rows in sections(document, "", schema, schema):
-        head = ["key", "shipped", "allowed", "what it is"]
         parts += [f"## {section or 'The rig'}", table(head, rows)]
+        known |= {(_of_any_loop(section), row[0]) for row in rows}
+    testbed = default_rig_path().parent / "fit-testbed.toml"
+    document = tomlkit.parse(testbed.read_text(encoding="utf-8"))
+    del document["base"]  # of files, not of rigs
+    for section, rows in sections(document, "", schema, schema):
+        further = [row for row in rows if (_of_any_loop(section), row[0]) not in known]
+        if further:
+            parts += [f"## {section or 'Another rig'} in {testbed.name}", table(head, further)]
     return "\n\n".join(parts)
+
+
+def _of_any_loop(section: str) -> str:
+    """A section's name with its loop's left out."""
+    return re.sub(r"\bloops\.\w+", "loops.NAME", section)
 
 
 def sections(
@@ -104,6 +119,12 @@ def _resolved(schema: dict[str, Any], value: Any, root: dict[str, Any]) -> dict[
             if value is None:
                 return schema
             schema = {"$ref": schema["discriminator"]["mapping"][value["driver"]]}
+        elif "oneOf" in schema:
+            if value is None:
+                return schema
+            each = [_resolved(one, None, root) for one in schema["oneOf"]]
+            kind = value.get("kind", "stellar")
+            (schema,) = [one for one in each if one["properties"]["kind"]["const"] == kind]
         elif "$ref" in schema:
             schema = root["$defs"][schema["$ref"].removeprefix("#/$defs/")]
         elif "anyOf" in schema:

@@ -4,14 +4,19 @@ Every key is required, so that a rig file shows everything that fitctl will use.
 :class:`ConfigError` whose lines each name the file, the key and what is allowed.
 """
 
-from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, is_name
+from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, Settings, is_name
+from fitctl.config.collector import Collector, CollectorGeometry, CollectorMotion, Fringes
 from fitctl.config.devices import (
+    AIN_RANGES_V,
     HALF_WINDOW_PX,
     BalAnalogDevice,
+    C887Device,
     Camera,
     Cia402Device,
     EnsembleDevice,
     Fsm,
+    HexapodTravel,
+    LabJackT7Device,
     Mdt693Device,
     ModbusDacDevice,
     Siderostat,
@@ -25,25 +30,32 @@ from fitctl.config.loops import (
     MOST_OVERLAP,
     AirPathModel,
     ControllerName,
+    Feedforward,
     Logging,
     Loop,
     LqgLtr,
     Vernier,
 )
+from fitctl.config.metrology import BeamSensor, MetrologyLoop
 from fitctl.config.mocks import (
     BalAnalogMock,
+    C887Mock,
     DacMock,
     EnsembleMock,
     Fault,
     GigeMock,
+    LabJackMock,
     LoopMocks,
     Mdt693Mock,
+    MetrologyMocks,
+    SiderostatMocks,
 )
-from fitctl.config.plant import AirPath, HotPixel, Hysteresis, Spot
+from fitctl.config.plant import AirPath, HotPixel, Hysteresis, LinkAir, MetrologyPlant, Spot
 from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_log
-from fitctl.config.rig import Rig, default_rig_path
+from fitctl.config.rig import AnyLoop, Rig, default_rig_path
 
 __all__ = [
+    "AIN_RANGES_V",
     "ARCSEC_PER_RAD",
     "CONTROLLERS",
     "HALF_WINDOW_PX",
@@ -53,33 +65,51 @@ __all__ = [
     "Action",
     "AirPath",
     "AirPathModel",
+    "AnyLoop",
     "AxisPair",
     "BalAnalogDevice",
     "BalAnalogMock",
+    "BeamSensor",
+    "C887Device",
+    "C887Mock",
     "Camera",
     "Cia402Device",
+    "Collector",
+    "CollectorGeometry",
+    "CollectorMotion",
     "ConfigError",
     "ControllerName",
     "DacMock",
     "EnsembleDevice",
     "EnsembleMock",
     "Fault",
+    "Feedforward",
+    "Fringes",
     "Fsm",
     "GigeMock",
+    "HexapodTravel",
     "HotPixel",
     "Hysteresis",
     "Interlock",
+    "LabJackMock",
+    "LabJackT7Device",
+    "LinkAir",
     "Logging",
     "Loop",
     "LoopMocks",
     "LqgLtr",
     "Mdt693Device",
     "Mdt693Mock",
+    "MetrologyLoop",
+    "MetrologyMocks",
+    "MetrologyPlant",
     "ModbusDacDevice",
     "Range",
     "ResetBy",
     "Rig",
+    "Settings",
     "Siderostat",
+    "SiderostatMocks",
     "Spot",
     "StackHysteresis",
     "Structure",

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
 
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
 
@@ -65,3 +66,22 @@ class Range(Settings):
             msg = "low must be below high"
             raise ValueError(msg)
         return self
+
+
+def _kind_of(settings: Any) -> str:
+    """A loop's kind: as its table says, and stellar without a word."""
+    if isinstance(settings, dict):
+        return str(settings.get("kind", STELLAR))
+    return getattr(settings, "kind", STELLAR)
+
+
+STELLAR, METROLOGY = "stellar", "metrology"
+BY_KIND = Discriminator(_kind_of)
+"""Which of two classes a loop's table is of, each marked with its kind as a pydantic ``Tag``."""
+
+_Kind = TypeVar("_Kind", bound=Settings)
+
+
+def of_kind(loops: Mapping[str, Settings], kind: type[_Kind]) -> dict[str, _Kind]:
+    """The loops whose settings are of one class, in the rig file's order."""
+    return {name: loop for name, loop in loops.items() if isinstance(loop, kind)}

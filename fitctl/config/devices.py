@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from fitctl.config.base import AxisPair, Count, Finite, NonNegative, Positive, Settings, TimeoutS
 
 HALF_WINDOW_PX = 3  # of Eq. 7's 7x7 window, about its central pixel
+AIN_RANGES_V = (10.0, 1.0, 0.1, 0.01)  # of a LabJack T7's inputs, either way from zero
 
 
 class Optics(Settings):
@@ -264,6 +265,111 @@ class Mdt693Device(Settings):
     limit_v: Annotated[float, Field(gt=0, le=151)]
     poll_s: Annotated[float, Field(ge=0.2, le=60)]
     follow_tolerance_v: Positive
+
+
+class LabJackT7Device(Settings):
+    """A LabJack T7 that reads four photodiodes on its inputs AIN0 to AIN3, single-ended.
+
+    Attributes
+    ----------
+    serial_number : int, optional
+        Absent: any T7 that answers is the right one.
+    inputs : list of int
+        Which AIN reads which photodiode, in the order az+, az-, el+, el-.
+    range_v : float
+        Either way from zero; see `AIN_RANGES_V`.
+    resolution_index : int
+        A larger one gives less noise and takes longer; 0 is the device's default. From 9 on, a T7-Pro.
+    settling_us : float
+        Between choosing an input and converting it; 0 is the device's own choice.
+    """
+
+    driver: Literal["labjack_t7"]
+    host: str
+    port: Annotated[int, Field(ge=1, le=65535)]
+    serial_number: Count | None = None
+    inputs: Annotated[list[Annotated[int, Field(ge=0, le=3)]], Field(min_length=4, max_length=4)]
+    range_v: Positive
+    resolution_index: Annotated[int, Field(ge=0, le=12)]
+    settling_us: Annotated[float, Field(ge=0, le=50_000)]
+    response_timeout_s: TimeoutS
+
+    @model_validator(mode="after")
+    def _is_a_setting_of_a_t7(self) -> LabJackT7Device:
+        if self.range_v not in AIN_RANGES_V:
+            msg = f"range_v must be one of {', '.join(f'{one:g}' for one in AIN_RANGES_V)}"
+            raise ValueError(msg)
+        if len(set(self.inputs)) != len(self.inputs):
+            msg = "inputs must name each of 0 to 3 once"
+            raise ValueError(msg)
+        return self
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return f"{self.host}:{self.port}"
+
+
+Ends = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
+class HexapodTravel(Settings):
+    """How far a hexapod's axes may go: low and high end of each, zero between them."""
+
+    x_mm: Ends
+    y_mm: Ends
+    z_mm: Ends
+    u_deg: Ends
+    v_deg: Ends
+    w_deg: Ends
+
+    @property
+    def ends(self) -> list[tuple[float, float]]:
+        """Low and high end of X, Y, Z, U, V and W."""
+        each = (self.x_mm, self.y_mm, self.z_mm, self.u_deg, self.v_deg, self.w_deg)
+        return [(low, high) for low, high in each]
+
+    @model_validator(mode="after")
+    def _includes_zero(self) -> HexapodTravel:
+        for name, (low, high) in zip(type(self).model_fields, self.ends, strict=True):
+            if not low < 0 < high:
+                msg = f"{name} must be a negative end and a positive one, such as [-10.0, 10.0]"
+                raise ValueError(msg)
+        return self
+
+
+class C887Device(Settings):
+    """A PI C-887 controller with a hexapod, spoken to in GCS 2.0.
+
+    Attributes
+    ----------
+    port : str
+        A serial port, or ``socket://host:50000``.
+    baud_rate : int
+        Of a serial port.
+    stage : str
+        What the controller's answer to ``CST?`` must contain, such as ``M-850``; empty: anything.
+    travel : HexapodTravel
+        Where the rig may send the platform, within what the controller allows.
+    velocity_limit_mm_s : float
+        Of the platform.
+    response_timeout_s, reference_timeout_s : float
+        For one answer, and for a whole reference move.
+    """
+
+    driver: Literal["c887"]
+    port: str
+    baud_rate: Count
+    stage: str
+    travel: HexapodTravel
+    velocity_limit_mm_s: Positive
+    response_timeout_s: TimeoutS
+    reference_timeout_s: Annotated[float, Field(gt=0, le=600)]
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is, for people."""
+        return self.port
 
 
 class Structure(Settings):

@@ -8,7 +8,9 @@ from pydantic import Field, field_validator, model_validator
 
 from fitctl.config.base import Finite, NonNegative, Positive, Settings
 
-ModeName = Literal["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT"]
+ModeName = Literal[
+    "OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT", "LOCKED"
+]
 Action = Literal["warn", "hold", "flatten", "safe"]
 ResetBy = Literal["hand", "itself"]
 
@@ -17,7 +19,17 @@ class Quantity(NamedTuple):
     """Something that is measured: what it is, which part of the rig it is of, and what to do about it."""
 
     meaning: str
-    part: Literal["star", "camera", "mirror", "D/A", "piezo amplifier", "siderostat", "computer"]
+    part: Literal[
+        "star",
+        "camera",
+        "mirror",
+        "D/A",
+        "piezo amplifier",
+        "beam",
+        "photodiodes",
+        "siderostat",
+        "computer",
+    ]
     remedy: str
     every_frame: bool = False
 
@@ -33,6 +45,26 @@ QUANTITIES: dict[str, Quantity] = {
         "the mirror's way from its middle, |az| + |el| over range_rad",
         "mirror",
         "let the siderostat take over more: see offload_per_s and crossover_hz",
+    ),
+    "beam_light_fraction": Quantity(
+        "light of the metrology beam when last sampled, all photodiodes, over that of a beam on the centre",
+        "beam",
+        "look at the laser, its path and on_axis_v",
+    ),
+    "beam_error_arcsec": Quantity(
+        "the metrology beam's angle from the centre when last sampled, the larger of the axes",
+        "beam",
+        "see whether the collector moves faster than the loop follows",
+    ),
+    "diode_saturated": Quantity(
+        "1 while a photodiode is at saturated_v, else 0",
+        "photodiodes",
+        "dim the laser or the room, or set a larger range_v",
+    ),
+    "diode_sample_age_s": Quantity(
+        "age of the photodiodes' newest sample",
+        "photodiodes",
+        "look at the A/D converter and its link",
     ),
     "siderostat_asked_fraction": Quantity(
         "the wanted set-point's way from the encoders' zero, before it is limited, over the travel",

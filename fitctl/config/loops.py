@@ -10,6 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from fitctl.config.base import (
     AxisPair,
     Count,
+    Finite,
     Fraction,
     Name,
     NonNegative,
@@ -119,9 +120,38 @@ class OtherSpot(Settings):
     flux_dn: Positive
 
 
-class Loop(Settings):
-    """One stellar loop."""
+class Feedforward(Settings):
+    """What the siderostat is moved by when the siderostat of the loop's link turns.
 
+    Attributes
+    ----------
+    signal : str
+        What says how far the link's siderostat turned the beam: its encoders, or those and the metrology
+        residual.
+    gain : float
+        0 is off.
+    matrix : list of list of float
+        From the beam of the link's siderostat, az and el on the sky, to this loop's; ``fitctl identify
+        feedforward`` measures it.
+    """
+
+    signal: Literal["encoders", "encoders+residual"]
+    gain: Finite
+    matrix: Annotated[
+        list[Annotated[list[Finite], Field(min_length=2, max_length=2)]],
+        Field(min_length=2, max_length=2),
+    ]
+
+
+class Loop(Settings):
+    """One stellar loop.
+
+    With ``link``, its star's light comes over the link that this metrology loop holds.
+    """
+
+    kind: Literal["stellar"] = "stellar"
+    link: Name | None = None
+    feedforward: Feedforward | None = None
     target_px: AxisPair
     star_flux_dn: Positive
     flux_range: Range
@@ -134,10 +164,21 @@ class Loop(Settings):
     vernier: Vernier
     prefilter: Prefilter
 
+    @property
+    def flux_range_dn(self) -> tuple[float, float]:
+        """The least and the most light that a spot of this loop's star may have."""
+        return self.flux_range.low * self.star_flux_dn, self.flux_range.high * self.star_flux_dn
+
+    @model_validator(mode="after")
+    def _feedforward_is_over_a_link(self) -> Loop:
+        if self.feedforward is not None and self.link is None:
+            msg = "feedforward needs link, the metrology loop whose siderostat it follows"
+            raise ValueError(msg)
+        return self
+
     @model_validator(mode="after")
     def _one_spot_is_the_star(self) -> Loop:
-        low_dn = self.flux_range.low * self.star_flux_dn
-        high_dn = self.flux_range.high * self.star_flux_dn
+        low_dn, high_dn = self.flux_range_dn
         for spot in self.other_spots:
             if low_dn <= spot.flux_dn <= high_dn:
                 msg = (

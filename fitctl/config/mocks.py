@@ -4,9 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, Tag
 
-from fitctl.config.base import Count, Finite, Fraction, NonNegative, Port, Positive, Settings
+from fitctl.config.base import (
+    BY_KIND,
+    METROLOGY,
+    STELLAR,
+    Count,
+    Finite,
+    Fraction,
+    NonNegative,
+    Port,
+    Positive,
+    Settings,
+    of_kind,
+)
+from fitctl.config.devices import HexapodTravel
 
 
 class DacMock(Settings):
@@ -130,17 +143,90 @@ class BalAnalogMock(Settings):
     ]
 
 
-class LoopMocks(Settings):
-    """Where the mock devices of one loop listen, and how they are."""
+class LabJackMock(Settings):
+    """Settings of the mock LabJack T7.
+
+    Attributes
+    ----------
+    modbus_port : int
+    serial_number : int
+    firmware : float
+        What the device reports as its version.
+    pro : bool
+        It has the high-resolution converter, resolution indices 9 to 12.
+    overhead_s : float
+        From a request to its answer, beside the time that conversions take.
+    """
+
+    modbus_port: Port
+    serial_number: Count
+    firmware: Positive
+    pro: bool
+    overhead_s: NonNegative
+
+
+class C887Mock(Settings):
+    """Settings of the mock hexapod controller.
+
+    Attributes
+    ----------
+    tcp_port : int
+    baud_rate : int
+        Of the pty; a client with another one is not understood.
+    stage, serial_number, firmware : str
+        What it reports.
+    travel : HexapodTravel
+        Of each axis while all others are at zero.
+    velocity_limit_mm_s, velocity_limit_deg_s : float
+        Of the platform; ``VLS`` lowers both in proportion.
+    acceleration_mm_s2, acceleration_deg_s2 : float
+    referenced : bool
+        Whether it has been referenced before fitctl connects.
+    reference_s : float
+        How long a reference move takes.
+    reply_s : float
+        From a command to its answer.
+    """
+
+    tcp_port: Port
+    baud_rate: Count
+    stage: str
+    serial_number: str
+    firmware: str
+    travel: HexapodTravel
+    velocity_limit_mm_s: Positive
+    velocity_limit_deg_s: Positive
+    acceleration_mm_s2: Positive
+    acceleration_deg_s2: Positive
+    referenced: bool
+    reference_s: NonNegative
+    reply_s: NonNegative
+
+
+class SiderostatMocks(Settings):
+    """Where the mock amplifiers of one siderostat listen, and how they are."""
 
     slcan_port: Port
-    modbus_port: Port
-    mdt693_port: Port
     drive_command_timeout_s: Positive
     ensemble: EnsembleMock | None = None  # where siderostat.device is one
     bal_analog: BalAnalogMock | None = None  # likewise
+
+
+class LoopMocks(SiderostatMocks):
+    """Where the mock devices of one stellar loop listen, and how they are."""
+
+    kind: Literal["stellar"] = "stellar"
+    modbus_port: Port
+    mdt693_port: Port
     dac: DacMock
     mdt693: Mdt693Mock
+
+
+class MetrologyMocks(SiderostatMocks):
+    """Where the mock devices of one metrology loop listen, and how they are."""
+
+    kind: Literal["metrology"]
+    labjack: LabJackMock
 
 
 class Fault(Settings):
@@ -179,5 +265,25 @@ class Mocks(Settings):
     gvcp_port: Port
     bench_port: Port
     camera: GigeMock
-    loops: Annotated[dict[str, LoopMocks], Field(min_length=1)]
+    loops: Annotated[
+        dict[
+            str,
+            Annotated[
+                Annotated[LoopMocks, Tag(STELLAR)] | Annotated[MetrologyMocks, Tag(METROLOGY)],
+                BY_KIND,
+            ],
+        ],
+        Field(min_length=1),
+    ]
+    hexapod: C887Mock | None = None  # where the rig has a collector
     faults: list[Fault] = Field(default_factory=list)
+
+    @property
+    def stellar_loops(self) -> dict[str, LoopMocks]:
+        """Those of kind stellar."""
+        return of_kind(self.loops, LoopMocks)
+
+    @property
+    def metrology_loops(self) -> dict[str, MetrologyMocks]:
+        """Those of kind metrology."""
+        return of_kind(self.loops, MetrologyMocks)

@@ -5,11 +5,22 @@ from __future__ import annotations
 import itertools
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, Tag, model_validator
 
-from fitctl.config.base import AxisPair, Name, NonNegative, Positive, Settings
+from fitctl.config.base import (
+    BY_KIND,
+    METROLOGY,
+    STELLAR,
+    AxisPair,
+    Name,
+    NonNegative,
+    Positive,
+    Settings,
+    of_kind,
+)
 from fitctl.config.devices import Structure
 from fitctl.config.loops import AirPathModel
+from fitctl.config.metrology import BeamSensor
 
 _MOST_HISTORY_STEPS = 10_000_000  # some hundred megabytes
 
@@ -55,8 +66,9 @@ class HotPixel(Settings):
 
 
 class LoopPlant(Settings):
-    """What one loop's hardware truly is; nothing but mocks and simulation reads it."""
+    """What one stellar loop's hardware truly is; nothing but mocks and simulation reads it."""
 
+    kind: Literal["stellar"] = "stellar"
     star_offset_sky_arcsec_max: NonNegative
     backlash_sky_arcsec: NonNegative
     amplifier_bandwidth_hz: Positive
@@ -64,6 +76,39 @@ class LoopPlant(Settings):
     structure: Structure
     air_path: AirPath
     spots: Annotated[list[Spot], Field(min_length=1)]
+
+
+class LinkAir(Settings):
+    """The air of a metrology loop's path: Eq. 8's filter, scaled to an RMS angle of the beam on each axis."""
+
+    rms_sky_arcsec: NonNegative
+    b1_s2: Positive
+    b2_s: Positive
+
+
+class MetrologyPlant(Settings):
+    """What a metrology loop's hardware truly is, as :class:`LoopPlant`.
+
+    Attributes
+    ----------
+    beam_offset_sky_arcsec_max : float
+        The seed places the beam within this radius of the centre of the array at the start.
+    backlash_sky_arcsec, amplifier_bandwidth_hz : float
+        Of its siderostat.
+    air_path : LinkAir
+    link_round_trip_s : float
+        From a request for a sample to its answer; the sample is from the middle of it.
+    sensor : BeamSensor
+        What beam and photodiodes truly are.
+    """
+
+    kind: Literal["metrology"]
+    beam_offset_sky_arcsec_max: NonNegative
+    backlash_sky_arcsec: NonNegative
+    amplifier_bandwidth_hz: Positive
+    air_path: LinkAir
+    link_round_trip_s: NonNegative
+    sensor: BeamSensor
 
 
 class PlantTruth(Settings):
@@ -75,7 +120,26 @@ class PlantTruth(Settings):
     )
     history_s: Annotated[float, Field(ge=1, le=3600)]
     hot_pixels: tuple[HotPixel, ...] = Field(default=(), strict=False)
-    loops: Annotated[dict[str, LoopPlant], Field(min_length=1)]
+    loops: Annotated[
+        dict[
+            str,
+            Annotated[
+                Annotated[LoopPlant, Tag(STELLAR)] | Annotated[MetrologyPlant, Tag(METROLOGY)],
+                BY_KIND,
+            ],
+        ],
+        Field(min_length=1),
+    ]
+
+    @property
+    def stellar_loops(self) -> dict[str, LoopPlant]:
+        """Those of kind stellar."""
+        return of_kind(self.loops, LoopPlant)
+
+    @property
+    def metrology_loops(self) -> dict[str, MetrologyPlant]:
+        """Those of kind metrology."""
+        return of_kind(self.loops, MetrologyPlant)
 
     @model_validator(mode="after")
     def _history_fits_in_memory(self) -> PlantTruth:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import ValidationError
 
-from fitctl.config.base import ConfigError, Settings
+from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings
 from fitctl.config.devices import DEVICE_BY_TAG
 from fitctl.config.rig import Rig
 from fitctl.text import plain
@@ -238,7 +238,7 @@ def parse_override(text: str, example: str) -> tuple[list[str], Any]:
 def _explain(origin: str, problem: Any) -> str:
     location = _without_tags([str(part) for part in problem["loc"]])
     if problem["type"] in {"union_tag_not_found", "union_tag_invalid"}:
-        location.append("driver")
+        location.append("kind" if location[-2:-1] == ["loops"] else "driver")
     key = ".".join(location)
     if problem["type"] == "union_tag_invalid":
         context = problem["ctx"]
@@ -260,21 +260,29 @@ def _explain(origin: str, problem: Any) -> str:
 
 
 def _without_tags(location: Sequence[str]) -> list[str]:
-    """A place in the rig file without what pydantic adds: which kind of `device`, and that a key is wrong."""
-    pairs = zip(["", *location], location, strict=False)
+    """A place in the rig file without what pydantic adds: kinds of devices and loops, a wrong key's mark."""
     return [
         part
-        for before, part in pairs
-        if part != "[key]" and not (before == "device" and part in DEVICE_BY_TAG)
+        for index, part in enumerate(location)
+        if part != "[key]" and not _is_tag(location[:index], part)
     ]
+
+
+def _is_tag(before: Sequence[str], part: str) -> bool:
+    """Whether this part of a place is the kind of the device or loop that is named before it."""
+    if before[-1:] == ["device"]:
+        return part in DEVICE_BY_TAG
+    return before[-2:-1] == ["loops"] and len(before) <= 3 and part in {STELLAR, METROLOGY}
 
 
 def _allowed_keys(location: Sequence[str]) -> list[str]:
     """The keys that the rig file may have at `location`, by walking the settings' own fields."""
     annotation: Any = Rig
-    for part in location:
+    for index, part in enumerate(location):
         if part in DEVICE_BY_TAG:
             annotation = DEVICE_BY_TAG[part]
+        elif _is_tag(location[:index], part):
+            annotation = _of_kind(annotation, part)
         elif isinstance(annotation, type) and issubclass(annotation, Settings):
             annotation = annotation.model_fields[part].annotation
         elif get_origin(annotation) in {dict, list}:
@@ -282,6 +290,12 @@ def _allowed_keys(location: Sequence[str]) -> list[str]:
         annotation = _without_none(annotation)
     is_settings = isinstance(annotation, type) and issubclass(annotation, Settings)
     return sorted(annotation.model_fields) if is_settings else []
+
+
+def _of_kind(union: Any, kind: str) -> Any:
+    """The one of a union of settings that is for loops of this kind."""
+    tagged = {get_args(option)[1].tag: get_args(option)[0] for option in get_args(union)}
+    return tagged[kind]
 
 
 def _without_none(annotation: Any) -> Any:

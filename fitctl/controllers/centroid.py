@@ -70,9 +70,15 @@ class StarSensor:
     camera : Camera
     loop : Loop
         Its flux range separates the pointing spot from fringe spots and hot pixels.
+
+    Attributes
+    ----------
+    excluded_px : list of pair of float
+        Places of other loops' stars: a star whose window would hold one of these is not this loop's.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
+        self.excluded_px: list[tuple[float, float]] = []
         self._dark = Dark(camera)
         self.threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_range = loop.flux_range
@@ -145,4 +151,7 @@ class StarSensor:
     def _accepted(self, star: Star | None) -> Star | None:
         if star is None or not self.flux_low_dn <= star.flux_dn <= self.flux_high_dn:
             return None
+        for az_px, el_px in self.excluded_px:
+            if max(abs(star.az_px - az_px), abs(star.el_px - el_px)) <= HALF_WINDOW_PX:
+                return None
         return star

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.config import ARCSEC_PER_RAD, HALF_WINDOW_PX, Rig
+from fitctl.controllers.photodiodes import capture_radius_m
 from fitctl.model.compiled import compilable
-from fitctl.model.optics import scales
+from fitctl.model.optics import motor_sky_rad_per_rad, scales, sky_px_per_rad
 
 _LOOKS_BEYOND_FOUND = 2  # frames in the chord beyond those that count a star as found
 
@@ -69,7 +70,7 @@ def plan_spiral(
     Its pitch follows from the field of view, its speed from the frame rate, the motors and the blur of
     a spot: not more than one window half in one exposure.
     """
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     scale = scales(rig, loop)
     camera, acquisition = rig.camera, loop.acquisition
     # The 7x7 window must fit, and its centre may be half a pixel off the spot's.
@@ -93,6 +94,37 @@ def plan_spiral(
         * scale.motor_px_per_rad,
         radius_px=radius_sky_arcsec / scale.sky_arcsec_per_px + pitch_px / 2,
         field_radius_px=field_px,
+    )
+
+
+def plan_beam_spiral(
+    rig: Rig, loop_name: str, *, radius_sky_arcsec: float | None = None
+) -> SpiralPlan:
+    """The spiral of a metrology loop's siderostat that misses no beam within the search radius.
+
+    Its pitch follows from the radius in which the photodiodes capture the beam, which their noise gives. Beam
+    angles are in the camera's pixels, as those of other loops.
+    """
+    loop = rig.metrology_loops[loop_name]
+    acquisition, sensor = loop.acquisition, loop.sensor
+    px_per_rad = sky_px_per_rad(rig)
+    px_per_motor_rad = px_per_rad * motor_sky_rad_per_rad(loop.siderostat)
+    captured_m = capture_radius_m(sensor, acquisition.detection_sigma)
+    capture_px = captured_m / sensor.link_length_m * px_per_rad
+    reach_px = capture_px * (1 - acquisition.field_overlap)
+    pitch_px = math.sqrt(2) * reach_px
+    looks = acquisition.found_frames + _LOOKS_BEYOND_FOUND
+    if radius_sky_arcsec is None:
+        radius_sky_arcsec = acquisition.search_radius_sky_arcsec
+    return SpiralPlan(
+        pitch_px=pitch_px,
+        speed_px_s=min(
+            pitch_px / looks * rig.camera.frame_rate_hz,
+            0.5 * loop.siderostat.velocity_limit_rad_s * px_per_motor_rad,
+        ),
+        acceleration_px_s2=0.25 * loop.siderostat.acceleration_limit_rad_s2 * px_per_motor_rad,
+        radius_px=radius_sky_arcsec / ARCSEC_PER_RAD * px_per_rad + pitch_px / 2,
+        field_radius_px=capture_px,
     )
 
 

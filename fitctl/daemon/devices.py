@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from fitctl.config import Rig, Siderostat
+from fitctl.config import AnyLoop, MetrologyLoop, Rig, Siderostat
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
+from fitctl.drivers.c887.driver import C887Hexapod
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
 from fitctl.drivers.gige.aravis import AravisCamera
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.interface import Devices, LoopDevices, ServoAmplifiers
+from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.drivers.mdt693.driver import Mdt693
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 
@@ -23,18 +25,28 @@ AMPLIFIERS: dict[str, Callable[[Siderostat[Any]], ServoAmplifiers]] = {
 }
 DACS = {"modbus_dac": ModbusDac}
 PIEZOS = {"mdt693": Mdt693}
+PHOTODIODES = {"labjack_t7": LabJackT7}
+HEXAPODS = {"c887": C887Hexapod}
 
 
 def rig_devices(rig: Rig) -> Devices:
     """Drivers for every device that the rig file names; none is opened yet."""
     return Devices(
         camera=CAMERAS[rig.camera.device.driver](rig.camera),
-        loops={
-            name: LoopDevices(
-                amplifiers=AMPLIFIERS[loop.siderostat.device.driver](loop.siderostat),
-                dac=DACS[loop.fsm.dac.driver](loop.fsm.dac),
-                piezo=PIEZOS[loop.fsm.piezo.driver](loop.fsm.piezo),
-            )
-            for name, loop in rig.loops.items()
-        },
+        loops={name: _loop_devices(loop) for name, loop in rig.loops.items()},
+        hexapod=HEXAPODS[rig.collector.hexapod.driver](rig.collector.hexapod)
+        if rig.collector is not None
+        else None,
+    )
+
+
+def _loop_devices(loop: AnyLoop) -> LoopDevices:
+    amplifiers = AMPLIFIERS[loop.siderostat.device.driver](loop.siderostat)
+    if isinstance(loop, MetrologyLoop):
+        device = loop.sensor.device
+        return LoopDevices(amplifiers, photodiodes=PHOTODIODES[device.driver](device))
+    return LoopDevices(
+        amplifiers,
+        dac=DACS[loop.fsm.dac.driver](loop.fsm.dac),
+        piezo=PIEZOS[loop.fsm.piezo.driver](loop.fsm.piezo),
     )

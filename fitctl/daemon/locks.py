@@ -13,6 +13,7 @@ from fitctl.config import (
     BalAnalogDevice,
     Cia402Device,
     ConfigError,
+    Loop,
     ModbusDacDevice,
     Rig,
 )
@@ -75,13 +76,10 @@ def device_addresses(rig: Rig) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for name, loop in rig.loops.items():
-        drive, dac = loop.siderostat.device, loop.fsm.dac
-        for device, address in (
-            (f"{name} siderostat", _amplifiers(drive)),
-            (f"{name} D/A", _modbus(dac)),
-            (f"{name} piezo", _port(loop.fsm.piezo.port)),
-        ):
-            found.setdefault(address, device)
+        found.setdefault(_amplifiers(loop.siderostat.device), f"{name} siderostat")
+        if isinstance(loop, Loop):
+            found.setdefault(_modbus(loop.fsm.dac), f"{name} D/A")
+            found.setdefault(_port(loop.fsm.piezo.port), f"{name} piezo")
     return found
 
 

@@ -163,7 +163,7 @@ def run_supervisor(
             rig,
             scheduling,
             clock.now_s(),
-            {name: loop.pointing.design for name, loop in supervisor.loops.items()},
+            {name: loop.pointing.design for name, loop in supervisor.stellar_loops.items()},
         )
         record(info)
         state = ServiceState(

@@ -239,18 +239,131 @@ class PiezoAmplifier(Protocol):
         ...
 
 
+class DiodeReading(NamedTuple):
+    """One sample of the four photodiodes.
+
+    Attributes
+    ----------
+    time_s : float
+        Host's monotonic time of sampling: midway between the request and its answer's arrival, so wrong by
+        at most half the round trip. The device converts its inputs one after the other within that time.
+    volts : tuple of four floats
+        Of the photodiodes az+, az-, el+ and el-, as measured: ambient light and noise are in them.
+    """
+
+    time_s: float
+    volts: tuple[float, float, float, float]
+
+
+class Photodiodes(Protocol):
+    """The metrology sensor's four photodiodes behind their A/D converter."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect, check who answers, write the converter's settings and read them back.
+
+        Raises DeviceMismatch where they are not as the rig file says.
+        """
+        ...
+
+    def send_request(self) -> None:
+        """Ask for one sample of all four; returns as soon as the request is on its way."""
+        ...
+
+    def receive(self) -> DiodeReading | None:
+        """The newest sample that has arrived, without waiting; None: none since the last call.
+
+        Samples that arrived before it are dropped, and so is one that is older than the last returned.
+        Raises DeviceTimeout when a request has gone without an answer for the device's time limit.
+        """
+        ...
+
+    def close(self) -> None:
+        """Disconnect; safe to call twice and after a failure."""
+        ...
+
+
+class Pose(NamedTuple):
+    """Where a hexapod's platform is: its pivot point in mm, its rotations in degrees."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    z_mm: float = 0.0
+    u_deg: float = 0.0
+    v_deg: float = 0.0
+    w_deg: float = 0.0
+
+
+class HexapodReading(NamedTuple):
+    """What the hexapod's controller reports.
+
+    Attributes
+    ----------
+    time_s : float
+        Host's monotonic time at which the pose was read: midway between question and answer.
+    pose : Pose
+        Measured; of no meaning while the hexapod is not referenced.
+    moving, referenced : bool
+        Some axis moves; all axes know where they are.
+    error : str
+        Empty, or the error that the controller had latched, which reading it has cleared.
+    """
+
+    time_s: float
+    pose: Pose
+    moving: bool
+    referenced: bool
+    error: str
+
+
+class Hexapod(Protocol):
+    """The hexapod under the collector bench; slow, never inside the tick."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect and check the device and its travel against the rig file; nothing moves."""
+        ...
+
+    def reference(self) -> None:
+        """Start a reference move and wait until it has ended; the platform moves."""
+        ...
+
+    def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
+        """Start a move, or give a running one a new target; returns when the controller has accepted it.
+
+        The velocity can change only while the platform stands still. Raises DeviceRefused where the pose
+        is out of reach or the hexapod is not referenced; a move that runs goes on then.
+        """
+        ...
+
+    def pose(self) -> HexapodReading:
+        """Where it is, and how it fares."""
+        ...
+
+    def stop(self) -> None:
+        """Stop every motion at once, where it is; may be called from any thread, also during another call."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; a move that runs goes on. Safe to call twice and after a failure."""
+        ...
+
+
 @dataclass(frozen=True)
 class LoopDevices:
-    """What one loop acts through; a loop without a mirror has neither D/A nor piezo amplifier."""
+    """What one loop senses and acts through.
+
+    A loop without a mirror has neither D/A nor piezo amplifier; a metrology loop alone has photodiodes.
+    """
 
     amplifiers: ServoAmplifiers
     dac: MirrorDac | None = None
     piezo: PiezoAmplifier | None = None
+    photodiodes: Photodiodes | None = None
 
 
 @dataclass(frozen=True)
 class Devices:
-    """Everything that a rig has."""
+    """Everything that a rig has; the hexapod only where a collector moves."""
 
     camera: CameraDriver
     loops: dict[str, LoopDevices]
+    hexapod: Hexapod | None = None

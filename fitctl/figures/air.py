@@ -31,11 +31,13 @@ def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) ->
     records = on_simulation(
         rig, loop_name, "airpath", plan(rig, loop_name), seed, lambda _part: None
     )
-    tracks = track_spots(frames_of_records(records, loop_name), rig.camera, rig.loops[loop_name])
+    tracks = track_spots(
+        frames_of_records(records, loop_name), rig.camera, rig.stellar_loops[loop_name]
+    )
     found = analyse(rig, loop_name, tracks)
     truth, _ = rig.mock_parts()
-    air = truth.loops[loop_name].air_path
-    noise_px = centroid_noise_px(rig.camera, truth.loops[loop_name].spots[0].flux_dn, 7)
+    air = truth.stellar_loops[loop_name].air_path
+    noise_px = centroid_noise_px(rig.camera, truth.stellar_loops[loop_name].spots[0].flux_dn, 7)
     fit = found.joint
     rows = [
         _row("k, px", _PAPER_GAIN_PX, fit.gain_px, air.gain_px),
@@ -72,17 +74,18 @@ def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) ->
 def coverage(rig: Rig, loop_name: str, seed: int, minutes: int) -> float:
     """Part of the 95 % intervals that hold the plant's parameters, both axes fitted together."""
     truth, _ = rig.mock_parts()
-    air, period_s = truth.loops[loop_name].air_path, rig.camera.period_s
-    noise_px = centroid_noise_px(rig.camera, rig.loops[loop_name].star_flux_dn, 7)
+    air, period_s = truth.stellar_loops[loop_name].air_path, rig.camera.period_s
+    noise_px = centroid_noise_px(rig.camera, rig.stellar_loops[loop_name].star_flux_dn, 7)
     held = 0
     for number in range(1, minutes + 1):
-        plant = Plant(rig, loop_name, [seed + number], history_s=RECOMMENDED_S + 1.0)
+        whole = Plant(rig, [seed + number], history_s=RECOMMENDED_S + 1.0)
+        plant = whole.stellar_loops[loop_name]
         plant.advance(RECOMMENDED_S)
         frame_s = np.arange(1, round(RECOMMENDED_S / period_s)) * period_s
         star_px = np.array([plant.spots_px(time_s)[0, 0] for time_s in frame_s])
         star_px += noise_px * np.random.default_rng(seed + number).standard_normal(star_px.shape)
         fit = fit_air_path(
-            star_px - star_px.mean(axis=0), period_s, rig.loops[loop_name].vernier.air_path
+            star_px - star_px.mean(axis=0), period_s, rig.stellar_loops[loop_name].vernier.air_path
         )
         held += fit.gain_px.covers(air.gain_px) + fit.b1_s2.covers(air.b1_s2)
         held += fit.b2_s.covers(air.b2_s)

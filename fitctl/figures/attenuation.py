@@ -83,7 +83,7 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
     ticks : mapping of str to array
         All ticks of a log in their order: the stacks remember.
     """
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     scale = scales(rig, loop)
     angles_rad = _mirror_angles_rad(loop.fsm, ticks)
     # A command acts from its tick's end until the next.

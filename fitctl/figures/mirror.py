@@ -27,7 +27,7 @@ _IN_WORDS = {"el": "elevation (tip)", "az": "azimuth (tilt)"}
 def hysteresis_gain(rig: Rig, loop_name: str, axis: int) -> complex:
     """The plant's stacks under a sine of the bench's amplitude: fundamental of mirror over command."""
     truth, _ = rig.mock_parts()
-    fsm, settings = rig.loops[loop_name].fsm, truth.loops[loop_name].hysteresis
+    fsm, settings = rig.stellar_loops[loop_name].fsm, truth.stellar_loops[loop_name].hysteresis
     half_v, gains = half_widths_v(settings), stack_gains(settings, fsm)
     samples = 4000
     phase = 2 * np.pi * np.arange(2 * samples) / samples
@@ -45,7 +45,7 @@ def hysteresis_gain(rig: Rig, loop_name: str, axis: int) -> complex:
 def plant_response(rig: Rig, loop_name: str, frequency_hz: Floats) -> Complexes:
     """The plant's own response at the bench's amplitude, shape (n, 2, 2); columns are driven axes."""
     truth, _ = rig.mock_parts()
-    modes = structure.frequency_response(truth.loops[loop_name].structure, frequency_hz)
+    modes = structure.frequency_response(truth.stellar_loops[loop_name].structure, frequency_hz)
     return np.asarray(modes * [hysteresis_gain(rig, loop_name, axis) for axis in range(2)])
 
 
@@ -65,7 +65,7 @@ def _plate(
     excited = np.abs(found.response[:, axis, axis])
     distance_db = 20 * np.log10(excited / np.abs(truth[:, axis, axis]))[below]
     plant, _ = rig.mock_parts()
-    true_hz = plant.loops[loop_name].structure.mode_hz
+    true_hz = plant.stellar_loops[loop_name].structure.mode_hz
     rows = [
         Comparison(
             f"largest distance from the plant to {FLAT_HZ:g} Hz, dB",

@@ -103,7 +103,7 @@ class Held:
         RuntimeError
             If the supervisor refuses.
         """
-        settings = self.rig.loops[self._loop_name].target_px
+        settings = self.rig.stellar_loops[self._loop_name].target_px
         reply = self.simulation.command(
             SetTarget(loop=self._loop_name, az_px=settings.az + px[0], el_px=settings.el + px[1])
         )
@@ -112,7 +112,7 @@ class Held:
 
     def motion(self) -> Motion:
         """All since the motion's clock started."""
-        loop = self.rig.loops[self._loop_name]
+        loop = self.rig.stellar_loops[self._loop_name]
         scale = scales(self.rig, loop)
         frames = [
             tick

@@ -139,7 +139,7 @@ def logged_spectra(rig: Rig, loop_name: str, seed: int, duration_s: float) -> Sp
 
 def step_and_jog(rig: Rig, loop_name: str, seed: int) -> Steps:
     """A star that jumps by 20 px, a target that does, and jogs of 1 px."""
-    settings = rig.loops[loop_name]
+    settings = rig.stellar_loops[loop_name]
     far = far_step(rig, loop_name)
     star, target = (
         step_response(

@@ -45,7 +45,7 @@ def write_performance(
         rows=rows,
         runs=runs,
         bound_px=bound_px,
-        bound_sky_arcsec=bound_px * scales(rig, rig.loops[loop_name]).sky_arcsec_per_px,
+        bound_sky_arcsec=bound_px * scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px,
         flight_bound_px=flight_bound_px,
         at_hz=AT_HZ,
         rough_hysteresis=ROUGH_HYSTERESIS,

@@ -29,7 +29,7 @@ def with_controller(rig: Rig, loop_name: str, controller: str) -> Rig:
 def with_rougher_stages(rig: Rig, loop_name: str, hysteresis: float, backlash_times: float) -> Rig:
     """A plant with another loop width of its stacks, and more backlash; what is believed of it stays."""
     truth, _ = rig.mock_parts()
-    backlash_arcsec = truth.loops[loop_name].backlash_sky_arcsec * backlash_times
+    backlash_arcsec = truth.stellar_loops[loop_name].backlash_sky_arcsec * backlash_times
     stages = {
         "hysteresis": {"loop_width_fraction": hysteresis},
         "backlash_sky_arcsec": backlash_arcsec,

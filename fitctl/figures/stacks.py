@@ -44,7 +44,7 @@ def interferometer_m(displacement_m: Floats) -> Floats:
 def figure_3(rig: Rig, loop_name: str, _seed: int, folder: Path) -> list[Plate]:
     """Read one ramp of a stack, make the model, and meet an underdamped step with both."""
     truth, _ = rig.mock_parts()
-    fsm, settings = rig.loops[loop_name].fsm, truth.loops[loop_name].hysteresis
+    fsm, settings = rig.stellar_loops[loop_name].fsm, truth.stellar_loops[loop_name].hysteresis
     full_scale_v = fsm.dac.full_scale_v
     half_v, gains = half_widths_v(settings), stack_gains(settings, fsm)
 

@@ -88,7 +88,7 @@ def far_step(rig: Rig, loop_name: str) -> tuple[float, float]:
     IdentifyError
         If neither side has.
     """
-    target = rig.loops[loop_name].target_px
+    target = rig.stellar_loops[loop_name].target_px
     for px in (-FAR_STEP_PX, FAR_STEP_PX):
         if rig.camera.window_fits(target.az + px, target.el):
             return px, 0.0
@@ -157,7 +157,7 @@ def steady_rms_px(motion: Motion, star_px: Floats) -> Floats:
 
 def figure_11(rig: Rig, loop_name: str, seed: int, folder: Path, after_s: float) -> list[Plate]:
     """A step of the target in elevation, as the paper's; and of the star, within and beyond the mirror."""
-    within_px = rig.loops[loop_name].requirement_px
+    within_px = rig.stellar_loops[loop_name].requirement_px
     near_px, far_px = (0.0, STEP_PX), far_step(rig, loop_name)
     near = target_step(rig, loop_name, seed, near_px, after_s)
     far = star_step(rig, loop_name, seed, far_px, after_s)
@@ -190,7 +190,7 @@ def figure_11(rig: Rig, loop_name: str, seed: int, folder: Path, after_s: float)
         rows += _step_rows(other, step_response(motion, axis, STEP_AT_S, within_px), within_px)
     _draw_step(near, EL, "el", folder, "fig11-step")
     _draw_step(far, AZ, "az", folder, "fig11-far-step")
-    controller = rig.loops[loop_name].vernier.controller
+    controller = rig.stellar_loops[loop_name].vernier.controller
     caption = (
         f"The target moves by {STEP_PX:g} px in elevation at t = {STEP_AT_S:g} s, through the prefilter; "
         f"controller {controller}. The mirror reacts first, the siderostat takes over, the mirror's command "
@@ -218,7 +218,7 @@ def _step_rows(name: str, found: Response, within_px: float) -> list[Comparison]
 
 def figure_12(rig: Rig, loop_name: str, seed: int, folder: Path) -> list[Plate]:
     """Jogs of the target by one pixel."""
-    settings = rig.loops[loop_name]
+    settings = rig.stellar_loops[loop_name]
     motion = jogs(rig, loop_name, seed)
     measured_px = steady_rms_px(motion, motion.measured_px)
     true_px = steady_rms_px(motion, motion.star_px)

@@ -159,7 +159,7 @@ def analyse(rig: Rig, loop_name: str, tracks: Tracks) -> AirPathResult:
             f"{RECOMMENDED_S:.0f} s, with the stages at rest; take a longer record"
         )
         raise IdentifyError(msg)
-    start = rig.loops[loop_name].vernier.air_path
+    start = rig.stellar_loops[loop_name].vernier.air_path
     period_s, px = tracks.period_s, tracks.px
     fits = []
     for spot in range(px.shape[1]):

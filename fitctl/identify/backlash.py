@@ -159,7 +159,7 @@ def analyse(rig: Rig, record: ExperimentRecord) -> BacklashResult:
     IdentifyError
         If an axis did not move enough, or the star was lost.
     """
-    scale = scales(rig, rig.loops[record.loop])
+    scale = scales(rig, rig.stellar_loops[record.loop])
     axes = {name: _analyse_axis(rig, record, axis) for axis, name in enumerate(AXES)}
     widths_px = np.array([axis.width_px for axis in axes.values()])
     weights = np.array([axis.width_sd_px for axis in axes.values()]) ** -2
@@ -175,7 +175,7 @@ def analyse(rig: Rig, record: ExperimentRecord) -> BacklashResult:
 
 
 def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash:
-    scale = scales(rig, rig.loops[record.loop])
+    scale = scales(rig, rig.stellar_loops[record.loop])
     nominal = scale.motor_px_per_rad
     star_px = record.star_px.dot(scale.siderostat_turn)[:, axis]  # along the siderostat's axis
     motor_px = record.motor_rad[:, axis] * nominal
@@ -211,7 +211,7 @@ def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash
     ratio, width_px, late_s = found.x
     model_px = modelled_px(found.x)
     # Where the motor turned back is known to a count, at either end; more frames do not help.
-    counts_per_rev = rig.loops[record.loop].siderostat.encoder_counts_per_rev
+    counts_per_rev = rig.stellar_loops[record.loop].siderostat.encoder_counts_per_rev
     counted_px = nominal * 2 * np.pi / counts_per_rev / np.sqrt(6)
     return AxisBacklash(
         # The play stands in motor angle; what the star shows is its width by the true plate scale.

@@ -116,7 +116,7 @@ class DelayResult:
 
 def plan(rig: Rig, loop_name: str) -> list[Drive]:
     """One axis after the other, from slow to quick swings, within the mirror's diamond."""
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     swing_px = SWING_OF_RANGE * loop.fsm.range_rad * scales(rig, loop).mirror_px_per_rad
     return [
         Drive(

@@ -18,7 +18,7 @@ def require_room(rig: Rig, loop_name: str, what: str, az_px: float, el_px: float
     ------
     IdentifyError
     """
-    target = rig.loops[loop_name].target_px
+    target = rig.stellar_loops[loop_name].target_px
     for sign in (-1, 1):
         if not rig.camera.window_fits(target.az + sign * az_px, target.el + sign * el_px):
             msg = (

@@ -56,12 +56,14 @@ def _of_stages(
 
 
 def _air_path(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> airpath.AirPathResult:
-    tracks = track_spots(frames, rig.camera, rig.loops[loop_name])
+    tracks = track_spots(frames, rig.camera, rig.stellar_loops[loop_name])
     return airpath.analyse(rig, loop_name, tracks)
 
 
 def _response_from_file(rig: Rig, loop_name: str, path: Path) -> Finding:
-    return response.analyse([response.read_bench(path, rig.loops[loop_name].fsm)], loop_name)
+    return response.analyse(
+        [response.read_bench(path, rig.stellar_loops[loop_name].fsm)], loop_name
+    )
 
 
 def response_on_mock_bench(

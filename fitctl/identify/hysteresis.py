@@ -47,7 +47,7 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
     IdentifyError
         If the star would leave the frame.
     """
-    fsm = rig.loops[loop_name].fsm
+    fsm = rig.stellar_loops[loop_name].fsm
     amplitude_v = min(fsm.bias_v, fsm.dac.full_scale_v - fsm.bias_v)
     _check_star_stays(rig, loop_name, amplitude_v)
     sweep = partial(Drive, shape="triangle", amplitude=amplitude_v)
@@ -70,7 +70,7 @@ def plan(rig: Rig, loop_name: str) -> list[Drive]:
 
 
 def _check_star_stays(rig: Rig, loop_name: str, amplitude_v: float) -> None:
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     per_stack_rad = loop.fsm.stack_scale_m_per_v / (2 * loop.fsm.stack_radius_m)
     swing_rad = 1.2 * amplitude_v * per_stack_rad
     scale = scales(rig, loop)
@@ -222,7 +222,7 @@ class _Evidence:
     def __init__(
         self, rig: Rig, record: ExperimentRecord, late_s: float = 0.0, unsure_s: float = 0.0
     ) -> None:
-        loop = rig.loops[record.loop]
+        loop = rig.stellar_loops[record.loop]
         exposed_s = record.tick["mid_exposure_s"] + late_s
         frames = _usable_frames(record, exposed_s, unsure_s, loop.fsm.dac.full_scale_v)
         self.record = record

@@ -32,7 +32,7 @@ def whitener(rig: Rig, loop_name: str, mid_exposure_s: Floats) -> Callable[[Floa
     callable
         From columns, shape (frames, m) in px, to as many whitened ones.
     """
-    settings = rig.loops[loop_name]
+    settings = rig.stellar_loops[loop_name]
     period_s = rig.camera.period_s
     noise_px = centroid_noise_px(rig.camera, settings.star_flux_dn, 7)
     air = settings.vernier.air_path

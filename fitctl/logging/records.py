@@ -13,7 +13,7 @@ import msgspec
 
 RECORD_VERSION = 1
 Severity = Literal["info", "warning", "error"]
-FailingDevice = Literal["camera", "siderostat", "D/A", "injector", "piezo"]
+FailingDevice = Literal["camera", "siderostat", "D/A", "injector", "piezo", "photodiodes"]
 CAMERA: Final = "camera"
 
 
@@ -88,6 +88,68 @@ class Tick(Record, frozen=True, kw_only=True, gc=False):
     decide_s: float = math.nan
     dac_sent_s: float = math.nan
     frames_skipped: int = 0  # since the camera was opened: a newer frame was there already
+
+
+class MetrologyTick(Record, frozen=True, kw_only=True, gc=False):
+    """One tick of one metrology loop.
+
+    ``number`` is the frame's that set its pace, as in :class:`Tick`. Beam angles are those of the beam from the
+    centre of its photodiodes; they are NaN at a tick without a new sample. Fields of the same name mean the
+    same as in :class:`Tick`.
+    """
+
+    loop: str
+    number: int
+    mode: str
+    mode_number: int
+    frame_age_s: float
+    compute_s: float
+    late: bool
+    frames_lost: int
+    sampled_s: float
+    beam_state: str
+    beam_az_m: float
+    beam_el_m: float
+    beam_az_arcsec: float
+    beam_el_arcsec: float
+    noise_az_arcsec: float
+    noise_el_arcsec: float
+    diode_az_plus_v: float
+    diode_az_minus_v: float
+    diode_el_plus_v: float
+    diode_el_minus_v: float
+    rate_az_arcsec_s: float
+    rate_el_arcsec_s: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+    siderostat_setpoint_az_rad: float
+    siderostat_setpoint_el_rad: float
+    siderostat_az_sky_arcsec: float
+    siderostat_el_sky_arcsec: float
+    search_progress: float
+    amplifier_round_trip_s: float
+    following_error_rad: float
+    encoder_read_s: float
+    encoder_az_rad: float
+    encoder_el_rad: float
+    sense_s: float
+    decide_s: float
+
+
+class Overlap(Record, frozen=True, kw_only=True, gc=False):
+    """The tilt between two loops' stars on one frame, and the fringe visibility that it leaves.
+
+    ``time_s`` is mid-exposure. The tilt is that of ``loop`` less that of ``other_loop``, each star from its
+    loop's ``target_px`` in the rig file, as an angle on the sky along the camera's axes. Where a star is not
+    held, tilt and visibility are NaN.
+    """
+
+    loop: str
+    other_loop: str
+    number: int
+    tilt_az_arcsec: float
+    tilt_el_arcsec: float
+    visibility: float
 
 
 class FrameRecord(Record, frozen=True, kw_only=True, gc=False):
@@ -278,6 +340,8 @@ class SequenceAttempt(Record, frozen=True, kw_only=True):
 AnyRecord = (
     RunInfo
     | Tick
+    | MetrologyTick
+    | Overlap
     | FrameRecord
     | ModeChange
     | DevicesOpened

@@ -34,7 +34,9 @@ from fitctl.logging.records import (
     InjectionRecord,
     LoopTiming,
     Losses,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     PiezoReading,
     QuantityReading,
     RecorderStatus,
@@ -45,6 +47,8 @@ from fitctl.logging.records import (
 
 TOPICS: dict[type[AnyRecord], str] = {
     Tick: "/fit/{loop}/tick",
+    MetrologyTick: "/fit/{loop}/metrology",
+    Overlap: "/fit/{loop}/overlap",
     FrameRecord: "/fit/camera/frame",
     ModeChange: "/fit/{loop}/mode",
     ControllerChange: "/fit/{loop}/controller",

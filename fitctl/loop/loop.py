@@ -2,23 +2,32 @@
 
 A loop's tick is :meth:`Loop.sense`, :meth:`Loop.decide` and :meth:`Loop.send`, for each loop of the rig in
 turn, and when all have sent, :meth:`Loop.confirm` and :meth:`Loop.tick_record`. So no loop waits for another's
-device or record, and a loop may use what those before it in the rig file have observed in the same step.
+device or record. Metrology loops come first: a loop that depends on one uses what it decided in the same step.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Loop as LoopSettings
-from fitctl.config import Rig
+from fitctl.config import QUANTITIES, AnyLoop, Rig
 from fitctl.drivers.interface import Frame
-from fitctl.logging.records import FailingDevice, ModeChange, Severity, Tick
+from fitctl.logging.records import FailingDevice, MetrologyTick, ModeChange, Severity, Tick
 from fitctl.loop.interlocks import Interlocks
-from fitctl.loop.quantities import Quantities, places
-from fitctl.messages.modes import Mode, Trigger, transition
+from fitctl.loop.quantities import Quantities
+from fitctl.messages.commands import Acquire, AnyCommand
+from fitctl.messages.modes import (
+    TRANSITIONS,
+    Mode,
+    Transition,
+    Trigger,
+    transition,
+    usable_commands,
+)
 from fitctl.messages.telemetry import LoopState
 from fitctl.stages.journal import Journal
 from fitctl.stages.periodic import Periodic
@@ -28,6 +37,7 @@ Floats = NDArray[np.float64]
 _SEVERITY: dict[Trigger, Severity] = {
     Trigger.FAULT: "error",
     Trigger.STAR_LOST: "warning",
+    Trigger.BEAM_LOST: "warning",
     Trigger.SEARCH_EXHAUSTED: "warning",
 }
 
@@ -41,9 +51,14 @@ class Loop(ABC):
     rig : Rig
     siderostat : SiderostatStage
     journal : Journal
+    quantities : Quantities
+    places : mapping of str to str
+        Where each part of the rig is that this kind of loop measures; interlocks about others are left out.
 
     Attributes
     ----------
+    transitions : tuple of Transition
+        The table of modes of this kind of loop.
     mode : Mode
     mode_since_s : float
     last_change : ModeChange or None
@@ -52,16 +67,33 @@ class Loop(ABC):
     interlocks : Interlocks
     """
 
-    def __init__(self, name: str, rig: Rig, siderostat: SiderostatStage, journal: Journal) -> None:
+    transitions: ClassVar[tuple[Transition, ...]] = TRANSITIONS
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        siderostat: SiderostatStage,
+        journal: Journal,
+        quantities: Quantities,
+        places: Mapping[str, str],
+    ) -> None:
         self.name = name
-        self.settings: LoopSettings = rig.loops[name]
+        self.settings: AnyLoop = rig.loops[name]
         self.siderostat = siderostat
         self.servo = siderostat.servo
         self.mode = Mode.OFF
         self.mode_since_s = journal.clock.now_s()
         self.last_change: ModeChange | None = None
-        self.quantities = Quantities(rig, name)
-        self.interlocks = Interlocks(rig.interlocks, places(rig, name))
+        self.quantities = quantities
+        self.interlocks = Interlocks(
+            {
+                row_name: row
+                for row_name, row in rig.interlocks.items()
+                if QUANTITIES[row.quantity].part in places
+            },
+            places,
+        )
         self._journal = journal
         self._clock = journal.clock
         self._last_failures: dict[str, str] = {}  # by what failed
@@ -88,7 +120,7 @@ class Loop(ABC):
         """Wait for the confirmation of what was sent."""
 
     @abstractmethod
-    def tick_record(self) -> Tick:
+    def tick_record(self) -> Tick | MetrologyTick:
         """The record of the tick that :meth:`confirm` ended."""
 
     # ------------------------------------------------------------ for the supervisor
@@ -97,6 +129,14 @@ class Loop(ABC):
     def periodic(self) -> list[Periodic]:
         """What runs at a pace of its own, beside the frames."""
         return [self.servo]
+
+    def join(self, loops: Mapping[str, Loop]) -> None:  # noqa: B027 - most loops need no other
+        """Learn of the rig's other loops; called once, before the first tick."""
+
+    @property
+    def usable_commands(self) -> list[Trigger]:
+        """The commands that mean something in the mode."""
+        return usable_commands(self.mode, self.transitions)
 
     @abstractmethod
     def state(self, now_s: float) -> LoopState:
@@ -158,9 +198,18 @@ class Loop(ABC):
 
     # ------------------------------------------------------------ modes
 
+    def obey(self, trigger: Trigger, command: AnyCommand) -> None:
+        """Fire what a command is for; a search is made as it asks."""
+        if isinstance(command, Acquire):
+            self.configure_search(command)
+        self.fire(trigger, "operator")
+
+    def configure_search(self, asked: Acquire) -> None:  # noqa: B027 - a loop may search for nothing
+        """How the next search, and no other, is to be made, as a command asks that was not refused."""
+
     def fire(self, trigger: Trigger, reason: str) -> bool:
         """Change the mode as the table has it; False where the trigger is not in this mode's rows."""
-        row = transition(self.mode, trigger)
+        row = transition(self.mode, trigger, self.transitions)
         if row is None:
             return False
         now_s, motor_rad = self._clock.now_s(), self.servo.position_rad

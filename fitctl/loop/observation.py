@@ -30,6 +30,8 @@ class Observation(NamedTuple):
         How the servo is now.
     now_s : float
         When that is: the tick's beginning.
+    link_rad : array, shape (2,), or None
+        Motor angles that turn the star as far as the siderostat of the loop's link did; None without one.
     """
 
     frame: Frame | None
@@ -40,3 +42,9 @@ class Observation(NamedTuple):
     motor_rad: NDArray[np.float64]
     servo: ServoState
     now_s: float
+    link_rad: NDArray[np.float64] | None = None
+
+    @property
+    def beam_rad(self) -> NDArray[np.float64]:
+        """Motor angles that turn the star as far as all siderostats did, shape (2,)."""
+        return self.motor_rad if self.link_rad is None else self.motor_rad + self.link_rad

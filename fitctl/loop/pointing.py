@@ -37,7 +37,7 @@ class Pointing:
     """
 
     def __init__(self, rig: Rig, loop_name: str, target_px: Floats, design: Design) -> None:
-        loop, period_s = rig.loops[loop_name], rig.camera.period_s
+        loop, period_s = rig.stellar_loops[loop_name], rig.camera.period_s
         self._scale = scales(rig, loop)
         self._range_rad = loop.fsm.range_rad
         self.prefilter = Prefilter(loop.prefilter.time_constant_s, period_s, target_px)
@@ -89,5 +89,5 @@ class Pointing:
             return None
         error_px = observation.star.position_px - command_px
         return self.pair.step(
-            Measurement(error_px, command_px, observation.mirror_rad, observation.motor_rad)
+            Measurement(error_px, command_px, observation.mirror_rad, observation.beam_rad)
         )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from fitctl.config import Rig
+from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.controllers.photodiodes import Beam, BeamState
 from fitctl.drivers.interface import ServoReading
 from fitctl.logging.records import LoopTiming, PiezoReading
 from fitctl.loop.interlocks import Reading
@@ -15,28 +16,20 @@ from fitctl.stages.siderostat import SiderostatStage
 
 
 class Quantities:
-    """One loop's; the names are those of :data:`fitctl.config.QUANTITIES`.
+    """What every kind of loop measures; the names are those of :data:`fitctl.config.QUANTITIES`.
 
     Attributes
     ----------
     readings : dict
         The newest of each quantity: value, time in s, note.
-    star_flux_dn : float
-        Of the star that is searched for or held.
     """
 
     def __init__(self, rig: Rig, loop_name: str) -> None:
-        loop = rig.loops[loop_name]
+        siderostat = rig.loops[loop_name].siderostat
         self.readings: dict[str, Reading] = {}
         self._period_s = rig.camera.period_s
-        self._delay_s = rig.camera.frame_delay_s
-        self.star_flux_dn = loop.star_flux_dn
-        self._range_rad = loop.fsm.range_rad
-        self._servo_period_s = 1.0 / loop.siderostat.servo.rate_hz
-        self._velocity_limit_rad_s = loop.siderostat.velocity_limit_rad_s
-        self._limit_v = loop.fsm.piezo.limit_v
-        self._exposed_s: float | None = None
-        self._skipped = 0
+        self._servo_period_s = 1.0 / siderostat.servo.rate_hz
+        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         self._read: ServoReading | None = None
 
     def put(self, name: str, value: float, time_s: float) -> None:
@@ -45,43 +38,12 @@ class Quantities:
 
     def begin(self) -> None:
         """Devices were opened anew: what was measured before says nothing about what comes now."""
-        self._exposed_s = self._read = None
+        self._read = None
 
-    def record_observation(self, observation: Observation) -> None:
-        """What a frame says about camera and star."""
-        frame, star, now_s = observation.frame, observation.star, observation.now_s
-        if frame is None:
-            return
-        readings, exposed_s = self.readings, frame.mid_exposure_s
-        late_s = frame.received_s - exposed_s - self._delay_s
-        readings["frame_late_s"] = (late_s, now_s, "")
-        if self._exposed_s is not None:
-            # Frames that were skipped did come.
-            frames = 1 + observation.frames_skipped - self._skipped
-            periods = (exposed_s - self._exposed_s) / self._period_s / frames
-            readings["frame_interval_periods"] = (periods, now_s, "")
-        self._exposed_s, self._skipped = exposed_s, observation.frames_skipped
-        if star is not None:
-            readings["star_flux_fraction"] = (star.flux_dn / self.star_flux_dn, now_s, "")
-
-    def record_stages(
-        self, observation: Observation, siderostat: SiderostatStage, mirror: MirrorStage
-    ) -> None:
-        """Where mirror and siderostat are, and how their devices are."""
-        self._record_mirror(mirror, observation.now_s)
-        self._record_siderostat(observation.servo, siderostat, observation.now_s)
-
-    def _record_mirror(self, mirror: MirrorStage, now_s: float) -> None:
-        readings = self.readings
-        az_rad, el_rad = mirror.command_rad.tolist()
-        fraction = (abs(az_rad) + abs(el_rad)) / self._range_rad
-        readings["fsm_range_fraction"] = (fraction, now_s, "")
-        readings["dac_unwritten_s"] = (now_s - mirror.written_s, now_s, "")
-        readings["dac_round_trip_s"] = (mirror.round_trip_s, now_s, "")
-
-    def _record_siderostat(
+    def record_siderostat(
         self, servo: ServoState, siderostat: SiderostatStage, now_s: float
     ) -> None:
+        """Where the siderostat is, and how its amplifiers are."""
         readings = self.readings
         readings["siderostat_asked_fraction"] = (siderostat.wanted_fraction, now_s, "")
         fault = servo.fault
@@ -114,6 +76,69 @@ class Quantities:
         """How long the tick took; judged at the next."""
         self.readings["tick_period_fraction"] = (compute_s / self._period_s, now_s, "")
 
+    def record_timing(self, record: LoopTiming) -> None:
+        """Whether the servo kept its pace, where it has a pace of its own."""
+        periods = record.servo_periods + record.servo_skipped
+        if periods:
+            self.put("servo_skipped_fraction", record.servo_skipped / periods, record.time_s)
+
+
+class StellarQuantities(Quantities):
+    """One stellar loop's.
+
+    Attributes
+    ----------
+    star_flux_dn : float
+        Of the star that is searched for or held.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        super().__init__(rig, loop_name)
+        loop = rig.stellar_loops[loop_name]
+        self._delay_s = rig.camera.frame_delay_s
+        self.star_flux_dn = loop.star_flux_dn
+        self._range_rad = loop.fsm.range_rad
+        self._limit_v = loop.fsm.piezo.limit_v
+        self._exposed_s: float | None = None
+        self._skipped = 0
+
+    def begin(self) -> None:
+        """Devices were opened anew, and the camera with them, perhaps."""
+        super().begin()
+        self._exposed_s = None
+
+    def record_observation(self, observation: Observation) -> None:
+        """What a frame says about camera and star."""
+        frame, star, now_s = observation.frame, observation.star, observation.now_s
+        if frame is None:
+            return
+        readings, exposed_s = self.readings, frame.mid_exposure_s
+        late_s = frame.received_s - exposed_s - self._delay_s
+        readings["frame_late_s"] = (late_s, now_s, "")
+        if self._exposed_s is not None:
+            # Frames that were skipped did come.
+            frames = 1 + observation.frames_skipped - self._skipped
+            periods = (exposed_s - self._exposed_s) / self._period_s / frames
+            readings["frame_interval_periods"] = (periods, now_s, "")
+        self._exposed_s, self._skipped = exposed_s, observation.frames_skipped
+        if star is not None:
+            readings["star_flux_fraction"] = (star.flux_dn / self.star_flux_dn, now_s, "")
+
+    def record_stages(
+        self, observation: Observation, siderostat: SiderostatStage, mirror: MirrorStage
+    ) -> None:
+        """Where mirror and siderostat are, and how their devices are."""
+        self._record_mirror(mirror, observation.now_s)
+        self.record_siderostat(observation.servo, siderostat, observation.now_s)
+
+    def _record_mirror(self, mirror: MirrorStage, now_s: float) -> None:
+        readings = self.readings
+        az_rad, el_rad = mirror.command_rad.tolist()
+        fraction = (abs(az_rad) + abs(el_rad)) / self._range_rad
+        readings["fsm_range_fraction"] = (fraction, now_s, "")
+        readings["dac_unwritten_s"] = (now_s - mirror.written_s, now_s, "")
+        readings["dac_round_trip_s"] = (mirror.round_trip_s, now_s, "")
+
     def record_piezo_error(self, error: str, now_s: float) -> None:
         """Whether the piezo amplifier has an error, and what it says."""
         self.readings["piezo_fault"] = (1.0 if error else 0.0, now_s, error)
@@ -122,21 +147,52 @@ class Quantities:
         """What the piezo amplifier said."""
         self.put("piezo_limit_error_v", record.limit_v - self._limit_v, record.time_s)
 
-    def record_timing(self, record: LoopTiming) -> None:
-        """Whether the servo kept its pace, where it has a pace of its own."""
-        periods = record.servo_periods + record.servo_skipped
-        if periods:
-            self.put("servo_skipped_fraction", record.servo_skipped / periods, record.time_s)
+
+class MetrologyQuantities(Quantities):
+    """One metrology loop's."""
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        super().__init__(rig, loop_name)
+        sensor = rig.metrology_loops[loop_name].sensor
+        self._on_axis_v = 4 * sensor.on_axis_v
+        self._arcsec_per_m = ARCSEC_PER_RAD / sensor.link_length_m
+
+    def record_beam(self, beam: Beam, now_s: float) -> None:
+        """What a new sample says about the beam."""
+        readings = self.readings
+        readings["beam_light_fraction"] = (beam.sum_v / self._on_axis_v, now_s, "")
+        saturated = float(beam.state is BeamState.SATURATED)
+        readings["diode_saturated"] = (saturated, now_s, "")
+        if beam.state is not BeamState.LOST:
+            error_arcsec = self._arcsec_per_m * max(abs(beam.az_m), abs(beam.el_m))
+            readings["beam_error_arcsec"] = (error_arcsec, now_s, "")
+
+    def record_sample_age(self, age_s: float, now_s: float) -> None:
+        """How old the newest sample is."""
+        self.readings["diode_sample_age_s"] = (age_s, now_s, "")
 
 
-def places(rig: Rig, loop_name: str) -> dict[str, str]:
-    """Each part of the rig by name and endpoint, as errors of devices call it."""
-    loop = rig.loops[loop_name]
-    return {
+def stellar_places(rig: Rig, loop_name: str) -> dict[str, str]:
+    """Each part that a stellar loop measures by name and endpoint, as errors of devices call it."""
+    loop = rig.stellar_loops[loop_name]
+    return _places(rig, loop_name) | {
         "camera": f"camera at {rig.camera.device.endpoint}",
         "mirror": f"mirror {loop_name}",
         "star": f"star of {loop_name}",
-        "siderostat": f"siderostat {loop_name} at {loop.siderostat.device.endpoint}",
         "D/A": f"D/A at {loop.fsm.dac.endpoint}",
         "piezo amplifier": f"piezo amplifier at {loop.fsm.piezo.port}",
     }
+
+
+def metrology_places(rig: Rig, loop_name: str) -> dict[str, str]:
+    """Each part that a metrology loop measures, as :func:`stellar_places`."""
+    loop = rig.metrology_loops[loop_name]
+    return _places(rig, loop_name) | {
+        "beam": f"beam of {loop_name}",
+        "photodiodes": f"photodiodes at {loop.sensor.device.endpoint}",
+    }
+
+
+def _places(rig: Rig, loop_name: str) -> dict[str, str]:
+    endpoint = rig.loops[loop_name].siderostat.device.endpoint
+    return {"siderostat": f"siderostat {loop_name} at {endpoint}", "computer": "computer"}

@@ -57,7 +57,7 @@ class Search:
     """
 
     def __init__(self, rig: Rig, loop_name: str, estimator: StarEstimator) -> None:
-        loop = rig.loops[loop_name]
+        loop = rig.stellar_loops[loop_name]
         self.centre_rad = np.zeros(2)
         self._settings = loop.acquisition
         self._estimator = estimator
@@ -226,7 +226,7 @@ def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
         return ""
     if not 0 < star_flux_dn < math.inf:
         return f"star_flux_dn must be above 0 (is {star_flux_dn:g})"
-    acquisition = rig.loops[loop_name].acquisition
+    acquisition = rig.stellar_loops[loop_name].acquisition
     least_dn = acquisition.detection_sigma * rig.camera.pixel_noise_dn / LARGEST_PEAK
     if star_flux_dn < least_dn:
         return (
@@ -238,7 +238,7 @@ def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
 
 def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
     """Why a search cannot be made as asked, or nothing."""
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     expected = [asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec]
     given = [place for place in expected if place is not None]
     if len(given) == 1:

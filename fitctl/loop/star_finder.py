@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from fitctl.controllers.centroid import Star, StarSensor
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.logging.records import Severity
 from fitctl.messages.modes import TRACKING, WITH_WINDOW, Mode
-from fitctl.model.optics import scales
+from fitctl.model.optics import AzEl, scales
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +34,8 @@ class StarFinder:
     estimator : StarEstimator
     look_at_px : tuple of float or None
         Where the star is looked for on the next frame, and then no more.
+    place_px : tuple of float or None
+        Where the star was when it was last found.
     """
 
     def __init__(
@@ -43,15 +45,20 @@ class StarFinder:
         target_px: Floats,
         report_event: Callable[[Severity, str], None],
     ) -> None:
-        loop = rig.loops[loop_name]
+        loop = rig.stellar_loops[loop_name]
         self.estimator = StarEstimator(scales(rig, loop), target_px)
-        self.look_at_px: tuple[float, float] | None = None
+        self.look_at_px: AzEl | None = None
+        self.place_px: AzEl | None = None
         self._sensor = StarSensor(rig.camera, loop)
         self._report_event = report_event
 
     def expect_flux(self, flux_dn: float) -> None:
         """What the star's light is to be from now on."""
         self._sensor.expect(flux_dn)
+
+    def exclude(self, places_px: Iterable[AzEl | None]) -> None:
+        """From now on no star is looked for at these places, where other loops follow theirs."""
+        self._sensor.excluded_px = [place for place in places_px if place is not None]
 
     def find(
         self,
@@ -72,6 +79,7 @@ class StarFinder:
             star = self._sensor.follow(image, *self.estimator.predict_px(stages_px))
         elif star is None:
             star = self._sensor.find(image)
+        self.place_px = self.place_px if star is None else (star.az_px, star.el_px)
         if star is not None and mode in TRACKING:
             self.estimator.observe((star.az_px, star.el_px), stages_px)
         return star

@@ -6,12 +6,13 @@ diamond -> D/A write and siderostat set-point -> record.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Rig
+from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.config import Loop as LoopSettings
 from fitctl.controllers.centroid import Star
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
@@ -19,17 +20,20 @@ from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
 from fitctl.logging.records import ControllerChange, Tick
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
+from fitctl.loop.link import Link
 from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
+from fitctl.loop.quantities import StellarQuantities, stellar_places
 from fitctl.loop.search import Search
 from fitctl.loop.star_finder import StarFinder
 from fitctl.loop.tick_record import TickRecords, TickTimes
 from fitctl.messages.commands import Acquire
-from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger, usable_commands
+from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger
 from fitctl.messages.telemetry import LoopLimits, LoopState, SpotPlace
 from fitctl.model.drives import Drive
-from fitctl.model.optics import scales
+from fitctl.model.optics import AzEl, scales
 from fitctl.stages.journal import Journal
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.periodic import Periodic
@@ -62,7 +66,19 @@ class StellarLoop(Loop):
         journal: Journal,
         design: Design,
     ) -> None:
-        super().__init__(name, rig, siderostat, journal)
+        super().__init__(
+            name,
+            rig,
+            siderostat,
+            journal,
+            quantities=StellarQuantities(rig, name),
+            places=stellar_places(rig, name),
+        )
+        self.settings: LoopSettings = rig.stellar_loops[name]
+        self.quantities: StellarQuantities
+        self.link: Link | None = None
+        self.others: list[StellarLoop] = []
+        self.waits_for = ""
         self.mirror = mirror
         self.target_px = np.array([self.settings.target_px.az, self.settings.target_px.el])
         scale = scales(rig, self.settings)
@@ -76,6 +92,9 @@ class StellarLoop(Loop):
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
         self._tick_records = TickRecords(rig, name)
         self._flattened = False
+        self._search_due: bool | None = None  # whether it is for a star that was followed
+        self._has_held = False  # since the devices were opened
+        self._held_undone_rad = np.zeros(2)  # of the link, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
             Mode.STANDBY: self._stand_by,
@@ -99,15 +118,28 @@ class StellarLoop(Loop):
         else:
             motor_rad = self.servo.position_at(frame.mid_exposure_s)
             mirror_rad = self.mirror.at(frame.mid_exposure_s)
-            star = self._find(frame, mirror_rad, motor_rad)
+        time_s = begun_s if frame is None else frame.mid_exposure_s
+        link_rad = None if self.link is None else self.link.turned_rad(time_s)
+        if frame is not None:
+            beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
+            star = self._find(frame, mirror_rad, beam_rad)
         self.observation = Observation(
-            frame, frames_lost, frames_skipped, star, mirror_rad, motor_rad, servo, begun_s
+            frame,
+            frames_lost,
+            frames_skipped,
+            star,
+            mirror_rad,
+            motor_rad,
+            servo,
+            begun_s,
+            link_rad,
         )
         self._sensed_s = self._clock.now_s()
 
     def decide(self) -> None:
         """Errors and findings first, then interlocks, then the mode's control law."""
         observation = self.observation
+        self._evaluate_waiting(observation)
         self._evaluate_findings(observation)
         self.quantities.record_observation(observation)
         self.quantities.record_stages(observation, self.siderostat, self.mirror)
@@ -146,23 +178,33 @@ class StellarLoop(Loop):
         return tick
 
     def _move(self, observation: Observation) -> None:
-        """Follow the mode's law, unless an interlock holds or flattens."""
+        """Follow the link and the mode's law, unless an interlock holds or flattens."""
         action = self.interlocks.action if self.mode in TRACKING else None
+        if self.link is not None and action not in {"hold", "flatten"}:
+            self._follow_link(self.link)
         if action == "flatten":
             self.mirror.step_to_bias()
         elif self._flattened and self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, observation.motor_rad)
+            self.pointing.start_pair(self.mirror, observation.beam_rad)
         self._flattened = action == "flatten"
         # Without a frame to track by, the stages wait where they are.
-        waits = observation.frame is None and self.mode in TRACKING
+        waits = self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
         if action not in {"hold", "flatten"} and not waits:
             self._laws[self.mode](observation)
 
-    def _find(self, frame: Frame, mirror_rad: Floats, motor_rad: Floats) -> Star | None:
-        if self.mode is Mode.ACQUISITION and not self.search.has_arrived(motor_rad):
+    def _find(self, frame: Frame, mirror_rad: Floats, beam_rad: Floats) -> Star | None:
+        self.star_finder.exclude([other.place_px for other in self.others])
+        if self.mode is Mode.ACQUISITION and (
+            self.waits_for or not self.search.has_arrived(beam_rad)
+        ):
             return None  # what is seen on the way is another star
         follows = self.mode in FOLLOWING and self.following.lost == 0
-        return self.star_finder.find(frame.image, self.mode, motor_rad, mirror_rad, follows=follows)
+        return self.star_finder.find(frame.image, self.mode, beam_rad, mirror_rad, follows=follows)
+
+    @property
+    def place_px(self) -> AzEl | None:
+        """Where other loops must not look for their stars: the star's place while it is followed."""
+        return self.star_finder.place_px if self.mode in FOLLOWING else None
 
     def _evaluate_findings(self, observation: Observation) -> None:
         """Errors of devices, and what the frame means for the mode."""
@@ -172,7 +214,7 @@ class StellarLoop(Loop):
         elif self.mode is Mode.EXPERIMENT and injector.fault is not None:
             self.mirror.ready = False
             self.device_failed("injector", injector.fault)
-        elif (frame := observation.frame) is not None:
+        elif (frame := observation.frame) is not None and not self.waits_for:
             found = self._find_trigger(frame, observation.star)
             if found is not None and found.trigger is None:
                 self._report_event("warning", found.reason)
@@ -194,11 +236,20 @@ class StellarLoop(Loop):
             self._end_experiment()
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
-            self._start_search(motor_rad, again=source in FOLLOWING)
+            self._search_due = source in FOLLOWING
+            if not self._why_wait(self._clock.now_s()):
+                self._start_search(motor_rad)
         elif self.mode is Mode.COARSE:
+            self._has_held = True
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, motor_rad)
+            self.pointing.start_pair(self.mirror, self._beam_rad(motor_rad))
+
+    def _beam_rad(self, motor_rad: Floats) -> Floats:
+        """Motor angles that turn the star as far as all siderostats have until now, shape (2,)."""
+        if self.link is None:
+            return motor_rad
+        return motor_rad + self.link.turned_rad(self._clock.now_s())
 
     def configure_search(self, asked: Acquire) -> None:
         """What the next search is to find, and how, as a command asks that was not refused."""
@@ -207,13 +258,90 @@ class StellarLoop(Loop):
         self.quantities.star_flux_dn = flux_dn
         self.search.configure(asked)
 
-    def _start_search(self, motor_rad: Floats, *, again: bool) -> None:
-        """As asked; else about where the star is expected: on the target, or where it was last seen.
-
-        `again` if the loop was following the star.
-        """
-        self.star_finder.estimator.expect(self.target_px, motor_rad, np.zeros(2))
+    def _start_search(self, motor_rad: Floats) -> None:
+        """As asked; else about where the star is expected: on the target, or where it was last seen."""
+        again, self._search_due = bool(self._search_due), None
+        if self.link is not None and not self._has_held:
+            # What the link's siderostat turned before, to find its beam, moved no star that was known.
+            self.link.set_origin()
+            self.star_finder.estimator.forget()
+        self.star_finder.estimator.expect(self.target_px, self._beam_rad(motor_rad), np.zeros(2))
         self.search.begin(again=again)
+
+    # ------------------------------------------------------------ the link, and other loops
+
+    def join(self, loops: Mapping[str, Loop]) -> None:
+        """Know the loop of the link, and those whose stars are on the same camera."""
+        if self.settings.link is not None:
+            link = loops[self.settings.link]
+            if not isinstance(link, MetrologyLoop):
+                msg = f"loops.{self.name}.link: {link.name} is no metrology loop"
+                raise TypeError(msg)
+            self.link = Link(link, self.settings)
+        self.others = [
+            loop for loop in loops.values() if isinstance(loop, StellarLoop) and loop is not self
+        ]
+
+    def _why_wait(self, now_s: float) -> str:
+        """What the stages wait for where they are; empty if for nothing."""
+        if self.mode not in TRACKING:
+            return ""
+        if self.link is not None and not self.link.settled(now_s):
+            loop = self.link.loop
+            return f"the link of {loop.name}, which is in {loop.mode.name}"
+        if self.mode is Mode.ACQUISITION and self._search_due is not None:
+            # Two stars that are both searched for look alike, and a star that is found comes to the middle.
+            busy = [other.name for other in self.others if other.is_acquiring]
+            if busy:
+                return f"{', '.join(busy)}, whose star is on its way to its target"
+        return ""
+
+    @property
+    def is_acquiring(self) -> bool:
+        """Its star is searched for, and was not followed before, or is not yet near its target."""
+        if self.waits_for:
+            return False
+        if self.mode is Mode.ACQUISITION:
+            return self._search_due is None and not self.search.again
+        place_px = self.place_px
+        if self.mode is not Mode.COARSE or place_px is None:
+            return False
+        return float(np.abs(self.target_px - place_px).max()) > HALF_WINDOW_PX
+
+    def _evaluate_waiting(self, observation: Observation) -> None:
+        """Wait where the stages are, or go on, and report which."""
+        if self.link is not None and self.link.zero_was_lost():
+            self._has_held = False
+            self.link.set_origin()
+            self.star_finder.estimator.forget()
+        before, waits_for = self.waits_for, self._why_wait(observation.now_s)
+        self.waits_for = waits_for
+        if waits_for and not before:
+            self._report_event("warning", f"waits for {waits_for}; the stages stay where they are")
+            if self.mode is Mode.EXPERIMENT:
+                self.fire(Trigger.EXPERIMENT_DONE, f"waits for {waits_for}")
+        if waits_for or self.mode not in TRACKING:
+            return
+        if before:
+            self._report_event("info", f"no longer waits for {before}")
+            self._go_on(observation)
+        if self.mode is Mode.ACQUISITION and self._search_due is not None:
+            self._start_search(self.servo.position_rad)
+
+    def _go_on(self, observation: Observation) -> None:
+        """The control laws begin anew from where the stages are."""
+        self.following.begin()
+        if self.mode is Mode.COARSE:
+            self.pointing.start_coarse(self.target_px)
+        elif self.mode is Mode.VERNIER:
+            self.pointing.start_pair(self.mirror, observation.beam_rad)
+
+    def _follow_link(self, link: Link) -> None:
+        """Undo what the link's siderostat turns, as soon as it holds."""
+        if self.mode not in TRACKING:
+            link.begin()
+        elif link.holds and self._search_due is None:
+            self.siderostat.move_by(link.step_rad())
 
     # ------------------------------------------------------------ control laws
 
@@ -227,7 +355,10 @@ class StellarLoop(Loop):
 
     def _search(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
-        self.siderostat.move_to(self.search.advance(self._period_s, observation.motor_rad))
+        wanted_rad = self.search.advance(self._period_s, observation.beam_rad)
+        if self.link is not None:
+            wanted_rad = wanted_rad - self.link.undone_from_origin_rad
+        self.siderostat.move_to(wanted_rad)
 
     def _pull_in(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
@@ -248,7 +379,11 @@ class StellarLoop(Loop):
         if setpoint_rad is None:
             self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
         else:
-            self.siderostat.move_to(setpoint_rad)
+            self.siderostat.move_to(setpoint_rad + self._undone_since_held())
+
+    def _undone_since_held(self) -> Floats:
+        """How far the link has moved the siderostat since an experiment began, shape (2,)."""
+        return np.zeros(2) if self.link is None else self._held_undone_rad - self.link.undone_rad
 
     # ------------------------------------------------------------ designs and experiments
 
@@ -262,7 +397,7 @@ class StellarLoop(Loop):
         before, motor_rad = self.controller, self.servo.position_rad
         self.pointing.use(design)
         if self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, motor_rad)
+            self.pointing.start_pair(self.mirror, self._beam_rad(motor_rad))
         az_rad, el_rad = motor_rad.tolist()
         self._journal.record(
             ControllerChange(
@@ -281,13 +416,15 @@ class StellarLoop(Loop):
         now_s = self._clock.now_s()
         if not self.fire(Trigger.EXPERIMENT, name):
             return False
+        if self.link is not None:
+            self._held_undone_rad = self.link.undone_rad
         self._experiments.begin(name, drives, self.siderostat, self.mirror, now_s)
         return True
 
     def _end_experiment(self) -> None:
         held_rad = self._experiments.end(self.mirror)
         if held_rad is not None and self.mode is not Mode.SAFE:
-            self.siderostat.move_to(held_rad)
+            self.siderostat.move_to(held_rad + self._undone_since_held())
 
     # ------------------------------------------------------------ for the supervisor
 
@@ -307,7 +444,7 @@ class StellarLoop(Loop):
             since_s=self.mode_since_s,
             requirement_px=self.settings.requirement_px,
             sky_arcsec_per_px=scale.sky_arcsec_per_px,
-            usable_commands=[trigger.name.capitalize() for trigger in usable_commands(mode)],
+            usable_commands=[trigger.name.capitalize() for trigger in self.usable_commands],
             controller=self.controller,
             last_change=self.last_change,
             interlocks=list(self.interlocks.tripped),
@@ -325,6 +462,7 @@ class StellarLoop(Loop):
             search_again=self.search.state_again(self.mode_since_s)
             if mode is Mode.ACQUISITION
             else None,
+            waits_for=self.waits_for,
         )
 
     def begin(self, stack_v: Floats | None) -> None:
@@ -336,6 +474,7 @@ class StellarLoop(Loop):
             self.mirror.start_from(stack_v)
         super().begin(stack_v)
         if self.servo.encoders_jumped:
+            self._has_held = False
             self.star_finder.estimator.forget()
             self._report_event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
@@ -375,7 +514,7 @@ def stellar_loop(
         msg = f"loop {name}: a stellar loop needs the D/A of its mirror"
         raise ValueError(msg)
     servo = SiderostatServo(
-        name, rig.loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
+        name, rig.stellar_loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
     )
     mirror = MirrorStage(rig, name, devices.dac, journal.clock)
     siderostat = SiderostatStage(rig, name, servo)
@@ -383,7 +522,7 @@ def stellar_loop(
 
 
 def _limits(rig: Rig, name: str) -> LoopLimits:
-    loop = rig.loops[name]
+    loop = rig.stellar_loops[name]
     return LoopLimits(
         fsm_range_rad=loop.fsm.range_rad,
         siderostat_travel_sky_arcsec=loop.siderostat.travel_sky_arcsec,

@@ -37,7 +37,7 @@ class TickRecords:
     """
 
     def __init__(self, rig: Rig, loop_name: str) -> None:
-        loop = rig.loops[loop_name]
+        loop = rig.stellar_loops[loop_name]
         self._loop_name = loop_name
         self._due_after_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._range_rad = loop.fsm.range_rad

@@ -107,6 +107,12 @@ class Reset(Command, frozen=True, kw_only=True):
     name: str
 
 
+class MoveCollector(Command, frozen=True, kw_only=True):
+    """Reference the hexapod (reference), or begin or end the collector's motion (start, stop)."""
+
+    action: Literal["reference", "start", "stop"]
+
+
 class Experiment(Command, frozen=True, kw_only=True):
     """From COARSE or VERNIER: move the stages of one loop as told, open loop, and go back to COARSE."""
 
@@ -177,6 +183,7 @@ AnyCommand = (
     | SetBiasOffset
     | SetController
     | Reset
+    | MoveCollector
     | Experiment
     | Status
     | RecentEvents

@@ -1,6 +1,6 @@
-"""The modes of a stellar loop, and the one table of what leads from each to which.
+"""The modes of a loop, and for each kind of loop the one table of what leads from each to which.
 
-The table is data: the machine, the console's diagram, the documentation and the exhaustive test all
+A table is data: the machine, the console's diagram, the documentation and the exhaustive test all
 read it.
 """
 
@@ -21,6 +21,7 @@ class Mode(IntEnum):
     VERNIER = 4
     SAFE = 5
     EXPERIMENT = 6
+    LOCKED = 7
 
 
 MEANING = {
@@ -31,7 +32,18 @@ MEANING = {
     Mode.VERNIER: "the fast steering mirror holds the star, the siderostat takes what lasts",
     Mode.SAFE: "mirror to its bias, siderostat stopped, amplifiers disabled after a time",
     Mode.EXPERIMENT: "open loop: the stages move as an identification asks, the camera watches",
+    Mode.LOCKED: "a metrology loop's siderostat holds its beam on the centre of the photodiodes",
 }
+
+STELLAR_MODES = tuple(mode for mode in Mode if mode is not Mode.LOCKED)
+METROLOGY_MODES = (
+    Mode.OFF,
+    Mode.STANDBY,
+    Mode.ACQUISITION,
+    Mode.COARSE,
+    Mode.LOCKED,
+    Mode.SAFE,
+)
 
 FOLLOWING = frozenset({Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
 """The star is known, and looked for where it should be."""
@@ -40,6 +52,15 @@ WITH_WINDOW = FOLLOWING - {Mode.EXPERIMENT}
 """The window may be put on another star: both stages follow what is in it."""
 
 TRACKING = FOLLOWING | {Mode.ACQUISITION}
+
+BEAM_FOLLOWING = frozenset({Mode.COARSE, Mode.LOCKED})
+"""The metrology beam is on the photodiodes."""
+
+HOLDING = frozenset({Mode.VERNIER, Mode.LOCKED})
+"""A loop of any kind holds its star or its beam."""
+
+POINTING = TRACKING | BEAM_FOLLOWING
+"""A loop of any kind points at something or searches for it."""
 
 
 class Trigger(IntEnum):
@@ -59,6 +80,8 @@ class Trigger(IntEnum):
     FAULT = 11
     EXPERIMENT = 12
     EXPERIMENT_DONE = 13
+    BEAM_FOUND = 14
+    BEAM_LOST = 15
 
 
 # Those that need no more than their name; an experiment needs its motions.
@@ -99,12 +122,27 @@ def _from(
 
 _POWERED = (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT)
 
-TRANSITIONS: tuple[Transition, ...] = (
+_BEGIN = (
     *_from((Mode.OFF,), Trigger.STANDBY, Mode.STANDBY, "all devices open, checked and enabled"),
     *_from((Mode.STANDBY,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for"),
     *_from(
         (Mode.ACQUISITION,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for; the search begins anew"
     ),
+)
+_RECOVER_OFF = (
+    *_from(
+        (Mode.SAFE,), Trigger.RECOVER, Mode.STANDBY, "all devices reopened, checked and enabled"
+    ),
+    *_from(
+        (Mode.STANDBY, Mode.SAFE),
+        Trigger.OFF,
+        Mode.OFF,
+        "asked for; amplifiers disabled, devices closed",
+    ),
+)
+
+TRANSITIONS: tuple[Transition, ...] = (
+    *_BEGIN,
     *_from(
         (Mode.ACQUISITION,), Trigger.STAR_FOUND, Mode.COARSE, "star on found_frames frames in a row"
     ),
@@ -140,37 +178,71 @@ TRANSITIONS: tuple[Transition, ...] = (
         Mode.STANDBY,
         "asked for",
     ),
-    *_from(tuple(Mode), Trigger.STOP, Mode.SAFE, "asked for, at once"),
+    *_from(STELLAR_MODES, Trigger.STOP, Mode.SAFE, "asked for, at once"),
     *_from(_POWERED, Trigger.FAULT, Mode.SAFE, "any device fault"),
-    *_from(
-        (Mode.SAFE,), Trigger.RECOVER, Mode.STANDBY, "all devices reopened, checked and enabled"
-    ),
-    *_from(
-        (Mode.STANDBY, Mode.SAFE),
-        Trigger.OFF,
-        Mode.OFF,
-        "asked for; amplifiers disabled, devices closed",
-    ),
+    *_RECOVER_OFF,
 )
+"""Of a stellar loop."""
 
-_TABLE = {(row.source, row.trigger): row for row in TRANSITIONS}
+METROLOGY_TRANSITIONS: tuple[Transition, ...] = (
+    *_BEGIN,
+    *_from(
+        (Mode.ACQUISITION,),
+        Trigger.BEAM_FOUND,
+        Mode.COARSE,
+        "beam on found_frames samples in a row",
+    ),
+    *_from(
+        (Mode.ACQUISITION,),
+        Trigger.SEARCH_EXHAUSTED,
+        Mode.STANDBY,
+        "whole search radius seen; for a beam that was lost, search_again_s over",
+    ),
+    *_from(
+        (Mode.COARSE,),
+        Trigger.IN_REACH,
+        Mode.LOCKED,
+        "beam near the centre for found_frames",
+    ),
+    *_from(
+        (Mode.LOCKED,),
+        Trigger.OUT_OF_REACH,
+        Mode.COARSE,
+        "beam not measured by all four photodiodes, or far from the centre, for lost_frames",
+    ),
+    *_from(
+        (Mode.COARSE, Mode.LOCKED), Trigger.BEAM_LOST, Mode.ACQUISITION, "no beam for lost_frames"
+    ),
+    *_from((Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED), Trigger.HOLD, Mode.STANDBY, "asked for"),
+    *_from(METROLOGY_MODES, Trigger.STOP, Mode.SAFE, "asked for, at once"),
+    *_from(
+        (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED),
+        Trigger.FAULT,
+        Mode.SAFE,
+        "any device fault",
+    ),
+    *_RECOVER_OFF,
+)
+"""Of a metrology loop."""
 
 
-def transition(mode: Mode, trigger: Trigger) -> Transition | None:
+def transition(
+    mode: Mode, trigger: Trigger, table: tuple[Transition, ...] = TRANSITIONS
+) -> Transition | None:
     """The row for a trigger in a mode, or None where it means nothing."""
-    return _TABLE.get((mode, trigger))
+    return next((row for row in table if row.source is mode and row.trigger is trigger), None)
 
 
-def usable_commands(mode: Mode) -> list[Trigger]:
+def usable_commands(mode: Mode, table: tuple[Transition, ...] = TRANSITIONS) -> list[Trigger]:
     """The commands that mean something in a mode, in the order of the table."""
-    return [row.trigger for row in TRANSITIONS if row.source is mode and row.trigger in COMMANDS]
+    return [row.trigger for row in table if row.source is mode and row.trigger in COMMANDS]
 
 
-def mermaid() -> str:
+def mermaid(table: tuple[Transition, ...] = TRANSITIONS) -> str:
     """The table as a Mermaid state diagram, for the documentation."""
     lines = ["stateDiagram-v2", "    [*] --> OFF"]
     lines += [
         f"    {row.source.name} --> {row.target.name}: {row.trigger.name.lower().replace('_', ' ')}"
-        for row in TRANSITIONS
+        for row in table
     ]
     return "\n".join(lines)

@@ -14,7 +14,9 @@ from fitctl.logging.records import (
     FrameRecord,
     LoopTiming,
     Losses,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     PiezoReading,
     RecorderStatus,
     Tick,
@@ -115,7 +117,9 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
 
     ``controller_file`` is the saved design that is at work, on the supervisor's machine; it is empty when the
     design was made from the rig's values. ``outcomes`` are those of the
-    commands under way, and of the last that ended.
+    commands under way, and of the last that ended. ``kind`` is the loop's in the rig file; a metrology loop's
+    ``requirement_px`` is its requirement on the beam in the camera's pixels. ``waits_for`` is what the loop
+    waits for while it holds its stages where they are, for people; empty while it waits for nothing.
     """
 
     name: str
@@ -136,6 +140,8 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     search_again: SearchAgain | None = None
     outcomes: list[CommandOutcome] = []
     last_failure: LoopFailure | None = None
+    kind: Literal["stellar", "metrology"] = "stellar"
+    waits_for: str = ""
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
@@ -165,6 +171,8 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     scheduling: str
     running_sequence: SequenceStatus | None = None
     commander: str = ""
+    metrology_ticks: list[MetrologyTick] = []
+    overlaps: list[Overlap] = []
 
     @property
     def records_lost(self) -> int:

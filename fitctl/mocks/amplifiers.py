@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from fitctl.config import LoopMocks, Siderostat
+from fitctl.config import Siderostat, SiderostatMocks
 from fitctl.mocks.bal_analog.station import BalAnalogMockStation
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock
@@ -26,7 +26,9 @@ class AmplifierMock(Protocol):
         ...
 
 
-def amplifier_mock(siderostat: Siderostat[Any], mocks: LoopMocks, motors: Motors) -> AmplifierMock:
+def amplifier_mock(
+    siderostat: Siderostat[Any], mocks: SiderostatMocks, motors: Motors
+) -> AmplifierMock:
     """The mock that speaks what the rig's driver speaks; the rig file has its settings, if it needs any."""
     match siderostat.device.driver:
         case "ensemble" if mocks.ensemble is not None:

@@ -15,12 +15,15 @@ import zmq
 import zmq.asyncio
 from pydantic import ValidationError
 
-from fitctl.config import Fault
+from fitctl.config import ARCSEC_PER_RAD, Fault, Fringes
 from fitctl.mocks.faults import Faults, UnknownFault, check_fault
+from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.model.plant import Plant
+from fitctl.model.stellar_part import StellarPart
 
 _MAX_QUESTION_BYTES = 1024
 _TIMEOUT_MS = 5000
+_VISIBILITY_EVERY = 10  # steps of the plant
 
 
 class _Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=True):
@@ -46,6 +49,41 @@ class Residual(msgspec.Struct, frozen=True):
     error: str = ""
 
 
+class BeamQuestion(_Question, frozen=True):
+    """Asks how far a metrology loop's beam was from the centre of its photodiodes."""
+
+    loop: str
+    start_s: float
+    end_s: float
+
+
+class Beam(msgspec.Struct, frozen=True):
+    """RMS of the beam's angle from the centre, every plant step; NaN without samples."""
+
+    az_rms_arcsec: float
+    el_rms_arcsec: float
+    samples: int
+    error: str = ""
+
+
+class VisibilityQuestion(_Question, frozen=True):
+    """Asks what the tilt between two loops' stars, each from its target, left of their fringes."""
+
+    loops: tuple[str, str]
+    targets_px: tuple[tuple[float, float], tuple[float, float]]
+    aperture_m: float
+    wavelength_m: float
+    start_s: float
+    end_s: float
+
+
+class Visibility(msgspec.Struct, frozen=True):
+    """The mean visibility; NaN without samples."""
+
+    mean: float
+    error: str = ""
+
+
 class StagesQuestion(_Question, frozen=True):
     """Asks where the stages of a loop are, whatever their devices say."""
 
@@ -53,7 +91,7 @@ class StagesQuestion(_Question, frozen=True):
 
 
 class StagesNow(msgspec.Struct, frozen=True):
-    """Motor angles, and the stacks' volts in the D/A's scale: az, el; stack 1 to 3."""
+    """Motor angles, and the stacks' volts in the D/A's scale, where it has them: az, el; stack 1 to 3."""
 
     motor_rad: list[float]
     stack_v: list[float]
@@ -95,8 +133,11 @@ class FaultsNow(msgspec.Struct, frozen=True):
     rig: str = ""
 
 
-_AnyQuestion = ResidualQuestion | StagesQuestion | SetFault | ClearFaults | ListFaults
-_Answer = TypeVar("_Answer", Residual, StagesNow, FaultsNow)
+_FaultQuestion = SetFault | ClearFaults | ListFaults
+_AnyQuestion = (
+    ResidualQuestion | BeamQuestion | VisibilityQuestion | StagesQuestion | _FaultQuestion
+)
+_Answer = TypeVar("_Answer", Residual, Beam, Visibility, StagesNow, FaultsNow)
 
 
 class FaultTable:
@@ -127,7 +168,7 @@ class FaultTable:
             begin = self._of(fault.device).set
             self._timers.append(loop.call_later(fault.at_s, begin, fault))
 
-    def answer(self, question: SetFault | ClearFaults | ListFaults) -> FaultsNow:
+    def answer(self, question: _FaultQuestion) -> FaultsNow:
         """Obey, and say what is wrong then."""
         try:
             if isinstance(question, SetFault):
@@ -167,7 +208,7 @@ class Bench:
     def __init__(
         self,
         rig_name: str,
-        plants: Mapping[str, Plant],
+        plant: Plant,
         faults: FaultTable,
         started_s: float,
         port: int,
@@ -175,7 +216,7 @@ class Bench:
         or_any_port: bool = False,
     ) -> None:
         self._rig_name = rig_name
-        self._plants = plants
+        self._plant = plant
         self._faults = faults
         self._started_s = started_s
         self._port = port
@@ -212,41 +253,91 @@ class Bench:
             answer = self._answer(await self._socket.recv())
             await self._socket.send(msgspec.msgpack.encode(answer))
 
-    def _answer(self, message: bytes) -> Residual | StagesNow | FaultsNow:
+    def _answer(self, message: bytes) -> Residual | Beam | Visibility | StagesNow | FaultsNow:
         try:
             question = msgspec.msgpack.decode(message, type=_AnyQuestion)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return Residual(np.nan, np.nan, 0, f"not a question: {error}")
-        if isinstance(question, ResidualQuestion):
-            return self._residual(question)
-        if isinstance(question, StagesQuestion):
-            return self._stages(question)
+        match question:
+            case ResidualQuestion():
+                return self._residual(question)
+            case BeamQuestion():
+                return self._beam(question)
+            case VisibilityQuestion():
+                return self._visibility(question)
+            case StagesQuestion():
+                return self._stages(question)
+        return self._of_faults(question)
+
+    def _of_faults(self, question: _FaultQuestion) -> FaultsNow:
         if question.rig not in {"", self._rig_name}:
             why_not = f"these are the mocks of rig {self._rig_name}, and not of rig {question.rig}"
             return FaultsNow([], why_not, self._rig_name)
         return msgspec.structs.replace(self._faults.answer(question), rig=self._rig_name)
 
     def _stages(self, question: StagesQuestion) -> StagesNow:
-        plant = self._plants.get(question.loop)
-        if plant is None:
+        part = self._plant.loops.get(question.loop)
+        if part is None:
             return StagesNow([], [], f"no loop is named {question.loop}")
-        state = plant.state
-        return StagesNow(state.motor_rad[0].tolist(), state.stack_v[0].tolist())
+        stack_v = part.state.stack_v[0].tolist() if isinstance(part, StellarPart) else []
+        return StagesNow(part.state.motor_rad[0].tolist(), stack_v)
 
     def _residual(self, question: ResidualQuestion) -> Residual:
-        if not np.all(np.isfinite([question.start_s, question.end_s])):
+        if not _times(question):
             return Residual(np.nan, np.nan, 0, "start_s and end_s must be times")
-        plant = self._plants.get(question.loop)
-        if plant is None:
+        part = self._plant.stellar_loops.get(question.loop)
+        if part is None:
             return Residual(np.nan, np.nan, 0, f"no loop is named {question.loop}")
-        track_px = plant.history_px(
-            question.start_s - self._started_s, question.end_s - self._started_s
-        )[:, 0, 0, :]
+        track_px = part.history_px(*self._span_s(question))[:, 0, 0, :]
         if len(track_px) == 0:
             return Residual(np.nan, np.nan, 0, "no history for that time")
         error_px = track_px - [question.target_az_px, question.target_el_px]
         az, el = np.sqrt(np.mean(error_px**2, axis=0))
         return Residual(float(az), float(el), len(track_px))
+
+    def _beam(self, question: BeamQuestion) -> Beam:
+        if not _times(question):
+            return Beam(np.nan, np.nan, 0, "start_s and end_s must be times")
+        part = self._plant.metrology_loops.get(question.loop)
+        if part is None:
+            return Beam(np.nan, np.nan, 0, f"no metrology loop is named {question.loop}")
+        track_m = part.history_offset_m(*self._span_s(question))[:, 0]
+        if len(track_m) == 0:
+            return Beam(np.nan, np.nan, 0, "no history for that time")
+        az_m, el_m = np.sqrt(np.mean(track_m**2, axis=0))
+        arcsec_per_m = ARCSEC_PER_RAD / part.sensor.link_length_m
+        return Beam(float(az_m * arcsec_per_m), float(el_m * arcsec_per_m), len(track_m))
+
+    def _visibility(self, question: VisibilityQuestion) -> Visibility:
+        if not _times(question):
+            return Visibility(np.nan, "start_s and end_s must be times")
+        parts = [self._plant.stellar_loops.get(name) for name in question.loops]
+        one, other = parts
+        if one is None or other is None:
+            return Visibility(np.nan, f"no two loops are named {', '.join(question.loops)}")
+        span_s = self._span_s(question)
+        # Every 5 ms: the wavefronts turn much slower.
+        one_px, other_px = (
+            part.history_px(*span_s)[::_VISIBILITY_EVERY, 0, 0] - np.array(target)
+            for part, target in zip((one, other), question.targets_px, strict=True)
+        )
+        fringes = Fringes(
+            loops=list(question.loops),
+            aperture_m=question.aperture_m,
+            wavelength_m=question.wavelength_m,
+        )
+        tilt_rad = (one_px - other_px) / one.constants.sky_px_per_rad
+        return Visibility(mean_visibility(tilt_rad, fringes))
+
+    def _span_s(
+        self, question: ResidualQuestion | BeamQuestion | VisibilityQuestion
+    ) -> tuple[float, float]:
+        """In the plant's time."""
+        return question.start_s - self._started_s, question.end_s - self._started_s
+
+
+def _times(question: ResidualQuestion | BeamQuestion | VisibilityQuestion) -> bool:
+    return bool(np.all(np.isfinite([question.start_s, question.end_s])))
 
 
 def ask_bench(port: int, question: _AnyQuestion, answer: type[_Answer]) -> _Answer:

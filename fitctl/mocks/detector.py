@@ -46,8 +46,8 @@ class DetectorBench:
 
     def __init__(self, rig: Rig, loop_name: str, seed: int = 0) -> None:
         truth, _ = rig.mock_parts()
-        self._fsm = rig.loops[loop_name].fsm
-        self._plant = truth.loops[loop_name]
+        self._fsm = rig.stellar_loops[loop_name].fsm
+        self._plant = truth.stellar_loops[loop_name]
         self._gains = hysteresis.stack_gains(self._plant.hysteresis, self._fsm)
         self._half_v = hysteresis.half_widths_v(self._plant.hysteresis)
         # The stacks came up from zero to their bias, as the plant's.

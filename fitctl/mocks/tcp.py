@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from typing import cast
 
@@ -26,11 +27,11 @@ class Link(asyncio.Protocol):
         self._server = server
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The client has connected; a device that is away aborts the connection."""
+        """The client has connected; a device that is away, or has enough clients, aborts the connection."""
         self.transport = cast(asyncio.Transport, transport)
         self.wire = Wire(self._server.faults, self.write)
         self._server.links.add(self)
-        if self._server.faults.away:
+        if self._server.faults.away or len(self._server.links) > self._server.clients_max:
             self.transport.abort()
 
     def write(self, data: bytes) -> None:
@@ -62,6 +63,8 @@ class TcpServer:
         With `WIRE_FAULTS` among its kinds; `disconnect` and `reboot` abort all connections.
     new_link : callable
         Makes the protocol of a new connection.
+    clients_max : float
+        How many connections the device has at once; without a limit by default.
 
     Attributes
     ----------
@@ -69,8 +72,11 @@ class TcpServer:
         The open connections.
     """
 
-    def __init__(self, faults: Faults, new_link: Callable[[], Link]) -> None:
+    def __init__(
+        self, faults: Faults, new_link: Callable[[], Link], clients_max: float = math.inf
+    ) -> None:
         self.faults = faults
+        self.clients_max = clients_max
         self.links: set[Link] = set()
         self._new_link = new_link
         self._listener: asyncio.Server | None = None

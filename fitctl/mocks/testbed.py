@@ -1,8 +1,9 @@
-"""The mock testbed: every mock device of a rig around its plants, in one process, on 127.0.0.1 only.
+"""The mock testbed: every mock device of a rig around its plant, in one process, on 127.0.0.1 only.
 
 Nothing here knows a protocol: devices are wired to the plant as the cables would be. The D/A's outputs
 are the piezo amplifier's external inputs; the amplifier's outputs are the stacks; the drive turns the
-motors; the camera looks at the spots.
+motors; the camera looks at the spots; the photodiodes give their volts to the LabJack's inputs; the
+hexapod carries the collector.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -18,10 +21,16 @@ from numpy.typing import NDArray
 from fitctl.config import LoopMocks, Rig
 from fitctl.mocks.amplifiers import amplifier_mock, endpoint_keys
 from fitctl.mocks.bench import Bench, FaultTable
+from fitctl.mocks.c887.platform import Platform
+from fitctl.mocks.c887.server import C887ControllerMock
 from fitctl.mocks.gige.camera import GigeCameraMock
+from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
+from fitctl.model.metrology.part import BeamState
+from fitctl.model.pixel_noise import pixel_normals
 from fitctl.model.plant import Plant
+from fitctl.model.plant_step import PlantState
 from fitctl.model.scene import Scene
 
 _HOUSEKEEPING_S = 0.05
@@ -36,45 +45,124 @@ class LivePlant:
         One run only.
     started_s : float
         Host's monotonic time of the plant's zero.
-    command_timeout_s : float
-        Motors stop when no velocity command came for this long, as a drive in cyclic velocity mode
-        does without its cycle. It also keeps a motor from running on while this process stands still.
     """
 
-    def __init__(self, plant: Plant, started_s: float, command_timeout_s: float) -> None:
+    def __init__(self, plant: Plant, started_s: float) -> None:
         self.plant = plant
         self.started_s = started_s
-        self._velocity_rad_s = np.zeros(2)
-        self._enabled = np.zeros(2, dtype=bool)
-        self._command_timeout_s = command_timeout_s
-        self._command_ends_s = 0.0
+        self._siderostats: list[LiveSiderostat] = []
+        self._platform: Platform | None = None
+        self._planned_s = 0.0
+        self._diode_samples = 0
+
+    def siderostat(self, loop_name: str, command_timeout_s: float) -> LiveSiderostat:
+        """The motors of one loop; `command_timeout_s` as :class:`LiveSiderostat` has it."""
+        made = LiveSiderostat(self, self.plant.loops[loop_name].inputs, command_timeout_s)
+        self._siderostats.append(made)
+        return made
+
+    def now_s(self) -> float:
+        """The plant's time that it is now."""
+        return time.monotonic() - self.started_s
+
+    def carry_collector(self, platform: Platform) -> None:
+        """The collector stands on this hexapod's platform, whose time is :meth:`now_s`."""
+        self._platform = platform
 
     def advance(self) -> None:
-        """Bring the plant to now; motors stop where their last velocity command had run out."""
-        now_s = time.monotonic() - self.started_s
-        if now_s > self._command_ends_s and np.any(self.plant.inputs.velocity_rad_s):
-            self.plant.advance(self._command_ends_s)
-            self.plant.inputs.velocity_rad_s[:] = 0.0
+        """Bring the plant to now.
+
+        On the way there motors stop where their last velocity command had run out, and the collector follows
+        the hexapod.
+        """
+        now_s = self.now_s()
+        changes: list[tuple[float, Callable[[], None]]] = [
+            (motors.command_ends_s, motors.run_out)
+            for motors in self._siderostats
+            if motors.runs_out_by(now_s)
+        ]
+        if self._platform is not None and self.plant.collector is not None:
+            follow = self.plant.collector.follow
+            plans = self._platform.plans_since(self._planned_s)
+            changes += [(began_s, partial(follow, plan)) for began_s, plan in plans]
+            self._planned_s = plans[-1][0] if plans else self._planned_s
+        for time_s, change in sorted(changes, key=itemgetter(0)):
+            self.plant.advance(time_s)
+            change()
         self.plant.advance(now_s)
 
     def spots_px(self, host_s: float) -> NDArray[np.float64]:
         """All spots at a recent host time, shape (spots, 2)."""
         return self.plant.spots_px(host_s - self.started_s)[0]
 
-    def set_stack_v(self, volts: Sequence[float]) -> None:
-        """Stack volts in the D/A's scale, from now on."""
+    def diode_volts(self, loop_name: str, host_s: float) -> list[float]:
+        """Volts of one loop's photodiodes with their noise at a recent host time: az+, az-, el+, el-."""
         self.advance()
-        self.plant.inputs.stack_v[0] = volts
+        part = self.plant.metrology_loops[loop_name]
+        self._diode_samples += 1
+        noise = pixel_normals(part.noise_keys[0], self._diode_samples, 4)
+        volts = part.diode_volts(host_s - self.started_s)[0] + part.sensor.noise_v * noise
+        return list(volts.tolist())
+
+    def set_laser(self, loop_name: str, power: float) -> None:
+        """Power of one loop's laser over its nominal power, from now on."""
+        self.advance()
+        self.plant.metrology_loops[loop_name].inputs.laser[:] = power
+
+    def set_stack_v(self, loop_name: str, volts: Sequence[float]) -> None:
+        """Stack volts of one loop in the D/A's scale, from now on."""
+        self.advance()
+        self.plant.stellar_loops[loop_name].inputs.stack_v[0] = volts
+
+
+class LiveSiderostat:
+    """The two motors of a siderostat in a plant at the wall clock's time.
+
+    Parameters
+    ----------
+    live : LivePlant
+    inputs : PlantState or BeamState
+        Of the siderostat's loop.
+    command_timeout_s : float
+        Motors stop when no velocity command came for this long, as a drive in cyclic velocity mode
+        does without its cycle. It also keeps a motor from running on while this process stands still.
+
+    Attributes
+    ----------
+    command_ends_s : float
+        Until then, in the plant's time, the last velocity command holds.
+    velocity_rad_s : array, shape (2,)
+        Of the plant's motors.
+    """
+
+    def __init__(
+        self, live: LivePlant, inputs: PlantState | BeamState, command_timeout_s: float
+    ) -> None:
+        self.command_ends_s = 0.0
+        self.velocity_rad_s = inputs.velocity_rad_s[0]
+        self._motor_rad = inputs.motor_rad[0]
+        self._live = live
+        self._commanded_rad_s = np.zeros(2)
+        self._enabled = np.zeros(2, dtype=bool)
+        self._command_timeout_s = command_timeout_s
+
+    def runs_out_by(self, now_s: float) -> bool:
+        """Whether motors turn by a command that holds no longer."""
+        return now_s > self.command_ends_s and bool(np.any(self.velocity_rad_s))
+
+    def run_out(self) -> None:
+        """Stop the motors."""
+        self.velocity_rad_s[:] = 0.0
 
     def position_rad(self) -> tuple[float, float]:
         """Motor angles now."""
-        self.advance()
-        az, el = self.plant.state.motor_rad[0]
+        self._live.advance()
+        az, el = self._motor_rad
         return float(az), float(el)
 
     def command_velocity_rad_s(self, az: float, el: float) -> None:
         """Motor velocities, as far as the axes are enabled; good for the command time-out."""
-        self._velocity_rad_s[:] = az, el
+        self._commanded_rad_s[:] = az, el
         self._apply()
 
     def set_enabled(self, axis: int, enabled: bool) -> None:
@@ -83,27 +171,24 @@ class LivePlant:
         self._apply()
 
     def _apply(self) -> None:
-        self.advance()
-        self._command_ends_s = time.monotonic() - self.started_s + self._command_timeout_s
-        self.plant.inputs.velocity_rad_s[0] = np.where(self._enabled, self._velocity_rad_s, 0.0)
+        self._live.advance()
+        self.command_ends_s = self._live.now_s() + self._command_timeout_s
+        self.velocity_rad_s[:] = np.where(self._enabled, self._commanded_rad_s, 0.0)
 
 
-class LoopTestbed:
-    """Mock devices of one loop: amplifiers, D/A and piezo amplifier, wired to its plant."""
+class StarTestbed:
+    """Mock D/A and piezo amplifier of one stellar loop, wired to its mirror's stacks."""
 
     def __init__(self, rig: Rig, name: str, mocks: LoopMocks, live: LivePlant) -> None:
-        loop = rig.loops[name]
-        gain = loop.fsm.piezo.gain
-        self.drive_name = loop.siderostat.device.driver
-        self.drive = amplifier_mock(loop.siderostat, mocks, live)
+        fsm = rig.stellar_loops[name].fsm
         self.piezo = Mdt693Mock(
             mocks.mdt693,
-            loop.fsm.piezo,
-            lambda volts: live.set_stack_v([volt / gain for volt in volts]),
+            fsm.piezo,
+            lambda volts: live.set_stack_v(name, [volt / fsm.piezo.gain for volt in volts]),
             port=mocks.mdt693_port,
         )
         self.dac = ModbusDacMock(
-            loop.fsm.dac, mocks.dac, self.piezo.set_external_input_v, port=mocks.modbus_port
+            fsm.dac, mocks.dac, self.piezo.set_external_input_v, port=mocks.modbus_port
         )
 
 
@@ -133,42 +218,57 @@ class Testbed:
     ) -> None:
         truth, mocks = rig.mock_parts()
         started_s = time.monotonic()
-        self._plants = {
-            # As in the simulation: each loop's plant has a seed of its own from the run's.
-            name: LivePlant(
-                Plant(rig, name, [seed + 1000 * index]),
-                started_s,
-                mocks.loops[name].drive_command_timeout_s,
+        self._live = LivePlant(Plant(rig, [seed]), started_s)
+        self._drive_names = {
+            name: loop.siderostat.device.driver for name, loop in rig.loops.items()
+        }
+        self._siderostats = {
+            name: self._live.siderostat(name, loop.drive_command_timeout_s)
+            for name, loop in mocks.loops.items()
+        }
+        self._drives = {
+            name: amplifier_mock(loop.siderostat, mocks.loops[name], self._siderostats[name])
+            for name, loop in rig.loops.items()
+        }
+        self._stars = {
+            name: StarTestbed(rig, name, loop, self._live)
+            for name, loop in mocks.stellar_loops.items()
+        }
+        self._labjacks = {
+            name: LabJackT7Mock(
+                rig.metrology_loops[name].sensor.device,
+                loop.labjack,
+                partial(self._live.diode_volts, name),
+                set_laser=partial(self._live.set_laser, name),
+                seed=seed,
             )
-            for index, name in enumerate(rig.loops)
+            for name, loop in mocks.metrology_loops.items()
         }
-        self._loops = {
-            name: LoopTestbed(rig, name, mocks.loops[name], live)
-            for name, live in self._plants.items()
-        }
+        self._hexapod = None
+        if rig.collector is not None and mocks.hexapod is not None:
+            self._hexapod = C887ControllerMock(mocks.hexapod, self._live.now_s)
+            self._live.carry_collector(self._hexapod.platform)
         self._scene = Scene(
             rig.camera,
-            [spot for name in rig.loops for spot in truth.loops[name].spots],
+            [spot for name in rig.stellar_loops for spot in truth.stellar_loops[name].spots],
             truth.hot_pixels,
         )
-        self._pixel_key = next(iter(self._plants.values())).plant.pixel_keys[0]
         self._exposures = 0
         self._camera = GigeCameraMock(
             rig.true_camera, mocks.camera, picture or self._render, port=mocks.gvcp_port
         )
         self._fault_plan = mocks.faults
         devices = {"camera": self._camera.faults}
-        for name, loop in self._loops.items():
-            devices |= {
-                f"{name}.drive": loop.drive.faults,
-                f"{name}.dac": loop.dac.faults,
-                f"{name}.mdt693": loop.piezo.faults,
-            }
+        devices |= {f"{name}.drive": drive.faults for name, drive in self._drives.items()}
+        for name, star in self._stars.items():
+            devices |= {f"{name}.dac": star.dac.faults, f"{name}.mdt693": star.piezo.faults}
+        devices |= {f"{name}.labjack": one.faults for name, one in self._labjacks.items()}
+        if self._hexapod is not None:
+            devices["hexapod"] = self._hexapod.faults
         self._faults = FaultTable(devices)
-        plants = {name: live.plant for name, live in self._plants.items()}
         self._bench = Bench(
             rig.name,
-            plants,
+            self._live.plant,
             self._faults,
             started_s,
             mocks.bench_port,
@@ -192,26 +292,35 @@ class Testbed:
         """
         self._faults.schedule(self._fault_plan)
         seen_s = time.monotonic()
-        for live in self._plants.values():
-            live.advance()  # compiles the kernels before anyone waits for an answer
+        self._live.advance()  # compiles the kernels before anyone waits for an answer
         self._render(seen_s)  # and the camera's
         endpoints: dict[str, Any] = {
             "camera.device.address": "127.0.0.1",
             "camera.device.gvcp_port": await self._camera.start(),
             "mocks.bench_port": self._bench.start(),
         }
-        for name, loop in self._loops.items():
-            piezo = await loop.piezo.start()
-            drive = await loop.drive.start()
-            dac = await loop.dac.start()
-            prefix = f"loops.{name}"
-            endpoints |= endpoint_keys(loop.drive_name, name, drive)
+        for name, drive in self._drives.items():
+            endpoints |= endpoint_keys(self._drive_names[name], name, await drive.start())
+        for name, star in self._stars.items():
+            piezo = await star.piezo.start()
+            dac = await star.dac.start()
             endpoints |= {
-                f"{prefix}.fsm.dac.host": "127.0.0.1",
-                f"{prefix}.fsm.dac.port": dac.tcp_port,
-                f"{prefix}.fsm.piezo.port": f"socket://127.0.0.1:{piezo.tcp_port}",
+                f"loops.{name}.fsm.dac.host": "127.0.0.1",
+                f"loops.{name}.fsm.dac.port": dac.tcp_port,
+                f"loops.{name}.fsm.piezo.port": f"socket://127.0.0.1:{piezo.tcp_port}",
                 f"mocks.loops.{name}.dac_pty": dac.pty_path,
                 f"mocks.loops.{name}.mdt693_pty": piezo.pty_path,
+            }
+        for name, labjack in self._labjacks.items():
+            endpoints |= {
+                f"loops.{name}.sensor.device.host": "127.0.0.1",
+                f"loops.{name}.sensor.device.port": await labjack.start(),
+            }
+        if self._hexapod is not None:
+            hexapod = await self._hexapod.start()
+            endpoints |= {
+                "collector.hexapod.port": f"socket://127.0.0.1:{hexapod.tcp_port}",
+                "mocks.hexapod_pty": hexapod.pty_path,
             }
         self._housekeeping = asyncio.create_task(self._keep_up())
         return endpoints
@@ -223,20 +332,25 @@ class Testbed:
             await asyncio.gather(self._housekeeping, return_exceptions=True)
         self._faults.close()
         await self._camera.stop()
-        for loop in self._loops.values():
-            await loop.drive.stop()
-            await loop.dac.stop()
-            await loop.piezo.stop()
+        for drive in self._drives.values():
+            await drive.stop()
+        for star in self._stars.values():
+            await star.dac.stop()
+            await star.piezo.stop()
+        for labjack in self._labjacks.values():
+            await labjack.stop()
+        if self._hexapod is not None:
+            await self._hexapod.stop()
         await self._bench.stop()
 
     def _render(self, mid_exposure_s: float) -> NDArray[np.uint16]:
-        spots = [live.spots_px(mid_exposure_s) for live in self._plants.values()]
         self._exposures += 1
-        return self._scene.frame(np.concatenate(spots), self._pixel_key, self._exposures)
+        return self._scene.frame(
+            self._live.spots_px(mid_exposure_s), self._live.plant.pixel_key, self._exposures
+        )
 
     async def _keep_up(self) -> None:
         """Advance in small pieces also when nobody looks, so that nobody ever waits for an hour's steps."""
         while True:
-            for live in self._plants.values():
-                live.advance()
+            self._live.advance()
             await asyncio.sleep(_HOUSEKEEPING_S)

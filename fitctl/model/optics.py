@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,20 +91,27 @@ def scales(rig: Rig, loop: Loop) -> Scales:
     """Scales of one loop of a rig (Table 1)."""
     pixel_size_m = rig.camera.pixel_size_m
     siderostat = loop.siderostat
-    sky_px_per_rad = rig.optics.compressor_ratio * rig.optics.focal_length_m / pixel_size_m
-    # The siderostat is a mirror: its beam turns by twice its own angle.
-    motor_sky = (
-        2 * siderostat.ball_screw_m_per_rad / siderostat.spur_gear_ratio / siderostat.lever_arm_m
-    )
+    px_per_rad = sky_px_per_rad(rig)
+    motor_sky = motor_sky_rad_per_rad(siderostat)
     return Scales(
-        sky_px_per_rad=sky_px_per_rad,
+        sky_px_per_rad=px_per_rad,
         motor_sky_rad_per_rad=motor_sky,
-        motor_px_per_rad=motor_sky * sky_px_per_rad,
+        motor_px_per_rad=motor_sky * px_per_rad,
         mirror_px_per_rad=loop.fsm.beam_per_mirror * rig.optics.focal_length_m / pixel_size_m,
         siderostat_turn=rotation(siderostat.rotation_deg),
         mirror_turn=rotation(loop.fsm.rotation_deg),
         pixel_size_m=pixel_size_m,
     )
+
+
+def sky_px_per_rad(rig: Rig) -> float:
+    """Beam angle on the sky, before the compressor, to focal plane."""
+    return rig.optics.compressor_ratio * rig.optics.focal_length_m / rig.camera.pixel_size_m
+
+
+def motor_sky_rad_per_rad(siderostat: Siderostat[Any]) -> float:
+    """Siderostat motor to beam on the sky: it is a mirror, whose beam turns by twice its own angle."""
+    return 2 * siderostat.ball_screw_m_per_rad / siderostat.spur_gear_ratio / siderostat.lever_arm_m
 
 
 def rotation(angle_deg: float) -> Floats:

@@ -56,6 +56,7 @@ class PlantConstants:
     mode_gain: Floats
     participation: float
     air: AirConstants
+    sky_px_per_rad: float
     motor_px_per_rad: float
     mirror_px_per_rad: float
     siderostat_turn: Floats
@@ -78,7 +79,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         If no stack has the hysteresis that the rig asks for.
     """
     truth, _ = rig.mock_parts()
-    loop, plant = rig.loops[loop_name], truth.loops[loop_name]
+    loop, plant = rig.stellar_loops[loop_name], truth.stellar_loops[loop_name]
     scale = scales(rig, loop)
     lag_s = 1 / (2 * np.pi * plant.amplifier_bandwidth_hz)
     try:
@@ -107,6 +108,7 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
         mode_gain=gain,
         participation=plant.structure.participation,
         air=air_constants(plant.air_path, truth.step_s),
+        sky_px_per_rad=scale.sky_px_per_rad,
         motor_px_per_rad=scale.motor_px_per_rad,
         mirror_px_per_rad=scale.mirror_px_per_rad,
         siderostat_turn=scale.siderostat_turn,

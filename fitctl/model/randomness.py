@@ -45,8 +45,13 @@ def run_randomness(seed: int, spots: int) -> RunRandomness:
 def place_star(rig: Rig, loop_name: str, random: np.random.Generator) -> Floats:
     """A place uniform over the disc of the rig's largest star offset, in pixels from the target."""
     truth, _ = rig.mock_parts()
-    largest = truth.loops[loop_name].star_offset_sky_arcsec_max
-    radius_arcsec = largest * np.sqrt(random.uniform())
+    largest_arcsec = truth.stellar_loops[loop_name].star_offset_sky_arcsec_max
+    arcsec_per_px = scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px
+    return disc_place(largest_arcsec, random) / arcsec_per_px
+
+
+def disc_place(radius: float, random: np.random.Generator) -> Floats:
+    """A place uniform over a disc about zero, shape (2,)."""
+    distance = radius * np.sqrt(random.uniform())
     angle = random.uniform(0, 2 * np.pi)
-    arcsec_per_px = scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
-    return np.array([np.cos(angle), np.sin(angle)]) * radius_arcsec / arcsec_per_px
+    return np.array([np.cos(angle), np.sin(angle)]) * distance

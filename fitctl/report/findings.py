@@ -108,7 +108,7 @@ def find(run: Run) -> Findings:
 
 def _loop(gathered: Gathered, name: str) -> LoopFindings:
     rig: Rig = gathered.run.rig
-    ticks, settings = gathered.ticks[name], rig.loops[name]
+    ticks, settings = gathered.ticks[name], rig.stellar_loops[name]
     selection = select_frames(ticks, rig.camera.period_s, settings.requirement_px)
     rows = selection.rows
     residual = {axis: rms_estimate(ticks[f"error_{axis}_px"][rows]) for axis in AXES}

@@ -132,7 +132,7 @@ def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float,
         if event["name"] == loop_name and (change := _CHANGE.fullmatch(event["message"]))
     ]
     logged = _logged_design(gathered, loop_name)
-    vernier = gathered.run.rig.loops[loop_name].vernier
+    vernier = gathered.run.rig.stellar_loops[loop_name].vernier
     name = changes[0][1] if changes else str(logged.get("name", vernier.controller))
     begins: list[tuple[float, str]] = [(-math.inf, name)]
     begins += [(time_s, after) for time_s, _, after in changes]

@@ -102,14 +102,14 @@ def stacks(rig: Rig, loop_name: str, ticks: Columns) -> Stacks | None:
 
     Ideal stacks under Eq. 1 have no piston, so that without a model nothing is known.
     """
-    fsm = rig.loops[loop_name].fsm
+    fsm = rig.stellar_loops[loop_name].fsm
     if fsm.hysteresis is not None:
         source = f"the hysteresis in the rig file (loops.{loop_name}.fsm.hysteresis)"
         half_v = np.asarray(fsm.hysteresis.half_widths_v)
         gains = np.asarray(fsm.hysteresis.gains_m_per_v)
     elif rig.plant is not None:
         source = f"the mock's own hysteresis (plant.loops.{loop_name}.hysteresis)"
-        settings = rig.plant.loops[loop_name].hysteresis
+        settings = rig.plant.stellar_loops[loop_name].hysteresis
         half_v = half_widths_v(settings)
         gains = np.tile(stack_gains(settings, fsm), (3, 1))
     else:
@@ -126,7 +126,7 @@ def motion_px(rig: Rig, loop_name: str, ticks: Columns) -> tuple[Floats, Floats,
 
     The siderostat's are from where its encoders were first.
     """
-    scale = scales(rig, rig.loops[loop_name])
+    scale = scales(rig, rig.stellar_loops[loop_name])
     mirror_rad, motor_rad, setpoint_rad = (
         axis_pair(ticks, name)
         for name in ("fsm_{}_rad", "siderostat_{}_rad", "siderostat_setpoint_{}_rad")

@@ -23,7 +23,7 @@ def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Ac
     """The command that makes an attempt's search, the first of which is 1."""
     radius = step.search_radius_sky_arcsec
     if step.max_offset_sky_arcsec is not None:
-        first = radius or rig.loops[loop_name].acquisition.search_radius_sky_arcsec
+        first = radius or rig.stellar_loops[loop_name].acquisition.search_radius_sky_arcsec
         radius = min(first * step.radius_growth ** (attempt - 1), step.max_offset_sky_arcsec)
     return Acquire(
         loop=loop_name,

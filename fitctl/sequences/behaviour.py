@@ -80,7 +80,7 @@ POWERED = frozenset({Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, 
 
 def too_far(step: Moving, rig: Rig, loop_name: str, offset_px: float) -> list[str]:
     """What is wrong with moving the star by so much."""
-    sky_arcsec = offset_px * scales(rig, rig.loops[loop_name]).sky_arcsec_per_px
+    sky_arcsec = offset_px * scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px
     problems = []
     if offset_px > step.max_offset_px:
         problems.append(

@@ -29,7 +29,7 @@ _SAMPLED_HZ = 100.0
 
 def motions_px(rig: Rig, loop_name: str, drives: list[Drive]) -> Floats:
     """Where the motions put the star about its place, by the rig file's scales, shape (n, 2)."""
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     scale = scales(rig, loop)
     per_px = stack_v_per_px(
         loop.fsm.stack_radius_m, loop.fsm.stack_scale_m_per_v, scale.mirror_px_per_rad

@@ -101,7 +101,7 @@ def _grid(step: steps.Raster) -> list[Offset]:
 
 
 def _check_visit(step: steps.Visiting, rig: Rig, loop_name: str) -> list[str]:
-    target, offsets = rig.loops[loop_name].target_px, places(step)
+    target, offsets = rig.stellar_loops[loop_name].target_px, places(step)
     problems = too_far(step, rig, loop_name, max(math.hypot(*offset) for offset in offsets))
     if not all(
         rig.camera.window_fits(target.az + offset.az_px, target.el + offset.el_px)

@@ -119,7 +119,7 @@ class View:
     @property
     def settings(self) -> Loop:
         """The loop's part of the rig file."""
-        return self.rig.loops[self.loop_name]
+        return self.rig.stellar_loops[self.loop_name]
 
     @property
     def loop(self) -> LoopState:

@@ -26,10 +26,10 @@ from prometheus_client.metrics_core import (
 from prometheus_client.registry import Collector
 
 from fitctl.config import ConfigError
-from fitctl.logging.records import DeviceHealth, LoopTiming, Severity
+from fitctl.logging.records import DeviceHealth, LoopTiming, Overlap, Severity
 from fitctl.messages.client import Client
 from fitctl.messages.modes import Mode
-from fitctl.messages.tally import Tally, add_ticks
+from fitctl.messages.tally import BeamTally, Tally, add_beam_ticks, add_ticks
 from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.troubles import troubles
 
@@ -82,6 +82,8 @@ class InstrumentCollector(Collector):
         self._received_s = -STALE_S
         self._messages_missed = 0
         self._tallies: dict[str, Tally] = {}
+        self._beams: dict[str, BeamTally] = {}
+        self._overlap: Overlap | None = None
         self._timings: dict[str, LoopTiming] = {}
         self._timed: Counter[tuple[str, str]] = Counter()
         self._events: Counter[str] = Counter(dict.fromkeys(SEVERITIES, 0))
@@ -94,6 +96,9 @@ class InstrumentCollector(Collector):
                 self._messages_missed += telemetry.sequence - before.sequence - 1
             self._newest, self._received_s = telemetry, now_s
             add_ticks(self._tallies, telemetry.ticks)
+            add_beam_ticks(self._beams, telemetry.metrology_ticks)
+            if telemetry.overlaps:
+                self._overlap = telemetry.overlaps[-1]
             for row in telemetry.timing:
                 before_it = self._timings.get(row.loop)
                 if before_it is None or before_it.time_s != row.time_s:
@@ -113,6 +118,8 @@ class InstrumentCollector(Collector):
                 return
             yield from _of_instrument(self._newest)
             yield from _of_loops(self._newest, self._tallies)
+            yield from _of_beams(self._beams)
+            yield from _of_overlap(self._overlap)
             yield from _of_timing(self._timings, self._timed)
             yield from _of_devices(self._newest)
             yield _counters(
@@ -285,6 +292,12 @@ def _of_loops(newest: Telemetry, tallies: dict[str, Tally]) -> Iterator[Metric]:
         ["loop", "interlock", "action"],
         [([at.name, row.name, row.action], 1) for at in newest.loops for row in at.interlocks],
     )
+    yield _gauges(
+        "fitctl_loop_waits",
+        "1 while the loop holds its stages and waits, such as for its link.",
+        ["loop"],
+        [([loop.name], bool(loop.waits_for)) for loop in newest.loops],
+    )
     ticks = {loop: tally.newest for loop, tally in tallies.items()}
     for name, text, field in OF_TICK:
         rows = [([loop], getattr(tick, field)) for loop, tick in ticks.items()]
@@ -300,6 +313,45 @@ def _of_loops(newest: Telemetry, tallies: dict[str, Tally]) -> Iterator[Metric]:
             for loop, tally in tallies.items()
             for axis, value in (("az", tally.az_px2), ("el", tally.el_px2))
         ],
+    )
+
+
+def _of_beams(tallies: dict[str, BeamTally]) -> Iterator[Metric]:
+    yield _counters(
+        "fitctl_beam_samples",
+        "Samples of the photodiodes that measured the metrology beam.",
+        ["loop"],
+        [([loop], tally.samples) for loop, tally in tallies.items()],
+    )
+    yield _counters(
+        "fitctl_beam_error_arcseconds_squared",
+        "Squared error of the metrology beam, summed over fitctl_beam_samples.",
+        ["loop", "axis"],
+        [
+            ([loop, axis], value)
+            for loop, tally in tallies.items()
+            for axis, value in (("az", tally.az_arcsec2), ("el", tally.el_arcsec2))
+        ],
+    )
+
+
+def _of_overlap(newest: Overlap | None) -> Iterator[Metric]:
+    rows = [] if newest is None else [newest]
+    yield _gauges(
+        "fitctl_tilt_arcseconds",
+        "Tilt between two loops' stars on the newest frame.",
+        ["loop", "other_loop", "axis"],
+        [
+            ([row.loop, row.other_loop, axis], value)
+            for row in rows
+            for axis, value in (("az", row.tilt_az_arcsec), ("el", row.tilt_el_arcsec))
+        ],
+    )
+    yield _gauges(
+        "fitctl_visibility",
+        "Fringe visibility that this tilt leaves.",
+        ["loop", "other_loop"],
+        [([row.loop, row.other_loop], row.visibility) for row in rows],
     )
 
 

@@ -15,7 +15,9 @@ from fitctl.logging.records import (
     FrameRecord,
     LoopTiming,
     Losses,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     PiezoReading,
     Record,
     RecorderStatus,
@@ -67,6 +69,8 @@ class TelemetryBuffer:
         self.frame: FrameRecord | None = None
         self.recorder: RecorderStatus | None = None
         self._ticks = CountingBuffer[Tick](_BUFFERED_TICKS)
+        self._metrology_ticks = CountingBuffer[MetrologyTick](_BUFFERED_TICKS)
+        self._overlaps = CountingBuffer[Overlap](_BUFFERED_TICKS)
         self._events = CountingBuffer[Event](_BUFFERED_EVENTS)
         self._changes = CountingBuffer[ModeChange](_BUFFERED_EVENTS)
         self._published = deque[Event](maxlen=_REMEMBERED_EVENTS)  # the service's thread alone
@@ -79,6 +83,10 @@ class TelemetryBuffer:
         match record:
             case Tick():
                 self._ticks.put(record)
+            case MetrologyTick():
+                self._metrology_ticks.put(record)
+            case Overlap():
+                self._overlaps.put(record)
             case FrameRecord():
                 self.frame = record
             case Event():
@@ -119,6 +127,8 @@ class TelemetryBuffer:
             scheduling=state.scheduling,
             running_sequence=supervisor.sequences.status(),
             commander=state.commander,
+            metrology_ticks=self._metrology_ticks.drain(),
+            overlaps=self._overlaps.drain(),
         )
 
     def recent_events(self) -> list[Event]:
@@ -138,7 +148,7 @@ class TelemetryBuffer:
             time_s=now_s,
             records_offered=state.records_offered(),
             records_lost=state.records_lost(),
-            ticks_unsent=self._ticks.lost,
+            ticks_unsent=self._ticks.lost + self._metrology_ticks.lost,
             events_unsent=self._events.lost,
             mode_changes_unsent=self._changes.lost,
             replies_unsent=state.replies_unsent,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
@@ -12,18 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import VirtualClock
-from fitctl.config import Rig
+from fitctl.config import C887Device, C887Mock, Rig
 from fitctl.drivers.interface import (
     AzEl,
     CameraCounts,
     DeviceIdentity,
+    DeviceRefused,
+    DiodeReading,
     Frame,
+    HexapodReading,
+    Pose,
     ServoReading,
 )
+from fitctl.model.hexapod_motion import MotionLimits, Trajectory, at_rest, plan_move, plan_stop
+from fitctl.model.metrology.collector import CollectorPart
+from fitctl.model.metrology.part import MetrologyPart
+from fitctl.model.pixel_noise import pixel_normals
 from fitctl.model.plant import Plant
 from fitctl.model.scene import Scene
+from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]
+_DIODE_BITS = 16  # of a LabJack T7's converter at its fastest; others are finer
 
 
 def _identity(model: str) -> DeviceIdentity:
@@ -46,7 +57,9 @@ class InlineExecutor(Executor):
 class SimulatedAmplifiers:
     """Velocity-mode amplifiers on the plant's motors, with encoders that count."""
 
-    def __init__(self, plant: Plant, clock: VirtualClock, counts_per_rev: int) -> None:
+    def __init__(
+        self, plant: StellarPart | MetrologyPart, clock: VirtualClock, counts_per_rev: int
+    ) -> None:
         self._plant = plant
         self._clock = clock
         self._motor_rad = plant.state.motor_rad[0]
@@ -91,8 +104,8 @@ class SimulatedAmplifiers:
 class SimulatedMirror:
     """D/A and piezo amplifier in one: volts, quantized and limited, on the plant's stacks."""
 
-    def __init__(self, plant: Plant, clock: VirtualClock, rig: Rig, loop_name: str) -> None:
-        fsm = rig.loops[loop_name].fsm
+    def __init__(self, plant: StellarPart, clock: VirtualClock, rig: Rig, loop_name: str) -> None:
+        fsm = rig.stellar_loops[loop_name].fsm
         self._plant = plant
         self._clock = clock
         self._stack_v = plant.inputs.stack_v[0]
@@ -130,21 +143,140 @@ class SimulatedMirror:
         """Nothing to disconnect."""
 
 
+class SimulatedPhotodiodes:
+    """Photodiodes behind an A/D converter at the other end of a link: noise, quantization and delay."""
+
+    def __init__(self, plant: MetrologyPart, clock: VirtualClock, rig: Rig, loop_name: str) -> None:
+        truth, _ = rig.mock_parts()
+        self._plant = plant
+        self._clock = clock
+        self._round_trip_s = truth.metrology_loops[loop_name].link_round_trip_s
+        self._range_v = rig.metrology_loops[loop_name].sensor.device.range_v
+        self._step_v = 2 * self._range_v / 2**_DIODE_BITS
+        self._requested_s: deque[float] = deque()
+        self._samples = 0  # never starts again: noise must not repeat
+
+    def open(self) -> DeviceIdentity:
+        """Nothing to connect."""
+        self._requested_s.clear()
+        return _identity("photodiodes")
+
+    def send_request(self) -> None:
+        """Ask for a sample; it is of the middle of the round trip."""
+        self._requested_s.append(self._clock.now_s())
+
+    def receive(self) -> DiodeReading | None:
+        """The newest sample that has arrived by now."""
+        newest_s = None
+        while self._requested_s and self._arrived(self._requested_s[0]):
+            newest_s = self._requested_s.popleft() + self._round_trip_s / 2
+        return None if newest_s is None else DiodeReading(newest_s, self._volts(newest_s))
+
+    def close(self) -> None:
+        """Nothing to disconnect."""
+
+    def _arrived(self, requested_s: float) -> bool:
+        return requested_s + self._round_trip_s <= self._clock.now_s() + 1e-9
+
+    def _volts(self, time_s: float) -> tuple[float, float, float, float]:
+        self._samples += 1
+        noise = pixel_normals(self._plant.noise_keys[0], self._samples, 4)
+        volts = self._plant.diode_volts(time_s)[0] + self._plant.sensor.noise_v * noise
+        steps = np.rint(np.clip(volts, -self._range_v, self._range_v) / self._step_v)
+        az_plus, az_minus, el_plus, el_minus = (steps * self._step_v).tolist()
+        return az_plus, az_minus, el_plus, el_minus
+
+
+class SimulatedHexapod:
+    """The hexapod under the collector, which moves as its controller would plan it."""
+
+    def __init__(
+        self, plant: CollectorPart, clock: VirtualClock, device: C887Device, mock: C887Mock
+    ) -> None:
+        self._plant = plant
+        self._clock = clock
+        self._ends = device.travel.ends
+        self._limits = MotionLimits(
+            mock.velocity_limit_mm_s,
+            mock.velocity_limit_deg_s,
+            mock.acceleration_mm_s2,
+            mock.acceleration_deg_s2,
+        )
+        self._trajectory = at_rest(np.zeros(6))
+        self._referenced = mock.referenced
+
+    def open(self) -> DeviceIdentity:
+        """Nothing to connect."""
+        return _identity("hexapod")
+
+    def reference(self) -> None:
+        """It knows where it is, and takes no time to find out."""
+        self._referenced = True
+
+    def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
+        """Start a move from where it is, or give a running one a new target.
+
+        Raises
+        ------
+        DeviceRefused
+            If the hexapod is not referenced, or the pose is beyond the travel.
+        """
+        if not self._referenced:
+            raise self._refusal("a referenced hexapod", "one that is not", "reference it first")
+        for axis, value, (low, high) in zip(Pose._fields, pose, self._ends, strict=True):
+            if not low <= value <= high:
+                raise self._refusal(
+                    f"{axis} within {low:g} to {high:g}", f"{value:g}", "choose a nearer pose"
+                )
+        velocity_mm_s = min(velocity_mm_s, self._limits.velocity_mm_s)
+        limits = self._limits._replace(velocity_mm_s=velocity_mm_s)
+        self._follow(plan_move(self._trajectory, self._clock.now_s(), pose, limits))
+
+    def pose(self) -> HexapodReading:
+        """Where it is."""
+        now_s = self._clock.now_s()
+        pose = Pose(*self._trajectory.pose_at(now_s).tolist())
+        return HexapodReading(now_s, pose, now_s < self._trajectory.ends_s, self._referenced, "")
+
+    def stop(self) -> None:
+        """Brake where it is."""
+        self._follow(plan_stop(self._trajectory, self._clock.now_s(), self._limits))
+
+    def close(self) -> None:
+        """A move that runs goes on."""
+
+    def _follow(self, trajectory: Trajectory) -> None:
+        self._plant.advance(self._clock.now_s())
+        self._trajectory = trajectory
+        self._plant.follow(trajectory)
+
+    def _refusal(self, expected: str, got: str, hint: str) -> DeviceRefused:
+        return DeviceRefused("hexapod", "simulation", expected, got, hint)
+
+
+def simulated_hexapod(plant: Plant, clock: VirtualClock, rig: Rig) -> SimulatedHexapod | None:
+    """The hexapod of a rig that has a collector."""
+    _, mocks = rig.mock_parts()
+    if rig.collector is None or plant.collector is None or mocks.hexapod is None:
+        return None
+    return SimulatedHexapod(plant.collector, clock, rig.collector.hexapod, mocks.hexapod)
+
+
 class SimulatedCamera:
     """Frames of one scene; waiting for one moves the virtual clock on, servo period by servo period."""
 
-    def __init__(self, rig: Rig, clock: VirtualClock, plants: dict[str, Plant]) -> None:
+    def __init__(self, rig: Rig, clock: VirtualClock, plant: Plant) -> None:
         truth, _ = rig.mock_parts()
         self.on_servo_period: list[tuple[float, Callable[[], None]]] = []
         self._camera = rig.true_camera
         self._clock = clock
-        self._plants = plants
+        self._plant = plant
         self._scene = Scene(
             rig.camera,
-            [spot for name in plants for spot in truth.loops[name].spots],
+            [spot for name in plant.stellar_loops for spot in truth.stellar_loops[name].spots],
             truth.hot_pixels,
         )
-        self._pixel_key = next(iter(plants.values())).pixel_keys[0]
+        self._pixel_key = plant.pixel_key
         self._exposures = 0  # never starts again, as the frames' numbers do: noise must not repeat
         self._frames = 0
         self._start_s = 0.0
@@ -174,7 +306,7 @@ class SimulatedCamera:
         self._go_on_to(arrives_s)
         self._frames += 1
         self._exposures += 1
-        spots = np.concatenate([plant.spots_px(exposed_s)[0] for plant in self._plants.values()])
+        spots = self._plant.spots_px(exposed_s)[0]
         image = self._scene.frame(spots, self._pixel_key, self._exposures)
         return Frame(self._frames, exposed_s, self._clock.now_s(), image)
 

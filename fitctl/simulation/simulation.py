@@ -13,21 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import VirtualClock
-from fitctl.config import Rig
+from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
-from fitctl.logging.records import AnyRecord, ModeChange, Tick
-from fitctl.messages.commands import Acquire, AnyCommand, Reply, Standby
-from fitctl.messages.modes import Mode
+from fitctl.logging.records import AnyRecord, MetrologyTick, ModeChange, Tick
+from fitctl.messages.commands import Acquire, AnyCommand, MoveCollector, Reply, Standby
+from fitctl.messages.modes import METROLOGY_MODES, Mode
+from fitctl.model.metrology.fringes import mean_visibility
+from fitctl.model.metrology.part import MetrologyPart
 from fitctl.model.plant import Plant
 from fitctl.simulation.devices import (
     InlineExecutor,
     SimulatedAmplifiers,
     SimulatedCamera,
     SimulatedMirror,
+    SimulatedPhotodiodes,
+    simulated_hexapod,
 )
 from fitctl.simulation.statistics import (
     SETTLE_S,
+    MetrologyResult,
+    RigResult,
     SimulationResult,
     mode_times,
     pair,
@@ -35,9 +41,11 @@ from fitctl.simulation.statistics import (
     rms,
     true_residual_rms,
 )
+from fitctl.stages.collector import CollectorDrive
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
+_EVERY = 10  # steps of the plant from one sample of the visibility to the next: 5 ms
 
 
 class Simulation:
@@ -68,35 +76,45 @@ class Simulation:
         self.rig = rig
         self.clock = VirtualClock()
         offset = None if star_offset_px is None else np.asarray(star_offset_px)[None]
-        self.plants = {
-            # Each loop's plant gets a seed of its own from the run's.
-            name: Plant(
-                rig, name, [seed + 1000 * index], star_offset_px=offset, history_s=history_s
-            )
-            for index, name in enumerate(rig.loops)
-        }
-        self.camera = SimulatedCamera(rig, self.clock, self.plants)
-        loops = {}
-        for name, plant in self.plants.items():
-            mirror = SimulatedMirror(plant, self.clock, rig, name)
-            counts = rig.loops[name].siderostat.encoder_counts_per_rev
-            loops[name] = LoopDevices(
-                SimulatedAmplifiers(plant, self.clock, counts), dac=mirror, piezo=mirror
-            )
+        self.plant = Plant(rig, [seed], star_offset_px=offset, history_s=history_s)
+        self.plants = self.plant.stellar_loops
+        self.camera = SimulatedCamera(rig, self.clock, self.plant)
+        self.hexapod = simulated_hexapod(self.plant, self.clock, rig)
         self.ticks: list[Tick] = []
         self.mode_changes: list[ModeChange] = []
+        self.samples = dict.fromkeys(rig.metrology_loops, 0)
         self._on_record = record
-        self.devices = Devices(self.camera, loops)
+        loops = {name: self._loop_devices(name) for name in rig.loops}
+        self.devices = Devices(self.camera, loops, self.hexapod)
         self.supervisor = Supervisor(
             rig, self.devices, self.clock, InlineExecutor(), self._receive, design_for
         )
+        if self.supervisor.collector is not None and rig.collector and self.hexapod is not None:
+            # A random course is the run's own.
+            self.supervisor.collector.drive = CollectorDrive(
+                rig.collector, self.hexapod, self.clock, seed
+            )
         self.camera.on_servo_period = [
             (work.period_s, work.period) for work in self.supervisor.periodic
         ]
 
+    def _loop_devices(self, name: str) -> LoopDevices:
+        part, counts = (
+            self.plant.loops[name],
+            self.rig.loops[name].siderostat.encoder_counts_per_rev,
+        )
+        amplifiers = SimulatedAmplifiers(part, self.clock, counts)
+        if isinstance(part, MetrologyPart):
+            photodiodes = SimulatedPhotodiodes(part, self.clock, self.rig, name)
+            return LoopDevices(amplifiers, photodiodes=photodiodes)
+        mirror = SimulatedMirror(part, self.clock, self.rig, name)
+        return LoopDevices(amplifiers, dac=mirror, piezo=mirror)
+
     def _receive(self, record: AnyRecord) -> None:
         if isinstance(record, Tick):
             self.ticks.append(record)
+        elif isinstance(record, MetrologyTick):
+            self.samples[record.loop] += not math.isnan(record.beam_az_m)
         elif isinstance(record, ModeChange):
             self.mode_changes.append(record)
         if self._on_record is not None:
@@ -124,51 +142,145 @@ class Simulation:
             If the supervisor refuses, which it has no reason to.
         """
         for command in (Standby(), Acquire()):
-            reply = self.command(command)
-            if not reply.accepted:
-                raise RuntimeError(reply.text)
+            self._command(command)
+
+    def move_collector(self) -> None:
+        """Reference the hexapod, and begin the collector's motion.
+
+        Raises
+        ------
+        RuntimeError
+            If the supervisor refuses.
+        """
+        self._command(MoveCollector(action="reference"))
+        self._command(MoveCollector(action="start"))
+
+    def _command(self, command: AnyCommand) -> None:
+        reply = self.command(command)
+        if not reply.accepted:
+            raise RuntimeError(reply.text)
 
 
-def simulate(
+def simulate(rig: Rig, seed: int, duration_s: float) -> dict[str, SimulationResult]:
+    """Acquire and hold for `duration_s` of virtual time; one result for each stellar loop."""
+    loops = simulate_rig(rig, seed, duration_s).loops
+    return {name: loop for name, loop in loops.items() if isinstance(loop, SimulationResult)}
+
+
+def simulate_rig(
     rig: Rig,
     seed: int,
     duration_s: float,
     *,
     on_progress: Callable[[float], None] = lambda _: None,
-) -> dict[str, SimulationResult]:
-    """Acquire and hold for `duration_s` of virtual time; one result for each loop.
+) -> RigResult:
+    """Acquire and hold for `duration_s` of virtual time, and move the collector from its start on.
 
     `on_progress` is called about ten times a second of real time with the part done.
     """
+    motion_s = motion_start_s(rig)
     simulation = Simulation(rig, seed, history_s=duration_s + 1.0)  # all of it is judged
-    for plant in simulation.plants.values():
-        plant.advance(plant.constants.step_s)  # compiles, before the time is taken
+    simulation.plant.advance(simulation.plant.step_s)  # compiles, before the time is taken
     started = shown = time.perf_counter()
     simulation.acquire()
     while simulation.clock.now_s() < duration_s:
         simulation.run(rig.camera.period_s)
+        if simulation.clock.now_s() >= motion_s:
+            simulation.move_collector()
+            motion_s = math.inf
+        if simulation.supervisor.collector and simulation.supervisor.collector.drive.fault:
+            raise simulation.supervisor.collector.drive.fault
         if time.perf_counter() - shown > 0.1:
             shown = time.perf_counter()
             on_progress(simulation.clock.now_s() / duration_s)
     speed_x = simulation.clock.now_s() / (time.perf_counter() - started)
-    return {name: _result(simulation, name, speed_x) for name in rig.loops}
+    loops = {name: _result_of(simulation, name, speed_x) for name in rig.loops}
+    return RigResult(loops, _visibility(simulation), speed_x)
+
+
+def motion_start_s(rig: Rig) -> float:
+    """When a simulated run begins to move the collector; infinite if it never does."""
+    if rig.collector is None or rig.collector.motion.kind == "still":
+        return math.inf
+    return rig.collector.motion.start_s
+
+
+def _judged_from_s(simulation: Simulation, name: str) -> float:
+    """From when on a loop is judged: it has settled, and the collector moves where it will; nan without."""
+    held = Mode.LOCKED if name in simulation.rig.metrology_loops else Mode.VERNIER
+    held_s = _reached_s(simulation, name, held) + SETTLE_S
+    motion_s = motion_start_s(simulation.rig)
+    return held_s if math.isinf(motion_s) else max(held_s, motion_s)
+
+
+def _reached_s(simulation: Simulation, name: str, mode: Mode) -> float:
+    """When a loop first came to a mode, or nan."""
+    times_s = (
+        change.time_s
+        for change in simulation.mode_changes
+        if change.loop == name and change.target == mode.name
+    )
+    return next(times_s, math.nan)
+
+
+def _result_of(
+    simulation: Simulation, name: str, speed_x: float
+) -> SimulationResult | MetrologyResult:
+    if name in simulation.rig.metrology_loops:
+        return _metrology_result(simulation, name, speed_x)
+    return _result(simulation, name, speed_x)
+
+
+def _metrology_result(simulation: Simulation, name: str, speed_x: float) -> MetrologyResult:
+    part = simulation.plant.metrology_loops[name]
+    start_s, end_s = _judged_from_s(simulation, name), simulation.clock.now_s()
+    beam_m = part.history_offset_m(start_s, end_s)[:, 0] if start_s < end_s else np.empty((0, 2))
+    beam_arcsec = beam_m / part.sensor.link_length_m * ARCSEC_PER_RAD
+    return MetrologyResult(
+        acquired_s=_reached_s(simulation, name, Mode.COARSE),
+        locked_s=_reached_s(simulation, name, Mode.LOCKED),
+        rms_arcsec=pair(rms(beam_arcsec)),
+        judged_s=max(0.0, end_s - start_s) if start_s < end_s else 0.0,
+        mode_times=mode_times(
+            [change for change in simulation.mode_changes if change.loop == name],
+            end_s,
+            METROLOGY_MODES,
+        ),
+        samples=simulation.samples[name],
+        speed_x=speed_x,
+    )
+
+
+def _visibility(simulation: Simulation) -> float:
+    """Of the stars' true places, each from its loop's target, while both are judged."""
+    fringes = simulation.rig.fringes
+    if fringes is None:
+        return math.nan
+    start_s = max(_judged_from_s(simulation, name) for name in fringes.loops)
+    if not start_s < simulation.clock.now_s():
+        return math.nan
+    one_px, other_px = (
+        simulation.plants[name].history_px(start_s, simulation.clock.now_s())[::_EVERY, 0, 0]
+        - simulation.supervisor.stellar_loops[name].target_px
+        for name in fringes.loops
+    )
+    sky_px_per_rad = simulation.plants[fringes.loops[0]].constants.sky_px_per_rad
+    return mean_visibility((one_px - other_px) / sky_px_per_rad, fringes)
 
 
 def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResult:
     changes = [change for change in simulation.mode_changes if change.loop == name]
     ticks = [tick for tick in simulation.ticks if tick.loop == name]
     end_s = simulation.clock.now_s()
-    reached = {change.target: change.time_s for change in reversed(changes)}
-    vernier_s = reached.get(Mode.VERNIER.name, math.nan)
-    start_s = vernier_s + SETTLE_S
+    start_s = _judged_from_s(simulation, name)
     judged = [t for t in ticks if t.time_s >= start_s and t.star_visible]
     true_px = true_residual_rms(
-        simulation.plants[name], simulation.supervisor.loops[name].target_px, start_s, end_s
+        simulation.plants[name], simulation.supervisor.stellar_loops[name].target_px, start_s, end_s
     )
     measured = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
     return SimulationResult(
-        acquired_s=reached.get(Mode.COARSE.name, math.nan),
-        vernier_s=vernier_s,
+        acquired_s=_reached_s(simulation, name, Mode.COARSE),
+        vernier_s=_reached_s(simulation, name, Mode.VERNIER),
         rms_px=pair(true_px),
         measured_rms_px=pair(rms(measured)),
         judged_s=max(0.0, end_s - start_s) if judged else 0.0,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.records import ModeChange
-from fitctl.messages.modes import Mode
-from fitctl.model.plant import Plant
+from fitctl.messages.modes import STELLAR_MODES, Mode
+from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]
 SETTLE_S = 10.0  # after vernier is reached, before its residual counts
@@ -34,14 +34,42 @@ class SimulationResult(NamedTuple):
     speed_x: float
 
 
-def true_residual_rms(plant: Plant, target_px: Floats, start_s: float, end_s: float) -> Floats:
+class MetrologyResult(NamedTuple):
+    """What a simulated run gave for a metrology loop; RMS of the beam's angle over `judged_s`.
+
+    Of the beam from the centre of the photodiodes, in the plant, the air of the path included.
+    """
+
+    acquired_s: float
+    locked_s: float
+    rms_arcsec: dict[str, float]
+    judged_s: float
+    mode_times: dict[str, float]
+    samples: int
+    speed_x: float
+
+
+class RigResult(NamedTuple):
+    """What a simulated run gave: each loop's, and the mean visibility that the stars' true tilt left.
+
+    The visibility is nan where the rig has no fringes, or its two loops did not hold their stars at one time.
+    """
+
+    loops: dict[str, SimulationResult | MetrologyResult]
+    visibility: float
+    speed_x: float
+
+
+def true_residual_rms(
+    plant: StellarPart, target_px: Floats, start_s: float, end_s: float
+) -> Floats:
     """RMS distance of the pointing spot from `target_px` in continuous time, shape (2,); nan if empty."""
     if not start_s < end_s:
         return np.full(2, math.nan)
     return rms(plant.history_px(start_s, end_s)[:, 0, 0, :] - target_px)
 
 
-def piston_rms_m(plant: Plant, start_s: float, end_s: float) -> float:
+def piston_rms_m(plant: StellarPart, start_s: float, end_s: float) -> float:
     """RMS of the mirror's piston (Eq. 4) about its mean; nan if the time is empty."""
     if not start_s < end_s:
         return math.nan
@@ -60,9 +88,11 @@ def pair(values: Floats) -> dict[str, float]:
     return {"az": float(values[0]), "el": float(values[1])}
 
 
-def mode_times(changes: Iterable[ModeChange], end_s: float) -> dict[str, float]:
-    """Seconds spent in each mode."""
-    times = dict.fromkeys((mode.name for mode in Mode), 0.0)
+def mode_times(
+    changes: Iterable[ModeChange], end_s: float, modes: Iterable[Mode] = STELLAR_MODES
+) -> dict[str, float]:
+    """Seconds spent in each mode of a kind of loop."""
+    times = dict.fromkeys((mode.name for mode in modes), 0.0)
     mode, since_s = Mode.OFF.name, 0.0
     for change in changes:
         times[mode] += change.time_s - since_s

@@ -25,7 +25,7 @@ def refused_drives(rig: Rig, loop_name: str, drives: list[Drive]) -> str:
     why_not = _refused_numbers(drives)
     if why_not:
         return why_not
-    loop = rig.loops[loop_name]
+    loop = rig.stellar_loops[loop_name]
     scale = scales(rig, loop)
     fsm = loop.fsm
     per_px = stack_v_per_px(fsm.stack_radius_m, fsm.stack_scale_m_per_v, scale.mirror_px_per_rad)

@@ -55,8 +55,8 @@ class MirrorStage:
         clock: Clock,
         injector: Injector | None = None,
     ) -> None:
-        fsm = rig.loops[loop_name].fsm
-        mirror_px_per_rad = scales(rig, rig.loops[loop_name]).mirror_px_per_rad
+        fsm = rig.stellar_loops[loop_name].fsm
+        mirror_px_per_rad = scales(rig, rig.stellar_loops[loop_name]).mirror_px_per_rad
         self.ready = False
         self.stack_v = np.full(3, fsm.bias_v)
         self.command_rad = np.zeros(2)

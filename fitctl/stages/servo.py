@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import Clock
-from fitctl.config import Loop
+from fitctl.config import AnyLoop
 from fitctl.controllers.position_servo import position_servo
 from fitctl.drivers.interface import (
     AzEl,
@@ -79,7 +79,7 @@ class SiderostatServo:
     ----------
     name : str
         Loop name, for errors.
-    loop : Loop
+    loop : AnyLoop
     amplifiers : ServoAmplifiers
     clock : Clock
     setpoint_period_s : float
@@ -89,7 +89,7 @@ class SiderostatServo:
     def __init__(
         self,
         name: str,
-        loop: Loop,
+        loop: AnyLoop,
         amplifiers: ServoAmplifiers,
         clock: Clock,
         setpoint_period_s: float,

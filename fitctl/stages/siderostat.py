@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Rig
-from fitctl.model.optics import scales
+from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.stages.servo import SiderostatServo
 
 Floats = NDArray[np.float64]
@@ -34,12 +34,12 @@ class SiderostatStage:
     """
 
     def __init__(self, rig: Rig, loop_name: str, servo: SiderostatServo) -> None:
-        loop = rig.loops[loop_name]
+        siderostat = rig.loops[loop_name].siderostat
         self.servo = servo
         self.setpoint_rad = np.zeros(2)
         self.wanted_fraction = 0.0
-        self._motor_sky_arcsec_per_rad = scales(rig, loop).motor_sky_arcsec_per_rad
-        self.travel_rad = loop.siderostat.travel_sky_arcsec / self._motor_sky_arcsec_per_rad
+        self._motor_sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
+        self.travel_rad = siderostat.travel_sky_arcsec / self._motor_sky_arcsec_per_rad
 
     def hold(self, motor_rad: Floats) -> None:
         """Servo about where the motors are, shape (2,)."""

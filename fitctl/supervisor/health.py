@@ -8,7 +8,9 @@ from fitctl.config import Rig
 from fitctl.drivers.interface import CameraCounts, DeviceIdentity
 from fitctl.logging.records import CAMERA, DeviceHealth
 from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.stellar import StellarLoop
+from fitctl.supervisor.collector import HEXAPOD, CollectorWatch
 from fitctl.supervisor.piezo import PiezoWatch
 
 Identities = Mapping[str, DeviceIdentity]
@@ -73,6 +75,32 @@ def mirror_health(
             fault=bool(piezo.error),
         ),
     ]
+
+
+def photodiode_health(loop: MetrologyLoop, identities: Identities, now_s: float) -> DeviceHealth:
+    """The A/D converter of a metrology loop's photodiodes."""
+    return _health(
+        f"{loop.name} photodiodes",
+        loop.settings.sensor.device.endpoint,
+        loop.sampled,
+        "sampled every tick" if loop.sampled else "not sampled",
+        identities,
+        now_s,
+    )
+
+
+def hexapod_health(collector: CollectorWatch, now_s: float) -> DeviceHealth:
+    """The hexapod under the collector."""
+    identity = collector.identity
+    return _health(
+        HEXAPOD,
+        collector.endpoint,
+        collector.is_open,
+        collector.detail,
+        {} if identity is None else {HEXAPOD: identity},
+        now_s,
+        fault=bool(collector.error),
+    )
 
 
 def _health(

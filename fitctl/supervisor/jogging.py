@@ -7,55 +7,66 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Rig
+from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import Jog, SetBiasOffset
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import scales
+from fitctl.model.optics import motor_sky_rad_per_rad, sky_px_per_rad
 
 Floats = NDArray[np.float64]
 
 
-def move_by_hand(rig: Rig, loops: Sequence[StellarLoop], command: Jog | SetBiasOffset) -> str:
-    """Move the siderostats or the mirrors of `loops`, all of them or none.
+def jog_siderostats(rig: Rig, loops: Sequence[Loop], command: Jog) -> str:
+    """Move the siderostats of `loops`, all of them or none.
 
     Returns
     -------
     str
         Why none was moved, and what to do; empty where all were.
     """
+    step_sky_arcsec = np.array([command.az_sky_arcsec, command.el_sky_arcsec])
+    why_not = _not_in_standby(loops) or next(
+        filter(None, (_beyond(rig, loop, step_sky_arcsec) for loop in loops)), ""
+    )
+    for loop in () if why_not else loops:
+        loop.siderostat.jog(step_sky_arcsec)
+    return why_not
+
+
+def offset_mirrors(_rig: Rig, loops: Sequence[StellarLoop], command: SetBiasOffset) -> str:
+    """Move the mirrors of `loops`, as :func:`jog_siderostats`."""
+    offset_rad = 1e-6 * np.array([command.az_urad, command.el_urad])
+    why_not = _not_in_standby(loops) or next(
+        filter(None, (_off_the_diamond(loop, offset_rad) for loop in loops)), ""
+    )
+    for loop in () if why_not else loops:
+        loop.mirror.rest_off_bias(offset_rad)
+    return why_not
+
+
+def _not_in_standby(loops: Sequence[Loop]) -> str:
     for loop in loops:
         if loop.mode is not Mode.STANDBY:
             return (
                 f"stages are moved by hand only in STANDBY (is {loop.mode.name}); while a star is held, "
                 "move the target"
             )
-    if isinstance(command, Jog):
-        step_sky_arcsec = np.array([command.az_sky_arcsec, command.el_sky_arcsec])
-        why_not = next(filter(None, (_beyond(rig, loop, step_sky_arcsec) for loop in loops)), "")
-        for loop in () if why_not else loops:
-            loop.siderostat.jog(step_sky_arcsec)
-        return why_not
-    offset_rad = 1e-6 * np.array([command.az_urad, command.el_urad])
-    why_not = next(filter(None, (_off_the_diamond(loop, offset_rad) for loop in loops)), "")
-    for loop in () if why_not else loops:
-        loop.mirror.rest_off_bias(offset_rad)
-    return why_not
+    return ""
 
 
-def _beyond(rig: Rig, loop: StellarLoop, step_sky_arcsec: Floats) -> str:
+def _beyond(rig: Rig, loop: Loop, step_sky_arcsec: Floats) -> str:
     """A slip of the finger must not lead far from the star, nor to the end of the travel."""
-    scale = scales(rig, loop.settings)
-    most_arcsec = min(rig.camera.width_px, rig.camera.height_px) * scale.sky_arcsec_per_px
+    field_px = min(rig.camera.width_px, rig.camera.height_px)
+    most_arcsec = field_px / sky_px_per_rad(rig) * ARCSEC_PER_RAD
     if not np.abs(step_sky_arcsec).max() <= most_arcsec:  # not-a-number too
         return f"a jog is at most a field of view, {most_arcsec:.1f} arcsec on the sky"
-    siderostat = loop.siderostat
-    goes_rad = siderostat.setpoint_rad + step_sky_arcsec / scale.motor_sky_arcsec_per_rad
-    if np.abs(goes_rad).max() > siderostat.travel_rad:
-        travel_arcsec = loop.settings.siderostat.travel_sky_arcsec
+    stage, settings = loop.siderostat, loop.settings.siderostat
+    step_rad = step_sky_arcsec / ARCSEC_PER_RAD / motor_sky_rad_per_rad(settings)
+    if np.abs(stage.setpoint_rad + step_rad).max() > stage.travel_rad:
         return (
-            f"siderostat {loop.name} would leave its travel of ±{travel_arcsec:g} arcsec on the sky; "
-            "jog the other way"
+            f"siderostat {loop.name} would leave its travel of ±{settings.travel_sky_arcsec:g} arcsec on "
+            "the sky; jog the other way"
         )
     return ""
 

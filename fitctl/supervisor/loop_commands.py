@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import Rig
+from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop, refused_beam_search
 from fitctl.loop.search import refused_search
 from fitctl.loop.stellar import StellarLoop
+from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
@@ -22,12 +25,13 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.modes import WITH_WINDOW, Trigger, transition
 from fitctl.stages.drives import refused_drives
-from fitctl.supervisor.jogging import move_by_hand
+from fitctl.supervisor.jogging import jog_siderostats, offset_mirrors
 
-Loops = Sequence[StellarLoop]
+Loops = Sequence[Loop]
+StellarLoops = Sequence[StellarLoop]
 
 
-def set_target(rig: Rig, loops: Loops, command: SetTarget) -> str:
+def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
     """Hold the star elsewhere; empty, or why not."""
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"target {rig.camera.window_range_text}"
@@ -36,7 +40,7 @@ def set_target(rig: Rig, loops: Loops, command: SetTarget) -> str:
     return ""
 
 
-def look(rig: Rig, loops: Loops, command: Look) -> str:
+def look(rig: Rig, loops: StellarLoops, command: Look) -> str:
     """Measure one loop's star elsewhere on the next frame; empty, or why not."""
     if len(loops) != 1:
         return f"one loop looks at a place; name it: {', '.join(loop.name for loop in loops)}"
@@ -55,7 +59,7 @@ def reset_interlock(_rig: Rig, loops: Loops, command: Reset) -> str:
     return "" if "" in why_not else why_not[0]
 
 
-def start_experiment(rig: Rig, loops: Loops, command: Experiment) -> str:
+def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
     """Move one loop's stages as told; empty, or why not."""
     if len(loops) != 1:
         return f"an experiment is on one loop; name it: {', '.join(loop.name for loop in loops)}"
@@ -71,15 +75,37 @@ def start_experiment(rig: Rig, loops: Loops, command: Experiment) -> str:
 
 def why_no_search(rig: Rig, loops: Loops, command: Acquire) -> str:
     """Why a search cannot be as it is asked for; empty if it can."""
-    refused = (refused_search(rig, loop.name, command) for loop in loops)
+    refused = (
+        refused_beam_search(loop.settings, loop.name, command)
+        if isinstance(loop, MetrologyLoop)
+        else refused_search(rig, loop.name, command)
+        for loop in loops
+    )
     return next((f"acquire: {why_not}" for why_not in refused if why_not), "")
 
 
-LOOP_COMMANDS: dict[type[AnyCommand], Callable[[Rig, Loops, Any], str]] = {
+OF_STARS: dict[type[AnyCommand], Callable[[Rig, StellarLoops, Any], str]] = {
     SetTarget: set_target,
     Look: look,
-    Jog: move_by_hand,
-    SetBiasOffset: move_by_hand,
-    Reset: reset_interlock,
+    SetBiasOffset: offset_mirrors,
     Experiment: start_experiment,
 }
+"""Commands that only a stellar loop obeys; without a loop's name, they are for all of these."""
+
+OF_ANY_LOOP: dict[type[AnyCommand], Callable[[Rig, Loops, Any], str]] = {
+    Jog: jog_siderostats,
+    Reset: reset_interlock,
+}
+
+LOOP_COMMANDS = OF_STARS.keys() | OF_ANY_LOOP.keys()
+
+
+def obey_loop_command(rig: Rig, loops: Loops, command: AnyCommand) -> str:
+    """Obey one of `LOOP_COMMANDS`; empty, or why not."""
+    if type(command) in OF_ANY_LOOP:
+        return OF_ANY_LOOP[type(command)](rig, loops, command)
+    stellar = [loop for loop in loops if isinstance(loop, StellarLoop)]
+    if not stellar:
+        row = ROWS[type(command)]
+        return f"{row.name} is for a stellar loop; {command.loop} holds a metrology beam"
+    return OF_STARS[type(command)](rig, stellar, command)

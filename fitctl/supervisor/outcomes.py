@@ -13,7 +13,7 @@ from fitctl.logging.records import ModeChange
 from fitctl.loop.loop import Loop
 from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import Acquire, AnyCommand
-from fitctl.messages.modes import COMMANDS, TRACKING, Mode, Trigger
+from fitctl.messages.modes import COMMANDS, HOLDING, POINTING, Mode, Trigger
 from fitctl.messages.telemetry import CommandOutcome, LoopFailure, LoopState
 
 _ENDED_KEPT = 4  # of each loop
@@ -85,11 +85,11 @@ class Outcomes:
     def _observe(self, name: str, change: ModeChange) -> None:
         target, trigger = Mode[change.target], Trigger[change.trigger]
         acquiring = self._under_way(name, _ACQUIRE)
-        if acquiring is not None and target is Mode.VERNIER:
-            self._end(name, acquiring, "done", f"VERNIER: {change.reason}")
-        elif acquiring is not None and target not in TRACKING and trigger in COMMANDS:
+        if acquiring is not None and target in HOLDING:
+            self._end(name, acquiring, "done", f"{target.name}: {change.reason}")
+        elif acquiring is not None and target not in POINTING and trigger in COMMANDS:
             self._end(name, acquiring, "ended", f"{trigger.name.lower()} ended the search")
-        elif acquiring is not None and target not in TRACKING:
+        elif acquiring is not None and target not in POINTING:
             self._end(name, acquiring, "failed", change.reason)
         elif trigger is Trigger.SEARCH_EXHAUSTED:
             self._fail(name, "search", change.reason)

@@ -43,6 +43,8 @@ def open_devices(
         loop = devices.loops[name]
         if loop.piezo is not None:
             opened.identities[f"{name} piezo"] = loop.piezo.open()
+        if loop.photodiodes is not None:
+            opened.identities[f"{name} photodiodes"] = loop.photodiodes.open()
         if loop.dac is not None:
             opened.identities[f"{name} D/A"] = loop.dac.open()
             opened.stack_v[name] = loop.dac.read_v()
@@ -67,6 +69,8 @@ def close_devices(
     for name in names:
         loop = devices.loops[name]
         closing[f"{name} siderostat"] = servos[name].close
+        if loop.photodiodes is not None:
+            closing[f"{name} photodiodes"] = loop.photodiodes.close
         if loop.dac is not None:
             closing[f"{name} D/A"] = loop.dac.close
         if loop.piezo is not None:

@@ -27,12 +27,15 @@ from fitctl.logging.records import (
     Severity,
 )
 from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop, metrology_loop
+from fitctl.loop.overlap import OverlapMeter
 from fitctl.loop.stellar import StellarLoop, stellar_loop
 from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
     Hold,
+    MoveCollector,
     Off,
     Recover,
     Reply,
@@ -43,13 +46,20 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import TRACKING, Mode, Trigger, usable_commands
+from fitctl.messages.modes import POINTING, Mode, Trigger
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.supervisor.camera_watch import CameraWatch
+from fitctl.supervisor.collector import CollectorWatch
 from fitctl.supervisor.device_jobs import DeviceJobs, Ended, Job
-from fitctl.supervisor.health import camera_health, mirror_health, siderostat_health
-from fitctl.supervisor.loop_commands import LOOP_COMMANDS, why_no_search
+from fitctl.supervisor.health import (
+    camera_health,
+    hexapod_health,
+    mirror_health,
+    photodiode_health,
+    siderostat_health,
+)
+from fitctl.supervisor.loop_commands import LOOP_COMMANDS, obey_loop_command, why_no_search
 from fitctl.supervisor.outcomes import Outcomes
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.sequence_board import SequenceBoard
@@ -64,7 +74,16 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
-MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], StellarLoop]
+MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], Loop]
+
+
+def loop_of_kind(
+    name: str, rig: Rig, devices: LoopDevices, journal: Journal, design: Designer
+) -> Loop:
+    """A loop of the kind that the rig file says, on its devices."""
+    if name in rig.metrology_loops:
+        return metrology_loop(name, rig, devices, journal)
+    return stellar_loop(name, rig, devices, journal, design)
 
 
 class Posted(NamedTuple):
@@ -104,7 +123,7 @@ class Supervisor:
         executor: Executor,
         record: Callable[[AnyRecord], None],
         design: Designer,
-        make_loop: MakeLoop = stellar_loop,
+        make_loop: MakeLoop = loop_of_kind,
         design_executor: Executor | None = None,
     ) -> None:
         self.rig = rig
@@ -112,6 +131,13 @@ class Supervisor:
         self.loops = {
             name: make_loop(name, rig, devices.loops[name], journal, design) for name in rig.loops
         }
+        for loop in self.loops.values():
+            loop.join(self.loops)
+        # A stellar loop uses what the metrology loop of its link has decided in the same step.
+        self._in_order = sorted(
+            self.loops.values(), key=lambda loop: loop.name not in rig.metrology_loops
+        )
+        self._overlap = None if rig.fringes is None else OverlapMeter(rig, self.loops)
         self.servos = {name: loop.servo for name, loop in self.loops.items()}
         self.sequences = SequenceBoard(journal)
         self.outcomes = Outcomes(rig.loops, clock)
@@ -129,12 +155,17 @@ class Supervisor:
         self._reported_s = clock.now_s()
         self.piezos = {
             name: PiezoWatch(loop, piezo, executor, journal)
-            for name, loop in self.loops.items()
+            for name, loop in self.stellar_loops.items()
             if (piezo := devices.loops[name].piezo) is not None
         }
         self._camera = CameraWatch(rig, devices.camera, clock, self._camera_failed)
         self._device_jobs = DeviceJobs(
             devices, self.loops, self.piezos, self._camera, executor, journal
+        )
+        self.collector = (
+            CollectorWatch(rig.collector, devices.hexapod, clock, self.report_event)
+            if rig.collector is not None and devices.hexapod is not None
+            else None
         )
         self._timing = TimingBook(clock, rig, self._timed)
 
@@ -149,9 +180,11 @@ class Supervisor:
     ) -> None:
         """Leave a command for the next step; `reply` is called from there.
 
-        A stop takes the velocity from the siderostats here and now; the rest follows at the next step.
+        A stop takes the velocity from the siderostats, and stops the hexapod, here and now; the rest follows
+        at the next step.
         """
         if isinstance(command, Stop):
+            self._stop_collector()
             for name in self._named(command):
                 self.loops[name].servo.stop()
         self._commands.append(Posted(command, reply, sender, address))
@@ -171,9 +204,15 @@ class Supervisor:
         self._quantities.append(reading)
 
     @property
+    def stellar_loops(self) -> dict[str, StellarLoop]:
+        """The loops that point a star."""
+        return {name: loop for name, loop in self.loops.items() if isinstance(loop, StellarLoop)}
+
+    @property
     def periodic(self) -> list[Periodic]:
         """What runs at a pace of its own, beside the frames."""
-        return [work for loop in self.loops.values() for work in loop.periodic]
+        drives = [] if self.collector is None else [self.collector.drive]
+        return [work for loop in self.loops.values() for work in loop.periodic] + drives
 
     # ------------------------------------------------------------ once a frame
 
@@ -187,7 +226,7 @@ class Supervisor:
         self._obey_posted()
         self._record_left()
         lost = self._camera.counts.lost if self._camera.ready else 0
-        loops = self.loops.values()
+        loops = self._in_order
         were_safe = [loop.mode is Mode.SAFE for loop in loops]
         for loop in loops:
             loop.sense(frame, lost, self._camera.skipped)
@@ -200,9 +239,12 @@ class Supervisor:
             if frame is not None or loop.mode is not Mode.OFF:
                 self._record(tick)
             self._timing.add(tick)
-            if was_safe:
-                self._make_safer(loop)
+            self._make_safer(loop, was_safe=was_safe)
         self.outcomes.observe(self.loops)
+        if self.collector is not None:
+            self.collector.check()
+        if frame is not None and self._overlap is not None and self.pointing:
+            self._record(self._overlap.measure(frame))
         for older in self._camera.older:
             self._record_frame(older)
         if frame is not None:
@@ -226,7 +268,8 @@ class Supervisor:
         )
 
     def stop(self, reason: str) -> None:
-        """Every loop to SAFE."""
+        """Every loop to SAFE, and the collector stopped."""
+        self._stop_collector()
         for loop in self.loops.values():
             loop.fire(Trigger.STOP, reason)
         now_s = self._clock.now_s()
@@ -234,8 +277,8 @@ class Supervisor:
 
     @property
     def pointing(self) -> bool:
-        """A loop has a star or looks for one."""
-        return any(loop.mode in TRACKING for loop in self.loops.values())
+        """A loop has its star or its beam, or looks for it."""
+        return any(loop.mode in POINTING for loop in self.loops.values())
 
     def at_rest(self) -> bool:
         """Every stage that can still be commanded is where it may be left without power."""
@@ -244,12 +287,18 @@ class Supervisor:
     def close(self) -> None:
         """Disable and let go of everything, whatever state it is in; nothing is asked of it any more."""
         self.shutdown_wanted = True
+        if self.collector is not None:
+            self.collector.close()
         self._device_jobs.close_all()
         self._obey_posted()
         self._record_left()
 
+    def _stop_collector(self) -> None:
+        if self.collector is not None:
+            self.collector.stop()
+
     def _camera_failed(self, error: DeviceError) -> None:
-        for loop in self.loops.values():
+        for loop in self.stellar_loops.values():
             loop.device_failed(CAMERA, error)
 
     def _record_left(self) -> None:
@@ -289,7 +338,6 @@ class Supervisor:
         return self._obey_for(command, names)
 
     def _obey_for(self, command: AnyCommand, names: list[str]) -> Reply:
-        loops = [self.loops[name] for name in names]
         match command:
             case SetController():
                 return self._set_controller(command, names)
@@ -297,19 +345,27 @@ class Supervisor:
                 return self.sequences.report(command.status)
             case SequenceControl():
                 return self.sequences.control(command.action)
-            case _ if type(command) in LOOP_COMMANDS:
-                why_not = LOOP_COMMANDS[type(command)](self.rig, loops, command)
-                return _refusal(why_not) if why_not else self._begin(command, names)
             case _ if type(command) in _COMMANDS:
                 return self._fire(_COMMANDS[type(command)], names, command)
-        return _refusal(f"{type(command).__name__} is not for the supervisor")
+            case MoveCollector():
+                return self._move_collector(command)
+            case _ if type(command) in LOOP_COMMANDS:
+                why_not = obey_loop_command(self.rig, [self.loops[name] for name in names], command)
+            case _:
+                why_not = f"{type(command).__name__} is not for the supervisor"
+        return _refusal(why_not) if why_not else self._begin(command, names)
+
+    def _move_collector(self, command: MoveCollector) -> Reply:
+        collector, none = self.collector, "the rig has no collector that moves"
+        why_not = none if collector is None else collector.obey(command.action)
+        return _refusal(why_not) if why_not else Reply(accepted=True)
 
     def _fire(self, trigger: Trigger, names: list[str], command: AnyCommand) -> Reply:
         if isinstance(command, Acquire):
             why_not = why_no_search(self.rig, [self.loops[name] for name in names], command)
             if why_not:
                 return _refusal(why_not)
-        usable = [name for name in names if trigger in usable_commands(self.loops[name].mode)]
+        usable = [name for name in names if trigger in self.loops[name].usable_commands]
         if not usable:
             return _refusal(self._why_not(trigger, names))
         if self._device_jobs.busy and trigger is not Trigger.STOP:
@@ -326,10 +382,9 @@ class Supervisor:
         else:
             if trigger is Trigger.STOP:
                 self._device_jobs.abandon(usable)
-            for name in usable:
-                if isinstance(command, Acquire):
-                    self.loops[name].configure_search(command)
-                self.loops[name].fire(trigger, "operator")
+            for loop in self._in_order:
+                if loop.name in usable:
+                    loop.obey(trigger, command)
         return reply
 
     def _rest_mirrors(self, names: list[str]) -> list[str]:
@@ -343,11 +398,14 @@ class Supervisor:
         return Reply(accepted=True, number=self.outcomes.begin(command, names))
 
     def _why_not(self, trigger: Trigger, names: list[str]) -> str:
-        mode = self.loops[names[0]].mode
-        can = ", ".join(t.name.lower() for t in usable_commands(mode))
+        loop = self.loops[names[0]]
+        mode, can = loop.mode, ", ".join(t.name.lower() for t in loop.usable_commands)
         return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
 
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
+        names = [name for name in names if name in self.stellar_loops]
+        if not names:
+            return _refusal(f"loop {command.loop} holds a metrology beam and has no design")
         number = self.outcomes.begin(command, names)
         for name in names:
             # A design takes longer than a tick.
@@ -364,7 +422,7 @@ class Supervisor:
     def _designed(self, name: str, controller: str, ended: Ended, future: Future) -> None:
         error = future.exception()
         if error is None:
-            self.loops[name].use(future.result())
+            self.stellar_loops[name].use(future.result())
             ended(f"controller {controller} is at work", failed=False)
         else:
             why = error_text(error)
@@ -373,8 +431,12 @@ class Supervisor:
 
     # ------------------------------------------------------------ beside the ticks
 
-    def _make_safer(self, loop: Loop) -> None:
-        """Without power after a while in SAFE, but never what is being given power just now."""
+    def _make_safer(self, loop: Loop, *, was_safe: bool) -> None:
+        """In SAFE the collector stops, and after a while the loop has no power, unless it is given some now."""
+        if loop.mode is Mode.SAFE and not was_safe:
+            self._stop_collector()
+        if not was_safe:
+            return
         lasted_s = self._clock.now_s() - loop.mode_since_s
         being_opened = self._device_jobs.opens(loop.name)
         if lasted_s > self.rig.supervisor.safe_disable_after_s and not being_opened:
@@ -407,11 +469,16 @@ class Supervisor:
         )
         for name, loop in self.loops.items():
             self._record(siderostat_health(loop, identities, now_s))
-            if name in self.piezos:
+            if isinstance(loop, MetrologyLoop):
+                self._record(photodiode_health(loop, identities, now_s))
+            elif isinstance(loop, StellarLoop) and name in self.piezos:
                 piezo = self.piezos[name]
                 loop.quantities.record_piezo_error(piezo.error, now_s)
                 for row in mirror_health(loop, piezo, identities, now_s):
                     self._record(row)
+        # Before the collector is to move, nobody has asked for the hexapod.
+        if self.collector is not None and (self.collector.is_open or self.collector.error):
+            self._record(hexapod_health(self.collector, now_s))
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)

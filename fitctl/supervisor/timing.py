@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.logging.records import LoopTiming, Tick
+from fitctl.logging.records import LoopTiming, MetrologyTick, Tick
 from fitctl.stages.servo import SiderostatServo
 
 
@@ -23,9 +23,9 @@ class TimingBook:
         self._clock = clock
         self._stall_s = rig.supervisor.stall_s
         self._record = record
-        self._ticks: dict[str, list[Tick]] = {name: [] for name in rig.loops}
+        self._ticks: dict[str, list[Tick | MetrologyTick]] = {name: [] for name in rig.loops}
 
-    def add(self, tick: Tick) -> None:
+    def add(self, tick: Tick | MetrologyTick) -> None:
         """Remember one tick until the next report; ticks without a frame have no timing."""
         if tick.number >= 0:
             self._ticks[tick.loop].append(tick)

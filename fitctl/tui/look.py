@@ -46,6 +46,7 @@ MODES = {
     "VERNIER": Look("◆", GREEN),
     "SAFE": Look("■", RED),
     "EXPERIMENT": Look("◈", PINK),
+    "LOCKED": Look("◉", GREEN),
 }
 UNKNOWN_MODE = Look("?", PINK)
 

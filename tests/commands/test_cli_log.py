@@ -176,7 +176,7 @@ def test_events_are_exported_with_their_level_as_a_word(log, whole):
 
 
 # Real numbers that are what they are, without a unit; the one of a quantity is in the quantity's own name.
-DIMENSIONLESS = {"fsm_range_fraction", "search_progress", "value"}
+DIMENSIONLESS = {"fsm_range_fraction", "search_progress", "value", "visibility"}
 UNITS = ("_s", "_px", "_rad", "_v", "_arcsec", "_dn", "_m", "_hz")
 
 

@@ -22,14 +22,19 @@ ON_SERIAL_PORTS = {
     "ensemble": ("ensemble", f"{LOOP}.siderostat.device", {"port": "{port}"}),
     "modbus_dac": ("fit-mock", f"{LOOP}.fsm.dac", {"transport": "rtu", "serial_port": "{port}"}),
     "mdt693": ("fit-mock", f"{LOOP}.fsm.piezo", {"port": "{port}"}),
+    "c887": ("fit-testbed", "collector.hexapod", {"port": "{port}"}),
 }
 
 
 def settings_of(driver, port):
     file, table, keys = ON_SERIAL_PORTS[driver]
     overrides = [f"{table}.{key}={value.format(port=port)}" for key, value in keys.items()]
-    loop = config.load_rig(RIGS / f"{file}.toml", overrides).loops["right"]
-    return {"modbus_dac": loop.fsm.dac, "mdt693": loop.fsm.piezo}.get(driver, loop.siderostat)
+    rig = config.load_rig(RIGS / f"{file}.toml", overrides)
+    loop = rig.stellar_loops["right"]
+    settings = {"modbus_dac": loop.fsm.dac, "mdt693": loop.fsm.piezo}
+    if rig.collector is not None:
+        settings["c887"] = rig.collector.hexapod
+    return settings.get(driver, loop.siderostat)
 
 
 @pytest.mark.parametrize("driver", ON_SERIAL_PORTS)

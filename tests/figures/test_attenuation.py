@@ -63,7 +63,7 @@ def test_noise_that_the_loop_turns_into_motion_does_not_spoil_the_measure():
 
 def test_the_open_loop_is_rebuilt_to_what_the_star_does_above_stages_at_rest(rig, held):
     """The same seed on a plant that nobody touches is the truth."""
-    alone = Plant(rig, "right", [1], star_offset_px=NEAR_PX[None])
+    alone = Plant(rig, [1], star_offset_px=NEAR_PX[None]).stellar_loops["right"]
     alone.advance(60.5)
 
     series = rebuilt(rig, "right", tick_columns(held.ticks))

@@ -22,7 +22,7 @@ def record_of(rig, loop, drives, seed=0, extra_s=0.5, frame_delay_s=None, plant=
     """
     settings, camera = rig.loops[loop], rig.camera
     fsm, siderostat, scale = settings.fsm, settings.siderostat, scales(rig, settings)
-    plant = plant or Plant(rig, loop, [seed], star_offset_px=np.zeros((1, 2)))
+    plant = plant or Plant(rig, [seed], star_offset_px=np.zeros((1, 2))).stellar_loops[loop]
     random = np.random.default_rng(seed)
     servo_s = 1 / siderostat.servo.rate_hz
     rad_per_count = 2 * math.pi / siderostat.encoder_counts_per_rev

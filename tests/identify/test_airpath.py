@@ -103,7 +103,7 @@ def test_centroids_that_stand_still_are_refused():
 @pytest.fixture(scope="module")
 def result(rig):
     """The default rig's own frames, stages at rest, 64 s."""
-    plant = Plant(rig, "right", [4], star_offset_px=np.zeros((1, 2)))
+    plant = Plant(rig, [4], star_offset_px=np.zeros((1, 2))).stellar_loops["right"]
     scene = Scene(rig.camera, rig.plant.loops["right"].spots)
     frames = [
         TimedImage(number * PERIOD_S, scene.frame(plant.spots_px(number * PERIOD_S)[0], 4, number))

@@ -23,7 +23,7 @@ def swings(rig, seed=0, stamp_error_s=0.0, delay_s=0.035, exposure_s=0.0, drives
     loop, period_s = rig.loops["right"], rig.camera.period_s
     fsm, scale = loop.fsm, scales(rig, loop)
     drives = delay.plan(rig, "right") if drives is None else drives
-    plant = Plant(rig, "right", [seed], star_offset_px=np.zeros((1, 2)))
+    plant = Plant(rig, [seed], star_offset_px=np.zeros((1, 2))).stellar_loops["right"]
     end_s = experiment_s(drives) + 0.5
     written_s = np.arange(0.0, end_s, HOLD_S)
     volts = np.full((len(written_s) + 1, 3), fsm.bias_v)

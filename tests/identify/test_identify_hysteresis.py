@@ -59,7 +59,7 @@ def test_the_model_gives_the_plants_output_within_half_a_percent(rig, result):
 
 
 def test_it_does_not_matter_what_the_stacks_did_before(rig):
-    plant = Plant(rig, "right", [5], star_offset_px=np.zeros((1, 2)))
+    plant = Plant(rig, [5], star_offset_px=np.zeros((1, 2))).stellar_loops["right"]
     for second, volts in enumerate([[9.0, 1.0, 5.0], [0.5, 8.0, 9.5], [5.0, 5.0, 5.0]]):
         plant.inputs.stack_v[0] = volts
         plant.advance(second + 1.0)

@@ -7,6 +7,7 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import DeviceHealth, DevicesOpened, LoopTiming, Tick
 from fitctl.loop.loop import Loop
+from fitctl.loop.quantities import Quantities
 from fitctl.messages.commands import Off, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.devices import InlineExecutor
@@ -49,7 +50,9 @@ def test_it_is_opened_ticked_stopped_and_turned_off():
 
     def make_loop(name, rig, devices, journal, _design):
         servo = SiderostatServo(name, rig.loops[name], devices.amplifiers, journal.clock, 0.02)
-        return Watcher(name, rig, SiderostatStage(rig, name, servo), journal)
+        return Watcher(
+            name, rig, SiderostatStage(rig, name, servo), journal, Quantities(rig, name), {}
+        )
 
     records, replies = [], []
     supervisor = Supervisor(

@@ -36,7 +36,7 @@ def test_a_motor_turns_by_the_wire_that_the_rig_file_names(name, in_loop):
             reading = driver.exchange((5.0, 0.0))
             az_rad = reading.position_rad[0] if reading else az_rad
         driver.close()
-        live = testbed._plants["right"]
+        live = testbed._siderostats["right"]
         assert live.position_rad()[0] > 0.5
         assert abs(live.position_rad()[1]) < 0.05
     finally:

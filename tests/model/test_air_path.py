@@ -140,7 +140,7 @@ def test_the_motion_is_the_reference_motion(air, motion, seed, steps, nodes):
 @pytest.fixture(scope="module")
 def motion_px(rig):
     """Pointing spot of resting stages at 50 Hz: shape (samples, runs and axes)."""
-    plant = Plant(rig, "right", range(8), star_offset_px=np.zeros((8, 2)))
+    plant = Plant(rig, range(8), star_offset_px=np.zeros((8, 2))).stellar_loops["right"]
     target = rig.loops["right"].target_px
     times_s = np.arange(1, 100 * 50 + 1) / 50
     spots = np.array([plant.spots_px(time_s)[:, 0] for time_s in times_s])
@@ -177,7 +177,7 @@ def test_axes_and_runs_move_independently(motion_px):
 
 
 def test_the_fringe_spot_follows_the_pointing_spot_up_to_its_relative_motion(rig, air):
-    plant = Plant(rig, "right", range(64))
+    plant = Plant(rig, range(64)).stellar_loops["right"]
     spots = np.concatenate([plant.spots_px(time_s) for time_s in np.arange(1, 11) * 3.0])
     spot = rig.plant.loops["right"].spots[1]
     apart = spots[:, 1] - spots[:, 0] - [spot.offset_px.az, spot.offset_px.el]

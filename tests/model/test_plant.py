@@ -28,7 +28,9 @@ def rig_with(*overrides):
 
 def plant_with(*overrides, seeds=(0,), **kwargs):
     offsets = np.zeros((len(seeds), 2))
-    return Plant(rig_with(*overrides), "right", seeds, star_offset_px=offsets, **kwargs)
+    return Plant(rig_with(*overrides), seeds, star_offset_px=offsets, **kwargs).stellar_loops[
+        "right"
+    ]
 
 
 def from_target(plant, rig, time_s):
@@ -60,7 +62,7 @@ def test_the_step_does_what_the_reference_does(machine_code, seed, runs, steps, 
         f"loops.right.fsm.rotation_deg={mirror_deg}",
     )
     random = np.random.default_rng(seed)
-    plant = Plant(rig, "right", range(runs))
+    plant = Plant(rig, range(runs)).stellar_loops["right"]
     state = plant.state
     for array, scale in (
         (state.motor_rad, 5.0), (state.motor_rad_s, 50.0), (state.beam_motor_rad, 5.0),
@@ -90,7 +92,7 @@ def test_the_step_does_what_the_reference_does(machine_code, seed, runs, steps, 
 @given(cuts=st.lists(st.integers(1, 1500), max_size=12))
 @example(cuts=[21])  # compiled, the steps after an odd cut round otherwise
 def test_the_motion_does_not_depend_on_how_the_time_is_cut(rig, cuts):
-    plants = [Plant(rig, "right", [7]) for _ in range(2)]
+    plants = [Plant(rig, [7]).stellar_loops["right"] for _ in range(2)]
     for plant in plants:
         plant.inputs.velocity_rad_s[:] = [3.0, -2.0]
         plant.inputs.stack_v[:] = [4.0, 5.5, 6.0]
@@ -108,20 +110,25 @@ def test_the_motion_does_not_depend_on_how_the_time_is_cut(rig, cuts):
 @pytest.mark.parametrize("machine_code", STEPS)
 def test_a_run_does_not_depend_on_the_runs_beside_it(rig, machine_code, monkeypatch):
     monkeypatch.setattr(plant_step, "numba_installed", lambda: machine_code)
-    together, alone = Plant(rig, "right", [3, 4, 5]), Plant(rig, "right", [4])
+    together, alone = (
+        Plant(rig, [3, 4, 5]).stellar_loops["right"],
+        Plant(rig, [4]).stellar_loops["right"],
+    )
     for plant in (together, alone):
         plant.inputs.velocity_rad_s[:] = [3.0, -2.0]
     assert together.spots_px(0.5)[1] == pytest.approx(alone.spots_px(0.5)[0], abs=1e-12)
 
 
 def test_a_seed_is_a_run(rig):
-    first, again, other = (Plant(rig, "right", [seed]).spots_px(1.0) for seed in (5, 5, 6))
+    first, again, other = (
+        Plant(rig, [seed]).stellar_loops["right"].spots_px(1.0) for seed in (5, 5, 6)
+    )
     assert np.array_equal(first, again)
     assert not np.allclose(first, other)
 
 
 def test_the_star_is_placed_all_over_the_configured_disc(rig):
-    plant = Plant(rig, "right", range(300))
+    plant = Plant(rig, range(300)).stellar_loops["right"]
     truth = rig.plant.loops["right"]
     radius_px = truth.star_offset_sky_arcsec_max / scales(rig, rig.loops["right"]).sky_arcsec_per_px
     distance = np.linalg.norm(from_target(plant, rig, 0.0005), axis=1) / radius_px
@@ -133,7 +140,7 @@ def test_the_star_is_placed_all_over_the_configured_disc(rig):
 
 
 def test_time_already_reached_changes_nothing(rig):
-    plant = Plant(rig, "right", [0])
+    plant = Plant(rig, [0]).stellar_loops["right"]
     before = plant.spots_px(0.1).copy()
     plant.advance(0.05)
     assert plant.time_s == pytest.approx(0.1)
@@ -153,7 +160,7 @@ def test_the_past_can_be_asked_for_as_long_as_the_history_holds():
 
 
 def test_a_history_is_every_grid_time_of_its_span(rig):
-    plant = Plant(rig, "right", [0, 1])
+    plant = Plant(rig, [0, 1]).stellar_loops["right"]
     plant.advance(0.2)
     history = plant.history_px(0.1, 0.15)
     assert history.shape == (101, 2, 2, 2)
@@ -164,7 +171,7 @@ def test_a_history_is_every_grid_time_of_its_span(rig):
 def test_a_rig_of_real_hardware_has_no_plant(rig):
     real = rig.model_copy(update={"plant": None, "mocks": None})
     with pytest.raises(ConfigError, match="sections plant and mocks are missing"):
-        Plant(real, "right", [0])
+        Plant(real, [0]).stellar_loops["right"]
 
 
 # ---------------------------------------------------------------- what the devices do to the star
@@ -235,7 +242,7 @@ def test_a_spots_own_air_does_not_depend_on_how_many_spots_there_are(rig):
     alone = rig.model_copy(
         update={"plant": rig.plant.model_copy(update={"loops": {"right": loop}})}
     )
-    pointing = [Plant(one, "right", [3]).spots_px(0.7)[0, 0] for one in (rig, alone)]
+    pointing = [Plant(one, [3]).stellar_loops["right"].spots_px(0.7)[0, 0] for one in (rig, alone)]
     assert pointing[0] == pytest.approx(pointing[1], abs=1e-12)
 
 

@@ -54,7 +54,7 @@ def test_the_plants_step_response_has_the_structures_frequency_response(structur
     rig = load_rig(default_rig_path(), MIRROR_ONLY)
     fsm, scale = rig.loops["right"].fsm, scales(rig, rig.loops["right"])
     # Two runs: one is told to turn in azimuth, the other in elevation.
-    plant = Plant(rig, "right", [0, 1], star_offset_px=np.zeros((2, 2)))
+    plant = Plant(rig, [0, 1], star_offset_px=np.zeros((2, 2))).stellar_loops["right"]
     turn_rad = 1e-5
     plant.inputs.stack_v[:] = stack_volts(
         turn_rad * np.eye(2), fsm.stack_radius_m, fsm.stack_scale_m_per_v, fsm.bias_v

@@ -1,8 +1,6 @@
 """A C program on libmodbus against the D/A mock, over TCP and over a pty."""
 
-import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -24,19 +22,8 @@ read: 0 11 22
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    compiler = shutil.which("cc")
-    if compiler is None or shutil.which("pkg-config") is None:
-        pytest.skip("no C compiler named cc, or no pkg-config")
-    flags = ["pkg-config", "--cflags", "--libs", "libmodbus"]
-    found = subprocess.run(flags, capture_output=True, text=True, check=False)
-    if found.returncode:
-        pytest.skip("libmodbus is not installed: Debian package libmodbus-dev")
-    program = tmp_path_factory.mktemp("libmodbus") / "client"
-    source = Path(__file__).with_name("libmodbus_client.c")
-    command = [compiler, "-Wall", "-Werror", str(source), "-o", str(program)]
-    subprocess.run([*command, *found.stdout.split()], check=True)
-    return program
+def client(libmodbus_program):
+    return libmodbus_program("libmodbus_client.c")
 
 
 @pytest.mark.parametrize("wire", ["tcp", "rtu"])

@@ -1,10 +1,11 @@
-"""tshark takes what a master and the D/A mock say to each other apart, and finds nothing wrong with it."""
+"""tshark takes what a master and the Modbus mocks say to each other apart, and finds nothing wrong with it."""
 
 import asyncio
 import shutil
 import subprocess
 
 import pytest
+from labjack_bench import Bench
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
@@ -18,31 +19,54 @@ pytestmark = [
 ]
 
 RIG = load_rig(default_rig_path())
-REQUESTS = [
-    "03 00 00 00 03",
-    "10 00 00 00 03 06 00 00 80 00 ff ff",
-    "06 00 01 00 63",
-    "17 00 00 00 03 00 01 00 02 04 00 0b 00 16",
-    "2b 0e 01 00",
-    "2b 0e 04 01",
-    "03 00 03 00 01",
-    "03 00 00 00 00",
-    "04 00 00 00 01",
-]
-FUNCTIONS = ["3", "16", "6", "23", "43", "43", "3", "3", "4"]
-EXCEPTIONS = ["", "", "", "", "", "", "2", "3", "1"]
 
 
-async def conversation():
+def dac_mock():
+    """The D/A."""
+    loop, mocks = RIG.loops["right"], RIG.mocks.loops["right"]
+    return ModbusDacMock(loop.fsm.dac, mocks.dac, lambda volts: None, port=0)
+
+
+# A mock, and what it is asked: a request, its function, and the exception that answers it, if one does.
+CONVERSATIONS = {
+    "D/A": (
+        dac_mock,
+        [
+            ("03 00 00 00 03", "3", ""),
+            ("10 00 00 00 03 06 00 00 80 00 ff ff", "16", ""),
+            ("06 00 01 00 63", "6", ""),
+            ("17 00 00 00 03 00 01 00 02 04 00 0b 00 16", "23", ""),
+            ("2b 0e 01 00", "43", ""),
+            ("2b 0e 04 01", "43", ""),
+            ("03 00 03 00 01", "3", "2"),
+            ("03 00 00 00 00", "3", "3"),
+            ("04 00 00 00 01", "4", "1"),
+        ],
+    ),
+    "LabJack T7": (
+        lambda: Bench().mock,
+        [
+            ("03 ea 60 00 02", "3", ""),
+            ("10 ab 7c 00 02 04 41 20 00 00", "16", ""),
+            ("06 ab 7f 00 04", "6", ""),
+            ("03 00 00 00 08", "3", ""),
+            ("04 00 00 00 08", "4", ""),
+            ("03 00 1c 00 02", "3", "2"),
+            ("10 ab 7c 00 02 04 40 a0 00 00", "16", "3"),
+            ("2b 0e 01 00", "43", "1"),
+        ],
+    ),
+}
+
+
+async def conversation(mock, requests):
     """Both directions, message by message."""
-    mock = ModbusDacMock(
-        RIG.loops["right"].fsm.dac, RIG.mocks.loops["right"].dac, lambda volts: None, port=0
-    )
     said = []
     try:
         ends = await mock.start()
-        reader, writer = await asyncio.open_connection("127.0.0.1", ends.tcp_port)
-        for number, request in enumerate(map(bytes.fromhex, REQUESTS), 1):
+        port = ends if isinstance(ends, int) else ends.tcp_port
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        for number, request in enumerate(map(bytes.fromhex, requests), 1):
             message = number.to_bytes(2, "big") + bytes(2)
             message += (1 + len(request)).to_bytes(2, "big") + b"\1" + request
             writer.write(message)
@@ -54,8 +78,14 @@ async def conversation():
     return said
 
 
-def test_every_message_is_sound_and_is_what_it_was_meant_to_be(tmp_path):
-    said = asyncio.run(conversation())
+@pytest.mark.parametrize("name", CONVERSATIONS)
+def test_every_message_is_sound_and_is_what_it_was_meant_to_be(tmp_path, name):
+    make_mock, exchanges = CONVERSATIONS[name]
+
+    async def talk():
+        return await conversation(make_mock(), [request for request, _, _ in exchanges])
+
+    said = asyncio.run(talk())
     # Requests and answers turn by turn, as text2pcap wants them: direction, offset, bytes.
     lines = [f"{'IO'[turn % 2]} 0000 {message.hex(' ')}\n" for turn, message in enumerate(said)]
     dump, capture = tmp_path / "said.txt", tmp_path / "said.pcap"
@@ -76,8 +106,6 @@ def test_every_message_is_sound_and_is_what_it_was_meant_to_be(tmp_path):
     ).stdout
     rows = [line.split("|") for line in shown.splitlines()]
     requests, answers = rows[::2], rows[1::2]
-    assert [row[0] for row in requests] == FUNCTIONS
-    assert [row[:2] for row in answers] == [
-        list(pair) for pair in zip(FUNCTIONS, EXCEPTIONS, strict=True)
-    ]
+    assert [row[0] for row in requests] == [function for _, function, _ in exchanges]
+    assert [row[:2] for row in answers] == [[*answer] for _, *answer in exchanges]
     assert [row[2:] for row in rows] == [["", ""]] * len(said), shown

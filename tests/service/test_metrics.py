@@ -11,6 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from fitctl.config import ConfigError
+from fitctl.logging.records import MetrologyTick, Overlap
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.service.metrics import HOST, InstrumentCollector, serve_metrics
 from tests.fake_supervisor import WALL_MINUS_MONOTONIC_S, FakeSupervisor
@@ -249,3 +250,39 @@ def test_many_who_never_ask_leave_few_threads_and_a_scrape_comes_through_after_t
     finally:
         for line in silent:
             line.close()
+
+
+def test_the_beam_and_the_overlap_of_the_testbed_are_served():
+    collector = InstrumentCollector()
+    beam = dict.fromkeys(("beam_az_arcsec", "beam_el_arcsec"), 0.5)
+    tick = metrology_tick(beam_state="MEASURED", **beam)
+    dark = metrology_tick(beam_state="", beam_az_arcsec=math.nan, beam_el_arcsec=math.nan)
+    overlap = Overlap(
+        time_s=0.0,
+        loop="left",
+        other_loop="right",
+        number=1,
+        tilt_az_arcsec=0.1,
+        tilt_el_arcsec=-0.2,
+        visibility=0.97,
+    )
+    message = msgspec.structs.replace(
+        FakeSupervisor().message(), metrology_ticks=[tick, dark, tick], overlaps=[overlap]
+    )
+    collector.accept(message, time.monotonic())
+    values = {
+        (sample.name, tuple(sample.labels.values())): sample.value
+        for family in collector.collect()
+        for sample in family.samples
+    }
+    assert values["fitctl_beam_samples_total", ("metrology",)] == 2
+    assert values["fitctl_beam_error_arcseconds_squared_total", ("metrology", "az")] == 0.5
+    assert values["fitctl_visibility", ("left", "right")] == 0.97
+    assert values["fitctl_tilt_arcseconds", ("left", "right", "el")] == -0.2
+    assert values["fitctl_loop_waits", ("right",)] == 0
+
+
+def metrology_tick(**fields):
+    nothing = {"int": 0, "float": 0.0, "str": "", "bool": False}
+    values = {name: nothing[kind] for name, kind in MetrologyTick.__annotations__.items()}
+    return MetrologyTick(time_s=0.0, **values | {"loop": "metrology"} | fields)

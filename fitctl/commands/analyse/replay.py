@@ -99,7 +99,7 @@ def _rig(
 
     rig = read(overrides)
     if controller is not None:
-        rig = read([*overrides, *controller_overrides(rig.loops, controller)])
+        rig = read([*overrides, *controller_overrides(rig.stellar_loops, controller)])
     then = json.loads(in_log)
     needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
     given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)

@@ -157,7 +157,9 @@ def _coarse(rig: Rig, loop: str) -> Report:
         gain_hz: [coarse.phase_margin_deg(its_basis, gain_hz, a) for a in _MARGIN_AMPLITUDES]
         for gain_hz in gains_hz
     }
-    prefilter = coarse.prefilter_design(its_basis, rig.loops[loop].prefilter.time_constant_s)
+    prefilter = coarse.prefilter_design(
+        its_basis, rig.stellar_loops[loop].prefilter.time_constant_s
+    )
     deadzones = {
         name: deadzone_result(design(its_basis), its_basis) for name, design in DESIGNS.items()
     }
@@ -219,10 +221,10 @@ def _deadzone_text(found: DeadzoneResult) -> str:
 
 
 def _backlash_half_width_px(rig: Rig, loop: str) -> float | None:
-    known_arcsec = rig.loops[loop].siderostat.backlash_sky_arcsec
+    known_arcsec = rig.stellar_loops[loop].siderostat.backlash_sky_arcsec
     if known_arcsec is None:
         return None
-    return known_arcsec / 2 / scales(rig, rig.loops[loop]).sky_arcsec_per_px
+    return known_arcsec / 2 / scales(rig, rig.stellar_loops[loop]).sky_arcsec_per_px
 
 
 # ---------------------------------------------------------------- bound and comparison

@@ -32,8 +32,8 @@ from fitctl.simulation.campaign import (
     run_campaign,
     summarize,
 )
-from fitctl.simulation.simulation import simulate as simulate_rig
-from fitctl.simulation.statistics import SimulationResult
+from fitctl.simulation.simulation import simulate_rig
+from fitctl.simulation.statistics import MetrologyResult, SimulationResult
 
 
 def simulate(
@@ -70,18 +70,35 @@ def simulate(
 def _simulate_once(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
     """Simulate and print the result; returns the exit status."""
     with progress_line("simulating") as progress:
-        results = simulate_rig(rig, seed, duration_s, on_progress=progress)
+        result = simulate_rig(rig, seed, duration_s, on_progress=progress)
         progress(1.0)
-    plain = {name: result._asdict() for name, result in results.items()}
+    loops = {name: loop._asdict() for name, loop in result.loops.items()}
     if as_json:
-        say(to_json(next(iter(plain.values())) if len(plain) == 1 else plain))
+        several = result._asdict() | {"loops": loops}
+        say(to_json(next(iter(loops.values())) if len(loops) == 1 else several))
     else:
-        for name, result in results.items():
-            say_lines(_result_text(name, result))
-    return 0 if all(not math.isnan(result.vernier_s) for result in results.values()) else FAILED
+        for name, loop in result.loops.items():
+            say_lines(_result_text(name, loop))
+        if not math.isnan(result.visibility):
+            say(f"mean visibility of the fringes {result.visibility:.4f}")
+    return 0 if all(_holds(loop) for loop in result.loops.values()) else FAILED
 
 
-def _result_text(name: str, result: SimulationResult) -> str:
+def _holds(result: SimulationResult | MetrologyResult) -> bool:
+    """Whether a loop came to hold its star or its beam."""
+    held_s = result.locked_s if isinstance(result, MetrologyResult) else result.vernier_s
+    return not math.isnan(held_s)
+
+
+def _result_text(name: str, result: SimulationResult | MetrologyResult) -> str:
+    if isinstance(result, MetrologyResult):
+        beam = result.rms_arcsec
+        return (
+            f"loop {name}: beam found after {result.acquired_s:.1f} s, locked after "
+            f"{result.locked_s:.1f} s\n"
+            f"  true beam RMS      az {beam['az']:.3f} arcsec, el {beam['el']:.3f} arcsec"
+            f" over {result.judged_s:.0f} s"
+        )
     rms, measured = result.rms_px, result.measured_rms_px
     return (
         f"loop {name}: star found after {result.acquired_s:.1f} s, vernier after "

@@ -67,7 +67,8 @@ def status_document(telemetry: Telemetry, found: list[str]) -> dict[str, Any]:
     plain = msgspec.to_builtins(telemetry)
     for stream in _STREAMS:
         del plain[stream]
-    plain["ticks"] = list({tick["loop"]: tick for tick in plain["ticks"]}.values())
+    for key in ("ticks", "metrology_ticks", "overlaps"):
+        plain[key] = list({record["loop"]: record for record in plain[key]}.values())
     for loop in plain["loops"]:
         loop["since"] = utc(telemetry, loop["since_s"])
     verdict = {"well": not found, "troubles": found, "time": utc(telemetry, telemetry.time_s)}

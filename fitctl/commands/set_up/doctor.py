@@ -21,12 +21,14 @@ from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
-from fitctl.config import Rig
+from fitctl.config import Loop, Rig
 from fitctl.drivers.bal_analog.driver import probe_bal_analog
+from fitctl.drivers.c887.driver import probe_c887
 from fitctl.drivers.cia402.configure import probe_drive
 from fitctl.drivers.ensemble.driver import probe_ensemble
 from fitctl.drivers.gige.probe import probe_camera
 from fitctl.drivers.interface import DeviceError, DeviceIdentity, DeviceTimeout, DeviceUnreachable
+from fitctl.drivers.labjack_t7.driver import probe_labjack
 from fitctl.drivers.mdt693.driver import probe_mdt693
 from fitctl.drivers.modbus_dac.probe import probe_dac
 from fitctl.drivers.probe import Probe
@@ -44,6 +46,8 @@ PROBES: dict[str, Callable[[Any], Probe]] = {
     "bal_analog": probe_bal_analog,
     "modbus_dac": probe_dac,
     "mdt693": probe_mdt693,
+    "labjack_t7": probe_labjack,
+    "c887": probe_c887,
 }
 
 
@@ -158,8 +162,13 @@ def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:
     yield "camera", rig.camera.device.driver, rig.camera
     for name, loop in rig.loops.items():
         yield f"{name} siderostat", loop.siderostat.device.driver, loop.siderostat
-        yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
-        yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
+        if isinstance(loop, Loop):
+            yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
+            yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
+        else:
+            yield f"{name} photodiodes", loop.sensor.device.driver, loop.sensor.device
+    if rig.collector is not None:
+        yield "hexapod", rig.collector.hexapod.driver, rig.collector.hexapod
 
 
 def _plain(finding: Finding) -> dict[str, Any]:

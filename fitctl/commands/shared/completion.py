@@ -12,10 +12,10 @@ import typer
 
 from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.commands.shared.welcome import rig_files
-from fitctl.config import CONTROLLERS, ConfigError, default_rig_path, load_rig
+from fitctl.config import CONTROLLERS, ConfigError, Rig, default_rig_path, load_rig
 from fitctl.sequences.files import shipped_sequences
 
-_OF_LOOP = ("drive", "dac", "mdt693")
+_OF_LOOP = {"stellar": ("drive", "dac", "mdt693"), "metrology": ("drive", "labjack")}
 
 
 def rigs(incomplete: str) -> list[str]:
@@ -38,10 +38,14 @@ def controllers(incomplete: str) -> list[str]:
 
 def devices(context: typer.Context, incomplete: str) -> list[str]:
     """Devices that can fail, of the rig that the command line names."""
-    loops = _loops(context.params.get("rig"))
-    return _beginning(
-        incomplete, ["camera", *(f"{loop}.{device}" for loop in loops for device in _OF_LOOP)]
-    )
+    rig = _rig(context.params.get("rig"))
+    if rig is None:
+        return []
+    of_loops = [
+        f"{name}.{device}" for name, loop in rig.loops.items() for device in _OF_LOOP[loop.kind]
+    ]
+    collector = [] if rig.collector is None else ["hexapod"]
+    return _beginning(incomplete, ["camera", *of_loops, *collector])
 
 
 def faults(context: typer.Context, incomplete: str) -> list[str]:
@@ -52,14 +56,15 @@ def faults(context: typer.Context, incomplete: str) -> list[str]:
 
 def loops(context: typer.Context, incomplete: str) -> list[str]:
     """Loops of the rig that the command line names."""
-    return _beginning(incomplete, _loops(context.params.get("rig")))
+    rig = _rig(context.params.get("rig"))
+    return [] if rig is None else _beginning(incomplete, rig.loops)
 
 
-def _loops(rig: Path | None) -> list[str]:
+def _rig(path: Path | None) -> Rig | None:
     try:
-        return list(load_rig(rig or default_rig_path()).loops)
+        return load_rig(path or default_rig_path())
     except ConfigError:
-        return []  # Tab has no place for errors
+        return None  # Tab has no place for errors
 
 
 def _beginning(incomplete: str, known: Iterable[str]) -> list[str]:

@@ -16,6 +16,8 @@ _MOCKS = {
     "drive (bal_analog)": "fitctl.mocks.bal_analog.station",
     "dac": "fitctl.mocks.modbus_dac.server",
     "mdt693": "fitctl.mocks.mdt693.server",
+    "labjack": "fitctl.mocks.labjack_t7.server",
+    "hexapod": "fitctl.mocks.c887.server",
 }
 
 

@@ -29,5 +29,5 @@ def check_plant(rig: Rig) -> None:
         If not.
     """
     if rig.plant is not None:
-        for name in rig.loops:
+        for name in rig.stellar_loops:
             plant_constants(rig, name, np.zeros((1, 2)))

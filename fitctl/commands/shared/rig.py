@@ -31,7 +31,7 @@ def with_controller(
     """The overrides, and with them one that gives every loop the named controller, if any."""
     if controller is None:
         return overrides or []
-    loops = rig_of(path, overrides).loops
+    loops = rig_of(path, overrides).stellar_loops
     return [*(overrides or []), *controller_overrides(loops, controller)]
 
 
@@ -41,13 +41,13 @@ def controller_overrides(loops: Iterable[str], controller: str) -> list[str]:
 
 
 def require_loop(command: str, rig: Rig, loop: str) -> None:
-    """Reject a loop that the rig has not.
+    """Reject a loop that the rig does not have, or that points no star.
 
     Raises
     ------
     ConfigError
         If so.
     """
-    if loop not in rig.loops:
-        msg = f"{command}: --loop {loop!r}: rig {rig.name} has {', '.join(rig.loops)}"
+    if loop not in rig.stellar_loops:
+        msg = f"{command}: --loop {loop!r}: rig {rig.name} has {', '.join(rig.stellar_loops)}"
         raise ConfigError(msg)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +21,7 @@ from fitctl.commands.shared.options import (
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
 from fitctl.commands.shared.terminal import has_terminal
-from fitctl.config import Rig, default_rig_path
+from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.telemetry import Telemetry
 from fitctl.processes import (
@@ -46,12 +47,21 @@ def demo(
     ] = False,
     as_json: JsonOption = False,
     controller: ControllerOption = None,
+    testbed: Annotated[
+        bool,
+        typer.Option("--testbed", help="Two stars, metrology and a moving collector."),
+    ] = False,
 ) -> None:
     """Run the whole instrument on mock devices: see a star acquired and held.
 
     On a terminal the console comes up. Without one, or with --headless, the same runs for a while and
     a summary is printed at the end.
     """
+    if testbed and rig is not None:
+        msg = "demo: --testbed is the rig rigs/fit-testbed.toml; leave out --testbed, or --rig"
+        raise ConfigError(msg)
+    if testbed:
+        rig = default_rig_path().parent / "fit-testbed.toml"
     overrides = with_controller(rig, overrides, controller)
     settings = rig_of(rig, overrides)
     settings.mock_parts()
@@ -59,7 +69,10 @@ def demo(
     console = not (headless or as_json) and has_terminal()
     with ended_by_signals(interrupt):
         try:
-            with demos.instrument(path, overrides, seed) as running:
+            with (
+                demos.instrument(path, overrides, seed) as running,
+                demos.moving_collector(running),
+            ):
                 beside = _beside(settings, path, running)
                 if beside:
                     say(beside, err=True)
@@ -116,12 +129,19 @@ def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as
             lambda gone_s, telemetry: progress(gone_s, _progress_text(telemetry)),
         )
     results = {name: demos.summary(rig, running, course, name) for name in rig.loops}
+    visibility = demos.visibility(rig, running, course)
     if as_json:
-        # One loop: its summary. Several: one for each, by name.
-        say(to_json(next(iter(results.values())) if len(results) == 1 else results))
+        # One loop: its summary. Several: one for each, by name, beside what they have in common.
+        whole = {"loops": results, "visibility": visibility} | {
+            key: max(result[key] for result in results.values())
+            for key in ("frames", "frames_lost", "late_ticks", "records_lost")
+        }
+        say(to_json(next(iter(results.values())) if len(results) == 1 else whole))
     else:
         for name, result in results.items():
             say_lines(_summary_text(name, result))
+        if not math.isnan(visibility):
+            say(f"mean visibility of the fringes {visibility:.4f}")
     held = all(result["judged_s"] > 0 for result in results.values())
     return 0 if held else FAILED
 
@@ -129,6 +149,12 @@ def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as
 def _progress_text(telemetry: Telemetry) -> str:
     parts = []
     for loop in telemetry.loops:
+        beams = [t for t in telemetry.metrology_ticks if t.loop == loop.name]
+        if beams:
+            beam = beams[-1]
+            error = f" az {beam.beam_az_arcsec:+.2f} el {beam.beam_el_arcsec:+.2f} arcsec"
+            parts.append(f"{loop.name} {loop.mode:<11}{error:<28}")
+            continue
         ticks = [t for t in telemetry.ticks if t.loop == loop.name and t.star_visible]
         error = (
             f" az {ticks[-1].error_az_px:+.3f} el {ticks[-1].error_el_px:+.3f} px" if ticks else ""
@@ -138,15 +164,9 @@ def _progress_text(telemetry: Telemetry) -> str:
 
 
 def _summary_text(name: str, result: dict[str, Any]) -> str:
-    rms, measured, arcsec = result["rms_px"], result["measured_rms_px"], result["rms_arcsec"]
     lines = [
         f"loop {name}",
-        f"  star found after     {result['acquired_s']:8.1f} s",
-        f"  vernier after        {result['vernier_s']:8.1f} s",
-        f"  true residual RMS    az {rms['az']:.4f} px, el {rms['el']:.4f} px"
-        f" (az {arcsec['az']:.3f}, el {arcsec['el']:.3f} arcsec on the sky)"
-        f" over the last {result['judged_s']:.0f} s",
-        f"  measured RMS         az {measured['az']:.4f} px, el {measured['el']:.4f} px",
+        *(_star_lines(result) if "rms_px" in result else _beam_lines(result)),
         f"  frames               {result['frames']} ({result['frames_lost']} lost),"
         f" {result['late_ticks']} late ticks, {result['records_lost']} records lost",
         f"  log                  {result['log']}",
@@ -158,3 +178,25 @@ def _summary_text(name: str, result: dict[str, Any]) -> str:
             f" {result['worst_stall_s'] * 1e3:.0f} ms at worst",
         )
     return "\n".join(lines)
+
+
+def _star_lines(result: dict[str, Any]) -> list[str]:
+    rms, measured, arcsec = result["rms_px"], result["measured_rms_px"], result["rms_arcsec"]
+    return [
+        f"  star found after     {result['acquired_s']:8.1f} s",
+        f"  vernier after        {result['vernier_s']:8.1f} s",
+        f"  true residual RMS    az {rms['az']:.4f} px, el {rms['el']:.4f} px"
+        f" (az {arcsec['az']:.3f}, el {arcsec['el']:.3f} arcsec on the sky)"
+        f" over the last {result['judged_s']:.0f} s",
+        f"  measured RMS         az {measured['az']:.4f} px, el {measured['el']:.4f} px",
+    ]
+
+
+def _beam_lines(result: dict[str, Any]) -> list[str]:
+    arcsec = result["rms_arcsec"]
+    return [
+        f"  beam found after     {result['acquired_s']:8.1f} s",
+        f"  locked after         {result['locked_s']:8.1f} s",
+        f"  true beam RMS        az {arcsec['az']:.3f} arcsec, el {arcsec['el']:.3f} arcsec"
+        f" over the last {result['judged_s']:.0f} s",
+    ]

@@ -23,7 +23,7 @@ from fitctl.commands.shared.options import (
 )
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
-from fitctl.config import ConfigError, Fault, LoopMocks, Rig
+from fitctl.config import ConfigError, Fault, Rig, Settings
 from fitctl.logging.pictures import LoggedPictures
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.faults import UnknownFault
@@ -109,18 +109,23 @@ def _pictures(rig: Rig, log: Path) -> Picture:
 
 def _with_free_ports(rig: Rig) -> Rig:
     _, mocks = rig.mock_parts()
-    loops = {name: _loop_with_free_ports(loop) for name, loop in mocks.loops.items()}
-    free = mocks.model_copy(update={"gvcp_port": 0, "loops": loops})
-    return rig.model_copy(update={"mocks": free})
+    devices: dict[str, Any] = {
+        "gvcp_port": 0,
+        "loops": {name: _with_ports_0(loop) for name, loop in mocks.loops.items()},
+        "hexapod": mocks.hexapod and _with_ports_0(mocks.hexapod),
+    }
+    return rig.model_copy(update={"mocks": mocks.model_copy(update=devices)})
 
 
-def _loop_with_free_ports(loop: LoopMocks) -> LoopMocks:
-    update: dict[str, Any] = {"slcan_port": 0, "modbus_port": 0, "mdt693_port": 0}
-    if loop.ensemble is not None:
-        update["ensemble"] = loop.ensemble.model_copy(update={"tcp_port": 0})
-    if loop.bal_analog is not None:
-        update["bal_analog"] = loop.bal_analog.model_copy(update={"modbus_port": 0})
-    return loop.model_copy(update=update)
+def _with_ports_0(settings: Settings) -> Settings:
+    """A mock's settings, and those within them, with each port any free one."""
+    update: dict[str, Any] = {}
+    for key, value in settings:
+        if isinstance(value, Settings):
+            update[key] = _with_ports_0(value)
+        elif key.endswith("_port"):
+            update[key] = 0
+    return settings.model_copy(update=update)
 
 
 async def _serve_mocks(

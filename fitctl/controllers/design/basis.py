@@ -50,7 +50,7 @@ def basis(rig: Rig, loop_name: str) -> Basis:
     ConfigError
         If the rig file knows of no disturbance: then there is nothing to design for.
     """
-    loop, camera = rig.loops[loop_name], rig.camera
+    loop, camera = rig.stellar_loops[loop_name], rig.camera
     if loop.vernier.air_path.gain_px == 0:
         msg = (
             f"rig {rig.name}: loops.{loop_name}.vernier.air_path.gain_px: must be above 0, or there is "

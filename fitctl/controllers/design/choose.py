@@ -35,7 +35,7 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
         If there is no such design, its file cannot be used with this rig, the rig's values have no
         solution, or the loop would be unstable.
     """
-    chosen = controller or rig.loops[loop_name].vernier.controller
+    chosen = controller or rig.stellar_loops[loop_name].vernier.controller
     its_basis = basis(rig, loop_name)
     if chosen.endswith(".json"):
         design = load_design(Path(chosen), its_basis, DESIGNS)

@@ -51,13 +51,18 @@ class LimitCycle(NamedTuple):
 
 def siderostat_response(basis: Basis) -> Response:
     """An integrator of 1 rad/s as the star loop meets it: delay, walk over one period, position servo."""
+    return integrator_response(basis.delay_s, basis.period_s)
+
+
+def integrator_response(delay_s: float, period_s: float) -> Response:
+    """An integrator of 1 rad/s of a siderostat's set-point, `delay_s` after what it acts on was measured."""
     wn = 2 * math.pi * SERVO_BANDWIDTH_HZ
 
     def response(omega_rad_s: Floats) -> NDArray[np.complex128]:
         s = 1j * np.asarray(omega_rad_s)
         servo = wn**2 / (s**2 + 2 * _SERVO_DAMPING * wn * s + wn**2)
         # Each set-point is reached in a straight line, one period after it was given.
-        lag_s = basis.delay_s + basis.period_s / 2
+        lag_s = delay_s + period_s / 2
         return np.asarray(np.exp(-s * lag_s) * servo / s)
 
     return response
@@ -77,6 +82,11 @@ def limit_cycles(basis: Basis, vernier: Response | None = None) -> list[LimitCyc
     if vernier is not None:
         # What the vernier leaves of a motion of the siderostat.
         loop = loop / (1 + vernier(omega) * np.exp(-1j * omega * basis.delay_s))
+    return cycles_of(loop, omega)
+
+
+def cycles_of(loop: NDArray[np.complex128], omega_rad_s: Floats) -> list[LimitCycle]:
+    """Where a loop of unit gain would swing by itself with a play in it, as :func:`limit_cycles`."""
     phase = np.unwrap(np.angle(loop))
     cycles = []
     for amplitude, play in zip(_AMPLITUDES, describing_function(_AMPLITUDES, 1.0), strict=True):
@@ -87,7 +97,7 @@ def limit_cycles(basis: Basis, vernier: Response | None = None) -> list[LimitCyc
             cycles.append(
                 LimitCycle(
                     gain_hz=float(gains[first]) / (2 * math.pi),
-                    frequency_hz=float(omega[crossing[first]]) / (2 * math.pi),
+                    frequency_hz=float(omega_rad_s[crossing[first]]) / (2 * math.pi),
                     amplitude_half_widths=float(amplitude),
                 )
             )

@@ -31,7 +31,7 @@ def design_in_own_process(
     ConfigError
         As `design_for`; and if the process fails, or is not ready within `timeout_s`.
     """
-    chosen = controller or rig.loops[loop_name].vernier.controller
+    chosen = controller or rig.stellar_loops[loop_name].vernier.controller
     remedy = f"fitctl design {chosen} --loop {loop_name} shows what it does"
     request = json.dumps({"rig": rig.model_dump_json(), "loop": loop_name, "controller": chosen})
     try:

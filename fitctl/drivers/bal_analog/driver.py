@@ -21,7 +21,6 @@ from pymodbus.pdu.register_message import ReadWriteMultipleRegistersRequest
 
 from fitctl.config import BalAnalogDevice, Siderostat
 from fitctl.drivers.amplifiers import AXES, DEVICE, LinkedAmplifiers
-from fitctl.drivers.bal_analog.link import ModbusLink
 from fitctl.drivers.bal_analog.protocol import (
     COUNTER_MODULUS,
     EXCEPTIONS,
@@ -32,6 +31,7 @@ from fitctl.drivers.bal_analog.protocol import (
     velocity_to_counts,
     word_of,
 )
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import (
     AzEl,
     DeviceFault,
@@ -41,6 +41,7 @@ from fitctl.drivers.interface import (
     ServoReading,
 )
 from fitctl.drivers.modbus import Answer, decode_exception, decode_registers
+from fitctl.drivers.modbus_tcp import ModbusLink
 from fitctl.drivers.plausibility import SPEED_MARGIN, MotionCheck, Pair
 from fitctl.drivers.probe import Probe, round_trip_s
 
@@ -97,7 +98,7 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         self._outstanding.clear()
         self._motion.restart()
         self._counted_s = -math.inf
-        with self._connected(ModbusLink(self._device)) as link:
+        with self._connected(_connect(self._device)) as link:
             identity = link.identify()
             self._settle()
         return identity
@@ -288,6 +289,18 @@ class BalAnalogAmplifiers(LinkedAmplifiers[ModbusLink, BalAnalogDevice]):
         return self._endpoint.error(DeviceTimeout, expected, got, hint)
 
 
+def _connect(device: BalAnalogDevice) -> ModbusLink:
+    return ModbusLink(
+        Endpoint(DEVICE, device.endpoint),
+        device.host,
+        device.port,
+        unit=device.device_id,
+        timeout_s=device.response_timeout_s,
+        station="the I/O station",
+        keys="siderostat.device",
+    )
+
+
 def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
     """Who a station is, and whether an amplifier behind it is in fault.
 
@@ -297,7 +310,7 @@ def probe_bal_analog(siderostat: Siderostat[BalAnalogDevice]) -> Probe:
         If it does not answer, or has no such registers.
     """
     device = siderostat.device
-    with closing(ModbusLink(device)) as link:
+    with closing(_connect(device)) as link:
         identity = link.identify()
         read = ReadHoldingRegistersRequest(address=device.first_input_register, count=REGISTERS)
         answer = link.ask(read)

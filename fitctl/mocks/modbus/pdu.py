@@ -1,4 +1,4 @@
-"""What a Modbus server of holding registers answers: a request PDU in, an answer PDU out, nothing else.
+"""What a Modbus server of registers answers: a request PDU in, an answer PDU out, nothing else.
 
 Checks are made in the order of the state diagrams of the MODBUS Application Protocol Specification
 V1.1b3, section 6: function (exception 01), quantities and lengths (03), addresses (02), doing it (04).
@@ -20,14 +20,31 @@ _BASIC_STREAM_AND_SINGLE = 0x81  # conformity level: the three basic objects, bo
 _SINGLE_OBJECT = 4
 
 
-class DeviceFailure(Exception):
-    """The device cannot do what was asked, though the request is right: exception 04."""
+class Refusal(Exception):
+    """What was asked is refused with an exception code."""
 
-
-class _Refusal(Exception):
     def __init__(self, exception_code: int) -> None:
         super().__init__(exception_code)
         self.exception_code = exception_code
+
+
+class DeviceFailure(Refusal):
+    """The device cannot do what was asked, though the request is right: exception 04."""
+
+    def __init__(self) -> None:
+        super().__init__(protocol.DEVICE_FAILURE)
+
+
+HOLDING_FUNCTIONS = frozenset(
+    {
+        protocol.READ_HOLDING_REGISTERS,
+        protocol.WRITE_SINGLE_REGISTER,
+        protocol.WRITE_MULTIPLE_REGISTERS,
+        protocol.READ_WRITE_MULTIPLE_REGISTERS,
+        protocol.READ_DEVICE_IDENTIFICATION,
+    }
+)
+"""What a device of holding registers has, unless it says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,34 +54,36 @@ class DataModel:
     Attributes
     ----------
     addresses : container of int
-        The holding registers that exist, counted from 0; often a range.
+        The registers that exist, counted from 0; often a range.
     read : callable
         Gets the first address and the count; returns as many unsigned values.
     write : callable
         Gets the first address and the values. Both are called with existing addresses only, and may raise
-        `DeviceFailure`.
+        `Refusal`.
     identity : sequence of bytes
         Vendor name, product code, revision; together at most 230 bytes.
+    functions : container of int
+        The function codes that the device has. Reading holding registers and reading input registers is the
+        same: one map of addresses.
     """
 
     addresses: Container[int]
     read: Callable[[int, int], Sequence[int]]
     write: Callable[[int, Sequence[int]], None]
     identity: Sequence[bytes]
+    functions: Container[int] = HOLDING_FUNCTIONS
 
 
 def answer(request: bytes, model: DataModel) -> bytes:
     """The answer PDU to a request PDU of at least one byte, an exception where it must be one."""
     code, body = request[0], request[1:]
     handler = _FUNCTIONS.get(code)
-    if handler is None:
+    if handler is None or code not in model.functions:
         return exception(code, protocol.ILLEGAL_FUNCTION)
     try:
         return bytes([code]) + handler(model, body)
-    except _Refusal as refusal:
+    except Refusal as refusal:
         return exception(code, refusal.exception_code)
-    except DeviceFailure:
-        return exception(code, protocol.DEVICE_FAILURE)
 
 
 def exception(function_code: int, exception_code: int) -> bytes:
@@ -132,6 +151,7 @@ def _identity_objects(identity: Sequence[bytes], begin: int, end: int) -> Iterat
 
 _FUNCTIONS: Mapping[int, Callable[[DataModel, bytes], bytes]] = {
     protocol.READ_HOLDING_REGISTERS: _read_registers,
+    protocol.READ_INPUT_REGISTERS: _read_registers,
     protocol.WRITE_SINGLE_REGISTER: _write_register,
     protocol.WRITE_MULTIPLE_REGISTERS: _write_registers,
     protocol.READ_WRITE_MULTIPLE_REGISTERS: _read_write_registers,
@@ -146,12 +166,12 @@ def _fields(layout: str, body: bytes) -> tuple[Any, ...]:
     try:
         return struct.unpack(layout, body)
     except struct.error:  # too short or too long: its implied length is wrong
-        raise _Refusal(protocol.ILLEGAL_VALUE) from None
+        raise Refusal(protocol.ILLEGAL_VALUE) from None
 
 
 def _check(is_right: bool, exception_code: int) -> None:
     if not is_right:
-        raise _Refusal(exception_code)
+        raise Refusal(exception_code)
 
 
 def _check_addresses(model: DataModel, address: int, count: int) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import STELLAR_MODES
 from fitctl.model.compiled import compiled, numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import PlantState
@@ -120,7 +120,7 @@ def _result(state: np.void) -> SimulationResult:
         measured_rms_px=pair(np.sqrt(_mean(state["measured_sum_px2"], frames))),
         judged_s=max(0.0, float(state["now_s"] - start_s)) if frames else 0.0,
         piston_rms_m=float(np.sqrt(np.maximum(piston_m2, 0.0))),
-        mode_times={mode.name: float(state["mode_times_s"][mode]) for mode in Mode},
+        mode_times={mode.name: float(state["mode_times_s"][mode]) for mode in STELLAR_MODES},
         frames=int(state["frames"]),
         speed_x=math.nan,
     )

@@ -10,7 +10,11 @@ from fitctl.model.optics import scales
 
 def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
     """Interlocks that do more than warn, and that a simulated run without them might have tripped."""
-    loop, camera, scale = rig.loops[loop_name], rig.camera, scales(rig, rig.loops[loop_name])
+    loop, camera, scale = (
+        rig.stellar_loops[loop_name],
+        rig.camera,
+        scales(rig, rig.stellar_loops[loop_name]),
+    )
     travel_rad = scale.travel_rad(loop.siderostat)
     rate_rad_s = loop.siderostat.velocity_limit_rad_s
     count_rad = loop.siderostat.encoder_count_rad

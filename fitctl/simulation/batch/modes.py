@@ -9,7 +9,7 @@ import numpy as np
 
 from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, count_frame, look_again
 from fitctl.controllers.search_rounds import round_fraction
-from fitctl.messages.modes import Mode, Trigger, transition
+from fitctl.messages.modes import STELLAR_MODES, Mode, Trigger, transition
 from fitctl.model.compiled import compilable
 from fitctl.model.optics import turned_back
 from fitctl.simulation.batch.laws import ACQUISITION, COARSE, VERNIER, start_pair
@@ -24,7 +24,7 @@ IN_REACH, OUT_OF_REACH = int(Trigger.IN_REACH), int(Trigger.OUT_OF_REACH)
 _TARGETS = np.array(
     [
         [row.target if (row := transition(mode, trigger)) else mode for trigger in Trigger]
-        for mode in Mode
+        for mode in STELLAR_MODES
     ],
     dtype=np.int64,
 )

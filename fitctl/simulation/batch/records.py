@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from fitctl.config import HALF_WINDOW_PX
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import STELLAR_MODES
 
 DONE, FOLLOWING_ERROR, NOT_FOUND = 0, 1, 2  # how a run ends; others than the first are simulated
 MOST_SPOTS, MOST_PLAYS, MOST_STATES, MOST_HISTORY = 8, 32, 33, 1024
@@ -24,7 +24,7 @@ RUN = np.dtype(
         ("now_s", "f8"),
         ("mode", "i8"),
         ("mode_since_s", "f8"),
-        ("mode_times_s", "f8", (len(Mode),)),
+        ("mode_times_s", "f8", (len(STELLAR_MODES),)),
         ("acquired_s", "f8"),
         ("vernier_s", "f8"),
         # a frame: its spots, where the stages were at its exposure, and the star

@@ -54,12 +54,12 @@ def batch_settings(rig: Rig, loop_name: str, constants: PlantConstants) -> NDArr
     if acting:
         msg = f"interlock {acting[0]} may act, and the batch has no interlocks"
         raise BatchRefusalError(msg)
-    loop, camera = rig.loops[loop_name], rig.true_camera
+    loop, camera = rig.stellar_loops[loop_name], rig.true_camera
     truth, _ = rig.mock_parts()
     if truth.hot_pixels or camera.dark_file is not None:
         msg = "its pixels differ (hot pixels or a dark file), and the batch makes all pixels alike"
         raise BatchRefusalError(msg)
-    plant, fsm, acquisition = truth.loops[loop_name], loop.fsm, loop.acquisition
+    plant, fsm, acquisition = truth.stellar_loops[loop_name], loop.fsm, loop.acquisition
     again_s = acquisition.search_again_s
     scale, plan = scales(rig, loop), plan_spiral(rig, loop_name)
     target_px = np.array([loop.target_px.az, loop.target_px.el])

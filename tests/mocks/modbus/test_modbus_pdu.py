@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.mocks.modbus.pdu import DataModel, DeviceFailure, answer
+from fitctl.mocks.modbus.pdu import DataModel, DeviceFailure, Refusal, answer
 
 BROKEN = 0xDEAD
 
@@ -112,6 +112,19 @@ def test_an_address_that_does_not_exist_is_exception_02_and_nothing_is_written(r
 def test_what_the_device_cannot_do_is_exception_04(request_):
     function = int(request_[:2], 16)
     assert Station().says(request_) == f"{function | 0x80:02x} 04"
+
+
+def test_a_device_says_itself_which_functions_it_has_and_what_it_refuses():
+    def refuse(_address, _values):
+        raise Refusal(3)
+
+    model = DataModel(range(2), lambda _first, count: [7] * count, refuse, (), {4, 6})
+    assert answer(bytes.fromhex("04 00 00 00 02"), model).hex(" ") == "04 04 00 07 00 07"
+    assert answer(bytes.fromhex("04 00 01 00 02"), model).hex(" ") == "84 02"
+    assert answer(bytes.fromhex("06 00 00 00 01"), model).hex(" ") == "86 03"
+    for lacking in ("03 00 00 00 02", "10 00 00 00 01 02 00 00", "2b 0e 01 00"):
+        function = int(lacking[:2], 16)
+        assert answer(bytes.fromhex(lacking), model).hex(" ") == f"{function | 0x80:02x} 01"
 
 
 ALL_OBJECTS = "00 05 6d 61 6b 65 72 01 05 6d 6f 64 65 6c 02 03 31 2e 30"

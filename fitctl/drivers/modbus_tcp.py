@@ -1,18 +1,17 @@
-"""The Modbus/TCP connection to the I/O station: requests out, answers in, matched by their number.
+"""A Modbus/TCP connection on which nobody waits: requests out, answers in, matched by their number.
 
-A servo goes on after one period, and takes a late answer when it comes.
+What is called every period or every frame goes on without an answer, and reads a late one when it comes.
 """
 
 from __future__ import annotations
 
 import select
 import socket
+import struct
 import time
 
 from pymodbus.pdu import ModbusPDU
 
-from fitctl.config import BalAnalogDevice
-from fitctl.drivers.amplifiers import DEVICE
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceIdentity, DeviceProtocolError, DeviceUnreachable
 from fitctl.drivers.modbus import (
@@ -24,13 +23,30 @@ from fitctl.drivers.modbus import (
     pop_answer,
 )
 
+_SO_TIMESTAMPNS = 35  # of Linux; not in Python's socket module
+_TIMESPEC = struct.Struct("@ll")
+_STAMP_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
+
 
 class ModbusLink:
     """One connection; closed after anything that is no Modbus message.
 
     Parameters
     ----------
-    device : BalAnalogDevice
+    endpoint : Endpoint
+    host, port : str, int
+    unit : int
+    timeout_s : float
+        Limit of connecting and of :meth:`ask`.
+    station : str
+        What errors call the device at the other end, such as ``"the I/O station"``.
+    keys : str
+        The table of the rig file that has `host` and `port`.
+
+    Attributes
+    ----------
+    arrived_s : float
+        Host's monotonic time at which the kernel received what was read last.
 
     Raises
     ------
@@ -38,33 +54,48 @@ class ModbusLink:
         If nobody listens there.
     """
 
-    def __init__(self, device: BalAnalogDevice) -> None:
-        self._device = device
-        self._endpoint = Endpoint(DEVICE, device.endpoint)
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        host: str,
+        port: int,
+        *,
+        unit: int,
+        timeout_s: float,
+        station: str,
+        keys: str,
+    ) -> None:
+        self.arrived_s = 0.0
+        self._endpoint = endpoint
+        self._unit = unit
+        self._timeout_s = timeout_s
+        self._station = station
+        self._keys = keys
         self._pending = bytearray()
         self._transaction = 0
         try:
-            self._socket = socket.create_connection(
-                (device.host, device.port), device.response_timeout_s
-            )
+            self._socket = socket.create_connection((host, port), timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all
-            raise self._endpoint.error(
+            raise endpoint.error(
                 DeviceUnreachable,
-                "a Modbus I/O station",
+                f"{station} to accept a connection",
                 str(error),
-                "check its power and cable, and siderostat.device.host and .port",
+                f"check its power and cable, and {keys}.host and .port",
             ) from error
+        self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def send(self, request: ModbusPDU) -> int:
-        """Send a request; returns the number that its answer will have.
+        """Send a request without waiting; returns the number that its answer will have.
 
         Raises
         ------
         DeviceUnreachable
+            Also when the station has read nothing for so long that no request fits into the buffers.
         """
         self._transaction = self._transaction + 1 & 0xFFFF
-        request.transaction_id, request.dev_id = self._transaction, self._device.device_id
+        request.transaction_id, request.dev_id = self._transaction, self._unit
         try:
             self._socket.sendall(TCP.buildFrame(request))
         except OSError as error:
@@ -86,25 +117,27 @@ class ModbusLink:
             if answer is not None:
                 return answer
             try:
-                left_s = max(0.0, deadline_s - time.monotonic())
-                if not select.select([self._socket], [], [], left_s)[0]:
+                data = self._read()
+            except BlockingIOError:
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0 or not select.select([self._socket], [], [], left_s)[0]:
                     return None
-                data = self._socket.recv(ANSWER_BYTES_MAX)
-            except (OSError, ValueError) as error:  # ValueError: closed before
+                continue
+            except OSError as error:
                 raise self._broken(str(error)) from error
             if not data:
                 raise self._broken("closed by the station")
             self._pending += data
 
     def ask(self, request: ModbusPDU) -> bytes:
-        """The answer's PDU to a request; empty when none comes within `response_timeout_s`.
+        """The answer's PDU to a request; empty when none comes within the time limit.
 
         Raises
         ------
         DeviceUnreachable, DeviceProtocolError
         """
         number = self.send(request)
-        deadline_s = time.monotonic() + self._device.response_timeout_s
+        deadline_s = time.monotonic() + self._timeout_s
         while (answer := self.receive(deadline_s)) is not None:
             if answer.transaction == number:
                 return answer.pdu
@@ -127,8 +160,18 @@ class ModbusLink:
     def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
         """The error for an answer that cannot be; the link is closed."""
         self.close()
-        hint = "check that siderostat.device.host and .port lead to the I/O station, then recover"
+        hint = f"check that {self._keys}.host and .port lead to {self._station}, then recover"
         return self._endpoint.error(DeviceProtocolError, expected, got, hint)
+
+    def _read(self) -> bytes:
+        data, ancillary, _, _ = self._socket.recvmsg(ANSWER_BYTES_MAX, _STAMP_BYTES)
+        self.arrived_s = time.monotonic()
+        for level, kind, stamp in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
+                seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+                waited_ns = time.time_ns() - (1_000_000_000 * seconds + nanoseconds)
+                self.arrived_s -= max(0, waited_ns) * 1e-9
+        return data
 
     def _broken(self, got: str) -> DeviceUnreachable:
         self.close()
@@ -136,5 +179,5 @@ class ModbusLink:
             DeviceUnreachable,
             "a connection",
             f"a broken one ({got})",
-            "check the I/O station's power and cable, then recover",
+            f"check the power and the cable of {self._station}, then recover",
         )

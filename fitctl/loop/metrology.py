@@ -1,0 +1,433 @@
+"""A metrology loop's tick, from a sample of its photodiodes to its siderostat's set-point.
+
+sample -> beam's place -> interlocks -> mode's control law -> siderostat set-point -> next sample -> record.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config import MetrologyLoop as MetrologySettings
+from fitctl.controllers.beam_hold import BeamHold
+from fitctl.controllers.photodiodes import Beam, BeamState, PhotodiodeArray
+from fitctl.controllers.spiral import plan_beam_spiral
+from fitctl.drivers.interface import (
+    DeviceError,
+    DiodeReading,
+    Frame,
+    LoopDevices,
+    Photodiodes,
+    ServoReading,
+)
+from fitctl.logging.records import MetrologyTick
+from fitctl.loop.beam_search import BeamSearch
+from fitctl.loop.loop import Loop
+from fitctl.loop.quantities import MetrologyQuantities, metrology_places
+from fitctl.messages.commands import Acquire
+from fitctl.messages.modes import (
+    BEAM_FOLLOWING,
+    METROLOGY_TRANSITIONS,
+    Finding,
+    Mode,
+    Trigger,
+)
+from fitctl.messages.telemetry import LoopLimits, LoopState
+from fitctl.model.optics import motor_sky_rad_per_rad, rotation, sky_px_per_rad
+from fitctl.stages.journal import Journal
+from fitctl.stages.servo import ServoState, SiderostatServo
+from fitctl.stages.siderostat import SiderostatStage
+
+Floats = NDArray[np.float64]
+IN_REACH = 3.0  # times the requirement: nearer to the centre than this, the beam is held (choice)
+OUT_OF_REACH = 20.0  # times the requirement: farther, it is pulled in again (choice)
+_PULL_IN = (
+    0.5  # of the motors' velocity limit: faster, a beam that is far off is not pulled in (choice)
+)
+_MOST_TICK_S = 0.1  # a longer wait between two ticks counts as this: the law was not made for it
+_NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
+_NO_SAMPLE = DiodeReading(math.nan, (math.nan,) * 4)
+_NO_BEAM = Beam(BeamState.LOST, math.nan, math.nan, math.nan, math.nan, math.nan)
+
+
+class _Sensed(NamedTuple):
+    """What a tick is decided by.
+
+    `sample` and `beam` are None at a tick without a new sample; `motor_rad` is where the motors were when it
+    was taken, without one where they are now.
+    """
+
+    frame: Frame | None
+    frames_lost: int
+    servo: ServoState
+    sample: DiodeReading | None
+    beam: Beam | None
+    motor_rad: Floats
+    begun_s: float
+
+
+class MetrologyLoop(Loop):
+    """One metrology loop: photodiodes, search, and the law that holds the beam on their centre.
+
+    Parameters
+    ----------
+    name : str
+    rig : Rig
+    siderostat : SiderostatStage
+    photodiodes : Photodiodes
+    journal : Journal
+
+    Attributes
+    ----------
+    search : BeamSearch
+    hold : BeamHold
+    zeros_lost : int
+        How often the encoders were found to read elsewhere than before, when the devices were opened.
+    """
+
+    transitions = METROLOGY_TRANSITIONS
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        siderostat: SiderostatStage,
+        photodiodes: Photodiodes,
+        journal: Journal,
+    ) -> None:
+        super().__init__(
+            name,
+            rig,
+            siderostat,
+            journal,
+            quantities=MetrologyQuantities(rig, name),
+            places=metrology_places(rig, name),
+        )
+        self.settings: MetrologySettings = rig.metrology_loops[name]
+        settings = self.settings
+        self.quantities: MetrologyQuantities
+        self.search = BeamSearch(rig, name)
+        self.hold = BeamHold(settings.hold.crossover_hz, settings.hold.second_integrator_hz)
+        self._array = PhotodiodeArray(settings.sensor, settings.acquisition.detection_sigma)
+        self._photodiodes = photodiodes
+        self._photodiode_error: DeviceError | None = None
+        self._asked = Acquire()
+        self.zeros_lost = 0
+        self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
+        self._turn = rotation(settings.siderostat.rotation_deg)
+        self._pull_in_rad_s = _PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
+        self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
+        self._period_s = rig.camera.period_s
+        self._sky_arcsec_per_px = ARCSEC_PER_RAD / sky_px_per_rad(rig)
+        self._limits = _limits(rig, name)
+        self._ready = False
+        self._sampled_s = math.nan
+        self._ticked_s = journal.clock.now_s()
+        self._lost = self._in_reach = self._out_of_reach = 0  # samples in a row
+        self._laws: dict[Mode, Callable[[_Sensed, float], None]] = {
+            Mode.ACQUISITION: self._search,
+            Mode.COARSE: self._pull_in,
+            Mode.LOCKED: self._hold_beam,
+        }
+
+    # ------------------------------------------------------------ the tick
+
+    def sense(self, frame: Frame | None, frames_lost: int, frames_skipped: int) -> None:
+        """Find the beam on the newest sample, and where the motors were when it was taken."""
+        servo = self.servo.read_state()
+        begun_s = self._clock.now_s()
+        sample = self._receive()
+        beam = None if sample is None else self._array.beam(sample.volts)
+        motor_rad = (
+            self.servo.position_rad if sample is None else self.servo.position_at(sample.time_s)
+        )
+        self._sensed = _Sensed(frame, frames_lost, servo, sample, beam, motor_rad, begun_s)
+        self._sensed_s = self._clock.now_s()
+
+    def _receive(self) -> DiodeReading | None:
+        if not self._ready:
+            return None
+        try:
+            sample = self._photodiodes.receive()
+        except DeviceError as error:
+            self._photodiode_error = error
+            return None
+        if sample is not None:
+            self._sampled_s = sample.time_s
+        return sample
+
+    def decide(self) -> None:
+        """Errors and findings first, then interlocks, then the mode's control law."""
+        sensed = self._sensed
+        self._evaluate_findings(sensed)
+        now_s, quantities = sensed.begun_s, self.quantities
+        quantities.record_siderostat(sensed.servo, self.siderostat, now_s)
+        if sensed.beam is not None:
+            quantities.record_beam(sensed.beam, now_s)
+        if self._ready:
+            quantities.record_sample_age(now_s - self._sampled_s, now_s)
+        self._evaluate_interlocks(now_s)
+        duration_s = min(now_s - self._ticked_s, _MOST_TICK_S)
+        self._ticked_s = now_s
+        law = self._laws.get(self.mode)
+        if law is not None and self.interlocks.action not in {"hold", "flatten"}:
+            law(sensed, duration_s)
+        self._decided_s = self._clock.now_s()
+
+    def send(self) -> None:
+        """Ask for the next sample."""
+        if not self._ready or self.mode is Mode.OFF:
+            return
+        try:
+            self._photodiodes.send_request()
+        except DeviceError as error:
+            self._photodiodes_failed(error)
+
+    def confirm(self) -> None:
+        """Nothing is to be confirmed: the sample is read at the next tick."""
+        self._done_s = self._clock.now_s()
+
+    def _photodiodes_failed(self, error: DeviceError) -> None:
+        self._ready = False
+        self.device_failed("photodiodes", error)
+
+    def _evaluate_findings(self, sensed: _Sensed) -> None:
+        """Errors of devices, and what the sample means for the mode."""
+        error, self._photodiode_error = self._photodiode_error, None
+        if sensed.servo.fault is not None:
+            self.device_failed("siderostat", sensed.servo.fault)
+        elif error is not None:
+            self._photodiodes_failed(error)
+        elif sensed.sample is not None and sensed.beam is not None:
+            found = self._find_trigger(sensed.sample, sensed.beam, sensed.motor_rad)
+            if found is not None and found.trigger is None:
+                self._report_event("warning", found.reason)
+            elif found is not None and found.trigger is not None:
+                self.fire(found.trigger, found.reason)
+
+    def _find_trigger(self, sample: DiodeReading, beam: Beam, motor_rad: Floats) -> Finding | None:
+        if self.mode is Mode.ACQUISITION:
+            has_light = beam.state is not BeamState.LOST
+            return self.search.evaluate(has_light, motor_rad, sample.time_s)
+        return self._follow(beam) if self.mode in BEAM_FOLLOWING else None
+
+    def _follow(self, beam: Beam) -> Finding | None:
+        """Whether a beam that is followed is still there, and near the centre."""
+        acquisition = self.settings.acquisition
+        measured = beam.state is BeamState.MEASURED
+        error = self._error_arcsec(beam) / self.settings.requirement_arcsec
+        self._lost = self._lost + 1 if beam.state is BeamState.LOST else 0
+        self._in_reach = self._in_reach + 1 if measured and error <= IN_REACH else 0
+        near = measured and error <= OUT_OF_REACH
+        self._out_of_reach = 0 if near else self._out_of_reach + 1
+        if self._lost >= acquisition.lost_frames:
+            return Finding(Trigger.BEAM_LOST, f"no beam on {self._lost} samples in a row")
+        if self.mode is Mode.COARSE and self._in_reach >= acquisition.found_frames:
+            return Finding(Trigger.IN_REACH, "the beam is near the centre of the photodiodes")
+        if self.mode is Mode.LOCKED and self._out_of_reach >= acquisition.lost_frames:
+            state = beam.state.name.lower()
+            return Finding(Trigger.OUT_OF_REACH, f"the beam is {state}, and not near the centre")
+        return None
+
+    def _error_arcsec(self, beam: Beam) -> float:
+        error_m = max(abs(beam.az_m), abs(beam.el_m))
+        return error_m / self.settings.sensor.link_length_m * ARCSEC_PER_RAD
+
+    # ------------------------------------------------------------ modes
+
+    def _enter(self, source: Mode, motor_rad: Floats) -> None:
+        self._lost = self._in_reach = self._out_of_reach = 0
+        super()._enter(source, motor_rad)
+        if self.mode is Mode.ACQUISITION:
+            self._start_search(motor_rad, again=source in BEAM_FOLLOWING)
+        elif self.mode is Mode.LOCKED:
+            self.hold.begin()
+
+    def configure_search(self, asked: Acquire) -> None:
+        """How the next search, and no other, is to be made, as a command asks that was not refused."""
+        self._asked = asked
+
+    def _start_search(self, motor_rad: Floats, *, again: bool) -> None:
+        """As asked; else about where the siderostat is, which for a beam that was lost is its last place."""
+        asked, self._asked = self._asked, Acquire()
+        centre_rad = motor_rad
+        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
+            expected = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
+            centre_rad = expected / ARCSEC_PER_RAD / self._motor_sky
+        self.search.begin(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
+
+    # ------------------------------------------------------------ control laws
+
+    def _search(self, _sensed: _Sensed, duration_s: float) -> None:
+        self.siderostat.move_to(self.search.advance(duration_s))
+
+    def _pull_in(self, sensed: _Sensed, duration_s: float) -> None:
+        error_rad = self._error_rad(sensed.beam)
+        if error_rad is not None:
+            step_rad = self.hold.pull_in(error_rad, duration_s)
+            # No faster than the siderostat follows, or the set-point would run away from it.
+            most_rad = self._pull_in_rad_s * duration_s
+            self._turn_beam(step_rad * min(1.0, most_rad / max(np.abs(step_rad).max(), 1e-12)))
+
+    def _hold_beam(self, sensed: _Sensed, duration_s: float) -> None:
+        self._turn_beam(self.hold.step(self._error_rad(sensed.beam), duration_s))
+
+    def _error_rad(self, beam: Beam | None) -> Floats | None:
+        if beam is None or beam.state is BeamState.LOST:
+            return None
+        return beam.place_m / self.settings.sensor.link_length_m
+
+    def _turn_beam(self, step_rad: Floats) -> None:
+        # The siderostat's axes may be turned from the photodiodes'.
+        self.siderostat.move_by(step_rad.dot(self._turn) / self._motor_sky)
+
+    # ------------------------------------------------------------ for the supervisor
+
+    def begin(self, stack_v: Floats | None) -> None:
+        """Begin anew: from now on the photodiodes are sampled."""
+        super().begin(stack_v)
+        self._photodiode_error = None
+        self.zeros_lost += self.servo.encoders_jumped
+        self._sampled_s = self._ticked_s = self._clock.now_s()
+        self._ready = True
+
+    def release(self) -> None:
+        """Ask for no more samples."""
+        self._ready = False
+
+    @property
+    def sampled(self) -> bool:
+        """Samples are asked for."""
+        return self._ready
+
+    def state(self, now_s: float) -> LoopState:
+        """The newest of everything, for consoles."""
+        mode, requirement_arcsec = self.mode, self.settings.requirement_arcsec
+        searching = mode is Mode.ACQUISITION
+        arcsec_per_rad = self._motor_sky * ARCSEC_PER_RAD
+        centre_az, centre_el = (self.search.centre_rad * arcsec_per_rad).tolist()
+        return LoopState(
+            name=self.name,
+            mode=mode.name,
+            since_s=self.mode_since_s,
+            requirement_px=requirement_arcsec / self._sky_arcsec_per_px,
+            sky_arcsec_per_px=self._sky_arcsec_per_px,
+            usable_commands=[trigger.name.capitalize() for trigger in self.usable_commands],
+            last_change=self.last_change,
+            interlocks=list(self.interlocks.tripped),
+            limits=self._limits,
+            watched=self.interlocks.watched(now_s, self.quantities.readings),
+            search_centre_sky_arcsec=(centre_az, centre_el) if searching else None,
+            search_again=self.search.state_again(self.mode_since_s) if searching else None,
+            kind="metrology",
+        )
+
+    def tick_record(self) -> MetrologyTick:
+        """What the tick was decided by, and what it did."""
+        sensed, frame = self._sensed, self._sensed.frame
+        sample, beam = sensed.sample or _NO_SAMPLE, sensed.beam or _NO_BEAM
+        read_s, (encoder_az_rad, encoder_el_rad), *_ = sensed.servo.reading or _NO_READING
+        arcsec_per_m = ARCSEC_PER_RAD / self.settings.sensor.link_length_m
+        arcsec_per_rad = self._motor_sky * ARCSEC_PER_RAD
+        rate_az_rad_s, rate_el_rad_s = self.hold.rate_rad_s.tolist()
+        motor_az_rad, motor_el_rad = sensed.motor_rad.tolist()
+        setpoint_az_rad, setpoint_el_rad = self.siderostat.setpoint_rad.tolist()
+        az_plus_v, az_minus_v, el_plus_v, el_minus_v = sample.volts
+        compute_s = self._done_s - sensed.begun_s
+        age_s = math.nan if frame is None else frame.received_s - frame.mid_exposure_s
+        late = frame is not None and self._done_s - frame.mid_exposure_s > self._late_s
+        self.quantities.record_tick(compute_s, self._done_s)
+        return MetrologyTick(
+            time_s=self._done_s,
+            loop=self.name,
+            number=-1 if frame is None else frame.number,
+            mode=self.mode.name,
+            mode_number=int(self.mode),
+            frame_age_s=age_s,
+            compute_s=compute_s,
+            late=late,
+            frames_lost=sensed.frames_lost,
+            sampled_s=sample.time_s,
+            beam_state="" if sensed.beam is None else beam.state.name,
+            beam_az_m=beam.az_m,
+            beam_el_m=beam.el_m,
+            beam_az_arcsec=arcsec_per_m * beam.az_m,
+            beam_el_arcsec=arcsec_per_m * beam.el_m,
+            noise_az_arcsec=arcsec_per_m * beam.noise_az_m,
+            noise_el_arcsec=arcsec_per_m * beam.noise_el_m,
+            diode_az_plus_v=az_plus_v,
+            diode_az_minus_v=az_minus_v,
+            diode_el_plus_v=el_plus_v,
+            diode_el_minus_v=el_minus_v,
+            rate_az_arcsec_s=ARCSEC_PER_RAD * rate_az_rad_s,
+            rate_el_arcsec_s=ARCSEC_PER_RAD * rate_el_rad_s,
+            siderostat_az_rad=motor_az_rad,
+            siderostat_el_rad=motor_el_rad,
+            siderostat_setpoint_az_rad=setpoint_az_rad,
+            siderostat_setpoint_el_rad=setpoint_el_rad,
+            siderostat_az_sky_arcsec=motor_az_rad * arcsec_per_rad,
+            siderostat_el_sky_arcsec=motor_el_rad * arcsec_per_rad,
+            search_progress=self.search.progress if self.mode is Mode.ACQUISITION else math.nan,
+            amplifier_round_trip_s=sensed.servo.round_trip_s,
+            following_error_rad=sensed.servo.following_rad,
+            encoder_read_s=read_s,
+            encoder_az_rad=encoder_az_rad,
+            encoder_el_rad=encoder_el_rad,
+            sense_s=self._sensed_s - sensed.begun_s,
+            decide_s=self._decided_s - self._sensed_s,
+        )
+
+
+def metrology_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) -> MetrologyLoop:
+    """A metrology loop on its devices.
+
+    Raises
+    ------
+    ValueError
+        If there are no photodiodes among them.
+    """
+    if devices.photodiodes is None:
+        msg = f"loop {name}: a metrology loop needs the A/D converter of its photodiodes"
+        raise ValueError(msg)
+    servo = SiderostatServo(
+        name, rig.loops[name], devices.amplifiers, journal.clock, rig.camera.period_s
+    )
+    return MetrologyLoop(name, rig, SiderostatStage(rig, name, servo), devices.photodiodes, journal)
+
+
+def refused_beam_search(settings: MetrologySettings, name: str, asked: Acquire) -> str:
+    """Why a search for the beam cannot be made as asked, or nothing."""
+    expected = [asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec]
+    given = [place for place in expected if place is not None]
+    if len(given) == 1:
+        return "expected_az_sky_arcsec and expected_el_sky_arcsec belong together"
+    radius = asked.search_radius_sky_arcsec
+    if radius is not None and not 0 < radius < math.inf:
+        return f"search_radius_sky_arcsec must be above 0 (is {radius:g})"
+    if radius is None and not given:
+        return ""
+    radius = radius or settings.acquisition.search_radius_sky_arcsec
+    travel = settings.siderostat.travel_sky_arcsec
+    reach = max((abs(place) for place in given), default=0.0) + radius
+    if not reach <= travel:
+        return (
+            f"the search would reach {reach:g} arcsec from where the encoders read zero; "
+            f"travel_sky_arcsec of loops.{name}.siderostat is {travel:g}"
+        )
+    return ""
+
+
+def _limits(rig: Rig, name: str) -> LoopLimits:
+    loop = rig.metrology_loops[name]
+    pitch_px = plan_beam_spiral(rig, name).pitch_px
+    return LoopLimits(
+        fsm_range_rad=0.0,
+        siderostat_travel_sky_arcsec=loop.siderostat.travel_sky_arcsec,
+        search_radius_sky_arcsec=loop.acquisition.search_radius_sky_arcsec,
+        spiral_pitch_sky_arcsec=pitch_px / sky_px_per_rad(rig) * ARCSEC_PER_RAD,
+    )

@@ -1,0 +1,1 @@
+"""A PI C-887 hexapod controller."""

@@ -1,0 +1,1 @@
+"""A mock LabJack T7."""

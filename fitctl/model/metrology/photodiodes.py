@@ -1,0 +1,30 @@
+"""Volts of four photodiodes in a Gaussian beam."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fitctl.config import BeamSensor
+
+Floats = NDArray[np.float64]
+
+
+def diode_volts(sensor: BeamSensor, offset_m: ArrayLike, laser: ArrayLike = 1.0) -> Floats:
+    """Volts without noise, shape (..., 4), in the order az+, az-, el+, el-.
+
+    Parameters
+    ----------
+    sensor : BeamSensor
+    offset_m : array_like, shape (..., 2)
+        The centre of the beam from the centre of the array.
+    laser : array_like
+        Power of the laser over its nominal power; 0 is off.
+    """
+    offset_m = np.asarray(offset_m, dtype=float)
+    along_m = np.stack([offset_m, -offset_m], axis=-1).reshape(*offset_m.shape[:-1], 4)
+    squared_m2 = np.sum(offset_m**2, axis=-1)[..., None]
+    # |p - r|^2 - d^2 of a diode at r, so that a beam on the centre gives on_axis_v.
+    beyond_m2 = squared_m2 - 2.0 * sensor.diode_offset_m * along_m
+    light_v = sensor.on_axis_v * np.exp(-2.0 * beyond_m2 / sensor.beam_radius_m**2)
+    return np.asarray(light_v * np.asarray(laser)[..., None] + np.asarray(sensor.ambient_v))

@@ -1,0 +1,158 @@
+"""The collector's hexapod: opened, referenced and moved beside the ticks, and stopped at once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+from fitctl.clock import Clock
+from fitctl.config import Collector
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceFault,
+    DeviceIdentity,
+    DeviceRefused,
+    Hexapod,
+)
+from fitctl.logging.records import Severity
+from fitctl.stages.collector import CollectorDrive
+from fitctl.stages.journal import error_text
+
+HEXAPOD = "hexapod"
+CollectorAction = Literal["reference", "start", "stop"]
+_STILL_CONNECTED = (DeviceRefused, DeviceFault)  # the others end the connection
+
+
+class CollectorWatch:
+    """Moves the collector on command; the hexapod is connected when it is first needed.
+
+    Nothing here waits for the hexapod in the caller's thread while the drive has one of its own.
+
+    Parameters
+    ----------
+    collector : Collector
+    hexapod : Hexapod
+    clock : Clock
+    report : callable
+        Records an event, from any thread: severity, source, message.
+
+    Attributes
+    ----------
+    drive : CollectorDrive
+        To be run at its own pace.
+    identity : DeviceIdentity or None
+        Who answered when it was opened.
+    is_open : bool
+    error : str
+        What went wrong last; empty since something went well.
+    """
+
+    def __init__(
+        self,
+        collector: Collector,
+        hexapod: Hexapod,
+        clock: Clock,
+        report: Callable[[Severity, str, str], None],
+    ) -> None:
+        self.drive = CollectorDrive(collector, hexapod, clock, seed=0)
+        self.identity: DeviceIdentity | None = None
+        self.is_open = False
+        self.error = ""
+        self.endpoint = collector.hexapod.endpoint
+        self._kind = collector.motion.kind
+        self._hexapod = hexapod
+        self._report = report
+        self._busy = False
+        self._stops = 0
+        self._fault: Exception | None = None
+
+    def obey(self, action: CollectorAction) -> str:
+        """Begin what a command asks for; returns why not, or nothing. An event reports how it ends."""
+        if action == "stop":
+            self.stop()
+            return ""
+        if self._busy:
+            return "the hexapod is being opened or referenced; wait for the event that reports it"
+        if self.drive.running:
+            return "the collector moves; stop it first"
+        self._busy = True
+        self._beside(partial(self._work, action, self._stops))
+        return ""
+
+    def stop(self) -> None:
+        """Stop the hexapod where it is, at once; from any thread. A start that is under way ends too."""
+        self._stops += 1
+        if self.is_open:
+            self._beside(self._stop)
+
+    def check(self) -> None:
+        """Report a course that has ended by itself."""
+        fault = self.drive.fault
+        if fault is not self._fault:
+            self._fault = fault
+            if fault is not None:
+                self._failed(fault)
+
+    @property
+    def detail(self) -> str:
+        """What it does, for people."""
+        if self.drive.running:
+            az_mm, el_mm = self.drive.displacement_mm()
+            return f"{self._kind} at {az_mm:+.2f} {el_mm:+.2f} mm"
+        return self.error or "stands still"
+
+    def close(self) -> None:
+        """Stop what moves, and disconnect; waits for that."""
+        self._stops += 1
+        if self.drive.running:
+            self._stop()
+        self.is_open = False
+        self._hexapod.close()
+
+    def _work(self, action: CollectorAction, stops: int) -> None:
+        try:
+            if not self.is_open:
+                self.identity = self._hexapod.open()
+                self.is_open = True
+            if stops != self._stops:
+                return
+            if action == "reference":
+                self._hexapod.reference()
+                self._report("info", HEXAPOD, "referenced: all axes are at zero")
+            else:
+                self.drive.start()
+                if stops != self._stops:  # a stop has the last word
+                    self.drive.stop()
+                    return
+                self._report("info", HEXAPOD, f"the collector begins to move: {self._kind}")
+            self.error = ""
+        except DeviceError as error:
+            self._failed(error)
+        finally:
+            self._busy = False
+
+    def _stop(self) -> None:
+        moved = self.drive.running
+        try:
+            self.drive.stop()
+        except DeviceError as error:
+            self._failed(error)
+        else:
+            if moved:
+                self._report("info", HEXAPOD, "the collector was stopped where it is")
+
+    def _failed(self, error: Exception) -> None:
+        self.error = error_text(error)
+        if not isinstance(error, _STILL_CONNECTED):
+            self.is_open = False
+            self._hexapod.close()
+        self._report("error", HEXAPOD, self.error)
+
+    def _beside(self, work: Callable[[], None]) -> None:
+        """In a thread of its own, unless nothing is threaded: a simulation, whose clock would go on."""
+        if self.drive.threaded:
+            threading.Thread(target=work, name="collector", daemon=True).start()
+        else:
+            work()

@@ -1,0 +1,267 @@
+"""A stellar loop whose light comes over a link: held while the link moves, waiting while it is lost."""
+
+import numpy as np
+import pytest
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.logging.records import Event, ModeChange, Overlap, Tick
+from fitctl.messages.commands import Acquire, Hold, Off, Recover, Standby, Stop
+from fitctl.messages.modes import Mode
+from fitctl.simulation.simulation import Simulation
+from fitctl.simulation.statistics import true_residual_rms
+
+RIG = default_rig_path().with_name("fit-testbed.toml")
+NEAR = (3.0, -2.0)  # px: both stars are in the field from the start
+STILL = "collector.motion.kind=still"
+METROLOGY, LEFT, RIGHT = "metrology", "left", "right"
+
+
+class Drift:
+    """The collector's array moves at a steady velocity across the link."""
+
+    def __init__(self, mm_s, start_s):
+        self.mm_s, self.start_s = mm_s, start_s
+
+    def pose_at(self, time_s):
+        moved_mm = self.mm_s * np.maximum(np.asarray(time_s) - self.start_s, 0.0)
+        pose = np.zeros((*moved_mm.shape, 6))
+        pose[..., 1] = moved_mm
+        return pose
+
+
+class Testbed:
+    """The whole testbed, simulated; its `records` are all that it made but frames."""
+
+    __test__ = False
+
+    def __init__(self, *overrides, seed=0, star_offset_px=NEAR):
+        self.records = []
+        self.simulation = Simulation(
+            load_rig(RIG, [STILL, *overrides]),
+            seed,
+            star_offset_px=star_offset_px,
+            record=self.records.append,
+            history_s=60.0,
+        )
+        self.supervisor, self.clock = self.simulation.supervisor, self.simulation.clock
+        self.run, self.command = self.simulation.run, self.simulation.command
+
+    def loop(self, name):
+        return self.supervisor.loops[name]
+
+    def modes(self):
+        return {name: loop.mode for name, loop in self.supervisor.loops.items()}
+
+    def until(self, limit_s=40.0, **modes):
+        end_s = self.clock.now_s() + limit_s
+        while any(self.loop(name).mode is not mode for name, mode in modes.items()):
+            assert self.clock.now_s() < end_s, f"{self.modes()}, wanted {modes}"
+            self.run(0.02)
+        return self
+
+    def held(self):
+        self.simulation.acquire()
+        return self.until(metrology=Mode.LOCKED, left=Mode.VERNIER, right=Mode.VERNIER)
+
+    def drift(self, mm_s):
+        self.simulation.plant.collector.follow(Drift(mm_s, self.clock.now_s()))
+
+    def laser(self, power):
+        self.simulation.plant.loops[METROLOGY].inputs.laser[:] = power
+
+    def darken(self, name):
+        """Cover one loop's spots; what uncovers them."""
+        scene, spots = self.simulation.camera._scene, [2 * [one] for one in (RIGHT, LEFT)]
+        light_dn = scene._flux_dn
+        scene._flux_dn = light_dn * np.array([one != name for pair in spots for one in pair])
+        return lambda: setattr(scene, "_flux_dn", light_dn)
+
+    def rms_px(self, name, since_s):
+        return true_residual_rms(
+            self.simulation.plants[name],
+            self.supervisor.stellar_loops[name].target_px,
+            since_s,
+            self.clock.now_s(),
+        )
+
+    def first_change(self, name, **fields):
+        return next(
+            record
+            for record in self.records
+            if isinstance(record, ModeChange)
+            and record.loop == name
+            and all(getattr(record, key) == value for key, value in fields.items())
+        )
+
+    def events(self, source):
+        return [r for r in self.records if isinstance(r, Event) and r.source == source]
+
+
+@pytest.fixture
+def held():
+    return Testbed().held()
+
+
+def test_one_command_brings_all_up_in_the_order_in_which_they_depend_on_each_other():
+    testbed = Testbed(star_offset_px=None).held()
+    locked_s = testbed.first_change(METROLOGY, target="LOCKED").time_s
+    went_on = [e for e in testbed.events(LEFT) if "no longer waits" in e.message]
+    assert went_on
+    assert went_on[0].time_s > locked_s
+    assert testbed.first_change(LEFT, target="COARSE").time_s > went_on[0].time_s
+    # The right loop needs no link.
+    assert testbed.first_change(RIGHT, target="ACQUISITION").time_s < locked_s
+    assert testbed.clock.now_s() < 60.0
+
+
+def test_the_left_star_stays_while_the_collector_drifts(held):
+    held.drift(0.1)
+    held.run(10.0)
+    since_s = held.clock.now_s()
+    held.run(30.0)
+    assert held.rms_px(LEFT, since_s).max() < 0.03
+    assert held.rms_px(RIGHT, since_s).max() < 0.03
+
+
+def test_with_a_gain_of_0_the_drift_is_left_to_the_mirror():
+    testbed = Testbed("loops.left.feedforward.gain=0.0").held()
+    testbed.drift(0.1)
+    testbed.run(30.0)
+    since_s = testbed.clock.now_s() - 10.0
+    assert testbed.rms_px(LEFT, since_s).max() > 0.2
+    assert testbed.rms_px(RIGHT, since_s).max() < 0.03
+
+
+def test_the_siderostats_turn_against_each_other(held):
+    before = {name: held.loop(name).siderostat.setpoint_rad.copy() for name in (METROLOGY, LEFT)}
+    held.drift(0.5)
+    held.run(10.0)
+    turned = {
+        name: held.loop(name).siderostat.setpoint_rad - before[name] for name in (METROLOGY, LEFT)
+    }
+    assert abs(turned[METROLOGY][0]) > 5.0  # 5 mm over 10 m are 103 arcsec, or 6.4 rad
+    assert turned[LEFT] == pytest.approx(-turned[METROLOGY], abs=0.15)
+
+
+def test_when_the_laser_is_cut_left_holds_in_the_same_tick_and_goes_on_by_itself(held):
+    held.drift(0.1)
+    held.run(5.0)
+    held.laser(0.0)
+    held.until(limit_s=1.0, metrology=Mode.ACQUISITION)
+    lost = held.first_change(METROLOGY, trigger="BEAM_LOST")
+    (waits,) = [e for e in held.events(LEFT)[-1:] if "waits for the link" in e.message]
+    assert waits.time_s - lost.time_s < 0.02
+    assert "waits for the link of metrology" not in held.loop(RIGHT).state(0.0).waits_for
+    assert "the link of metrology" in held.loop(LEFT).state(0.0).waits_for
+    stood_rad = held.loop(LEFT).siderostat.setpoint_rad.copy()
+    mirror_rad = held.loop(LEFT).mirror.command_rad.copy()
+    held.run(5.0)
+    assert held.loop(LEFT).siderostat.setpoint_rad == pytest.approx(stood_rad)
+    assert held.loop(LEFT).mirror.command_rad == pytest.approx(mirror_rad)
+    assert held.loop(RIGHT).mode is Mode.VERNIER
+    held.laser(1.0)
+    held.until(limit_s=10.0, metrology=Mode.LOCKED)
+    held.run(1.0)
+    held.until(limit_s=30.0, left=Mode.VERNIER)
+    assert held.loop(LEFT).state(0.0).waits_for == ""
+    held.run(5.0)
+    since_s = held.clock.now_s()
+    held.run(5.0)
+    assert held.rms_px(LEFT, since_s).max() < 0.05
+
+
+def test_a_metrology_loop_that_is_stopped_and_brought_back_finds_left_waiting(held):
+    assert held.command(Stop(loop=METROLOGY)).accepted
+    held.run(3.0)
+    assert held.modes() == {
+        METROLOGY: Mode.SAFE,
+        LEFT: Mode.VERNIER,
+        RIGHT: Mode.VERNIER,
+    }
+    assert held.loop(LEFT).waits_for
+    assert held.command(Recover(loop=METROLOGY)).accepted
+    held.run(0.5)
+    assert held.command(Acquire(loop=METROLOGY)).accepted
+    held.until(limit_s=10.0, metrology=Mode.LOCKED)
+    held.run(1.0)
+    held.until(limit_s=20.0, left=Mode.VERNIER)
+
+
+def test_hold_ends_the_waiting(held):
+    held.command(Hold(loop=METROLOGY))
+    held.run(0.1)
+    assert held.loop(LEFT).waits_for
+    held.command(Hold(loop=LEFT))
+    held.run(0.1)
+    assert held.loop(LEFT).mode is Mode.STANDBY
+    assert not held.loop(LEFT).waits_for
+
+
+def test_neither_loop_takes_the_others_star_while_one_is_away(held):
+    for away, stays in ((RIGHT, LEFT), (LEFT, RIGHT)):
+        uncover = held.darken(away)
+        since_s = held.clock.now_s()
+        held.run(8.0)
+        assert held.loop(away).mode is Mode.ACQUISITION
+        assert held.loop(stays).mode is Mode.VERNIER
+        assert held.rms_px(stays, since_s).max() < 0.03
+        uncover()
+        held.until(limit_s=40.0, **{away: Mode.VERNIER})
+        since_s = held.clock.now_s()
+        held.run(3.0)
+        assert held.rms_px(away, since_s).max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_loop_finds_its_own_star_though_both_are_in_the_field(seed):
+    testbed = Testbed(seed=seed).held()
+    testbed.run(10.0)
+    since_s = testbed.clock.now_s()
+    testbed.run(3.0)
+    for name in (LEFT, RIGHT):
+        assert testbed.rms_px(name, since_s).max() < 0.05
+
+
+def test_each_frames_tilt_between_the_stars_and_its_visibility_are_recorded(held):
+    held.run(5.0)
+    overlaps = [record for record in held.records if isinstance(record, Overlap)][-100:]
+    ticks = {(tick.loop, tick.number): tick for tick in held.records if isinstance(tick, Tick)}
+    arcsec_per_px = held.loop(LEFT).state(0.0).sky_arcsec_per_px
+    for overlap in overlaps:
+        left, right = (ticks[name, overlap.number] for name in (LEFT, RIGHT))
+        tilt_px = (left.star_az_px - 12.0) - (right.star_az_px - 28.0)
+        assert overlap.tilt_az_arcsec == pytest.approx(arcsec_per_px * tilt_px)
+    assert np.mean([overlap.visibility for overlap in overlaps]) > 0.95
+
+
+def test_before_both_stars_are_followed_there_is_no_visibility():
+    testbed = Testbed()
+    testbed.simulation.acquire()
+    testbed.run(0.2)
+    overlaps = [record for record in testbed.records if isinstance(record, Overlap)]
+    assert overlaps
+    assert np.isnan([overlap.visibility for overlap in overlaps]).all()
+
+
+def test_what_was_turned_before_the_links_encoders_lost_their_zero_is_not_undone(held):
+    stood_rad = held.loop(LEFT).siderostat.setpoint_rad.copy()
+    for command in (Stop(loop=METROLOGY), Off(loop=METROLOGY)):
+        assert held.command(command).accepted
+        held.run(0.1)
+    amplifiers = held.simulation.devices.loops[METROLOGY].amplifiers
+    exchange = amplifiers.exchange
+
+    def from_another_zero(velocity_rad_s):
+        reading = exchange(velocity_rad_s)
+        az_rad, el_rad = reading.position_rad
+        return reading._replace(position_rad=(az_rad + 3.0, el_rad))
+
+    amplifiers.exchange = from_another_zero
+    for command in (Standby(loop=METROLOGY), Acquire(loop=METROLOGY)):
+        assert held.command(command).accepted
+        held.run(0.1)
+    held.until(limit_s=10.0, metrology=Mode.LOCKED)
+    held.run(0.1)
+    assert held.loop(LEFT).siderostat.setpoint_rad == pytest.approx(stood_rad, abs=0.3)
+    held.run(3.0)
+    held.until(limit_s=20.0, left=Mode.VERNIER)

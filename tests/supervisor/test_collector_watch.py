@@ -1,0 +1,154 @@
+"""The collector under the supervisor: commanded beside the ticks, stopped by STOP, faults as events."""
+
+import time
+from types import SimpleNamespace
+
+import pytest
+from c887_settings import MOCK, device
+from serial.urlhandler import protocol_socket
+
+from fitctl.clock import MonotonicClock
+from fitctl.config import Fault, default_rig_path, load_rig
+from fitctl.drivers.c887.driver import C887Hexapod
+from fitctl.messages.commands import MoveCollector, Standby, Stop
+from fitctl.mocks.c887.server import C887ControllerMock
+from fitctl.simulation.simulation import Simulation
+from fitctl.stages.periodic import PeriodicThread
+from fitctl.supervisor.collector import CollectorWatch
+
+RIG = load_rig(
+    default_rig_path().parent / "fit-testbed.toml",
+    ["collector.motion.kind=drift", "collector.motion.velocity_mm_s=2.0"],
+)
+PATIENCE_S = 10.0
+
+
+@pytest.fixture
+def watched(in_loop, monkeypatch):
+    """A watch and the mock that it moves, in real time; `events` are those reported."""
+    # pyserial sleeps 0.3 s after closing a socket, for servers that are slow to accept again.
+    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda _seconds: None))
+
+    async def made():
+        mock = C887ControllerMock(MOCK.model_copy(update={"referenced": False, "reference_s": 1.0}))
+        return mock, await mock.start()
+
+    async def struck(fault):
+        mock.faults.set(fault)
+
+    mock, ends = in_loop(made())
+    clock, events = MonotonicClock(), []
+    settings = device(f"socket://127.0.0.1:{ends.tcp_port}", response_timeout_s=0.5)
+    watch = CollectorWatch(
+        RIG.collector, C887Hexapod(settings), clock, lambda *event: events.append(event)
+    )
+    watch.events = events
+    watch.strike = lambda kind: in_loop(struck(Fault(device="hexapod", kind=kind)))
+    thread = PeriodicThread(watch.drive, clock)
+    thread.start()
+    yield watch, mock
+    thread.stop()
+    watch.close()
+    in_loop(mock.stop())
+
+
+def until(holds, what):
+    end_s = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.01)
+
+
+def reported(watch, text):
+    until(lambda: any(text in message for _, _, message in watch.events), f"{text} in an event")
+
+
+def y_mm(mock):
+    return mock.pose_at(time.monotonic())[1]
+
+
+def moving(watch, mock):
+    """Reference it and let it drift."""
+    assert watch.obey("reference") == ""
+    reported(watch, "referenced")
+    assert watch.obey("start") == ""
+    until(lambda: y_mm(mock) > 0.5, "a drift")
+
+
+def test_it_is_connected_when_it_is_first_needed_and_moves_only_on_command(watched):
+    watch, mock = watched
+    assert not watch.is_open
+    moving(watch, mock)
+    assert watch.identity.model == "C-887 with M-850.H11"
+    assert watch.detail.startswith("drift at +")
+    assert watch.obey("start") == "the collector moves; stop it first"
+
+
+def test_it_is_not_moved_before_it_is_referenced(watched):
+    watch, mock = watched
+    assert watch.obey("start") == ""
+    reported(watch, "reference it first")
+    assert not watch.drive.running
+    assert y_mm(mock) == 0.0
+    assert watch.is_open, "a refusal does not end the connection"
+
+
+def test_a_stop_returns_at_once_and_leaves_it_where_it_is(watched):
+    watch, mock = watched
+    moving(watch, mock)
+    started_s = time.monotonic()
+    watch.stop()
+    assert time.monotonic() - started_s < 0.1
+    reported(watch, "was stopped where it is")
+    here = y_mm(mock)
+    time.sleep(0.2)
+    assert y_mm(mock) == here > 0.5
+    assert watch.obey("start") == ""
+    until(lambda: y_mm(mock) > here + 0.2, "a new start from there")
+
+
+def test_a_stop_ends_a_reference_move(watched):
+    watch, _ = watched
+    watch.obey("reference")
+    until(lambda: watch.is_open, "a connection")
+    time.sleep(0.2)
+    assert "wait for the event" in watch.obey("start")
+    watch.stop()
+    reported(watch, "all axes referenced")
+    assert watch.error
+    assert watch.obey("reference") == ""
+    reported(watch, "referenced: all axes are at zero")
+    assert not watch.error
+
+
+@pytest.mark.parametrize("kind", ["motion_error", "emergency_stop", "disconnect", "silent"])
+def test_a_fault_on_the_way_is_an_event_and_the_collector_is_no_longer_moved(watched, kind):
+    watch, mock = watched
+    moving(watch, mock)
+    watch.strike(kind)
+    until(lambda: not watch.drive.running, "the end of the course")
+    watch.check()
+    assert [severity for severity, _, _ in watch.events][-1] == "error"
+    assert watch.error
+    assert watch.is_open == (kind in {"motion_error", "emergency_stop"})
+
+
+def test_the_supervisor_s_stop_stops_the_collector():
+    simulation = Simulation(RIG, seed=1)
+    assert simulation.command(Standby()).accepted
+    simulation.run(0.2)
+    simulation.move_collector()
+    simulation.run(2.0)
+    assert simulation.hexapod.pose().pose.y_mm > 1.0
+    assert simulation.command(Stop()).accepted
+    simulation.run(0.5)
+    here = simulation.hexapod.pose()
+    assert not here.moving
+    simulation.run(0.5)
+    assert simulation.hexapod.pose().pose == here.pose
+    assert not simulation.supervisor.collector.drive.running
+
+
+def test_a_rig_without_a_collector_refuses_the_command(simulate_with):
+    reply = simulate_with().command(MoveCollector(action="start"))
+    assert (reply.accepted, reply.text) == (False, "the rig has no collector that moves")

@@ -1,0 +1,158 @@
+"""Rig files with several loops, a metrology loop and a collector."""
+
+import copy
+
+import pytest
+
+from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_document
+
+TESTBED = default_rig_path().parent / "fit-testbed.toml"
+RIG = load_rig(TESTBED)
+DOCUMENT = RIG.model_dump(mode="json", exclude_none=True)
+
+
+def complaint(changes, *, without=(), document=DOCUMENT):
+    changed = copy.deepcopy(document)
+    for key in without:
+        *path, last = key.split(".")
+        table = changed
+        for part in path:
+            table = table[part]
+        del table[last]
+    for key, value in changes.items():
+        *path, last = key.split(".")
+        table = changed
+        for part in path:
+            table = table[part]
+        table[last] = value
+    with pytest.raises(ConfigError) as caught:
+        rig_from_document(changed, "my.toml")
+    return str(caught.value)
+
+
+def test_loops_are_parted_by_kind_in_the_rig_files_order():
+    assert list(RIG.loops) == ["right", "metrology", "left"]
+    assert list(RIG.stellar_loops) == ["right", "left"]
+    assert list(RIG.metrology_loops) == ["metrology"]
+    truth, mocks = RIG.mock_parts()
+    assert list(truth.stellar_loops) == list(mocks.stellar_loops) == ["right", "left"]
+    assert list(truth.metrology_loops) == list(mocks.metrology_loops) == ["metrology"]
+
+
+def test_a_loop_without_a_kind_points_a_star(rig):
+    assert rig.stellar_loops == rig.loops
+    assert rig.loops["right"].link is None
+
+
+def test_a_rig_survives_its_own_document():
+    assert rig_from_document(DOCUMENT, "again") == RIG
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"loops.left.link": "laser"},
+         "loops.left.link: must name a loop of kind metrology (metrology), is 'laser'"),
+        ({"loops.left.link": "right"},
+         "loops.left.link: must name a loop of kind metrology (metrology), is 'right'"),
+        ({"loops.metrology.kind": "laser"},
+         "loops.metrology.kind: must be one of 'stellar', 'metrology' (is 'laser')"),
+        ({"plant.loops.metrology": DOCUMENT["plant"]["loops"]["right"]},
+         "plant.loops.metrology.kind: must be metrology, as loops.metrology.kind (is stellar)"),
+        ({"mocks.loops.metrology": DOCUMENT["mocks"]["loops"]["right"]},
+         "mocks.loops.metrology.kind: must be metrology, as loops.metrology.kind (is stellar)"),
+        ({"loops.left.target_px.az": 15.0},
+         "loops.left.target_px: 13 px from loops.right.target_px; must be at least 13.75 px"),
+        ({"loops.left.siderostat.servo.gain_per_s": 300.0},
+         "loops.left.siderostat.servo: gain_per_s may be at most 200 at 500 Hz"),
+        ({"loops.metrology.siderostat.servo.gain_per_s": 300.0},
+         "loops.metrology.siderostat.servo: gain_per_s may be at most 200 at 500 Hz"),
+        ({"loops.left.feedforward.gian": 1.0},
+         "loops.left.feedforward.gian: unknown key; did you mean gain?"),
+        ({"loops.metrology.hold.crossover": 1.0},
+         "loops.metrology.hold.crossover: unknown key; did you mean crossover_hz?"),
+        ({"plant.loops.metrology.air_path.rms_arcsec": 1.0},
+         "plant.loops.metrology.air_path.rms_arcsec: unknown key; did you mean rms_sky_arcsec?"),
+        ({"loops.left.feedforward.matrix": [[1.0, 0.0]]},
+         "loops.left.feedforward.matrix: List should have at least 2 items"),
+        ({"loops.metrology.sensor.ambient_v": [0.0, 0.0, 0.0]},
+         "loops.metrology.sensor.ambient_v: List should have at least 4 items"),
+        ({"loops.metrology.sensor.on_axis_v": 10.0},
+         "loops.metrology.sensor: on_axis_v and ambient_v give 10.03 V with the beam on the centre"),
+        ({"loops.metrology.hold.second_integrator_hz": 1.1},
+         "loops.metrology.hold: second_integrator_hz may be at most half of crossover_hz, 1"),
+        ({"collector.geometry.link": [2.0, 0.0, 0.0]},
+         "collector.geometry: link must be a direction of length 1"),
+        ({"collector.geometry.link_azimuth": [1.0, 0.0, 0.0]},
+         "collector.geometry: link_azimuth must be at a right angle to link"),
+        ({"collector.geometry.array_m": [0.1, 0.0, 0.15]},
+         "collector.geometry: siderostat_m and array_m must be two places"),
+        ({"collector.geometry.starlight": [0.0, 0.0, 1.0]},
+         "collector.geometry: starlight must differ from the direction from siderostat_m to array_m"),
+        ({"collector.motion.kind": "file"},
+         'collector.motion: file must name a CSV file where kind is "file"'),
+        ({"collector.motion.kind": "jump"},
+         "collector.motion.kind: must be 'still', 'drift', 'sine', 'random' or 'file'"),
+        ({"fringes.loops": ["left", "metrology"]},
+         "fringes.loops: must name two loops of kind stellar (right, left), is left, metrology"),
+        ({"fringes.loops": ["left", "left"]}, "fringes.loops: must name two loops of kind stellar"),
+    ],
+)  # fmt: skip
+def test_a_rig_that_does_not_agree_is_refused_by_the_key_that_is_wrong(changes, line):
+    assert f"my.toml: {line}" in complaint(changes)
+
+
+def test_what_is_missing_is_named():
+    assert "my.toml: loops.left: feedforward needs link" in complaint(
+        {}, without=["loops.left.link"]
+    )
+    assert "mocks.hexapod is missing: the rig has a collector" in complaint(
+        {}, without=["mocks.hexapod"]
+    )
+    parts = ["loops", "plant.loops", "mocks.loops"]
+    assert (
+        "collector: needs one loop of kind metrology, which follows it; loops has 0"
+        in complaint(
+            {},
+            without=[
+                "loops.left.feedforward",
+                "loops.left.link",
+                *(f"{p}.metrology" for p in parts),
+            ],
+        )
+    )
+    only_metrology = {"loops": {"metrology": DOCUMENT["loops"]["metrology"]}}
+    assert "loops: at least one must be of kind stellar" in complaint(
+        only_metrology, without=["plant", "mocks", "collector", "fringes"]
+    )
+
+
+def test_a_link_comes_before_the_loop_that_uses_it():
+    loops = DOCUMENT["loops"]
+    swapped = {name: loops[name] for name in ("right", "left", "metrology")}
+    assert (
+        "loops.left.link: loops.metrology must come before loops.left in the rig file"
+        in complaint({"loops": swapped})
+    )
+
+
+def test_fringe_spots_that_lie_on_each_other_are_checked_as_they_interfere():
+    brighter = copy.deepcopy(DOCUMENT["loops"])
+    brighter["left"]["other_spots"][0]["flux_dn"] = 4500.0
+    assert (
+        "loops.left.other_spots: fringe lies on fringe of loop right; both reach 16985.3 DN and would be "
+        "taken for the star of loop right, which may have 16800 to 44800"
+        in complaint({"loops": brighter})
+    )
+    apart = copy.deepcopy(brighter)
+    apart["left"]["other_spots"][0]["offset_px"]["el"] = 8.0
+    assert rig_from_document(DOCUMENT | {"loops": apart}, "apart.toml")
+
+
+def test_two_stars_need_no_metrology():
+    parts = copy.deepcopy(DOCUMENT)
+    del parts["collector"]
+    for section in (parts, parts["plant"], parts["mocks"]):
+        section["loops"] = {n: section["loops"][n] for n in ("right", "left")}
+    del parts["loops"]["left"]["link"], parts["loops"]["left"]["feedforward"]
+    assert list(rig_from_document(parts, "two.toml").loops) == ["right", "left"]
