@@ -187,7 +187,7 @@ def two_loops():
         loops["left"] = dict(loops["right"])
     document["loops"]["left"] = document["loops"]["right"] | {
         "star_flux_dn": 84000.0,
-        "target_px": {"az": 12.0, "el": 19.5},
+        "target_px": {"az": 10.0, "el": 19.5},
     }
     (spot, *_) = document["plant"]["loops"]["left"]["spots"]
     document["plant"]["loops"]["left"]["spots"] = [spot | {"flux_dn": 84000.0}]

@@ -126,8 +126,8 @@ class Feedforward(Settings):
     Attributes
     ----------
     signal : str
-        What says how far the link's siderostat turned the beam: its encoders, or those and the metrology
-        residual.
+        What says how far the link's siderostat turned the beam: its encoders. With the known backlash of both
+        siderostats, the mirror makes up for what the encoders do not see.
     gain : float
         0 is off.
     matrix : list of list of float
@@ -135,7 +135,7 @@ class Feedforward(Settings):
         feedforward`` measures it.
     """
 
-    signal: Literal["encoders", "encoders+residual"]
+    signal: Literal["encoders", "encoders+backlash"]
     gain: Finite
     matrix: Annotated[
         list[Annotated[list[Finite], Field(min_length=2, max_length=2)]],

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import ARCSEC_PER_RAD
 from fitctl.config import Loop as LoopSettings
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import motor_sky_rad_per_rad
+from fitctl.model.hysteresis import play
+from fitctl.model.optics import Scales, motor_sky_rad_per_rad
+from fitctl.stages.siderostat import SiderostatStage
 
 Floats = NDArray[np.float64]
+_HISTORY_TICKS = 50
 
 
 class Link:
@@ -66,6 +72,11 @@ class Link:
         """From the origin, at a recent time, by the encoders."""
         return self._matrix @ self.loop.servo.position_at(time_s) - self.origin_rad
 
+    @property
+    def matrix(self) -> Floats:
+        """From the motors of the link's siderostat to those of the own one, shape (2, 2)."""
+        return self._matrix
+
     def begin(self) -> None:
         """Nothing is to be undone of what was turned so far."""
         self.undone_rad = self._ahead_rad()
@@ -92,3 +103,68 @@ class Link:
         That is the set-point that it was given in this same tick: both servos follow theirs alike.
         """
         return self._matrix @ self.loop.siderostat.setpoint_rad
+
+
+class BacklashFeedforward:
+    """What the mirror makes up for: the plays of both siderostats, which their encoders do not see.
+
+    Only changes since :meth:`begin` count, so that nothing jumps. A backlash that the rig file does not
+    know counts as none.
+
+    Parameters
+    ----------
+    link : Link
+    own : SiderostatStage
+    settings : LoopSettings
+        Of the stellar loop.
+    scale : Scales
+
+    Attributes
+    ----------
+    offset_rad : array, shape (2,)
+        The mirror's, in force now.
+    """
+
+    def __init__(
+        self, link: Link, own: SiderostatStage, settings: LoopSettings, scale: Scales
+    ) -> None:
+        self.offset_rad = np.zeros(2)
+        self._link = link
+        self._stages = link.loop.siderostat, own
+        self._half_rad = [
+            np.full(2, (one.backlash_sky_arcsec or 0.0) / ARCSEC_PER_RAD / 2)
+            / motor_sky_rad_per_rad(one)
+            for one in (link.loop.settings.siderostat, settings.siderostat)
+        ]
+        self._beams_rad = [stage.servo.position_rad for stage in self._stages]
+        self._mirror_per_motor = -scale.motor_px_per_rad / scale.mirror_px_per_rad
+        self._turn = scale.siderostat_turn.T @ scale.mirror_turn
+        self._lost_rad = np.zeros(2)
+        self._origin_rad = np.zeros(2)
+        self._in_force: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY_TICKS)
+
+    def begin(self, offset_rad: Floats) -> None:
+        """Go on from an offset of the mirror, shape (2,)."""
+        self.offset_rad = offset_rad
+        self._origin_rad = self._lost_rad - offset_rad
+
+    def update(self, now_s: float) -> None:
+        """Follow both plays, and have the mirror make up for them from now on."""
+        lost_rad = []
+        for index, stage in enumerate(self._stages):
+            # Halfway between where the motors are and where they are to be at the next tick.
+            motor_rad = 0.5 * (stage.servo.position_rad + stage.setpoint_rad)
+            beam_rad = play(self._beams_rad[index], motor_rad, self._half_rad[index])
+            self._beams_rad[index] = beam_rad
+            lost_rad.append(beam_rad - motor_rad)
+        turned_rad = self._link.matrix @ lost_rad[0] + lost_rad[1]
+        self._lost_rad = self._mirror_per_motor * turned_rad.dot(self._turn)
+        self.offset_rad = self._lost_rad - self._origin_rad
+        self._in_force.append((now_s, self.offset_rad))
+
+    def at(self, time_s: float) -> Floats:
+        """The offset in force at a recent time, shape (2,)."""
+        return next(
+            (offset for since_s, offset in reversed(self._in_force) if since_s <= time_s),
+            np.zeros(2),
+        )

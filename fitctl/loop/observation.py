@@ -32,6 +32,8 @@ class Observation(NamedTuple):
         When that is: the tick's beginning.
     link_rad : array, shape (2,), or None
         Motor angles that turn the star as far as the siderostat of the loop's link did; None without one.
+    backlash_rad : array, shape (2,), or None
+        Part of `mirror_rad` that makes up for the siderostats' backlash, which is no part of the law's.
     """
 
     frame: Frame | None
@@ -43,6 +45,12 @@ class Observation(NamedTuple):
     servo: ServoState
     now_s: float
     link_rad: NDArray[np.float64] | None = None
+    backlash_rad: NDArray[np.float64] | None = None
+
+    @property
+    def law_mirror_rad(self) -> NDArray[np.float64]:
+        """Where the mirror was by the control law alone, shape (2,)."""
+        return self.mirror_rad if self.backlash_rad is None else self.mirror_rad - self.backlash_rad
 
     @property
     def beam_rad(self) -> NDArray[np.float64]:

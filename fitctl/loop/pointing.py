@@ -69,9 +69,16 @@ class Pointing:
         """Rest on the target, shape (2,)."""
         self.prefilter.reset(target_px)
 
-    def start_pair(self, mirror: MirrorStage, motor_rad: Floats) -> None:
-        """Go on from where the mirror is held, with the motors at `motor_rad`, shape (2,)."""
+    def start_pair(
+        self, mirror: MirrorStage, motor_rad: Floats, offset_rad: Floats | None = None
+    ) -> None:
+        """Go on from where the mirror is held, with the motors at `motor_rad`, shape (2,).
+
+        `offset_rad` is the part of the mirror's angles, shape (2,), that is added to the pair's.
+        """
         held_rad = mirror.held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
+        if offset_rad is not None:
+            held_rad = held_rad - offset_rad
         self.pair.start(held_rad, motor_rad, self.command_px)
 
     def step_coarse(self, observation: Observation, target_px: Floats) -> Floats | None:
@@ -89,5 +96,5 @@ class Pointing:
             return None
         error_px = observation.star.position_px - command_px
         return self.pair.step(
-            Measurement(error_px, command_px, observation.mirror_rad, observation.beam_rad)
+            Measurement(error_px, command_px, observation.law_mirror_rad, observation.beam_rad)
         )

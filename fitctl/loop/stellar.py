@@ -20,7 +20,7 @@ from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
 from fitctl.logging.records import ControllerChange, Tick
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
-from fitctl.loop.link import Link
+from fitctl.loop.link import BacklashFeedforward, Link
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
@@ -33,7 +33,7 @@ from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger
 from fitctl.messages.telemetry import LoopLimits, LoopState, SpotPlace
 from fitctl.model.drives import Drive
-from fitctl.model.optics import AzEl, scales
+from fitctl.model.optics import AzEl, saturate_diamond, scales
 from fitctl.stages.journal import Journal
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.periodic import Periodic
@@ -77,6 +77,7 @@ class StellarLoop(Loop):
         self.settings: LoopSettings = rig.stellar_loops[name]
         self.quantities: StellarQuantities
         self.link: Link | None = None
+        self.backlash: BacklashFeedforward | None = None
         self.others: list[StellarLoop] = []
         self.waits_for = ""
         self.mirror = mirror
@@ -133,6 +134,7 @@ class StellarLoop(Loop):
             servo,
             begun_s,
             link_rad,
+            None if self.backlash is None else self.backlash.at(time_s),
         )
         self._sensed_s = self._clock.now_s()
 
@@ -185,7 +187,7 @@ class StellarLoop(Loop):
         if action == "flatten":
             self.mirror.step_to_bias()
         elif self._flattened and self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, observation.beam_rad)
+            self._start_pair(observation.beam_rad)
         self._flattened = action == "flatten"
         # Without a frame to track by, the stages wait where they are.
         waits = self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
@@ -243,7 +245,17 @@ class StellarLoop(Loop):
             self._has_held = True
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, self._beam_rad(motor_rad))
+            if self.backlash is not None:
+                self.backlash.begin(np.zeros(2))
+            self._start_pair(self._beam_rad(motor_rad))
+
+    def _start_pair(self, beam_rad: Floats) -> None:
+        """The pair goes on from where the mirror is, with all siderostats at `beam_rad`, shape (2,)."""
+        if self.backlash is None:
+            self.pointing.start_pair(self.mirror, beam_rad)
+        else:
+            self.backlash.begin(self.backlash.offset_rad)
+            self.pointing.start_pair(self.mirror, beam_rad, self.backlash.offset_rad)
 
     def _beam_rad(self, motor_rad: Floats) -> Floats:
         """Motor angles that turn the star as far as all siderostats have until now, shape (2,)."""
@@ -278,6 +290,11 @@ class StellarLoop(Loop):
                 msg = f"loops.{self.name}.link: {link.name} is no metrology loop"
                 raise TypeError(msg)
             self.link = Link(link, self.settings)
+            given = self.settings.feedforward
+            if given is not None and given.gain and given.signal == "encoders+backlash":
+                self.backlash = BacklashFeedforward(
+                    self.link, self.siderostat, self.settings, self._scale
+                )
         self.others = [
             loop for loop in loops.values() if isinstance(loop, StellarLoop) and loop is not self
         ]
@@ -334,7 +351,7 @@ class StellarLoop(Loop):
         if self.mode is Mode.COARSE:
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, observation.beam_rad)
+            self._start_pair(observation.beam_rad)
 
     def _follow_link(self, link: Link) -> None:
         """Undo what the link's siderostat turns, as soon as it holds."""
@@ -370,8 +387,14 @@ class StellarLoop(Loop):
         command = self.pointing.step_pair(observation, self.target_px)
         if command is not None:
             self.siderostat.move_by(command.motor_step_rad)
+            mirror_rad = command.mirror_rad
+            if self.backlash is not None:
+                self.backlash.update(observation.now_s)
+                mirror_rad = saturate_diamond(
+                    mirror_rad + self.backlash.offset_rad, self.settings.fsm.range_rad
+                )
             self.mirror.move_to(
-                command.mirror_rad, hysteresis_inverse=self.pointing.design.hysteresis_inverse
+                mirror_rad, hysteresis_inverse=self.pointing.design.hysteresis_inverse
             )
 
     def _run_experiment(self, observation: Observation) -> None:
@@ -397,7 +420,7 @@ class StellarLoop(Loop):
         before, motor_rad = self.controller, self.servo.position_rad
         self.pointing.use(design)
         if self.mode is Mode.VERNIER:
-            self.pointing.start_pair(self.mirror, self._beam_rad(motor_rad))
+            self._start_pair(self._beam_rad(motor_rad))
         az_rad, el_rad = motor_rad.tolist()
         self._journal.record(
             ControllerChange(

@@ -5,7 +5,7 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import Event, ModeChange, Overlap, Tick
-from fitctl.messages.commands import Acquire, Hold, Off, Recover, Standby, Stop
+from fitctl.messages.commands import Acquire, Hold, Off, Recover, SetController, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -26,6 +26,16 @@ class Drift:
         moved_mm = self.mm_s * np.maximum(np.asarray(time_s) - self.start_s, 0.0)
         pose = np.zeros((*moved_mm.shape, 6))
         pose[..., 1] = moved_mm
+        return pose
+
+
+class Sine(Drift):
+    """It moves to and fro by `mm_s` millimetres, every two seconds."""
+
+    def pose_at(self, time_s):
+        passed_s = np.maximum(np.asarray(time_s) - self.start_s, 0.0)
+        pose = np.zeros((*passed_s.shape, 6))
+        pose[..., 1] = self.mm_s * np.sin(np.pi * passed_s)
         return pose
 
 
@@ -62,6 +72,9 @@ class Testbed:
     def held(self):
         self.simulation.acquire()
         return self.until(metrology=Mode.LOCKED, left=Mode.VERNIER, right=Mode.VERNIER)
+
+    def swing(self, amplitude_mm):
+        self.simulation.plant.collector.follow(Sine(amplitude_mm, self.clock.now_s()))
 
     def drift(self, mm_s):
         self.simulation.plant.collector.follow(Drift(mm_s, self.clock.now_s()))
@@ -130,6 +143,36 @@ def test_with_a_gain_of_0_the_drift_is_left_to_the_mirror():
     since_s = testbed.clock.now_s() - 10.0
     assert testbed.rms_px(LEFT, since_s).max() > 0.2
     assert testbed.rms_px(RIGHT, since_s).max() < 0.03
+
+
+UNEQUAL = (
+    "plant.loops.left.backlash_sky_arcsec=2.0",
+    "loops.left.siderostat.backlash_sky_arcsec=2.0",
+)
+
+
+def test_plays_that_are_not_alike_are_made_up_for_by_the_mirror_if_it_is_told_to():
+    rms_px = {}
+    for signal in ("encoders", "encoders+backlash"):
+        testbed = Testbed(*UNEQUAL, f"loops.left.feedforward.signal={signal}").held()
+        testbed.swing(0.1)
+        testbed.run(10.0)
+        since_s = testbed.clock.now_s()
+        testbed.run(20.0)
+        rms_px[signal] = testbed.rms_px(LEFT, since_s).max()
+        assert testbed.loop(LEFT).mode is Mode.VERNIER
+    assert rms_px["encoders"] > 0.06
+    assert rms_px["encoders+backlash"] < 0.5 * rms_px["encoders"]
+
+
+def test_the_mirror_does_not_jump_as_it_begins_to_make_up_for_backlash():
+    testbed = Testbed(*UNEQUAL, "loops.left.feedforward.signal=encoders+backlash").held()
+    testbed.run(5.0)
+    mirror = testbed.loop(LEFT).mirror
+    before_rad = mirror.command_rad.copy()
+    testbed.command(SetController(loop=LEFT, name="minimum-variance"))
+    testbed.run(0.04)
+    assert mirror.command_rad == pytest.approx(before_rad, abs=4e-6)  # 0.15 px
 
 
 def test_the_siderostats_turn_against_each_other(held):
