@@ -21,6 +21,7 @@ from fitctl.stages.collector import CollectorDrive
 from fitctl.stages.journal import error_text
 
 HEXAPOD = "hexapod"
+_CLOSE_TIMEOUT_S = 5.0
 CollectorAction = Literal["reference", "start", "stop"]
 _STILL_CONNECTED = (DeviceRefused, DeviceFault)  # the others end the connection
 
@@ -67,6 +68,7 @@ class CollectorWatch:
         self._busy = False
         self._stops = 0
         self._fault: Exception | None = None
+        self._threads: list[threading.Thread] = []
 
     def obey(self, action: CollectorAction) -> str:
         """Begin what a command asks for; returns why not, or nothing. An event reports how it ends."""
@@ -108,6 +110,8 @@ class CollectorWatch:
         self._stops += 1
         if self.drive.running:
             self._stop()
+        for thread in self._threads:
+            thread.join(_CLOSE_TIMEOUT_S)
         self.is_open = False
         self._hexapod.close()
 
@@ -153,6 +157,8 @@ class CollectorWatch:
     def _beside(self, work: Callable[[], None]) -> None:
         """In a thread of its own, unless nothing is threaded: a simulation, whose clock would go on."""
         if self.drive.threaded:
-            threading.Thread(target=work, name="collector", daemon=True).start()
+            thread = threading.Thread(target=work, name="collector", daemon=True)
+            self._threads = [one for one in self._threads if one.is_alive()] + [thread]
+            thread.start()
         else:
             work()

@@ -164,7 +164,8 @@ class C887Link:
         """Close the port, after the answer to another thread's question; safe to call twice."""
         has_turn = self._turn.acquire(timeout=self._limit_s)
         try:
-            self._port.close()
+            with self._writing:
+                self._port.close()
         finally:
             if has_turn:
                 self._turn.release()

@@ -396,6 +396,26 @@ def test_closing_ends_what_another_thread_does_with_a_typed_error(hexapod):
     assert isinstance(ended[0], DeviceUnreachable)
 
 
+def stop(driver, failures):
+    try:
+        driver.stop()
+    except Exception as error:
+        failures.append(error)
+
+
+def test_a_stop_while_it_is_closed_is_done_or_a_typed_error(mock):
+    controller = mock()
+    for _ in range(20):
+        driver = C887Hexapod(device(f"socket://127.0.0.1:{controller.ends.tcp_port}"))
+        driver.open()
+        failures = []
+        thread = threading.Thread(target=stop, args=(driver, failures))
+        thread.start()
+        driver.close()
+        thread.join(5)
+        assert all(isinstance(error, DeviceError) for error in failures), failures
+
+
 @pytest.mark.parametrize("what", ["a move", "a reference move"])
 def test_a_stop_from_another_thread_acts_at_once(mock, what):
     controller = mock(referenced=what != "a reference move", reference_s=5.0)
