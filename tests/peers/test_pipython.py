@@ -117,9 +117,12 @@ def test_it_knows_what_the_controller_can_do(device):
     assert not device.HasEAX()
 
 
-def test_it_reads_parameters_by_their_types(device):
+def test_it_reads_parameters_by_their_types(pipython, device):
     assert device.qSPA("X", 0x3C) == {"X": {0x3C: "M-850.H11"}}
-    raises(device, -7, device.qSPA, "X", 0x70)  # as for every question without an answer
+    with pytest.raises(pipython.GCSError) as raised:
+        device.qSPA("X", 0x70)
+    assert raised.value.val == -7, "a time-out, as for every question that has no answer"
+    assert device.qERR() == 54
 
 
 def test_it_reads_travel_velocity_servo_and_pivot(device):
