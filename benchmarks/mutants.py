@@ -49,6 +49,7 @@ TESTS = {
     "logging": ("tests/logging", "tests/**/test_cli_log.py"),
     "drivers": ("tests/drivers", "tests/mocks"),
     "drivers/bal_analog": ("tests/drivers/bal_analog", _AMPLIFIERS, "tests/mocks/bal_analog"),
+    "drivers/c887": ("tests/drivers/c887", "tests/mocks/c887"),
     "drivers/cia402": ("tests/drivers/cia402", _AMPLIFIERS, "tests/mocks/cia402"),
     "drivers/ensemble": ("tests/drivers/ensemble", _AMPLIFIERS, "tests/mocks/ensemble"),
     "drivers/gige": ("tests/drivers/gige", "tests/mocks/gige"),
