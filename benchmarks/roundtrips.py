@@ -35,6 +35,7 @@ from fitctl.drivers.gige.protocol import Command, Register, encode_command, enco
 from fitctl.mocks.amplifiers import amplifier_mock
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.gige.camera import GigeCameraMock
+from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus.rtu import frame as rtu_frame
 from fitctl.mocks.modbus.tcp import frame as tcp_frame
@@ -122,6 +123,14 @@ async def _bal_analog() -> int:
     return int(await _amplifiers("fit-bal-analog.toml", "bal_analog.modbus_port=0"))
 
 
+async def _labjack() -> int:
+    rig = load_rig(default_rig_path().with_name("fit-testbed.toml"))
+    (name, loop), *_ = rig.metrology_loops.items()
+    ours = rig.mock_parts()[1].metrology_loops[name].labjack
+    ours = ours.model_copy(update={"modbus_port": 0})
+    return await LabJackT7Mock(loop.sensor.device, ours, lambda _: [5.0] * 4).start()
+
+
 async def _camera() -> int:
     rig = load_rig(default_rig_path())
     image = np.zeros((rig.camera.height_px, rig.camera.width_px), np.uint16)
@@ -180,6 +189,8 @@ def every_line() -> Iterator[Line]:
     yield Line("MDT693 at its pace: a voltage", PTY, _mdt693_pty, *voltage, is_paced=True)
     framed = rtu_frame(dac.device_id, write)
     yield Line("D/A at its pace: FC 16, RTU", PTY, _dac_pty, framed, _is(8), is_paced=True)
+    diodes = _adu(1, struct.pack(">BHH", 3, 0, 8))
+    yield Line("LabJack T7 at its pace: four inputs", TCP, _labjack, diodes, _is(25), is_paced=True)
     yield Line("Ensemble at its pace: a position", TCP, _ensemble, *position, is_paced=True)
 
 
