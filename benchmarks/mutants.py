@@ -53,6 +53,11 @@ TESTS = {
     "drivers/cia402": ("tests/drivers/cia402", _AMPLIFIERS, "tests/mocks/cia402"),
     "drivers/ensemble": ("tests/drivers/ensemble", _AMPLIFIERS, "tests/mocks/ensemble"),
     "drivers/gige": ("tests/drivers/gige", "tests/mocks/gige"),
+    "drivers/labjack_t7": (
+        "tests/drivers/labjack_t7",
+        "tests/drivers/test_modbus_link.py",
+        "tests/mocks/labjack_t7",
+    ),
     "drivers/mdt693": ("tests/drivers/mdt693", "tests/mocks/mdt693"),
     "drivers/modbus_dac": (
         "tests/drivers/modbus_dac",
