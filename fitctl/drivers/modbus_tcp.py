@@ -46,7 +46,8 @@ class ModbusLink:
     Attributes
     ----------
     arrived_s : float
-        Host's monotonic time at which the kernel received what was read last.
+        Host's monotonic time at which the kernel received what was read last; at which it was read where the
+        kernel has no stamp of it, as in the first milliseconds after the first socket that wants one.
 
     Raises
     ------

@@ -35,6 +35,7 @@ def answer_at_once(client):
         client.sendall(frame(int.from_bytes(data[:2], "big"), 1, bytes.fromhex("03 02 00 07")))
 
 
+@pytest.mark.usefixtures("kernel_stamps")
 def test_an_answer_is_dated_by_its_arrival_however_late_it_is_read():
     with scripted_server(answer_at_once) as port:
         link = link_to(port)
