@@ -22,7 +22,7 @@ DEVICES = {
     "mdt693": ("fit-mock", "right.mdt693"),
 }
 
-NOT_STRUCK = {"labjack"}  # until a supervisor runs a metrology loop
+NOT_STRUCK = {"labjack", "hexapod"}  # no setup of the catalogue has them yet
 
 
 @pytest.mark.parametrize("name", GROUPS)
