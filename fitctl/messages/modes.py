@@ -45,6 +45,12 @@ METROLOGY_MODES = (
     Mode.SAFE,
 )
 
+KIND_MODES = {
+    "stellar": {mode.name for mode in STELLAR_MODES},
+    "metrology": {mode.name for mode in METROLOGY_MODES},
+}
+"""Modes by kind of loop, as the rig file names both."""
+
 FOLLOWING = frozenset({Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
 """The star is known, and looked for where it should be."""
 

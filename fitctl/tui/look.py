@@ -44,9 +44,9 @@ MODES = {
     "ACQUISITION": Look("◎", YELLOW),
     "COARSE": Look("◇", ORANGE),
     "VERNIER": Look("◆", GREEN),
+    "LOCKED": Look("◉", GREEN),
     "SAFE": Look("■", RED),
     "EXPERIMENT": Look("◈", PINK),
-    "LOCKED": Look("◉", GREEN),
 }
 UNKNOWN_MODE = Look("?", PINK)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
@@ -80,8 +81,13 @@ def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
     lines = [f"{telemetry.rig_name}: {'not well' if found else 'well'}"]
     lines += [f"  ! {trouble}" for trouble in found]
     for loop in telemetry.loops:
-        for_s = duration(telemetry.time_s - loop.since_s)
-        lines.append(_line(loop.name, f"{loop.mode} for {for_s}, controller {loop.controller}"))
+        text = f"{loop.mode} for {duration(telemetry.time_s - loop.since_s)}"
+        text += f", controller {loop.controller}" if loop.controller else ""
+        lines.append(_line(loop.name, text + _beam(telemetry, loop.name)))
+    if telemetry.overlaps and not math.isnan(telemetry.overlaps[-1].visibility):
+        overlap = telemetry.overlaps[-1]
+        tilt = f"{overlap.tilt_az_arcsec:+.3f} {overlap.tilt_el_arcsec:+.3f} arcsec"
+        lines.append(_line("fringes", f"tilt {tilt}, visibility {overlap.visibility:.3f}"))
     for device in telemetry.devices:
         known = f" ({device.identity})" if device.identity else ""
         text = f"{device.state}{known} at {device.endpoint}, {device.detail}"
@@ -104,6 +110,14 @@ def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
     lines.append(_line("commander", telemetry.commander or "nobody"))
     lines.append(_line("supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"))
     return lines
+
+
+def _beam(telemetry: Telemetry, loop_name: str) -> str:
+    """How far a metrology loop's beam is from its photodiodes' centre, where it is measured."""
+    ticks = [tick for tick in telemetry.metrology_ticks if tick.loop == loop_name]
+    if not ticks or math.isnan(ticks[-1].beam_az_arcsec):
+        return ""
+    return f", beam {ticks[-1].beam_az_arcsec:+.2f} {ticks[-1].beam_el_arcsec:+.2f} arcsec"
 
 
 def _line(what: str, text: str) -> str:

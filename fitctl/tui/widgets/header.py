@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from rich.segment import Segment
 
+from fitctl.messages.modes import KIND_MODES
 from fitctl.tui.commands import VIEWS
 from fitctl.tui.look import (
     DIM,
@@ -126,9 +127,11 @@ class Header(Panel):
 
     def _diagram(self) -> Line:
         line: Line = []
+        loop = self.state.loop
+        modes = KIND_MODES["stellar" if loop is None else loop.state.kind]
         for mode, look in MODES.items():
-            if mode == "EXPERIMENT" and mode != self._mode:
-                continue  # rare, and the line is full
+            if mode not in modes or (mode == "EXPERIMENT" and mode != self._mode):
+                continue  # an experiment is rare, and the line is full
             if line:
                 line.append(text("   " if mode in ASIDE else " ── ", FAINT))
             if mode == self._mode:
