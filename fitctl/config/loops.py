@@ -146,7 +146,8 @@ class Feedforward(Settings):
 class Loop(Settings):
     """One stellar loop.
 
-    With ``link``, its star's light comes over the link that this metrology loop holds.
+    With ``link``, its star's light comes over the link that this metrology loop holds. ``spot_diameter_px`` is
+    the 1/e^2 diameter of its spots; other loops on the same camera subtract their light by it.
     """
 
     kind: Literal["stellar"] = "stellar"
@@ -155,6 +156,7 @@ class Loop(Settings):
     target_px: AxisPair
     star_flux_dn: Positive
     flux_range: Range
+    spot_diameter_px: Positive = 3.0
     other_spots: Annotated[tuple[OtherSpot, ...], Field(strict=False)]
     requirement_px: Positive
     siderostat: AnySiderostat

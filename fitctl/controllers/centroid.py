@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 from fitctl.controllers.dark import Dark
 from fitctl.model.compiled import compilable
+from fitctl.model.light import light_below
 
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 # Eq. 7's three sums over a window, row by row: light, and its moments along azimuth and elevation.
@@ -23,6 +24,8 @@ _SUMS = np.array(
 )
 EDGE_PX = HALF_WINDOW_PX - 1.5  # nearer to its edge, the window would cut the spot
 MAX_CANDIDATES = 6
+_REACH_DIAMETERS = 1.0  # from the centre of a spot: beyond lies a part of its light in 10 000
+_EDGES_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 2.0) - 0.5
 LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
 
 
@@ -62,6 +65,15 @@ def window_centre(px: float, largest_px: int) -> int:
     return min(max(round(px), HALF_WINDOW_PX), largest_px)
 
 
+class OtherLight(NamedTuple):
+    """A spot of another loop: where it is, its whole light, and its 1/e^2 diameter."""
+
+    az_px: float
+    el_px: float
+    flux_dn: float
+    diameter_px: float
+
+
 class StarSensor:
     """Finds one loop's pointing spot.
 
@@ -75,10 +87,13 @@ class StarSensor:
     ----------
     excluded_px : list of pair of float
         Places of other loops' stars: a star whose window would hold one of these is not this loop's.
+    other_light : list of OtherLight
+        Spots of other loops. Their light is subtracted from a window, or it would pull this loop's star.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
         self.excluded_px: list[tuple[float, float]] = []
+        self.other_light: list[OtherLight] = []
         self._dark = Dark(camera)
         self.threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_range = loop.flux_range
@@ -142,6 +157,10 @@ class StarSensor:
         el = window_centre(window_el_px, self.largest_el_px)
         side = _LEVER_PX.size
         light_dn = self._dark.light(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
+        for spot in self.other_light:
+            reach_px = side / 2 + _REACH_DIAMETERS * spot.diameter_px
+            if max(abs(spot.az_px - az), abs(spot.el_px - el)) < reach_px:
+                light_dn -= spot_light(spot, az, el)
         flux_dn, az_moment, el_moment = _SUMS.dot(light_dn.ravel()).tolist()
         peak_dn = light_dn.item(light_dn.argmax())  # `max` takes four times as long
         if flux_dn <= 0 or peak_dn > LARGEST_PEAK * flux_dn:
@@ -155,3 +174,12 @@ class StarSensor:
             if max(abs(star.az_px - az_px), abs(star.el_px - el_px)) <= HALF_WINDOW_PX:
                 return None
         return star
+
+
+def spot_light(spot: OtherLight, az_px: int, el_px: int) -> NDArray[np.float64]:
+    """What a spot leaves on each pixel of the window about a place, shape (7, 7), in DN."""
+    across, down = (
+        np.diff(light_below((centre + _EDGES_PX - place) / (spot.diameter_px / 4)))
+        for centre, place in ((az_px, spot.az_px), (el_px, spot.el_px))
+    )
+    return spot.flux_dn * np.outer(down, across)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.centroid import Star, StarSensor
+from fitctl.controllers.centroid import OtherLight, Star, StarSensor
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.logging.records import Severity
 from fitctl.messages.modes import TRACKING, WITH_WINDOW, Mode
@@ -34,8 +34,8 @@ class StarFinder:
     estimator : StarEstimator
     look_at_px : tuple of float or None
         Where the star is looked for on the next frame, and then no more.
-    place_px : tuple of float or None
-        Where the star was when it was last found.
+    last : Star or None
+        The star when it was last found.
     """
 
     def __init__(
@@ -48,17 +48,45 @@ class StarFinder:
         loop = rig.stellar_loops[loop_name]
         self.estimator = StarEstimator(scales(rig, loop), target_px)
         self.look_at_px: AzEl | None = None
-        self.place_px: AzEl | None = None
+        self.last: Star | None = None
+        self._visible = False
         self._sensor = StarSensor(rig.camera, loop)
+        self._other_spots = loop.other_spots
+        self._star_flux_dn = loop.star_flux_dn
+        self._diameter_px = loop.spot_diameter_px
         self._report_event = report_event
 
     def expect_flux(self, flux_dn: float) -> None:
         """What the star's light is to be from now on."""
         self._sensor.expect(flux_dn)
 
-    def exclude(self, places_px: Iterable[AzEl | None]) -> None:
-        """From now on no star is looked for at these places, where other loops follow theirs."""
-        self._sensor.excluded_px = [place for place in places_px if place is not None]
+    def exclude(self, others: Iterable[list[OtherLight]]) -> None:
+        """From now on no star is looked for where other loops follow theirs, and their light is subtracted.
+
+        Each loop's list begins with its star.
+        """
+        spots = [spots for spots in others if spots]
+        self._sensor.excluded_px = [(star.az_px, star.el_px) for star, *_ in spots]
+        self._sensor.other_light = [spot for of_loop in spots for spot in of_loop]
+
+    def spots(self) -> list[OtherLight]:
+        """The star when it was last found, then what moves with it; dark if the last frame lacks it."""
+        if self.last is None:
+            return []
+        az_px, el_px, flux_dn, *_ = self.last
+        flux_dn *= self._visible
+        return [
+            OtherLight(az_px, el_px, flux_dn, self._diameter_px),
+            *(
+                OtherLight(
+                    az_px + spot.offset_px.az,
+                    el_px + spot.offset_px.el,
+                    spot.flux_dn * flux_dn / self._star_flux_dn,
+                    self._diameter_px,
+                )
+                for spot in self._other_spots
+            ),
+        ]
 
     def find(
         self,
@@ -79,7 +107,7 @@ class StarFinder:
             star = self._sensor.follow(image, *self.estimator.predict_px(stages_px))
         elif star is None:
             star = self._sensor.find(image)
-        self.place_px = self.place_px if star is None else (star.az_px, star.el_px)
+        self.last, self._visible = star or self.last, star is not None
         if star is not None and mode in TRACKING:
             self.estimator.observe((star.az_px, star.el_px), stages_px)
         return star

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX, Rig
 from fitctl.config import Loop as LoopSettings
-from fitctl.controllers.centroid import Star
+from fitctl.controllers.centroid import OtherLight, Star
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
@@ -33,7 +33,7 @@ from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger
 from fitctl.messages.telemetry import LoopLimits, LoopState, SpotPlace
 from fitctl.model.drives import Drive
-from fitctl.model.optics import AzEl, saturate_diamond, scales
+from fitctl.model.optics import saturate_diamond, scales
 from fitctl.stages.journal import Journal
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.periodic import Periodic
@@ -195,7 +195,7 @@ class StellarLoop(Loop):
             self._laws[self.mode](observation)
 
     def _find(self, frame: Frame, mirror_rad: Floats, beam_rad: Floats) -> Star | None:
-        self.star_finder.exclude([other.place_px for other in self.others])
+        self.star_finder.exclude(other.spots for other in self.others)
         if self.mode is Mode.ACQUISITION and (
             self.waits_for or not self.search.has_arrived(beam_rad)
         ):
@@ -204,9 +204,9 @@ class StellarLoop(Loop):
         return self.star_finder.find(frame.image, self.mode, beam_rad, mirror_rad, follows=follows)
 
     @property
-    def place_px(self) -> AzEl | None:
-        """Where other loops must not look for their stars: the star's place while it is followed."""
-        return self.star_finder.place_px if self.mode in FOLLOWING else None
+    def spots(self) -> list[OtherLight]:
+        """What other loops must not measure: the star, then what moves with it; empty if none is followed."""
+        return self.star_finder.spots() if self.mode in FOLLOWING else []
 
     def _evaluate_findings(self, observation: Observation) -> None:
         """Errors of devices, and what the frame means for the mode."""
@@ -320,10 +320,10 @@ class StellarLoop(Loop):
             return False
         if self.mode is Mode.ACQUISITION:
             return self._search_due is None and not self.search.again
-        place_px = self.place_px
-        if self.mode is not Mode.COARSE or place_px is None:
+        star = self.star_finder.last
+        if self.mode is not Mode.COARSE or star is None:
             return False
-        return float(np.abs(self.target_px - place_px).max()) > HALF_WINDOW_PX
+        return float(np.abs(self.target_px - star.position_px).max()) > HALF_WINDOW_PX
 
     def _evaluate_waiting(self, observation: Observation) -> None:
         """Wait where the stages are, or go on, and report which."""

@@ -5,7 +5,16 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import Event, ModeChange, Overlap, Tick
-from fitctl.messages.commands import Acquire, Hold, Off, Recover, SetController, Standby, Stop
+from fitctl.messages.commands import (
+    Acquire,
+    Hold,
+    Off,
+    Recover,
+    SetController,
+    SetTarget,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -263,6 +272,17 @@ def test_each_loop_finds_its_own_star_though_both_are_in_the_field(seed):
     testbed.run(3.0)
     for name in (LEFT, RIGHT):
         assert testbed.rms_px(name, since_s).max() < 0.05
+
+
+@pytest.mark.parametrize("fringe_az_px", [26.5, 25.0, 23.5])
+def test_a_loop_is_not_pulled_by_the_other_loops_fringe_spot(held, fringe_az_px):
+    """Left is pointed so that its fringe spot, 8 px beside its star, lies near right's star at az 28 px."""
+    assert held.command(SetTarget(loop=LEFT, az_px=fringe_az_px - 8.0, el_px=20.0)).accepted
+    held.run(15.0)
+    since_s = held.clock.now_s()
+    held.run(5.0)
+    assert held.modes() == {RIGHT: Mode.VERNIER, METROLOGY: Mode.LOCKED, LEFT: Mode.VERNIER}
+    assert held.rms_px(RIGHT, since_s).max() < 0.03
 
 
 def test_each_frames_tilt_between_the_stars_and_its_visibility_are_recorded(held):

@@ -1,0 +1,49 @@
+"""A star beside another loop's spot is measured where it is."""
+
+import numpy as np
+import pytest
+
+from fitctl.config import Spot
+from fitctl.config.base import AxisPair
+from fitctl.controllers.centroid import OtherLight, StarSensor
+from fitctl.model.scene import Scene
+
+STAR = (28.2, 19.9)
+
+
+@pytest.fixture
+def sensor(rig):
+    return StarSensor(rig.camera, rig.loops["right"])
+
+
+def frame(rig, other_px, flux_dn):
+    spots = [
+        Spot(name=name, offset_px=AxisPair(az=0.0, el=0.0), flux_dn=dn, diameter_px=3.0)
+        for name, dn in (("star", 28_000.0), ("other", flux_dn))
+    ]
+    return Scene(rig.camera, spots).frame(np.array([STAR, other_px]), 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("other_px", "flux_dn"),
+    [((29.7, 19.0), 4_000.0), ((25.0, 20.0), 4_000.0), ((24.3, 20.3), 4_000.0),
+     ((28.0, 15.5), 28_000.0), ((24.0, 16.0), 28_000.0)],
+)  # fmt: skip
+def test_the_light_of_another_loops_spot_does_not_pull_a_star(rig, sensor, other_px, flux_dn):
+    image = frame(rig, other_px, flux_dn)
+    pulled = sensor.measure(image, *STAR)
+    assert pulled is None or np.abs(pulled.position_px - STAR).max() > 0.1
+
+    sensor.other_light = [OtherLight(*other_px, flux_dn, 3.0)]
+    star = sensor.measure(image, *STAR)
+
+    # Six times the noise.
+    assert star.position_px == pytest.approx(STAR, abs=0.06)
+    assert star.flux_dn == pytest.approx(28_000, abs=6 * 7 * 20)
+
+
+def test_a_spot_that_is_not_near_changes_nothing(rig, sensor):
+    image = frame(rig, (20.0, 20.0), 4_000.0)
+    alone = sensor.measure(image, *STAR)
+    sensor.other_light = [OtherLight(20.0, 20.0, 4_000.0, 3.0)]
+    assert sensor.measure(image, *STAR) == alone
