@@ -19,7 +19,7 @@ FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-loop bench-sim soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-loop bench-sim bench-testbed soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -104,6 +104,9 @@ soak: $(READY)  ## SOAK_S seconds on mocks with random faults: what grows, is la
 
 bench-sim: $(READY)  ## How many times real time the simulation and the batch run
 	$(BIN)/python -m benchmarks.simulate $(ARGS)
+
+bench-testbed: $(READY)  ## What the testbed reaches while its collector moves, beside its goals (an hour)
+	$(BIN)/python -m benchmarks.testbed $(ARGS)
 
 bench-report: $(READY)  ## What the report of an eight-hour night takes in time and room
 	$(BIN)/python -m benchmarks.report $(ARGS)
