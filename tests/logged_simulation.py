@@ -13,7 +13,7 @@ NEAR_PX = (2.0, -1.0)
 
 def designs_of(rig):
     """The designs that a rig's supervisor starts with."""
-    return {name: design_for(rig, name) for name in rig.loops}
+    return {name: design_for(rig, name) for name in rig.stellar_loops}
 
 
 class LoggedSimulation(Simulation):

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.logging.reading import Columns
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
+from fitctl.report.fringes import FringeFindings, find_fringes
 from fitctl.report.gather import Gathered, gather
 from fitctl.report.rejection import Rejection, rejections
 from fitctl.report.residual import Estimate, Verdict, Word, night_verdict, rms_estimate, verdict
 from fitctl.report.run import Run
-from fitctl.report.selection import Selection, select_frames
+from fitctl.report.selection import Selection, select_frames, select_samples
 from fitctl.report.stages import Stacks, Stages, stacks, stages
 
 AXES = ("az", "el")
@@ -36,25 +38,50 @@ _OF_SECONDS: dict[str, _Statistic] = {
 }
 
 
+class Quantity(NamedTuple):
+    """What a kind of loop keeps small.
+
+    Attributes
+    ----------
+    of : str
+        What the loop holds.
+    mode : Mode
+        In which it holds it.
+    unit : str
+        Of error and requirement.
+    field : str
+        Of ticks: the error, with a place for the axis.
+    """
+
+    of: str
+    mode: Mode
+    unit: str
+    field: str
+
+
+STAR = Quantity("star", Mode.VERNIER, "px", "error_{}_px")
+BEAM = Quantity("beam", Mode.LOCKED, "arcsec", "beam_{}_arcsec")
+
+
 @dataclass(frozen=True)
 class LoopFindings:
-    """One loop.
+    """One loop of any kind.
 
     Attributes
     ----------
     name : str
     ticks : dict of str to array
         See :class:`fitctl.report.gather.Gathered`.
-    requirement_px, sky_arcsec_per_px : float
+    quantity : Quantity
+        What the loop keeps small.
+    requirement : float
+        RMS on each axis, in the quantity's unit.
     selection : Selection
     residual : dict of str to Estimate
         By axis.
     verdict : Verdict
     mode_s : dict of str to float
         Seconds in each mode that there was.
-    rejections : list of Rejection
-    stacks : Stacks or None
-    stages : Stages
     counts : dict of str to int
         Frames, late ticks, frames lost, stalls.
     timing : dict of str to float
@@ -63,17 +90,42 @@ class LoopFindings:
 
     name: str
     ticks: Columns
-    requirement_px: float
-    sky_arcsec_per_px: float
+    quantity: Quantity
+    requirement: float
     selection: Selection
     residual: dict[str, Estimate]
     verdict: Verdict
     mode_s: dict[str, float]
+    counts: dict[str, int]
+    timing: dict[str, float]
+
+    def error(self, axis: str) -> NDArray[np.floating]:
+        """Of every tick, in the quantity's unit; NaN where nothing was measured."""
+        return self.ticks[self.quantity.field.format(axis)]
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """The ticks on which the loop held its star or beam and measured it."""
+        measured = ~np.isnan(self.error("az"))
+        return (self.ticks["mode_number"] == self.quantity.mode) & measured
+
+
+@dataclass(frozen=True)
+class StarFindings(LoopFindings):
+    """One stellar loop.
+
+    Attributes
+    ----------
+    sky_arcsec_per_px : float
+    rejections : list of Rejection
+    stacks : Stacks or None
+    stages : Stages
+    """
+
+    sky_arcsec_per_px: float
     rejections: list[Rejection]
     stacks: Stacks | None
     stages: Stages
-    counts: dict[str, int]
-    timing: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -82,6 +134,7 @@ class Findings:
 
     gathered: Gathered
     loops: dict[str, LoopFindings]
+    fringes: FringeFindings | None
 
     @property
     def run(self) -> Run:
@@ -103,33 +156,59 @@ def find(run: Run) -> Findings:
         If it cannot be read.
     """
     gathered = gather(run)
-    return Findings(gathered, {name: _loop(gathered, name) for name in run.rig.loops})
+    of_kind = dict.fromkeys(run.rig.stellar_loops, _star)
+    of_kind |= dict.fromkeys(run.rig.metrology_loops, _beam)
+    loops = {name: of_kind[name](gathered, name) for name in run.rig.loops}
+    selections = {name: loop.selection for name, loop in loops.items()}
+    return Findings(gathered, loops, find_fringes(gathered, selections))
 
 
-def _loop(gathered: Gathered, name: str) -> LoopFindings:
+def _beam(gathered: Gathered, name: str) -> LoopFindings:
+    rig: Rig = gathered.run.rig
+    ticks, requirement_arcsec = gathered.ticks[name], rig.metrology_loops[name].requirement_arcsec
+    selection = select_samples(ticks, rig.camera.period_s)
+    return LoopFindings(**_of_any(gathered, name, BEAM, requirement_arcsec, selection))
+
+
+def _star(gathered: Gathered, name: str) -> LoopFindings:
     rig: Rig = gathered.run.rig
     ticks, settings = gathered.ticks[name], rig.stellar_loops[name]
     selection = select_frames(ticks, rig.camera.period_s, settings.requirement_px)
-    rows = selection.rows
-    residual = {axis: rms_estimate(ticks[f"error_{axis}_px"][rows]) for axis in AXES}
     found = stacks(rig, name, ticks)
-    return LoopFindings(
-        name=name,
-        ticks=ticks,
-        requirement_px=settings.requirement_px,
+    return StarFindings(
+        **_of_any(gathered, name, STAR, settings.requirement_px, selection),
         sky_arcsec_per_px=scales(rig, settings).sky_arcsec_per_px,
-        selection=selection,
-        residual=residual,
-        verdict=verdict(
-            residual, settings.requirement_px, selection.evaluated_s, selection.star_fraction
-        ),
-        mode_s=_mode_s(ticks, rig.camera.period_s),
         rejections=rejections(gathered, name, selection),
         stacks=found,
         stages=stages(rig, name, ticks, selection, found),
-        counts=_counts(ticks, gathered.timing[name]),
-        timing=_timing(ticks, gathered.timing[name]),
     )
+
+
+def _of_any(
+    gathered: Gathered, name: str, quantity: Quantity, requirement: float, selection: Selection
+) -> dict[str, Any]:
+    """The fields of :class:`LoopFindings`."""
+    ticks, rows = gathered.ticks[name], selection.rows
+    residual = {axis: rms_estimate(ticks[quantity.field.format(axis)][rows]) for axis in AXES}
+    return {
+        "name": name,
+        "ticks": ticks,
+        "quantity": quantity,
+        "requirement": requirement,
+        "selection": selection,
+        "residual": residual,
+        "verdict": verdict(
+            residual,
+            requirement,
+            selection.evaluated_s,
+            selection.measured_fraction,
+            mode=quantity.mode.name,
+            of=quantity.of,
+        ),
+        "mode_s": _mode_s(ticks, gathered.run.rig.camera.period_s),
+        "counts": _counts(ticks, gathered.timing[name]),
+        "timing": _timing(ticks, gathered.timing[name]),
+    }
 
 
 def _mode_s(ticks: Columns, period_s: float) -> dict[str, float]:

@@ -4,12 +4,29 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fitctl.identify.drawing import GREEN
-from fitctl.report.drawing import AZ, EL, FAINT, INK, SERIES, Plot, decimal, nothing, panels
-from fitctl.report.findings import AXES, LoopFindings
+from fitctl.report.drawing import (
+    AZ,
+    COLORS,
+    EL,
+    FAINT,
+    INK,
+    SERIES,
+    Plot,
+    decimal,
+    nothing,
+    panels,
+)
+from fitctl.report.findings import AXES, LoopFindings, StarFindings
+from fitctl.report.fringes import FringeFindings, density
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _POINTS = 900  # of a path in the plane
 _DIRECTIONS = (
@@ -19,26 +36,26 @@ _DIRECTIONS = (
 )
 
 
-def spectra(loop: LoopFindings) -> Plot:
+def spectra(loop: StarFindings) -> Plot:
     """Spectral densities before and after, and what they add up to."""
-    figure, (density, sums) = panels(1, 3.8, 2)
+    figure, (densities, sums) = panels(1, 3.8, 2)
     for found, color in zip(loop.rejections, itertools.cycle(SERIES), strict=False):
         frequency_hz = found.spectra.frequency_hz
         for what, line in (("disturbance", "--"), ("error", "-")):
             power, label = getattr(found.spectra, what), f"{what}, {found.controller}"
-            density.loglog(frequency_hz, power, line, color=color, label=label)
+            densities.loglog(frequency_hz, power, line, color=color, label=label)
             total = np.sqrt(np.cumsum(power) * frequency_hz[0])
             sums.semilogx(frequency_hz, total, line, color=color)
-    sums.axhline(loop.requirement_px, color=INK, linestyle=":")
-    density.set(title="Power spectral density", xlabel="Hz", ylabel="px²/Hz")
+    sums.axhline(loop.requirement, color=INK, linestyle=":")
+    densities.set(title="Power spectral density", xlabel="Hz", ylabel="px²/Hz")
     sums.set(title="Cumulative RMS: of all below a frequency", xlabel="Hz", ylabel="px")
     sums.set_yscale("log")
-    for axis in (density.xaxis, density.yaxis, sums.xaxis, sums.yaxis):
+    for axis in (densities.xaxis, densities.yaxis, sums.xaxis, sums.yaxis):
         decimal(axis)
     if loop.rejections:
-        density.legend(loc="lower left")
+        densities.legend(loc="lower left")
     else:
-        nothing(density)
+        nothing(densities)
     caption = (
         "Mean of both axes, Welch's method, segments of 8 s. Dashed: the disturbance, which is the open loop "
         "rebuilt from the log, the error less where both stages had moved the star at mid-exposure. Solid: "
@@ -47,7 +64,53 @@ def spectra(loop: LoopFindings) -> Plot:
     return Plot(f"{loop.name}-psd", "Before and after", caption, figure)
 
 
-def rejection(loop: LoopFindings) -> Plot:
+def beam_spectrum(loop: LoopFindings, period_s: float) -> Plot:
+    """Spectral density of the error of a metrology loop."""
+    errors = np.column_stack([loop.error(axis) for axis in AXES]).astype(float)
+    found = density(loop.ticks["time_s"], errors, loop.selection.rows, period_s)
+    caption = (
+        "Welch's method, segments of 8 s. The error is that of the samples: the photodiodes' noise is in it. "
+        "Dotted: the requirement."
+    )
+    figure = _axes_spectra(*found, loop.requirement)
+    return Plot(f"{loop.name}-psd", "Spectrum of the error", caption, figure)
+
+
+def tilt_spectrum(fringes: FringeFindings) -> Plot:
+    """Spectral density of the tilt between two stars."""
+    caption = (
+        "Welch's method, segments of 8 s. Both stars are measured, so both stars' noise of the camera is in "
+        "the tilt."
+    )
+    figure = _axes_spectra(fringes.frequency_hz, fringes.density, math.nan)
+    return Plot("fringes-psd", "Spectrum of the tilt", caption, figure)
+
+
+def _axes_spectra(
+    frequency_hz: NDArray[np.floating], power: NDArray[np.floating], requirement: float
+) -> Figure:
+    """Both axes' densities, arcsec²/Hz, and what they add up to."""
+    figure, (densities, sums) = panels(1, 3.8, 2)
+    for number, axis in enumerate(AXES if len(frequency_hz) else ()):
+        densities.loglog(frequency_hz, power[:, number], color=COLORS[axis], label=axis)
+        total = np.sqrt(np.cumsum(power[:, number]) * frequency_hz[0])
+        sums.loglog(frequency_hz, total, color=COLORS[axis], label=axis)
+    densities.set(title="Power spectral density", xlabel="Hz", ylabel="arcsec²/Hz")
+    sums.set(title="Cumulative RMS: of all below a frequency", xlabel="Hz", ylabel="arcsec")
+    if not len(frequency_hz):
+        nothing(densities)
+        nothing(sums)
+        return figure
+    if not math.isnan(requirement):
+        sums.axhline(requirement, color=INK, linestyle=":")
+    densities.legend(loc="lower left")
+    for axes in (densities, sums):
+        decimal(axes.xaxis)
+        decimal(axes.yaxis, dense=True)
+    return figure
+
+
+def rejection(loop: StarFindings) -> Plot:
     """Measured rejection over the design's."""
     figure, (axes,) = panels(1, 3.8)
     for found, color in zip(loop.rejections, itertools.cycle(SERIES), strict=False):
@@ -75,7 +138,7 @@ def rejection(loop: LoopFindings) -> Plot:
     return Plot(f"{loop.name}-rejection", "Rejection against the design", caption, figure)
 
 
-def hysteresis(loop: LoopFindings) -> Plot:
+def hysteresis(loop: StarFindings) -> Plot:
     """Command against target, and displacement against voltage."""
     figure, (*commands, stack) = panels(1, 3.6, 3)
     dwells_of = [gap.dwells for gap in loop.stages.gaps] or [[], []]
@@ -120,7 +183,7 @@ def hysteresis(loop: LoopFindings) -> Plot:
     return Plot(f"{loop.name}-hysteresis", "Hysteresis in the commands", _gap_text(loop), figure)
 
 
-def _gap_text(loop: LoopFindings) -> str:
+def _gap_text(loop: StarFindings) -> str:
     gaps = [
         f"{axis} {gap.px:+.3f} px"
         + ("" if math.isnan(gap.error_px) else f" (standard error {gap.error_px:.3f})")

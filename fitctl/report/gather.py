@@ -20,7 +20,9 @@ from fitctl.logging.records import (
     DeviceHealth,
     Event,
     LoopTiming,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     RecorderStatus,
     SequenceAttempt,
     Tick,
@@ -71,6 +73,38 @@ TICK_FIELDS: dict[str, Any] = {
 }
 
 
+BEAM_FIELDS: dict[str, Any] = {
+    "time_s": np.float64,
+    "number": np.int64,
+    "mode_number": np.int8,
+    "late": np.bool_,
+    "frames_lost": np.int32,
+    **dict.fromkeys(
+        (
+            "frame_age_s",
+            "compute_s",
+            "beam_az_arcsec",
+            "beam_el_arcsec",
+            "diode_az_plus_v",
+            "diode_az_minus_v",
+            "diode_el_plus_v",
+            "diode_el_minus_v",
+            "siderostat_az_sky_arcsec",
+            "siderostat_el_sky_arcsec",
+        ),
+        np.float32,
+    ),
+}
+"""Of a metrology loop's ticks."""
+
+OVERLAP_FIELDS: dict[str, Any] = {
+    "time_s": np.float64,
+    "tilt_az_arcsec": np.float32,
+    "tilt_el_arcsec": np.float32,
+    "visibility": np.float32,
+}
+
+
 @dataclass(frozen=True)
 class Gathered:
     """A run in hand.
@@ -80,6 +114,8 @@ class Gathered:
     run : Run
     ticks, timing : dict of str to dict of str to array
         By loop; fields as in :mod:`fitctl.logging.records`. Without any, `timing` has no more than its times.
+    overlap : dict of str to array, or None
+        The tilt between the stars of the rig's ``fringes.loops`` on each frame; None if the rig has no fringes.
     modes, events, health, attempts : list of dict
         Records with their fields; of `health` only what differs from before.
     lost : int or None
@@ -89,6 +125,7 @@ class Gathered:
     run: Run
     ticks: dict[str, Columns]
     timing: dict[str, Columns]
+    overlap: Columns | None
     modes: list[dict[str, Any]]
     events: list[dict[str, Any]]
     health: list[dict[str, Any]]
@@ -110,32 +147,35 @@ def gather(run: Run) -> Gathered:
         for kind, name in _KINDS.items()
         for loop in (loops if "{loop}" in TOPICS[kind] else [""])
     }
-    tick_topics = {TOPICS[Tick].format(loop=loop): loop for loop in loops}
-    ticks = {loop: _room(run, topic) for topic, loop in tick_topics.items()}
-    filled = dict.fromkeys(loops, 0)
+    series = _series(run)
+    rooms = {topic: _room(run, topic, wanted) for topic, (_, wanted) in series.items()}
+    filled = dict.fromkeys(series, 0)
     blocks: dict[tuple[str, str], list[Columns]] = defaultdict(list)
     health: list[dict[str, Any]] = []
     states: dict[str, str] = {}
-    fields = dict.fromkeys(tick_topics, TICK_FIELDS) | {TOPICS[RecorderStatus]: ["lost"]}
+    fields: dict[str, Any] = {topic: wanted for topic, (_, wanted) in series.items()}
+    fields[TOPICS[RecorderStatus]] = ["lost"]
     for log in run.logs:
-        for topic, columns in column_blocks(log.path, [*tick_topics, *places], _ROWS, fields):
+        for topic, columns in column_blocks(log.path, [*series, *places], _ROWS, fields):
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
-            if topic in tick_topics:
-                loop = tick_topics[topic]
-                filled[loop] += _fill(ticks[loop], filled[loop], columns, time_s, str(log.path))
+            if topic in series:
+                filled[topic] += _fill(rooms[topic], filled[topic], columns, time_s, str(log.path))
                 continue
             block = columns | {"time_s": time_s}
             if places[topic][0] == "health":  # says the same every second, all night
                 health += _changes(_rows([block]), states)
             else:
                 blocks[places[topic]].append(block)
-    for loop, its in ticks.items():
-        its.update({name: column[: filled[loop]] for name, column in its.items()})
+    for topic, room in rooms.items():
+        room.update({name: column[: filled[topic]] for name, column in room.items()})
+        _in_order(room)
+    of_loop = {loop: rooms[topic] for topic, (loop, _) in series.items() if loop}
     modes = [row for loop in loops for row in _rows(blocks["modes", loop])]
     return Gathered(
         run=run,
-        ticks={loop: _in_order(its) for loop, its in ticks.items()},
+        ticks={loop: of_loop[loop] for loop in loops},
         timing={loop: _joined(blocks["timing", loop]) for loop in loops},
+        overlap=next((rooms[topic] for topic, (loop, _) in series.items() if not loop), None),
         modes=sorted(modes, key=itemgetter("time_s")),
         events=_rows(blocks["events", ""]),
         health=health,
@@ -144,23 +184,32 @@ def gather(run: Run) -> Gathered:
     )
 
 
-def _room(run: Run, topic: str) -> Columns:
-    """For all ticks of a topic at once: put together from pieces, hours would be held twice."""
+def _series(run: Run) -> dict[str, tuple[str, dict[str, Any]]]:
+    """What comes with every frame: by topic, the loop (none for the overlap) and the fields."""
+    rig = run.rig
+    series = {TOPICS[Tick].format(loop=loop): (loop, TICK_FIELDS) for loop in rig.stellar_loops}
+    for loop in rig.metrology_loops:
+        series[TOPICS[MetrologyTick].format(loop=loop)] = (loop, BEAM_FIELDS)
+    if rig.fringes is not None:
+        series[TOPICS[Overlap].format(loop=rig.fringes.loops[0])] = ("", OVERLAP_FIELDS)
+    return series
+
+
+def _room(run: Run, topic: str, wanted: dict[str, Any]) -> Columns:
+    """For all rows of a topic at once: put together from pieces, hours would be held twice."""
     rows = sum(log.counts.get(topic, 0) for log in run.logs)
-    return {name: np.empty(rows, dtype) for name, dtype in TICK_FIELDS.items()}
+    return {name: np.empty(rows, dtype) for name, dtype in wanted.items()}
 
 
 def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64], path: str) -> int:
     """Put a block of ticks into their room, from row `at` on; returns how many rows there was room for."""
-    missing = [name for name in TICK_FIELDS if name not in columns]
+    missing = [name for name in room if name not in columns]
     if missing:
         msg = f"{path}: its ticks lack {', '.join(missing)}; it was recorded by another version of fitctl"
         raise LogError(msg)
-    moved = {
-        "time_s": time_s,
-        "mid_exposure_s": columns["mid_exposure_s"] + (time_s - columns["time_s"]),
-    }
-    block = columns | moved
+    block = columns | {"time_s": time_s}
+    if "mid_exposure_s" in room:
+        block["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])
     rows = min(
         len(time_s), len(room["time_s"]) - at
     )  # a log in the making has grown since it was counted

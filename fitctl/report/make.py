@@ -11,7 +11,7 @@ from typing import Any
 from fitctl.figures.pages import write_json, write_page
 from fitctl.report import tables
 from fitctl.report.drawing import draw, styled
-from fitctl.report.findings import Findings, LoopFindings
+from fitctl.report.findings import Findings, LoopFindings, StarFindings
 from fitctl.report.page import EVALUATION, SIGNS, Section, sections
 
 PAGE = "report.html"
@@ -84,23 +84,39 @@ def plain(findings: Findings) -> dict[str, Any]:
         "verdict": findings.word,
         "records_lost": findings.gathered.lost,
         "loops": {name: _plain_loop(loop) for name, loop in findings.loops.items()},
+        "fringes": None if findings.fringes is None else findings.fringes.figures._asdict(),
     }
 
 
 def _plain_loop(loop: LoopFindings) -> dict[str, Any]:
-    moved = loop.stages
-    return {
+    unit, selection = loop.quantity.unit, loop.selection
+    figures = {
         "verdict": loop.verdict.word,
         "why": loop.verdict.why,
-        "requirement_px": loop.requirement_px,
-        "sky_arcsec_per_px": loop.sky_arcsec_per_px,
-        "residual": {axis: found._asdict() for axis, found in loop.residual.items()},
-        "vernier_s": loop.selection.vernier_s,
-        "judged_s": loop.selection.evaluated_s,
-        "star_fraction": loop.selection.star_fraction,
+        f"requirement_{unit}": loop.requirement,
+        "residual": {
+            axis: {
+                f"rms_{unit}": found.rms,
+                f"low_{unit}": found.low,
+                f"high_{unit}": found.high,
+                "independent": found.independent,
+            }
+            for axis, found in loop.residual.items()
+        },
+        f"{loop.quantity.mode.name.lower()}_s": selection.held_s,
+        "judged_s": selection.evaluated_s,
+        f"{loop.quantity.of}_fraction": selection.measured_fraction,
         "mode_s": loop.mode_s,
         "counts": loop.counts,
         "timing": loop.timing,
+    }
+    return figures | (_plain_star(loop) if isinstance(loop, StarFindings) else {})
+
+
+def _plain_star(loop: StarFindings) -> dict[str, Any]:
+    moved = loop.stages
+    return {
+        "sky_arcsec_per_px": loop.sky_arcsec_per_px,
         "fsm_range_mean": moved.range_mean,
         "fsm_range_worst": moved.range_worst,
         "fsm_saturated_fraction": moved.saturated_fraction,

@@ -24,7 +24,8 @@ from fitctl.report.drawing import (
     span,
     trace,
 )
-from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
+from fitctl.report.fringes import FringeFindings
 from fitctl.report.selection import last_marked
 from fitctl.report.stages import motion_px
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 
 
-def mirror(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+def mirror(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
     """How much of its range the mirror uses, and its piston."""
     ticks = loop.ticks
     ready = ticks["mode_number"] >= Mode.COARSE
@@ -65,7 +66,7 @@ def mirror(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     return Plot(f"{loop.name}-mirror", "Mirror: range and piston", caption, figure)
 
 
-def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+def siderostat(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
     """Where the siderostat is on the sky, and how the mirror hands over to it."""
     ticks = loop.ticks
     mirror_px, motor_px, setpoint_px = motion_px(findings.run.rig, loop.name, ticks)
@@ -99,6 +100,36 @@ def siderostat(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
         "encoders."
     )
     return Plot(f"{loop.name}-siderostat", "Siderostat and offload", caption, figure)
+
+
+def tilt(findings: Findings, fringes: FringeFindings, time: TimeAxis) -> Plot:
+    """The tilt between two loops' stars, and the visibility that it leaves."""
+    overlap = fringes.overlap
+    measured = ~np.isnan(overlap["visibility"])
+    time_s = overlap["time_s"][measured]
+    figure, (tilts, visibility) = panels(2, 4.4)
+    for axis in AXES:
+        tilt_arcsec = overlap[f"tilt_{axis}_arcsec"][measured]
+        trace(tilts, time, time_s, tilt_arcsec, COLORS[axis], axis)
+    trace(visibility, time, time_s, overlap["visibility"][measured], GREEN, "visibility")
+    one, other = fringes.loops
+    if len(fringes.rows):  # before, while a star is pulled in, the tilt is a hundred times larger
+        tilts_arcsec = [overlap[f"tilt_{axis}_arcsec"][fringes.rows] for axis in AXES]
+        shown = 1.3 * float(np.abs(tilts_arcsec).max())
+        tilts.set_ylim(-shown, shown)
+    if len(time_s):
+        legend_above(tilts, 2)
+    tilts.set(title=f"Tilt between the stars: {one} less {other}", ylabel="arcsec on the sky")
+    visibility.set(
+        title="Fringe visibility that the tilt leaves", xlabel=time.label, ylim=(0, 1.02)
+    )
+    span([visibility], time, findings.run.duration_s)
+    caption = (
+        "Each star from its loop's target in the rig file, on every frame on which both loops follow their "
+        "stars, in COARSE too. The tilt is measured, so the camera's noise is in it and lowers the visibility "
+        "a little."
+    )
+    return Plot("fringes-tilt", "Tilt and visibility", caption, figure)
 
 
 def timing(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:

@@ -14,7 +14,7 @@ Floats = NDArray[np.floating]
 CONFIDENCE = 0.95
 WIDEST = 3.0
 """No interval is reported whose ends differ by more than this: so short a record may not hold all there is."""
-LEAST_STAR_FRACTION = 0.98
+LEAST_MEASURED_FRACTION = 0.98
 BATCHES = 10
 _LEAST_FRAMES = 2 * BATCHES
 _AT_REST_BINS = 4  # the lowest frequencies, which show what noise there is at none
@@ -27,23 +27,23 @@ class Estimate(NamedTuple):
 
     Attributes
     ----------
-    rms_px : float
-        nan without data.
-    low_px, high_px : float
+    rms : float
+        In the unit of the values; nan without data.
+    low, high : float
         nan where the record is too short for an interval.
     independent : float
         So many independent values would leave the RMS as uncertain; nan without data.
     """
 
-    rms_px: float
-    low_px: float
-    high_px: float
+    rms: float
+    low: float
+    high: float
     independent: float
 
     @property
     def known(self) -> bool:
         """Whether there is an interval."""
-        return not math.isnan(self.high_px)
+        return not math.isnan(self.high)
 
 
 class Verdict(NamedTuple):
@@ -53,7 +53,7 @@ class Verdict(NamedTuple):
     why: str
 
 
-def rms_estimate(error_px: Floats) -> Estimate:
+def rms_estimate(error: Floats) -> Estimate:
     """RMS about zero of one axis' error, with an interval that knows that neighbouring frames are alike.
 
     Two methods say how uncertain the mean square is, and the wider one counts, by Student's t on the logarithm,
@@ -62,33 +62,33 @@ def rms_estimate(error_px: Floats) -> Estimate:
 
     Parameters
     ----------
-    error_px : array, shape (frames,)
-        Evenly sampled; pieces of a record end to end.
+    error : array, shape (frames,)
+        Of any unit; evenly sampled; pieces of a record end to end.
     """
     from scipy.fft import prev_fast_len
 
     # Student's t; scipy.stats has it too, and takes half a second to import.
     from scipy.special import stdtrit
 
-    error_px = np.asarray(error_px, dtype=float)
-    if len(error_px) == 0:
+    error = np.asarray(error, dtype=float)
+    if len(error) == 0:
         return Estimate(math.nan, math.nan, math.nan, math.nan)
-    rms_px = math.sqrt(np.mean(error_px**2))
+    rms = math.sqrt(np.mean(error**2))
     # To transform other lengths takes ten times the room.
-    whole_px = error_px[: prev_fast_len(len(error_px), real=True)]
-    if len(error_px) < _LEAST_FRAMES or whole_px.min() == whole_px.max():
-        return Estimate(rms_px, math.nan, math.nan, math.nan)
-    found = (_by_spectrum(whole_px), _by_batches(error_px))
+    whole = error[: prev_fast_len(len(error), real=True)]
+    if len(error) < _LEAST_FRAMES or whole.min() == whole.max():
+        return Estimate(rms, math.nan, math.nan, math.nan)
+    found = (_by_spectrum(whole), _by_batches(error))
     independent = 2 / max(variance for variance, _ in found)
     # ln RMS is half of ln square.
     half = max(stdtrit(freedom, (1 + CONFIDENCE) / 2) * math.sqrt(v) / 2 for v, freedom in found)
     if 2 * half > math.log(WIDEST):
-        return Estimate(rms_px, math.nan, math.nan, independent)
+        return Estimate(rms, math.nan, math.nan, independent)
     factor = math.exp(half)
-    return Estimate(rms_px, rms_px / factor, rms_px * factor, independent)
+    return Estimate(rms, rms / factor, rms * factor, independent)
 
 
-def _by_spectrum(error_px: Floats) -> tuple[float, float]:
+def _by_spectrum(error: Floats) -> tuple[float, float]:
     """Relative variance of the mean square, and the degrees of freedom with which it is known.
 
     Each frequency of the periodogram is an independent chi-square of two degrees of freedom, so that half its
@@ -102,7 +102,7 @@ def _by_spectrum(error_px: Floats) -> tuple[float, float]:
     """
     from scipy.fft import rfft
 
-    power = np.abs(rfft(error_px) / len(error_px)) ** 2
+    power = np.abs(rfft(error) / len(error)) ** 2
     at_rest, moving = float(power[0]), 2 * power[1:]
     noise_at_rest = float(moving[:_AT_REST_BINS].mean()) / 2
     squares = float(np.sum(moving**2)) / 2
@@ -111,26 +111,35 @@ def _by_spectrum(error_px: Floats) -> tuple[float, float]:
     return variance, max(1.0, freedom / 2)
 
 
-def _by_batches(error_px: Floats) -> tuple[float, float]:
+def _by_batches(error: Floats) -> tuple[float, float]:
     """The same from the spread of the mean squares of a few long batches."""
-    length = len(error_px) // BATCHES
-    means = np.mean(error_px[: BATCHES * length].reshape(BATCHES, length) ** 2, axis=1)
+    length = len(error) // BATCHES
+    means = np.mean(error[: BATCHES * length].reshape(BATCHES, length) ** 2, axis=1)
     return float(means.var(ddof=1) / means.mean() ** 2) / BATCHES, BATCHES - 1.0
 
 
 def verdict(
-    axes: dict[str, Estimate], requirement_px: float, evaluated_s: float, star_fraction: float
+    axes: dict[str, Estimate],
+    requirement: float,
+    evaluated_s: float,
+    measured_fraction: float,
+    *,
+    mode: str = "VERNIER",
+    of: str = "star",
 ) -> Verdict:
-    """Whether both axes stay within the requirement; never "met" without data that say so."""
+    """Whether both axes stay within the requirement; never "met" without data that say so.
+
+    `mode` is the mode in which a loop is evaluated, and `of` is what the loop holds: for the text.
+    """
     if evaluated_s <= 0:
-        return Verdict("not known", "no time in VERNIER counts")
-    above = [axis for axis, found in axes.items() if found.known and found.low_px > requirement_px]
+        return Verdict("not known", f"no time in {mode} counts")
+    above = [axis for axis, found in axes.items() if found.known and found.low > requirement]
     if above:
         return Verdict("not met", f"the whole interval of {' and '.join(above)} is above it")
-    if star_fraction < LEAST_STAR_FRACTION:
-        missing = 100 * (1 - star_fraction)
+    if measured_fraction < LEAST_MEASURED_FRACTION:
+        missing = 100 * (1 - measured_fraction)
         return Verdict(
-            "not known", f"the star is missing on {missing:.1f} % of the frames that count"
+            "not known", f"the {of} is missing on {missing:.1f} % of the frames that count"
         )
     few = [axis for axis, found in axes.items() if not found.known]
     if few:
@@ -139,7 +148,7 @@ def verdict(
             f"too short to judge: the {evaluated_s:.0f} s that count hold too few independent values of the "
             f"error in {' and '.join(few)} for an interval",
         )
-    if all(found.high_px <= requirement_px for found in axes.values()):
+    if all(found.high <= requirement for found in axes.values()):
         return Verdict("met", "the whole intervals of both axes are within it")
     return Verdict("not known", "the interval holds the requirement; more data would tell")
 

@@ -7,7 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
+from fitctl.report.fringes import FringeFindings
 from fitctl.report.residual import Estimate
 from fitctl.report.run import Run
 from fitctl.report.selection import searches_for_lost_star
@@ -56,29 +57,24 @@ def utc(run: Run, time_s: float = 0.0, form: str = "%Y-%m-%d %H:%M:%S UTC") -> s
 
 
 def interval(found: Estimate) -> str:
-    """95 % confidence, px."""
-    return f"{found.low_px:.4f} to {found.high_px:.4f}" if found.known else UNKNOWN
+    """95 % confidence."""
+    return f"{found.low:.4f} to {found.high:.4f}" if found.known else UNKNOWN
 
 
 def residual(loop: LoopFindings) -> Table:
     """What the verdict is of."""
+    unit = loop.quantity.unit
+    sky = {"arcsec on the sky": loop.sky_arcsec_per_px} if isinstance(loop, StarFindings) else {}
     return Table(
-        "Measured error about the target, RMS, with 95 % confidence",
-        [
-            "axis",
-            "px",
-            "interval, px",
-            "arcsec on the sky",
-            "of the requirement",
-            "independent values",
-        ],
+        f"Measured error of the {loop.quantity.of}, RMS about its target, with 95 % confidence",
+        ["axis", unit, f"interval, {unit}", *sky, "of the requirement", "independent values"],
         [
             [
                 axis,
-                number(found.rms_px, ".4f"),
+                number(found.rms, ".4f"),
                 interval(found),
-                number(found.rms_px * loop.sky_arcsec_per_px, ".4f"),
-                number(found.rms_px / loop.requirement_px, ".0f", "%", 100),
+                *(number(found.rms * arcsec_per_px, ".4f") for arcsec_per_px in sky.values()),
+                number(found.rms / loop.requirement, ".0f", "%", 100),
                 number(found.independent, ".0f"),
             ]
             for axis, found in loop.residual.items()
@@ -88,11 +84,36 @@ def residual(loop: LoopFindings) -> Table:
 
 def key_figures(loop: LoopFindings) -> Table:
     """What else one asks first."""
-    selection, moved = loop.selection, loop.stages
+    selection, held = loop.selection, loop.quantity
     rows = [
-        ["time in VERNIER, all of the run", seconds(selection.vernier_s)],
+        [f"time in {held.mode.name}, all of the run", seconds(selection.held_s)],
         ["judged", f"{seconds(selection.evaluated_s)}; pieces: {len(selection.pieces)}"],
-        ["star seen in it", number(selection.star_fraction, ".2f", "% of the frames", 100)],
+        [
+            f"{held.of} measured in it",
+            number(selection.measured_fraction, ".2f", "% of the frames", 100),
+        ],
+    ]
+    if isinstance(loop, StarFindings):
+        rows += _stages(loop)
+    rows.append(
+        [
+            "modes, all of the run",
+            ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks",
+        ]
+    )
+    lost_s = searches_for_lost_star(loop.ticks)
+    if lost_s:
+        times = f"{len(lost_s)} times, searched again for {seconds(sum(lost_s))}"
+        rows.append(
+            [f"{held.of} lost, all of the run", f"{times}, at most {seconds(max(lost_s))} at once"]
+        )
+    return Table("In the part that is judged", ["what", "how much"], rows)
+
+
+def _stages(loop: StarFindings) -> list[list[str]]:
+    """Rows of a stellar loop's mirror and siderostat."""
+    moved = loop.stages
+    rows = [
         [
             "mirror's range",
             f"{number(moved.range_mean, '.1f', '% mean', 100)}, "
@@ -108,22 +129,10 @@ def key_figures(loop: LoopFindings) -> Table:
         ]
         for axis, px in zip(AXES, moved.motor_moved_px, strict=True)
     ]
-    rows.append(
-        [
-            "modes, all of the run",
-            ", ".join(f"{mode} {seconds(s)}" for mode, s in loop.mode_s.items()) or "no ticks",
-        ]
-    )
-    lost_s = searches_for_lost_star(loop.ticks)
-    if lost_s:
-        times = f"{len(lost_s)} times, searched again for {seconds(sum(lost_s))}"
-        rows.append(
-            ["star lost, all of the run", f"{times}, at most {seconds(max(lost_s))} at once"]
-        )
-    return Table("In the part that is judged", ["what", "how much"], rows)
+    return rows
 
 
-def rejected(loop: LoopFindings) -> Table:
+def rejected(loop: StarFindings) -> Table:
     """Measured rejection beside the design's."""
     head = ["controller", "judged", "bound", "design's residual"]
     frequencies = [at_hz for at_hz, *_ in loop.rejections[0].table()] if loop.rejections else []
@@ -141,6 +150,22 @@ def rejected(loop: LoopFindings) -> Table:
         ]
         rows.append(row)
     return Table("Disturbance rejection: measured / design", head, rows)
+
+
+def fringes(found: FringeFindings) -> Table:
+    """The tilt and what it leaves."""
+    figures = found.figures
+    rows = [
+        ["judged: both loops hold, and have settled", seconds(figures.judged_s)],
+        ["visibility, mean", number(figures.visibility_mean, ".4f")],
+        ["visibility, 5 % of the frames are below", number(figures.visibility_p5, ".4f")],
+    ]
+    for axis in AXES:
+        mean, spread = (getattr(figures, f"tilt_{what}_{axis}_arcsec") for what in ("mean", "std"))
+        rows.append([f"tilt {axis}, mean", number(mean, "+.4f", "arcsec")])
+        rows.append([f"tilt {axis}, RMS about its mean", number(spread, ".4f", "arcsec")])
+    one, other = found.loops
+    return Table(f"Tilt of {one} less {other}, as measured", ["what", "how much"], rows)
 
 
 def timings(loop: LoopFindings) -> Table:

@@ -23,7 +23,7 @@ from fitctl.report.drawing import (
     span,
     trace,
 )
-from fitctl.report.findings import AXES, Findings, LoopFindings
+from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,18 +35,19 @@ _MODE_COLORS = {
     Mode.ACQUISITION: ORANGE,
     Mode.COARSE: PURPLE,
     Mode.VERNIER: GREEN,
+    Mode.LOCKED: GREEN,
     Mode.SAFE: EL,
     Mode.EXPERIMENT: AZ,
 }
 _SIGNS = {3: ("v", ORANGE, "warning"), 4: ("X", EL, "error")}  # by foxglove.Log's level
 WINDOW_S = 10.0
+DIODES = ("az_plus", "az_minus", "el_plus", "el_minus")
 
 
 def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
-    """Mean times in windows of `WINDOW_S` and the RMS of each axis' error in VERNIER; NaN without a star."""
-    ticks = loop.ticks
-    held = (ticks["mode_number"] == Mode.VERNIER) & ticks["star_visible"]
-    time_s = ticks["time_s"][held]
+    """Mean times in windows of `WINDOW_S` and the RMS of each axis' error while held; NaN without a star."""
+    held = loop.held
+    time_s = loop.ticks["time_s"][held]
     if len(time_s) == 0:
         return np.empty(0), {axis: np.empty(0) for axis in AXES}
     window = np.floor(time_s / WINDOW_S).astype(int)
@@ -56,8 +57,7 @@ def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
         middles_s = np.bincount(window - first, time_s) / count
         rms = {
             axis: np.sqrt(
-                np.bincount(window - first, ticks[f"error_{axis}_px"][held].astype(float) ** 2)
-                / count
+                np.bincount(window - first, loop.error(axis)[held].astype(float) ** 2) / count
             )
             for axis in AXES
         }
@@ -91,13 +91,14 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
         line = "o-" if len(at_s) < 60 else "-"
         shown = at_s / time.s_per_unit
         residual.plot(shown, rms[axis], line, ms=3, color=COLORS[axis], label=axis)
-    limit(residual, loop.requirement_px, f"requirement {loop.requirement_px:g} px")
+    unit = loop.quantity.unit
+    limit(residual, loop.requirement, f"requirement {loop.requirement:g} {unit}")
     residual.set_yscale("log")
     decimal(residual.yaxis, dense=True)
     residual.set(
-        title=f"RMS of the measured error in VERNIER, {WINDOW_S:g} s at a time",
+        title=f"RMS of the measured error in {loop.quantity.mode.name}, {WINDOW_S:g} s at a time",
         xlabel=time.label,
-        ylabel="px",
+        ylabel=unit,
     )
     legend_above(residual, 3)
     span([residual], time, findings.run.duration_s)
@@ -127,19 +128,17 @@ def _spans(loop: LoopFindings) -> list[tuple[float, float, Mode]]:
     ]
 
 
-def traces(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+def traces(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
     """Error, target and flux."""
     ticks = loop.ticks
     frames = ticks["star_visible"]
-    held = frames & (ticks["mode_number"] == Mode.VERNIER)
+    held = loop.held
     figure, (error, target, flux) = panels(3, 5.4)
     time_s, tracked = ticks["time_s"], ticks["mode_number"] >= Mode.ACQUISITION
     for axis in AXES:
-        error_px, target_px = ticks[f"error_{axis}_px"], ticks[f"target_{axis}_px"]
-        trace(error, time, time_s[held], error_px[held], COLORS[axis], axis)
+        target_px = ticks[f"target_{axis}_px"]
+        trace(error, time, time_s[held], loop.error(axis)[held], COLORS[axis], axis)
         trace(target, time, time_s[tracked], target_px[tracked], COLORS[axis], axis)
-    for sign in (-1, 1):
-        limit(error, sign * loop.requirement_px)
     beyond = _limit(error, loop, held)
     trace(flux, time, time_s[frames], ticks["star_flux_dn"][frames], GREEN, "flux")
     error.set(title=f"Error in VERNIER: star less target{beyond}", ylabel="px")
@@ -154,12 +153,40 @@ def traces(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     return Plot(f"{loop.name}-traces", "Traces", caption, figure)
 
 
+def beam_traces(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
+    """Error of the beam, the siderostat that holds it, and light."""
+    ticks, held = loop.ticks, loop.held
+    time_s, sampled = ticks["time_s"], ~np.isnan(ticks["diode_az_plus_v"])
+    figure, (error, siderostat, light) = panels(3, 5.4)
+    for axis in AXES:
+        trace(error, time, time_s[held], loop.error(axis)[held], COLORS[axis], axis)
+        sky_arcsec = ticks[f"siderostat_{axis}_sky_arcsec"]
+        trace(siderostat, time, time_s, sky_arcsec, COLORS[axis], axis)
+    beyond = _limit(error, loop, held)
+    for diode, color in zip(DIODES, (AZ, SKY, EL, ORANGE), strict=True):
+        volts = ticks[f"diode_{diode}_v"][sampled]
+        trace(light, time, time_s[sampled], volts, color, diode.replace("_", " "))
+    error.set(title=f"Error in LOCKED: beam less centre{beyond}", ylabel="arcsec")
+    siderostat.set(title="Siderostat, by its encoders", ylabel="arcsec on the sky")
+    light.set(title="Photodiodes", xlabel=time.label, ylabel="V")
+    legend_above(error, 2)
+    legend_above(light, 4)
+    span([light], time, findings.run.duration_s)
+    caption = (
+        "Dashed: the requirement, either side. The siderostat follows the collector across the link: what it "
+        "turns here, a star that comes over the link turns too."
+    )
+    return Plot(f"{loop.name}-traces", "Traces", caption, figure)
+
+
 def _limit(axes: Axes, loop: LoopFindings, held: NDArray[np.bool_]) -> str:
-    """So that a few frames of hand-over do not flatten the rest; returns what is to be said of them."""
+    """Draw the requirement, and keep a few frames of hand-over from flattening the rest; returns the worst."""
+    for sign in (-1, 1):
+        limit(axes, sign * loop.requirement)
     if not held.any():
         return ""
-    errors = np.abs(np.concatenate([loop.ticks[f"error_{axis}_px"][held] for axis in AXES]))
-    shown_px = max(1.3 * loop.requirement_px, 1.2 * float(np.quantile(errors, 0.995)))
-    worst_px = float(errors.max())
-    axes.set_ylim(-shown_px, shown_px)
-    return f"; at worst {worst_px:.2f} px, not shown" if worst_px > shown_px else ""
+    errors = np.abs(np.concatenate([loop.error(axis)[held] for axis in AXES]))
+    shown = max(1.3 * loop.requirement, 1.2 * float(np.quantile(errors, 0.995)))
+    worst = float(errors.max())
+    axes.set_ylim(-shown, shown)
+    return f"; at worst {worst:.2f} {loop.quantity.unit}, not shown" if worst > shown else ""

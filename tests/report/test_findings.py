@@ -20,8 +20,8 @@ def test_the_residual_is_that_of_the_ticks(held, findings):
     errors = np.array([tick.error_az_px for tick in simulation.ticks])[rows]
 
     assert loop.verdict.word == "met"
-    assert loop.residual["az"].rms_px == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-5)
-    assert loop.residual["az"].low_px < loop.residual["az"].rms_px < loop.residual["az"].high_px
+    assert loop.residual["az"].rms == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-5)
+    assert loop.residual["az"].low < loop.residual["az"].rms < loop.residual["az"].high
 
 
 def test_the_rejection_is_measured_and_the_design_is_the_logged_one(rig, findings):
@@ -83,7 +83,7 @@ def test_what_was_lost_late_and_when_is_counted(findings):
 
     assert findings.gathered.lost == 3
     assert loop.counts["frames"] == np.count_nonzero(loop.ticks["number"] >= 0)
-    assert loop.mode_s["VERNIER"] == pytest.approx(loop.selection.vernier_s, abs=0.1)
+    assert loop.mode_s["VERNIER"] == pytest.approx(loop.selection.held_s, abs=0.1)
     assert loop.timing["age_median_s"] == pytest.approx(0.035, abs=1e-4)
 
 

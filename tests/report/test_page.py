@@ -128,7 +128,7 @@ def test_the_figures_are_there_for_programs(made, findings):
 
     loop = figures["loops"]["right"]
     assert figures["verdict"] == "met"
-    assert loop["residual"]["az"]["rms_px"] == findings.loops["right"].residual["az"].rms_px
+    assert loop["residual"]["az"]["rms_px"] == findings.loops["right"].residual["az"].rms
     assert loop["command_gap_px"] == [None, None]
     assert loop["controllers"][0]["rejection"][0]["hz"] == 0.25
 

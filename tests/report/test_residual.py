@@ -24,7 +24,7 @@ def trials(make, runs):
     """How many of some records have an interval, and how many of those intervals hold an RMS of 1."""
     rng = np.random.default_rng(5)
     known = [found for _ in range(runs) if (found := rms_estimate(make(rng))).known]
-    return len(known), sum(found.low_px <= 1.0 <= found.high_px for found in known)
+    return len(known), sum(found.low <= 1.0 <= found.high for found in known)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_frames_that_resemble_their_neighbours_tell_less():
     rng = np.random.default_rng(6)
     slow, quick = (rms_estimate(motion(rng, 600.0, correlated_s)) for correlated_s in (3.0, 0.05))
 
-    slow_width, quick_width = (math.log(one.high_px / one.low_px) for one in (slow, quick))
+    slow_width, quick_width = (math.log(one.high / one.low) for one in (slow, quick))
     assert slow_width > 2 * quick_width
     assert slow.independent < quick.independent / 10
 
@@ -93,7 +93,7 @@ def test_the_interval_scales_with_the_motion_and_is_never_wide(factor, duration_
     whole, found = rms_estimate(series), rms_estimate(factor * series)
 
     assert found == pytest.approx([factor * px for px in whole[:3]] + [whole[3]], nan_ok=True)
-    assert not whole.known or 1 < whole.high_px / whole.low_px <= WIDEST
+    assert not whole.known or 1 < whole.high / whole.low <= WIDEST
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Which files are a run, and what becomes of files that are not whole, double, empty or somebody else's."""
 
+import copy
 import json
 import re
 from pathlib import Path
@@ -92,8 +93,8 @@ def test_time_in_off_is_no_pointing(rig, tmp_path):
 def test_two_loops_are_judged_each_by_itself(rig, tmp_path):
     document = rig.model_dump(mode="json")
     for section in (document["loops"], document["plant"]["loops"], document["mocks"]["loops"]):
-        section["left"] = section["right"]
-    document["loops"]["left"]["target_px"] = {"az": 12.0, "el": 30.0}
+        section["left"] = copy.deepcopy(section["right"])
+    document["loops"]["left"]["target_px"] = {"az": 10.0, "el": 30.0}
     both = type(rig).model_validate_json(json.dumps(document))
     path = tmp_path / "both.mcap"
 

@@ -23,10 +23,10 @@ def selected(ticks):
 def test_the_first_seconds_of_vernier_do_not_count():
     found = selected(ticks_of(FRAMES))
 
-    assert found.vernier_s == pytest.approx(60.0)
+    assert found.held_s == pytest.approx(60.0)
     assert found.evaluated_s == pytest.approx(60.0 - SETTLE_S)
     assert len(found.pieces) == 1
-    assert found.star_fraction == 1.0
+    assert found.measured_fraction == 1.0
 
 
 def test_each_return_to_vernier_settles_anew():
@@ -73,7 +73,7 @@ def test_missing_stars_are_counted_and_longer_gaps_end_a_piece():
     found = selected(ticks_of(FRAMES, star_visible=seen))
 
     assert len(found.pieces) == 2
-    assert found.star_fraction == pytest.approx(1 - 110 / 2500)
+    assert found.measured_fraction == pytest.approx(1 - 110 / 2500)
     assert len(found.rows) == 2390
 
 
@@ -81,7 +81,7 @@ def test_missing_stars_are_counted_and_longer_gaps_end_a_piece():
 def test_other_modes_are_not_judged(mode):
     found = selected(ticks_of(FRAMES, mode=mode))
 
-    assert (found.pieces, found.vernier_s, found.evaluated_s) == ([], 0.0, 0.0)
+    assert (found.pieces, found.held_s, found.evaluated_s) == ([], 0.0, 0.0)
 
 
 def test_no_tick_at_all_is_judged_by_nothing():

@@ -18,7 +18,7 @@ from fitctl.report.make import make_report
 from fitctl.report.page import SIGNS
 from fitctl.report.pdf import PdfError, print_pdf
 from fitctl.report.run import find_run
-from fitctl.report.tables import interval, number
+from fitctl.report.tables import interval, number, seconds
 
 MOST_NIGHTS = 6
 
@@ -86,11 +86,18 @@ def report(
 
 def _print_verdict(night: Findings) -> None:
     for loop in night.loops.values():
+        unit = loop.quantity.unit
         say(
             f"{night.run.name}, loop {loop.name}: {SIGNS[loop.verdict.word]} requirement of "
-            f"{loop.requirement_px:g} px {loop.verdict.word}: {loop.verdict.why}"
+            f"{loop.requirement:g} {unit} {loop.verdict.word}: {loop.verdict.why}"
         )
         for axis, found in loop.residual.items():
             say(
-                f"  {axis} {number(found.rms_px, '.4f', 'px RMS')}, 95 % interval {interval(found)}"
+                f"  {axis} {number(found.rms, '.4f', f'{unit} RMS')}, 95 % interval {interval(found)}"
             )
+    if night.fringes is not None:
+        figures = night.fringes.figures
+        say(
+            f"{night.run.name}, fringes of {' and '.join(night.fringes.loops)}: visibility "
+            f"{number(figures.visibility_mean, '.3f', 'mean')} over {seconds(figures.judged_s)}"
+        )
