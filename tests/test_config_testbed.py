@@ -1,8 +1,10 @@
 """Rig files with several loops, a metrology loop and a collector."""
 
 import copy
+import tomllib
 
 import pytest
+from documents import blocks
 
 from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_document
 
@@ -156,3 +158,26 @@ def test_two_stars_need_no_metrology():
         section["loops"] = {n: section["loops"][n] for n in ("right", "left")}
     del parts["loops"]["left"]["link"], parts["loops"]["left"]["feedforward"]
     assert list(rig_from_document(parts, "two.toml").loops) == ["right", "left"]
+
+
+def test_the_rig_of_two_stars_is_what_its_how_to_shows():
+    (shown,) = [
+        tomllib.loads(block.text)
+        for block in blocks("text")
+        if block.document.name == "testbed.md" and "[loops.left]" in block.text
+    ]
+    path = TESTBED.with_name("two-stars.toml")
+
+    def assert_holds(document, part):
+        for key, value in part.items():
+            if isinstance(value, dict):
+                assert_holds(document[key], value)
+            else:
+                assert document[key] == value, key
+
+    rig = load_rig(path)
+    assert_holds(tomllib.loads(path.read_text()), shown)
+    assert list(rig.stellar_loops) == list(rig.loops) == ["right", "left"]
+    assert all(loop.link is None and loop.feedforward is None for loop in rig.loops.values())
+    assert rig.collector is None
+    assert list(rig.fringes.loops) == ["left", "right"]
