@@ -37,7 +37,7 @@ SCAN = [
 def replayed(*paths, change=()):
     with whole_run(paths) as info, logged_files(info) as files:
         rig = rig_from_log(info.metadata["rig"]["json"], "the log", [*files, *change])
-        return replay(rig, read_steps(info, list(rig.loops)))
+        return replay(rig, read_steps(info, rig))
 
 
 def hold_a_star(simulation):

@@ -88,14 +88,18 @@ class Tick(Record, frozen=True, kw_only=True, gc=False):
     decide_s: float = math.nan
     dac_sent_s: float = math.nan
     frames_skipped: int = 0  # since the camera was opened: a newer frame was there already
+    # Of the siderostat of the loop's link, when `siderostat_az_rad` was read; NaN without a link.
+    link_az_rad: float = math.nan
+    link_el_rad: float = math.nan
 
 
 class MetrologyTick(Record, frozen=True, kw_only=True, gc=False):
     """One tick of one metrology loop.
 
     ``number`` is the frame's that set its pace, as in :class:`Tick`. Beam angles are those of the beam from the
-    centre of its photodiodes; they are NaN at a tick without a new sample. Fields of the same name mean the
-    same as in :class:`Tick`.
+    centre of its photodiodes; they are NaN at a tick without a new sample. ``sampled_s`` is when the sample was
+    taken that the tick used, ``requested_s`` when the tick requested the next; NaN without. Fields of the same
+    name mean the same as in :class:`Tick`.
     """
 
     loop: str
@@ -134,6 +138,7 @@ class MetrologyTick(Record, frozen=True, kw_only=True, gc=False):
     encoder_el_rad: float
     sense_s: float
     decide_s: float
+    requested_s: float = math.nan
 
 
 class Overlap(Record, frozen=True, kw_only=True, gc=False):
@@ -163,7 +168,7 @@ class FrameRecord(Record, frozen=True, kw_only=True, gc=False):
 
 
 class ModeChange(Record, frozen=True, kw_only=True):
-    """A loop went from one mode to another; the motor angles are what it then took them to be."""
+    """A loop went from one mode to another; the motor angles, its link's too, are those that it then read."""
 
     loop: str
     source: str
@@ -173,6 +178,8 @@ class ModeChange(Record, frozen=True, kw_only=True):
     reason: str
     siderostat_az_rad: float = math.nan
     siderostat_el_rad: float = math.nan
+    link_az_rad: float = math.nan
+    link_el_rad: float = math.nan
 
 
 class CommandRecord(Record, frozen=True, kw_only=True):
@@ -215,6 +222,8 @@ class ControllerChange(Record, frozen=True, kw_only=True):
     target: str
     siderostat_az_rad: float
     siderostat_el_rad: float
+    link_az_rad: float = math.nan
+    link_el_rad: float = math.nan
 
 
 class QuantityReading(Record, frozen=True, kw_only=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,24 @@ from fitctl.loop.metrology import MetrologyLoop
 from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import play
 from fitctl.model.optics import Scales, motor_sky_rad_per_rad
+from fitctl.stages.servo import ServoState
 from fitctl.stages.siderostat import SiderostatStage
 
 Floats = NDArray[np.float64]
 _HISTORY_TICKS = 50
+
+
+class LinkServo(Protocol):
+    """Where the motors of a link's siderostat are; :class:`fitctl.stages.servo.SiderostatServo` is one."""
+
+    @property
+    def position_rad(self) -> Floats:
+        """As last read, shape (2,)."""
+        ...
+
+    def position_at(self, time_s: float) -> Floats:
+        """At a recent time, shape (2,)."""
+        ...
 
 
 class Link:
@@ -38,11 +53,17 @@ class Link:
         What counts as no turn.
     undone_rad : array, shape (2,)
         How much of the turn the own siderostat has undone, from the same zero as `origin_rad`.
+    motor_rad : array, shape (2,)
+        Angles of the link's motors, by the last :meth:`read_at` or :meth:`read_now`.
+    servo : LinkServo
+        Where they are read.
     """
 
     def __init__(self, loop: MetrologyLoop, settings: LoopSettings) -> None:
         given = settings.feedforward
         self.loop = loop
+        self.servo: LinkServo = loop.servo
+        self.motor_rad = np.zeros(2)
         self.origin_rad = np.zeros(2)
         self.undone_rad = np.zeros(2)
         self._matrix = link_matrix(
@@ -68,9 +89,18 @@ class Link:
         before, self._zeros_lost = self._zeros_lost, self.loop.zeros_lost
         return self._zeros_lost != before
 
-    def turned_rad(self, time_s: float) -> Floats:
-        """From the origin, at a recent time, by the encoders."""
-        return self._matrix @ self.loop.servo.position_at(time_s) - self.origin_rad
+    def read_at(self, time_s: float) -> None:
+        """Read the encoders at a recent time."""
+        self.motor_rad = self.servo.position_at(time_s)
+
+    def read_now(self) -> None:
+        """Read the newest of the encoders."""
+        self.motor_rad = self.servo.position_rad
+
+    @property
+    def turned_rad(self) -> Floats:
+        """From the origin, by the encoders as last read."""
+        return self._matrix @ self.motor_rad - self.origin_rad
 
     @property
     def matrix(self) -> Floats:
@@ -148,12 +178,14 @@ class BacklashFeedforward:
         self.offset_rad = offset_rad
         self._origin_rad = self._lost_rad - offset_rad
 
-    def update(self, now_s: float) -> None:
-        """Follow both plays, and have the mirror make up for them from now on."""
+    def update(self, now_s: float, own: ServoState) -> None:
+        """Follow both plays from the encoders that this tick read; the mirror makes up for them from now on."""
         lost_rad = []
-        for index, stage in enumerate(self._stages):
+        servos = self._link.loop.servo_state, own
+        for index, (stage, servo) in enumerate(zip(self._stages, servos, strict=True)):
+            read_rad = servo.position_rad if servo.reading is None else servo.reading.position_rad
             # Halfway between where the motors are and where they are to be at the next tick.
-            motor_rad = 0.5 * (stage.servo.position_rad + stage.setpoint_rad)
+            motor_rad = 0.5 * (np.array(read_rad) + stage.setpoint_rad)
             beam_rad = play(self._beams_rad[index], motor_rad, self._half_rad[index])
             self._beams_rad[index] = beam_rad
             lost_rad.append(beam_rad - motor_rad)

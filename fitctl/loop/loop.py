@@ -7,6 +7,7 @@ device or record. Metrology loops come first: a loop that depends on one uses wh
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import QUANTITIES, AnyLoop, Rig
-from fitctl.drivers.interface import Frame
+from fitctl.drivers.interface import AzEl, Frame
 from fitctl.logging.records import FailingDevice, MetrologyTick, ModeChange, Severity, Tick
 from fitctl.loop.interlocks import Interlocks
 from fitctl.loop.quantities import Quantities
@@ -212,12 +213,13 @@ class Loop(ABC):
         row = transition(self.mode, trigger, self.transitions)
         if row is None:
             return False
-        now_s, motor_rad = self._clock.now_s(), self.servo.position_rad
+        now_s, motor_rad, link_rad = self._clock.now_s(), self.servo.position_rad, self._read_link()
         source, self.mode = self.mode, row.target
         if source is not self.mode:
             self.mode_since_s = now_s
         self._enter(source, motor_rad)
         motor_az_rad, motor_el_rad = motor_rad.tolist()
+        link_az_rad, link_el_rad = link_rad
         self.last_change = ModeChange(
             time_s=now_s,
             loop=self.name,
@@ -228,12 +230,18 @@ class Loop(ABC):
             reason=reason,
             siderostat_az_rad=motor_az_rad,
             siderostat_el_rad=motor_el_rad,
+            link_az_rad=link_az_rad,
+            link_el_rad=link_el_rad,
         )
         self._journal.record(self.last_change)
         self._report_event(
             _SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}"
         )
         return True
+
+    def _read_link(self) -> AzEl:
+        """Motor angles of the siderostat of the loop's link, read now; NaN without a link."""
+        return math.nan, math.nan
 
     def _enter(self, source: Mode, motor_rad: Floats) -> None:
         """Do what a change from `source` to the mode needs, with the motors at `motor_rad`, shape (2,)."""

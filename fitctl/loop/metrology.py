@@ -127,7 +127,7 @@ class MetrologyLoop(Loop):
         self._limits = _limits(rig, name)
         self._ready = False
         self._sampled_s = math.nan
-        self._ticked_s = journal.clock.now_s()
+        self._ticked_s = self._requested_s = math.nan
         self._lost = self._in_reach = self._out_of_reach = 0  # samples in a row
         self._laws: dict[Mode, Callable[[_Sensed, float], None]] = {
             Mode.ACQUISITION: self._search,
@@ -143,9 +143,7 @@ class MetrologyLoop(Loop):
         begun_s = self._clock.now_s()
         sample = self._receive()
         beam = None if sample is None else self._array.beam(sample.volts)
-        motor_rad = (
-            self.servo.position_rad if sample is None else self.servo.position_at(sample.time_s)
-        )
+        motor_rad = servo.position_rad if sample is None else self.servo.position_at(sample.time_s)
         self._sensed = _Sensed(frame, frames_lost, servo, sample, beam, motor_rad, begun_s)
         self._sensed_s = self._clock.now_s()
 
@@ -172,7 +170,8 @@ class MetrologyLoop(Loop):
         if self._ready:
             quantities.record_sample_age(now_s - self._sampled_s, now_s)
         self._evaluate_interlocks(now_s)
-        duration_s = min(now_s - self._ticked_s, _MOST_TICK_S)
+        since_s = 0.0 if math.isnan(self._ticked_s) else now_s - self._ticked_s
+        duration_s = min(since_s, _MOST_TICK_S)
         self._ticked_s = now_s
         law = self._laws.get(self.mode)
         if law is not None and self.interlocks.action not in {"hold", "flatten"}:
@@ -181,8 +180,10 @@ class MetrologyLoop(Loop):
 
     def send(self) -> None:
         """Ask for the next sample."""
+        self._requested_s = math.nan
         if not self._ready or self.mode is Mode.OFF:
             return
+        self._requested_s = self._clock.now_s()
         try:
             self._photodiodes.send_request()
         except DeviceError as error:
@@ -293,12 +294,17 @@ class MetrologyLoop(Loop):
         super().begin(stack_v)
         self._photodiode_error = None
         self.zeros_lost += self.servo.encoders_jumped
-        self._sampled_s = self._ticked_s = self._clock.now_s()
+        self._sampled_s, self._ticked_s = self._clock.now_s(), math.nan
         self._ready = True
 
     def release(self) -> None:
         """Ask for no more samples."""
         self._ready = False
+
+    @property
+    def servo_state(self) -> ServoState:
+        """The siderostat's servo as the newest tick read it."""
+        return self._sensed.servo
 
     @property
     def sampled(self) -> bool:
@@ -380,6 +386,7 @@ class MetrologyLoop(Loop):
             encoder_el_rad=encoder_el_rad,
             sense_s=self._sensed_s - sensed.begun_s,
             decide_s=self._decided_s - self._sensed_s,
+            requested_s=self._requested_s,
         )
 
 

@@ -32,6 +32,8 @@ class Observation(NamedTuple):
         When that is: the tick's beginning.
     link_rad : array, shape (2,), or None
         Motor angles that turn the star as far as the siderostat of the loop's link did; None without one.
+    link_motor_rad : array, shape (2,), or None
+        Angles of the motors of the link's siderostat at the same time as `motor_rad`; None without a link.
     backlash_rad : array, shape (2,), or None
         Part of `mirror_rad` that makes up for the siderostats' backlash, which is no part of the law's.
     """
@@ -45,6 +47,7 @@ class Observation(NamedTuple):
     servo: ServoState
     now_s: float
     link_rad: NDArray[np.float64] | None = None
+    link_motor_rad: NDArray[np.float64] | None = None
     backlash_rad: NDArray[np.float64] | None = None
 
     @property

@@ -120,7 +120,10 @@ class StellarLoop(Loop):
             motor_rad = self.servo.position_at(frame.mid_exposure_s)
             mirror_rad = self.mirror.at(frame.mid_exposure_s)
         time_s = begun_s if frame is None else frame.mid_exposure_s
-        link_rad = None if self.link is None else self.link.turned_rad(time_s)
+        link_rad = link_motor_rad = None
+        if self.link is not None:
+            self.link.read_at(time_s)
+            link_rad, link_motor_rad = self.link.turned_rad, self.link.motor_rad
         if frame is not None:
             beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
             star = self._find(frame, mirror_rad, beam_rad)
@@ -134,6 +137,7 @@ class StellarLoop(Loop):
             servo,
             begun_s,
             link_rad,
+            link_motor_rad,
             None if self.backlash is None else self.backlash.at(time_s),
         )
         self._sensed_s = self._clock.now_s()
@@ -258,10 +262,17 @@ class StellarLoop(Loop):
             self.pointing.start_pair(self.mirror, beam_rad, self.backlash.offset_rad)
 
     def _beam_rad(self, motor_rad: Floats) -> Floats:
-        """Motor angles that turn the star as far as all siderostats have until now, shape (2,)."""
+        """Motor angles that turn the star as far as all siderostats, the link's as last read, shape (2,)."""
         if self.link is None:
             return motor_rad
-        return motor_rad + self.link.turned_rad(self._clock.now_s())
+        return motor_rad + self.link.turned_rad
+
+    def _read_link(self) -> AzEl:
+        if self.link is None:
+            return super()._read_link()
+        self.link.read_now()
+        az_rad, el_rad = self.link.motor_rad.tolist()
+        return az_rad, el_rad
 
     def configure_search(self, asked: Acquire) -> None:
         """What the next search is to find, and how, as a command asks that was not refused."""
@@ -343,7 +354,7 @@ class StellarLoop(Loop):
             self._report_event("info", f"no longer waits for {before}")
             self._go_on(observation)
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
-            self._start_search(self.servo.position_rad)
+            self._start_search(observation.motor_rad)
 
     def _go_on(self, observation: Observation) -> None:
         """The control laws begin anew from where the stages are."""
@@ -389,7 +400,7 @@ class StellarLoop(Loop):
             self.siderostat.move_by(command.motor_step_rad)
             mirror_rad = command.mirror_rad
             if self.backlash is not None:
-                self.backlash.update(observation.now_s)
+                self.backlash.update(observation.now_s, observation.servo)
                 mirror_rad = saturate_diamond(
                     mirror_rad + self.backlash.offset_rad, self.settings.fsm.range_rad
                 )
@@ -417,11 +428,12 @@ class StellarLoop(Loop):
 
     def use(self, design: Design) -> None:
         """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
-        before, motor_rad = self.controller, self.servo.position_rad
+        before, motor_rad, link_rad = self.controller, self.servo.position_rad, self._read_link()
         self.pointing.use(design)
         if self.mode is Mode.VERNIER:
             self._start_pair(self._beam_rad(motor_rad))
         az_rad, el_rad = motor_rad.tolist()
+        link_az_rad, link_el_rad = link_rad
         self._journal.record(
             ControllerChange(
                 time_s=self._clock.now_s(),
@@ -430,6 +442,8 @@ class StellarLoop(Loop):
                 target=design.name,
                 siderostat_az_rad=az_rad,
                 siderostat_el_rad=el_rad,
+                link_az_rad=link_az_rad,
+                link_el_rad=link_el_rad,
             )
         )
         self._report_event("info", f"controller {before} -> {design.name}")

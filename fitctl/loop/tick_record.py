@@ -65,6 +65,8 @@ class TickRecords:
         stack1_v, stack2_v, stack3_v = mirror.stack_v.tolist()
         motor_az_rad, motor_el_rad = observation.motor_rad.tolist()
         setpoint_az_rad, setpoint_el_rad = siderostat.setpoint_rad.tolist()
+        link_rad = observation.link_motor_rad
+        link_az_rad, link_el_rad = (math.nan, math.nan) if link_rad is None else link_rad.tolist()
         return Tick(
             time_s=done_s,
             loop=self._loop_name,
@@ -111,4 +113,6 @@ class TickRecords:
             decide_s=decided_s - sensed_s,
             dac_sent_s=mirror.sent_s,
             frames_skipped=observation.frames_skipped,
+            link_az_rad=link_az_rad,
+            link_el_rad=link_el_rad,
         )

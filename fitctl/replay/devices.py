@@ -20,6 +20,7 @@ from fitctl.drivers.interface import (
     CameraCounts,
     DeviceError,
     DeviceIdentity,
+    DiodeReading,
     Frame,
     ServoReading,
 )
@@ -120,7 +121,7 @@ class LoggedCamera(NoDevice):
         )
         self._frames.clear()
         if step.frame is not None:
-            tick = next(iter(step.ticks.values()))
+            tick = next(tick for tick in step.ticks.values() if is_stellar(tick))
             exposed_s = tick.mid_exposure_s
             # To the last bit: the age was had by subtracting times that lie close together.
             received_s = exposed_s + tick.frame_age_s
@@ -158,7 +159,7 @@ class LoggedServo(SiderostatServo):
         self._logged_clock = clock
         self._tick: Any = None
         self._ticked = False
-        self._moments: deque[Floats] = deque()
+        self._moments: deque[Any] = deque()
         self._timing = ServoTiming([], 0, 0)
 
     def load_step(self, step: LoggedStep) -> None:
@@ -169,7 +170,7 @@ class LoggedServo(SiderostatServo):
         self._tick = step.ticks.get(self.name, self._tick)
         changes = (ModeChange, ControllerChange)
         self._moments.extend(
-            az_el(record.message, "siderostat")
+            record.message
             for record in step.before_tick.get(self.name, ())
             if record.kind in changes
         )
@@ -182,21 +183,31 @@ class LoggedServo(SiderostatServo):
             late_s = [0.0] * timing.servo_periods
             self._timing = ServoTiming(late_s, timing.servo_missed, timing.servo_skipped)
 
-    def changed(self) -> None:
-        """A mode or a controller has changed: the next change has motor angles of its own."""
-        if self._moments:
-            self._moments.popleft()
+    def changed(self) -> Any:
+        """A mode or a controller has changed: the log's record of it; None if the log has no change here."""
+        return self._moments.popleft() if self._moments else None
 
     @property
     def position_rad(self) -> Floats:
         """As it was taken at the step's next change of mode or controller; else the tick's, shape (2,)."""
-        if self._moments:
-            return self._moments[0]
-        return np.zeros(2) if self._tick is None else az_el(self._tick, "siderostat")
+        return self._newest("siderostat")
+
+    def _newest(self, name: str) -> Floats:
+        message = self._moments[0] if self._moments else self._tick
+        return np.zeros(2) if message is None else az_el(message, name)
 
     def position_at(self, time_s: float) -> Floats:
         """As the tick had it, shape (2,)."""
         return az_el(self._tick, "siderostat")
+
+    def link_position_at(self, time_s: float) -> Floats:
+        """Of the siderostat of this loop's link, as this loop's tick read it, shape (2,)."""
+        return np.zeros(2) if self._tick is None else az_el(self._tick, "link")
+
+    @property
+    def link_position_rad(self) -> Floats:
+        """The same, as :attr:`position_rad`."""
+        return self._newest("link")
 
     def read_state(self) -> ServoState:
         """As the tick found it; its time begins here."""
@@ -229,6 +240,58 @@ class LoggedServo(SiderostatServo):
     def drain_timing(self) -> ServoTiming:
         """As the log has it of this second."""
         return self._timing
+
+
+class LoggedLink:
+    """Where one loop read the siderostat of its link, by its own log: loops read at times of their own.
+
+    Parameters
+    ----------
+    reader : LoggedServo
+        Of the loop that read it.
+    """
+
+    def __init__(self, reader: LoggedServo) -> None:
+        self._reader = reader
+
+    @property
+    def position_rad(self) -> Floats:
+        """As read at the step's next change of mode or controller; else the tick's, shape (2,)."""
+        return self._reader.link_position_rad
+
+    def position_at(self, time_s: float) -> Floats:
+        """As the tick had it, shape (2,)."""
+        return self._reader.link_position_at(time_s)
+
+
+class LoggedPhotodiodes(NoDevice):
+    """Give each tick the sample that it used then, or none, or the converter's error."""
+
+    def __init__(self, loop: str) -> None:
+        self._loop = loop
+        self._tick: Any = None
+        self._error: DeviceError | None = None
+
+    def load_step(self, step: LoggedStep) -> None:
+        """What :meth:`receive` gives next, or how it or the next request fails."""
+        self._tick = step.ticks.get(self._loop)
+        self._error = failures(step, self._loop).get("photodiodes")
+
+    def receive(self) -> DiodeReading | None:
+        """The tick's sample."""
+        tick = self._tick
+        # Where no request followed, it was here that the converter failed.
+        if self._error is not None and (tick is None or math.isnan(tick.requested_s)):
+            raise self._error
+        if tick is None or math.isnan(tick.sampled_s):
+            return None
+        diodes = ("az_plus", "az_minus", "el_plus", "el_minus")
+        return DiodeReading(tick.sampled_s, tuple(getattr(tick, f"diode_{d}_v") for d in diodes))
+
+    def send_request(self) -> None:
+        """Nothing to ask; fails as then."""
+        if self._error is not None:
+            raise self._error
 
 
 class LoggedMirror(MirrorStage):
@@ -381,6 +444,11 @@ def _end(waiting: _Waiting) -> None:
         waiting.future.set_result(waiting.work())
     except Exception as error:
         waiting.future.set_exception(error)
+
+
+def is_stellar(tick: Any) -> bool:
+    """Whether a logged tick is a stellar loop's."""
+    return "mid_exposure_s" in tick.DESCRIPTOR.fields_by_name
 
 
 def _stacks(message: Any) -> Floats:

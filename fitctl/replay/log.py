@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fitctl.config import Rig
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info, read_records
@@ -26,7 +27,9 @@ from fitctl.logging.records import (
     FrameRecord,
     InjectionRecord,
     LoopTiming,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     PiezoReading,
     QuantityReading,
     RecorderStatus,
@@ -39,8 +42,14 @@ _AT_THE_START_S = 10.0  # the first record of a run comes within this
 # What a step begins with; then come its ticks, each after what led to it; then the frame, and the rest.
 _BEGIN = {CommandRecord, ControllerChange, DevicesOpened, PiezoReading, QuantityReading}
 _BEFORE_TICK = {ControllerChange, DeviceFailure, ExperimentStart, InjectionRecord, ModeChange}
-_AT_THE_END = {DeviceHealth, LoopTiming, RecorderStatus}
-KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | {Tick, FrameRecord}
+_AT_THE_END = {DeviceHealth, LoopTiming, Overlap, RecorderStatus}
+_TICKS = {Tick, MetrologyTick}
+KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
+# The newest field that a replay needs of each kind of tick, and what a log without it lacks.
+_NEEDED = {
+    Tick: ("fsm_written_s", "have neither commands nor when voltages took effect"),
+    MetrologyTick: ("requested_s", "have neither when samples were requested nor where links were"),
+}
 
 
 class Logged(NamedTuple):
@@ -62,6 +71,8 @@ class LoggedStep:
         By loop: what its tick, or a command, made known in this step, in order.
     ticks : dict of str to Message
         By loop; of a loop that is OFF only those with a frame.
+    overlap : Message or None
+        Of the two stars on the frame.
     frame : Message or None
         On which the ticks acted.
     older : list of Message
@@ -77,6 +88,7 @@ class LoggedStep:
     begin: list[Logged] = field(default_factory=list)
     before_tick: dict[str, list[Logged]] = field(default_factory=lambda: defaultdict(list))
     ticks: dict[str, Any] = field(default_factory=dict)
+    overlap: Any = None
     frame: Any = None
     older: list[Any] = field(default_factory=list)
     records_lost: int = 0
@@ -125,8 +137,8 @@ def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
             raise LogError(str(error).replace(str(together), ", ".join(map(str, paths)))) from None
 
 
-def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
-    """Step by step what is in a log.
+def read_steps(info: LogInfo, rig: Rig) -> Iterator[LoggedStep]:
+    """Step by step what is in a log of a rig's loops.
 
     Raises
     ------
@@ -136,7 +148,7 @@ def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
     """
     step, before_tick = LoggedStep(), defaultdict[str, list[Logged]](list)
     powered: dict[str, bool] = {}
-    for record, sequence in _records(info, loops):
+    for record, sequence in _records(info, rig):
         kind, message = record
         loop = getattr(message, "loop", "")
         if _is_over(step, record, any(powered.values())):
@@ -150,10 +162,12 @@ def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
             powered[loop] = False
         if kind in _BEFORE_TICK:
             before_tick[loop].append(record)
-        elif kind is Tick:
+        elif kind in _TICKS:
             powered[loop] = message.mode_number != Mode.OFF
             step.before_tick[loop] = before_tick.pop(loop, [])
             step.ticks[loop] = message
+        elif kind is Overlap:
+            step.overlap = message
         elif kind is FrameRecord:
             step.add_frame(message, sequence)
         elif kind is LoopTiming:
@@ -165,10 +179,14 @@ def read_steps(info: LogInfo, loops: Sequence[str]) -> Iterator[LoggedStep]:
     yield step
 
 
-def _records(info: LogInfo, loops: Sequence[str]) -> Iterator[tuple[Logged, int]]:
+def _records(info: LogInfo, rig: Rig) -> Iterator[tuple[Logged, int]]:
     """What of a log a replay goes by, and its sequence numbers; LogError if that cannot do."""
-    kinds = {TOPICS[kind].format(loop=loop): kind for kind in KINDS for loop in loops}
-    for topic in (TOPICS[FrameRecord], *(TOPICS[Tick].format(loop=loop) for loop in loops)):
+    kinds = {TOPICS[kind].format(loop=loop): kind for kind in KINDS for loop in rig.loops}
+    tick_topics = [
+        TOPICS[MetrologyTick if loop in rig.metrology_loops else Tick].format(loop=loop)
+        for loop in rig.loops
+    ]
+    for topic in (TOPICS[FrameRecord], *tick_topics):
         if topic not in info.counts:
             there = ", ".join(sorted(info.counts)) or "none"
             msg = f"{info.path}: has no {topic}, so there is nothing to replay; topics: {there}"
@@ -183,8 +201,8 @@ def _records(info: LogInfo, loops: Sequence[str]) -> Iterator[tuple[Logged, int]
             is_first = False
         if kind is DevicesOpened or (kind is ModeChange and message.source == Mode.OFF.name):
             begun.add(message.loop)
-        elif kind is Tick:
-            _insist_on_fields(info, message)
+        elif kind in _TICKS:
+            _insist_on_field(info, message, *_NEEDED[kind])
             if message.mode_number != Mode.OFF and message.loop not in begun:
                 raise _midst(info, f"loop {message.loop} is in {message.mode} at its first tick")
         yield Logged(kind, message), entry.sequence
@@ -196,17 +214,17 @@ def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
         # Without a powered loop no tick is logged: what comes between commands is steps all the same.
         again = record.kind is CommandRecord and record.message.command == "Standby"
         return again and not powered and bool(step.of(CommandRecord))
-    if record.kind is Tick:
+    if record.kind in _TICKS:
         return record.message.loop in step.ticks or step.frame is not None
     return record.kind in _BEGIN
 
 
-def _insist_on_fields(info: LogInfo, tick: Any) -> None:
-    if "fsm_written_s" not in tick.DESCRIPTOR.fields_by_name:
+def _insist_on_field(info: LogInfo, tick: Any, field_name: str, lacks: str) -> None:
+    if field_name not in tick.DESCRIPTOR.fields_by_name:
         version = info.metadata.get("versions", {}).get("fitctl", "of unknown version")
         msg = (
-            f"{info.path}: was recorded by an older fitctl ({version}), whose logs have neither commands "
-            "nor when voltages took effect; without these a run cannot be replayed"
+            f"{info.path}: was recorded by an older fitctl ({version}), whose logs {lacks}; "
+            "without these a run cannot be replayed"
         )
         raise LogError(msg)
 

@@ -26,11 +26,15 @@ from fitctl.logging.records import (
     ControllerChange,
     DeviceFailure,
     ExperimentStart,
+    MetrologyTick,
     ModeChange,
+    Overlap,
     PiezoReading,
     QuantityReading,
     Tick,
 )
+from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.modes import Mode
@@ -38,20 +42,29 @@ from fitctl.replay.devices import (
     LoggedCamera,
     LoggedClock,
     LoggedExecutor,
+    LoggedLink,
     LoggedMirror,
+    LoggedPhotodiodes,
     LoggedServo,
     NoDevice,
     az_el,
     logged_error,
 )
 from fitctl.replay.log import LoggedStep
-from fitctl.replay.result import COMPARED, LoopReplay, ReplayResult
+from fitctl.replay.result import (
+    METROLOGY_COMPARED,
+    OVERLAP_COMPARED,
+    STELLAR_COMPARED,
+    LoopReplay,
+    ReplayResult,
+)
 from fitctl.stages.journal import Journal
 from fitctl.stages.siderostat import SiderostatStage
 from fitctl.supervisor.supervisor import Supervisor
 
-# Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well.
-_OF_PEOPLE = {"SequenceControl", "TakeOver"}
+# Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well. What a
+# collector that moves does to the stars and the beam is in what was measured.
+_NOT_REPLAYED = {"SequenceControl", "TakeOver", "MoveCollector"}
 
 
 class Replay:
@@ -64,14 +77,30 @@ class Replay:
     """
 
     def __init__(self, rig: Rig) -> None:
-        self.result = ReplayResult({name: LoopReplay() for name in rig.loops})
+        self._compared = {
+            name: METROLOGY_COMPARED if name in rig.metrology_loops else STELLAR_COMPARED
+            for name in rig.loops
+        }
+        self._overlap_of = None if rig.fringes is None else rig.fringes.loops[0]
+        self.result = ReplayResult(
+            {
+                name: LoopReplay.of(
+                    compared | (OVERLAP_COMPARED if name == self._overlap_of else {})
+                )
+                for name, compared in self._compared.items()
+            }
+        )
         self._clock = LoggedClock()
         self._camera = LoggedCamera()
         self._executor = LoggedExecutor()
         self._servos = {name: LoggedServo(name, rig, self._clock) for name in rig.loops}
-        self._mirrors = {name: LoggedMirror(name, rig, self._clock) for name in rig.loops}
+        self._mirrors = {name: LoggedMirror(name, rig, self._clock) for name in rig.stellar_loops}
+        self._photodiodes = {name: LoggedPhotodiodes(name) for name in rig.metrology_loops}
         nothing = NoDevice()
-        devices = {name: LoopDevices(nothing, nothing, nothing) for name in rig.loops}
+        devices = {name: LoopDevices(nothing, nothing, nothing) for name in rig.stellar_loops} | {
+            name: LoopDevices(nothing, photodiodes=diodes)
+            for name, diodes in self._photodiodes.items()
+        }
         self._supervisor = Supervisor(
             rig,
             Devices(self._camera, devices),
@@ -81,25 +110,32 @@ class Replay:
             design_for,
             self._make_loop,
         )
+        for name, loop in self._supervisor.stellar_loops.items():
+            if loop.link is not None:
+                loop.link.servo = LoggedLink(self._servos[name])
         self._step = LoggedStep()
         self._waiting: set[str] = set()
+        self._overlap: Overlap | None = None
 
     def _make_loop(
         self, name: str, rig: Rig, _devices: LoopDevices, journal: Journal, design: Designer
-    ) -> StellarLoop:
+    ) -> Loop:
         siderostat = SiderostatStage(rig, name, self._servos[name])
+        if name in self._photodiodes:
+            return MetrologyLoop(name, rig, siderostat, self._photodiodes[name], journal)
         return StellarLoop(
             name, rig, siderostat, self._mirrors[name], journal, design(rig, name, "")
         )
 
     def play(self, step: LoggedStep) -> None:
         """Make one step as it was made then, and compare its ticks with the log's."""
-        self._step, self._waiting = step, set(step.ticks)
+        self._step, self._waiting, self._overlap = step, set(step.ticks), None
         self.result.records_lost = max(self.result.records_lost, step.records_lost)
         self._load_step(step)
         self._supervisor.step()
         for name in self._waiting:  # today they are OFF, which gives no tick
             self._compare(name, None)
+        self._compare_overlap(step.overlap, self._overlap)
 
     def _load_step(self, step: LoggedStep) -> None:
         supervisor = self._supervisor
@@ -111,15 +147,20 @@ class Replay:
         self._executor.load_step(step)
         for name, servo in self._servos.items():
             servo.load_step(step)
-            self._mirrors[name].load_step(step)
             for failure in step.of(DeviceFailure, name):
                 if failure.device == "piezo":
                     supervisor.piezos[name].evaluate(_piezo_answer(failure))
+        for mirror in self._mirrors.values():
+            mirror.load_step(step)
+        for photodiodes in self._photodiodes.values():
+            photodiodes.load_step(step)
         for reading in step.of(PiezoReading):
             supervisor.piezos[reading.loop].evaluate(_piezo_answer(reading))
         for command in step.of(CommandRecord):
             # A refused Off takes the mirror to its bias.
-            if command.command not in _OF_PEOPLE and (command.accepted or command.command == "Off"):
+            if command.command not in _NOT_REPLAYED and (
+                command.accepted or command.command == "Off"
+            ):
                 self._post(command)
 
     def _post(self, message: Any) -> None:
@@ -139,28 +180,53 @@ class Replay:
     def _receive(self, record: AnyRecord) -> None:
         """What today's supervisor records, while it does."""
         match record:
-            case ModeChange() | ControllerChange():
+            case ControllerChange():
                 self._servos[record.loop].changed()
-            case Tick() if record.loop in self._waiting:
+            case ModeChange():
+                then = self._servos[record.loop].changed()
+                if then is not None and record.source != record.target:
+                    # A loop that waits for this one's counts from here, to the last bit.
+                    self._supervisor.loops[record.loop].mode_since_s = then.time_s
+            case Overlap():
+                self._overlap = record
+            case Tick() | MetrologyTick() if record.loop in self._waiting:
                 self._waiting.remove(record.loop)
                 self._compare(record.loop, record)
 
-    def _compare(self, name: str, now: Tick | None) -> None:
-        then, mirror, found = self._step.ticks[name], self._mirrors[name], self.result.loops[name]
+    def _compare_overlap(self, then: Any, now: Overlap | None) -> None:
+        """The log's and today's overlap on one frame; without one of them, as if its stars were not held."""
+        any_of = then or now
+        if any_of is None or self._overlap_of is None:
+            return
+        found = self.result.loops[self._overlap_of]
+        for what, fields in OVERLAP_COMPARED.items():
+            logged, values = (
+                tuple(math.nan if one is None else getattr(one, part) for part in fields)
+                for one in (then, now)
+            )
+            found.differences[what].add(any_of.time_s, logged, values)
+
+    def _compare(self, name: str, now: Tick | MetrologyTick | None) -> None:
+        then, mirror, found = (
+            self._step.ticks[name],
+            self._mirrors.get(name),
+            self.result.loops[name],
+        )
         found.ticks += 1
         found.frames_missing += then.number >= 0 and self._step.frame is None
         mode = Mode.OFF.name if now is None else now.mode
         found.mode.add(then.time_s, then.mode, mode)
         if now is not None and mode == then.mode:
-            for what, fields in COMPARED.items():
+            for what, fields in self._compared[name].items():
                 values = (
                     tuple(mirror.wanted_v.tolist())
-                    if what == "stacks_v"
+                    if what == "stacks_v" and mirror is not None
                     else tuple(getattr(now, part) for part in fields)
                 )
                 logged = tuple(getattr(then, part) for part in fields)
                 found.differences[what].add(then.time_s, logged, values)
-        mirror.follow()
+        if mirror is not None:
+            mirror.follow()
         loop = self._supervisor.loops[name]
         loop.siderostat.setpoint_rad = az_el(then, "siderostat_setpoint")
         loop.quantities.record_tick(then.compute_s, then.time_s)

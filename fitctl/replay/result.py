@@ -5,12 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-# What is compared: fields of a tick.
-COMPARED = {
+Compared = dict[str, tuple[str, ...]]
+# What is compared: fields of a stellar loop's tick, of a metrology loop's, and of the overlap of two stars.
+STELLAR_COMPARED: Compared = {
     "star_px": ("star_az_px", "star_el_px"),
     "mirror_rad": ("fsm_az_rad", "fsm_el_rad"),
     "stacks_v": ("stack1_v", "stack2_v", "stack3_v"),
     "siderostat_setpoint_rad": ("siderostat_setpoint_az_rad", "siderostat_setpoint_el_rad"),
+}
+METROLOGY_COMPARED: Compared = {
+    "beam_arcsec": ("beam_az_arcsec", "beam_el_arcsec"),
+    "rate_arcsec_s": ("rate_az_arcsec_s", "rate_el_arcsec_s"),
+    "siderostat_setpoint_rad": ("siderostat_setpoint_az_rad", "siderostat_setpoint_el_rad"),
+}
+OVERLAP_COMPARED: Compared = {
+    "tilt_arcsec": ("tilt_az_arcsec", "tilt_el_arcsec"),
+    "visibility": ("visibility",),
 }
 
 
@@ -89,15 +99,19 @@ class LoopReplay:
         Ticks that had a frame which is not in the log; they were replayed without one.
     mode : ModeDifference
     differences : dict of str to Difference
-        By the names of :data:`COMPARED`.
+        By what is compared: the names of :data:`STELLAR_COMPARED` or :data:`METROLOGY_COMPARED`, and those of
+        :data:`OVERLAP_COMPARED` for the first of the two loops.
     """
 
     ticks: int = 0
     frames_missing: int = 0
     mode: ModeDifference = field(default_factory=ModeDifference)
-    differences: dict[str, Difference] = field(
-        default_factory=lambda: {name: Difference() for name in COMPARED}
-    )
+    differences: dict[str, Difference] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, compared: Compared) -> LoopReplay:
+        """Nothing replayed yet."""
+        return cls(differences={name: Difference() for name in compared})
 
     @property
     def same(self) -> bool:

@@ -27,7 +27,11 @@ _ROWS = {
     "star_px": ("star's place", "px"),
     "mirror_rad": ("mirror", "rad"),
     "stacks_v": ("D/A voltages", "V"),
+    "beam_arcsec": ("beam's place", "arcsec"),
+    "rate_arcsec_s": ("beam's drift", "arcsec/s"),
     "siderostat_setpoint_rad": ("siderostat set-point", "rad"),
+    "tilt_arcsec": ("tilt between stars", "arcsec"),
+    "visibility": ("visibility", ""),
 }
 _OPEN_LOOP = (
     "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
@@ -75,7 +79,7 @@ def replay(
 def _replayed(info: LogInfo, rig: Rig) -> ReplayResult:
     """The replay, with its progress."""
     with progress_line("replaying", info.duration_s) as progress:
-        result = replay_steps(rig, read_steps(info, list(rig.loops)), on_tick=progress)
+        result = replay_steps(rig, read_steps(info, rig), on_tick=progress)
         progress(info.duration_s)
     return result
 
@@ -164,9 +168,12 @@ def _loop_lines(info: LogInfo, name: str, loop: LoopReplay) -> Iterator[str]:
     first = f"{_from_start_s(info, mode.first_s):>10.2f} s   {mode.then} then, {mode.now} now"
     yield f"  {'mode':<22}{mode.ticks:>8}" + (first if mode.ticks else "")
     for what, (title, unit) in _ROWS.items():
-        found = loop.differences[what]
+        if (found := loop.differences.get(what)) is None:
+            continue
         first = f"{_from_start_s(info, found.first_s):>10.2f} s"
-        sizes = "".join(f"{f'{value:.3g} {unit}':>16}" for value in (found.worst, found.rms))
+        sizes = "".join(
+            f"{f'{value:.3g} {unit}'.rstrip():>16}" for value in (found.worst, found.rms)
+        )
         yield f"  {title:<22}{found.ticks:>8}" + (first + sizes if found.ticks else "")
 
 
