@@ -5,7 +5,7 @@ Every key is required, so that a rig file shows everything that fitctl will use.
 """
 
 from fitctl.config.base import ARCSEC_PER_RAD, AxisPair, ConfigError, Range, Settings, is_name
-from fitctl.config.collector import Collector, CollectorGeometry, CollectorMotion, Fringes
+from fitctl.config.collector import Collector, CollectorGeometry, CollectorMotion, Fringes, Motion
 from fitctl.config.devices import (
     AIN_RANGES_V,
     HALF_WINDOW_PX,
@@ -104,6 +104,7 @@ __all__ = [
     "MetrologyMocks",
     "MetrologyPlant",
     "ModbusDacDevice",
+    "Motion",
     "Range",
     "ResetBy",
     "Rig",

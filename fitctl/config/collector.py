@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from fitctl.config.base import Finite, Name, NonNegative, Positive, Settings
+from fitctl.config.base import ConfigError, Finite, Name, NonNegative, Positive, Settings
 from fitctl.config.devices import C887Device
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
@@ -103,6 +104,25 @@ class CollectorMotion(Settings):
             msg = 'file must name a CSV file where kind is "file"'
             raise ValueError(msg)
         return self
+
+    def changed(self, values: Mapping[str, Any]) -> CollectorMotion:
+        """The motion that it is with some values replaced.
+
+        Raises
+        ------
+        ConfigError
+            If it is none; the text names each key and what is allowed.
+        """
+        try:
+            return CollectorMotion.model_validate(self.model_dump() | dict(values))
+        except ValidationError as error:
+            wrong = [
+                f"{key}: {each['msg'].replace('Input should be', 'must be')} (is {each['input']!r})"
+                if (key := ".".join(map(str, each["loc"])))
+                else each["msg"].removeprefix("Value error, ")
+                for each in error.errors()
+            ]
+            raise ConfigError("; ".join(wrong)) from None
 
 
 class Collector(Settings):

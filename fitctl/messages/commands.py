@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
-from fitctl.config import ControllerName
+from fitctl.config import ControllerName, Motion
 from fitctl.logging.records import Event, RecorderStatus, SequenceAttempt
 from fitctl.model.drives import Drive
 
@@ -108,9 +108,28 @@ class Reset(Command, frozen=True, kw_only=True):
 
 
 class MoveCollector(Command, frozen=True, kw_only=True):
-    """Reference the hexapod (reference), or begin or end the collector's motion (start, stop)."""
+    """Reference the hexapod (reference), or begin or end the collector's motion (start, stop).
+
+    What is given of a motion that begins stands in place of the rig file's ``collector.motion``, this once.
+    Files cannot be named here: ``kind`` "file" is the rig file's.
+    """
 
     action: Literal["reference", "start", "stop"]
+    kind: Motion | None = None
+    direction_deg: float | None = None
+    range_mm: float | None = None
+    velocity_mm_s: float | None = None
+    amplitude_mm: float | None = None
+    frequency_hz: float | None = None
+    rms_mm_s: float | None = None
+    correlation_s: float | None = None
+
+    @property
+    def motion(self) -> dict[str, Any]:
+        """What is given of the motion."""
+        common = {"version", "loop", "action"}
+        given = msgspec.structs.asdict(self)
+        return {name: v for name, v in given.items() if name not in common and v is not None}
 
 
 class Experiment(Command, frozen=True, kw_only=True):

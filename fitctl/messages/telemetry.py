@@ -144,6 +144,21 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     waits_for: str = ""
 
 
+class CollectorState(msgspec.Struct, frozen=True, kw_only=True):
+    """What moves the collector.
+
+    ``busy`` while a command for it is carried out. ``motion`` is the kind of motion that goes on, empty while
+    there is none; ``az_mm`` and ``el_mm`` are where it has the collector, from its start. ``error`` is what
+    went wrong last, empty since something went well.
+    """
+
+    busy: bool
+    motion: str
+    az_mm: float
+    el_mm: float
+    error: str
+
+
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """Sent `telemetry_hz` times a second.
 
@@ -173,6 +188,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     commander: str = ""
     metrology_ticks: list[MetrologyTick] = []
     overlaps: list[Overlap] = []
+    collector: CollectorState | None = None
 
     @property
     def records_lost(self) -> int:

@@ -129,6 +129,7 @@ class TelemetryBuffer:
             commander=state.commander,
             metrology_ticks=self._metrology_ticks.drain(),
             overlaps=self._overlaps.drain(),
+            collector=None if supervisor.collector is None else supervisor.collector.state,
         )
 
     def recent_events(self) -> list[Event]:

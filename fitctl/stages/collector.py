@@ -10,7 +10,7 @@ from collections import deque
 import numpy as np
 
 from fitctl.clock import Clock
-from fitctl.config import Collector
+from fitctl.config import Collector, CollectorMotion
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceError, DeviceFault, DeviceRefused, Hexapod, Pose
 from fitctl.model.collector_motion import Course, Displacement, course_of
@@ -53,6 +53,8 @@ class CollectorDrive:
         self.skipped = 0
         self._hexapod = hexapod
         self._clock = clock
+        self._rig_motion = self._motion = collector.motion
+        self._seed = seed
         self._course = course_of(collector.motion, seed)
         self._axes = transverse_axes(collector.geometry)
         self._ends = collector.hexapod.travel.ends
@@ -73,11 +75,18 @@ class CollectorDrive:
         """Where the course has the collector now, azimuth and elevation from its start; (0, 0) without one."""
         return self._course(self._clock.now_s() - self._started_s) if self.running else (0.0, 0.0)
 
-    def start(self) -> None:
-        """Begin the course where the hexapod is, once the whole course is known to be allowed.
+    @property
+    def kind(self) -> str:
+        """Of the motion that was begun last, at first of the rig file's."""
+        return self._motion.kind
+
+    def start(self, motion: CollectorMotion | None = None) -> None:
+        """Begin a motion, by default the rig's, where the hexapod is, once its course is known to be allowed.
 
         Raises
         ------
+        ConfigError
+            The motion's file cannot be read. Nothing has moved.
         DeviceRefused
             The hexapod is not referenced, or moves, or the course goes farther or faster than
             `collector.hexapod` allows. Nothing has moved.
@@ -88,8 +97,10 @@ class CollectorDrive:
             raise self._refused("a referenced hexapod", "one that is not", "reference it first")
         if reading.moving:
             raise self._refused("a hexapod at rest", "one that moves", "stop it first")
-        self._check(self._course, reading.pose)
-        self.fault = None
+        motion = motion or self._rig_motion
+        course = course_of(motion, self._seed)
+        self._check(course, reading.pose)
+        self.fault, self._motion, self._course = None, motion, course
         self._origin, self._started_s, self._targets = reading.pose, self._clock.now_s(), 0
         self._running.set()
 

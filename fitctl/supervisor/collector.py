@@ -5,10 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
 
 from fitctl.clock import Clock
-from fitctl.config import Collector
+from fitctl.config import Collector, CollectorMotion, ConfigError
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceFault,
@@ -17,13 +16,14 @@ from fitctl.drivers.interface import (
     Hexapod,
 )
 from fitctl.logging.records import Severity
+from fitctl.messages.commands import MoveCollector
+from fitctl.messages.telemetry import CollectorState
 from fitctl.stages.collector import CollectorDrive
 from fitctl.stages.journal import error_text
 
 HEXAPOD = "hexapod"
 _CLOSE_TIMEOUT_S = 5.0
-CollectorAction = Literal["reference", "start", "stop"]
-_STILL_CONNECTED = (DeviceRefused, DeviceFault)  # the others end the connection
+_STILL_CONNECTED = (DeviceRefused, DeviceFault, ConfigError)  # the others end the connection
 
 
 class CollectorWatch:
@@ -62,7 +62,7 @@ class CollectorWatch:
         self.is_open = False
         self.error = ""
         self.endpoint = collector.hexapod.endpoint
-        self._kind = collector.motion.kind
+        self._motion = collector.motion
         self._hexapod = hexapod
         self._report = report
         self._busy = False
@@ -70,17 +70,23 @@ class CollectorWatch:
         self._fault: Exception | None = None
         self._threads: list[threading.Thread] = []
 
-    def obey(self, action: CollectorAction) -> str:
+    def obey(self, command: MoveCollector) -> str:
         """Begin what a command asks for; returns why not, or nothing. An event reports how it ends."""
-        if action == "stop":
+        if command.motion and command.action != "start":
+            return f"{command.action} has no motion; {', '.join(command.motion)} belong to start"
+        if command.action == "stop":
             self.stop()
             return ""
         if self._busy:
             return "the hexapod is being opened or referenced; wait for the event that reports it"
         if self.drive.running:
             return "the collector moves; stop it first"
+        try:
+            motion = self._motion.changed(command.motion) if command.action == "start" else None
+        except ConfigError as error:
+            return f"no such motion: {error}"
         self._busy = True
-        self._beside(partial(self._work, action, self._stops))
+        self._beside(partial(self._work, motion, self._stops))
         return ""
 
     def stop(self) -> None:
@@ -102,8 +108,21 @@ class CollectorWatch:
         """What it does, for people."""
         if self.drive.running:
             az_mm, el_mm = self.drive.displacement_mm()
-            return f"{self._kind} at {az_mm:+.2f} {el_mm:+.2f} mm"
+            return f"{self.drive.kind} at {az_mm:+.2f} {el_mm:+.2f} mm"
         return self.error or "stands still"
+
+    @property
+    def state(self) -> CollectorState:
+        """As telemetry has it."""
+        az_mm, el_mm = self.drive.displacement_mm()
+        running = self.drive.running
+        return CollectorState(
+            busy=self._busy or any(thread.is_alive() for thread in self._threads),
+            motion=self.drive.kind if running else "",
+            az_mm=az_mm,
+            el_mm=el_mm,
+            error=self.error,
+        )
 
     def close(self) -> None:
         """Stop what moves, and disconnect; waits for that."""
@@ -115,24 +134,25 @@ class CollectorWatch:
         self.is_open = False
         self._hexapod.close()
 
-    def _work(self, action: CollectorAction, stops: int) -> None:
+    def _work(self, motion: CollectorMotion | None, stops: int) -> None:
+        """Begin a motion, or without one reference the hexapod."""
         try:
             if not self.is_open:
                 self.identity = self._hexapod.open()
                 self.is_open = True
             if stops != self._stops:
                 return
-            if action == "reference":
+            if motion is None:
                 self._hexapod.reference()
                 self._report("info", HEXAPOD, "referenced: all axes are at zero")
             else:
-                self.drive.start()
+                self.drive.start(motion)
                 if stops != self._stops:  # a stop has the last word
                     self.drive.stop()
                     return
-                self._report("info", HEXAPOD, f"the collector begins to move: {self._kind}")
+                self._report("info", HEXAPOD, f"the collector begins to move: {motion.kind}")
             self.error = ""
-        except DeviceError as error:
+        except (DeviceError, ConfigError) as error:
             self._failed(error)
         finally:
             self._busy = False

@@ -357,7 +357,7 @@ class Supervisor:
 
     def _move_collector(self, command: MoveCollector) -> Reply:
         collector, none = self.collector, "the rig has no collector that moves"
-        why_not = none if collector is None else collector.obey(command.action)
+        why_not = none if collector is None else collector.obey(command)
         return _refusal(why_not) if why_not else Reply(accepted=True)
 
     def _fire(self, trigger: Trigger, names: list[str], command: AnyCommand) -> Reply:

@@ -69,9 +69,9 @@ def y_mm(mock):
 
 def moving(watch, mock):
     """Reference it and let it drift."""
-    assert watch.obey("reference") == ""
+    assert watch.obey(MoveCollector(action="reference")) == ""
     reported(watch, "referenced")
-    assert watch.obey("start") == ""
+    assert watch.obey(MoveCollector(action="start")) == ""
     until(lambda: y_mm(mock) > 0.5, "a drift")
 
 
@@ -81,12 +81,55 @@ def test_it_is_connected_when_it_is_first_needed_and_moves_only_on_command(watch
     moving(watch, mock)
     assert watch.identity.model == "C-887 with M-850.H11"
     assert watch.detail.startswith("drift at +")
-    assert watch.obey("start") == "the collector moves; stop it first"
+    assert watch.obey(MoveCollector(action="start")) == "the collector moves; stop it first"
+
+
+def test_a_motion_of_the_command_s_own_replaces_the_rig_s_once(watched):
+    watch, mock = watched
+    assert watch.obey(MoveCollector(action="reference")) == ""
+    reported(watch, "referenced")
+    until(lambda: not watch.state.busy, "the end of the reference move")
+    across = {"kind": "sine", "direction_deg": 90.0, "amplitude_mm": 1.0, "frequency_hz": 0.5}
+    assert watch.obey(MoveCollector(action="start", **across)) == ""
+    until(lambda: abs(mock.pose_at(time.monotonic())[2]) > 0.5, "a sine in elevation")
+    assert abs(y_mm(mock)) < 0.01
+    assert watch.state.motion == "sine"
+    watch.stop()
+    until(lambda: not watch.state.busy, "the end of the stop")
+    assert watch.state.motion == ""
+    assert watch.obey(MoveCollector(action="start")) == ""
+    until(lambda: watch.state.motion == "drift", "the rig's own motion")
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [
+        (MoveCollector(action="start", amplitude_mm=-1.0), "amplitude_mm: must be greater than 0"),
+        (MoveCollector(action="start", direction_deg=float("nan")), "direction_deg: must be"),
+        (MoveCollector(action="start", kind="file"), "file must name a CSV file"),
+        (MoveCollector(action="stop", kind="sine"), "stop has no motion; kind belong to start"),
+    ],
+)
+def test_a_motion_that_is_none_is_refused_at_once(watched, command, answer):
+    watch, _ = watched
+    assert answer in watch.obey(command)
+    assert not watch.is_open
+
+
+def test_a_motion_that_goes_too_fast_is_refused_before_anything_moves(watched):
+    watch, mock = watched
+    watch.obey(MoveCollector(action="reference"))
+    reported(watch, "referenced")
+    until(lambda: not watch.state.busy, "the end of the reference move")
+    assert watch.obey(MoveCollector(action="start", kind="drift", velocity_mm_s=900.0)) == ""
+    reported(watch, "mm/s")
+    assert "900 mm/s" in watch.state.error
+    assert (watch.state.motion, y_mm(mock)) == ("", 0.0)
 
 
 def test_it_is_not_moved_before_it_is_referenced(watched):
     watch, mock = watched
-    assert watch.obey("start") == ""
+    assert watch.obey(MoveCollector(action="start")) == ""
     reported(watch, "reference it first")
     assert not watch.drive.running
     assert y_mm(mock) == 0.0
@@ -103,20 +146,20 @@ def test_a_stop_returns_at_once_and_leaves_it_where_it_is(watched):
     here = y_mm(mock)
     time.sleep(0.2)
     assert y_mm(mock) == here > 0.5
-    assert watch.obey("start") == ""
+    assert watch.obey(MoveCollector(action="start")) == ""
     until(lambda: y_mm(mock) > here + 0.2, "a new start from there")
 
 
 def test_a_stop_ends_a_reference_move(watched):
     watch, _ = watched
-    watch.obey("reference")
+    watch.obey(MoveCollector(action="reference"))
     until(lambda: watch.is_open, "a connection")
     time.sleep(0.2)
-    assert "wait for the event" in watch.obey("start")
+    assert "wait for the event" in watch.obey(MoveCollector(action="start"))
     watch.stop()
     reported(watch, "all axes referenced")
     assert watch.error
-    assert watch.obey("reference") == ""
+    assert watch.obey(MoveCollector(action="reference")) == ""
     reported(watch, "referenced: all axes are at zero")
     assert not watch.error
 
