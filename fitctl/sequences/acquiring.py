@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from fitctl.config import Rig
-from fitctl.controllers.spiral import plan_spiral
+from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
+from fitctl.loop.metrology import refused_beam_search
 from fitctl.loop.search import refused_search
 from fitctl.messages.commands import Acquire, Hold, Standby
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, stop_tracking
@@ -23,10 +24,11 @@ def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Ac
     """The command that makes an attempt's search, the first of which is 1."""
     radius = step.search_radius_sky_arcsec
     if step.max_offset_sky_arcsec is not None:
-        first = radius or rig.stellar_loops[loop_name].acquisition.search_radius_sky_arcsec
+        first = radius or rig.loops[loop_name].acquisition.search_radius_sky_arcsec
         radius = min(first * step.radius_growth ** (attempt - 1), step.max_offset_sky_arcsec)
     return Acquire(
-        loop=loop_name,
+        # Without a loop, all of them search at once: each then leaves the others' stars alone.
+        loop=step.loop,
         search_radius_sky_arcsec=radius,
         field_overlap=step.field_overlap,
         expected_az_sky_arcsec=step.expected_az_sky_arcsec,
@@ -43,12 +45,22 @@ def _check(step: steps.Acquire, rig: Rig, loop_name: str) -> list[str]:
         return [
             f"search_radius_sky_arcsec passes max_offset_sky_arcsec, {step.max_offset_sky_arcsec:g}"
         ]
-    why_not = refused_search(rig, loop_name, widest)
+    if loop_name not in rig.metrology_loops:
+        why_not = refused_search(rig, loop_name, widest)
+    elif step.star_flux_dn is not None or step.field_overlap is not None:
+        why_not = (
+            f"star_flux_dn and field_overlap are of a star; {loop_name} holds a metrology beam"
+        )
+    else:
+        why_not = refused_beam_search(rig.metrology_loops[loop_name], loop_name, widest)
     return [why_not] if why_not else []
 
 
 def _own_s(step: steps.Acquire, rig: Rig, loop_name: str) -> float:
     widest = search_of(step, rig, loop_name, step.attempts)
+    if loop_name in rig.metrology_loops:
+        radius = widest.search_radius_sky_arcsec
+        return plan_beam_spiral(rig, loop_name, radius_sky_arcsec=radius).duration_s
     return plan_spiral(
         rig,
         loop_name,
@@ -62,7 +74,7 @@ def _run(step: steps.Acquire, view: View) -> None:
     if another and view.tracking:
         view.command(Hold(loop=view.loop_name))  # another star, or the same anew
     if view.mode is Mode.OFF:
-        view.command(Standby(loop=view.loop_name))
+        view.command(Standby(loop=step.loop))
 
 
 def _search(step: steps.Acquire, view: View) -> None:
@@ -78,12 +90,13 @@ def _done(step: steps.Acquire, view: View) -> Result | None:
         return None
     if view.mode is Mode.OFF:
         return None
-    view.require_mode(Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER)
-    if view.mode is not Mode.VERNIER:
+    view.require_mode(Mode.ACQUISITION, Mode.COARSE, *HOLDING)
+    if view.mode not in HOLDING:
         return None
-    return Result(
-        {"acquired_s": view.elapsed_s, **_found(view)}, f"held after {view.elapsed_s:.1f} s"
-    )
+    figures = {"acquired_s": view.elapsed_s}
+    if view.mode is Mode.VERNIER:
+        figures |= _found(view)
+    return Result(figures, f"held after {view.elapsed_s:.1f} s")
 
 
 def _found(view: View) -> Figures:
@@ -103,11 +116,13 @@ def _found(view: View) -> Figures:
 
 ACQUIRE = {
     "acquire": Behaviour(
-        frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER}),
+        frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, *HOLDING}),
         _done,
         _run,
         stop_tracking,
         _check,
         _own_s,
+        loops="links first",
+        of_beams=True,
     )
 }

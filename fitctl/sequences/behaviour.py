@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -64,6 +64,11 @@ class Behaviour(NamedTuple):
         After an attempt that failed or was stopped: ends what the step began.
     pausable : bool
         Whether a pause can begin inside the step.
+    loops : str
+        Which loops it is for where none is named: "one" must be named unless it is the only one, "none" needs
+        no loop, and all of them come one after the other with "links first" or "links last".
+    of_beams : bool
+        Whether it works for a metrology loop.
     """
 
     needs: frozenset[Mode]
@@ -73,9 +78,11 @@ class Behaviour(NamedTuple):
     check: Callable[[Any, Rig, str], list[str]] = lambda _step, _rig, _loop: []
     own_s: Callable[[Any, Rig, str], float] = lambda _step, _rig, _loop: 0.0
     pausable: bool = False
+    loops: Literal["one", "none", "links first", "links last"] = "one"
+    of_beams: bool = False
 
 
-POWERED = frozenset({Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
+POWERED = frozenset(set(Mode) - {Mode.OFF, Mode.SAFE})
 
 
 def too_far(step: Moving, rig: Rig, loop_name: str, offset_px: float) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fitctl.config import Rig
 from fitctl.sequences.acquiring import ACQUIRE
 from fitctl.sequences.behaviour import Behaviour
+from fitctl.sequences.collector import COLLECTOR
 from fitctl.sequences.dark import DARK
 from fitctl.sequences.open_loop import OPEN_LOOP
 from fitctl.sequences.plain import PLAIN
@@ -12,21 +13,34 @@ from fitctl.sequences.plate_scale import PLATE_SCALE
 from fitctl.sequences.pointing import POINTING
 from fitctl.sequences.stars import STARS
 from fitctl.sequences.steps import Step
+from fitctl.sequences.visibility import VISIBILITY
 
 BEHAVIOURS: dict[str, Behaviour] = (
-    PLAIN | ACQUIRE | POINTING | OPEN_LOOP | PLATE_SCALE | DARK | STARS
+    PLAIN | ACQUIRE | POINTING | OPEN_LOOP | PLATE_SCALE | DARK | STARS | COLLECTOR | VISIBILITY
 )
 
 
 def problems(step: Step, rig: Rig) -> list[str]:
     """What is wrong with a step for a rig, without the instrument: one text each."""
-    if not step.loop and len(rig.loops) > 1:
-        return [f"loop is missing: rig {rig.name} has {', '.join(rig.loops)}"]
+    behaviour = BEHAVIOURS[step.step]
     if step.loop and step.loop not in rig.loops:
         return [f"loop {step.loop!r}: rig {rig.name} has {', '.join(rig.loops)}"]
-    return BEHAVIOURS[step.step].check(step, rig, loop_of(step, rig))
+    if not step.loop and len(rig.loops) > 1 and behaviour.loops == "one":
+        return [f"loop is missing: rig {rig.name} has {', '.join(rig.loops)}"]
+    if step.loop in rig.metrology_loops and not behaviour.of_beams:
+        return [f"{step.step} is for a stellar loop; {step.loop} holds a metrology beam"]
+    found = [behaviour.check(step, rig, name) for name in loops_of(step, rig)]
+    return list(dict.fromkeys(problem for each in found for problem in each))
 
 
-def loop_of(step: Step, rig: Rig) -> str:
-    """The name of the loop that works."""
-    return step.loop or next(iter(rig.loops))
+def loops_of(step: Step, rig: Rig) -> list[str]:
+    """The names of the loops that work, in the order in which they do."""
+    if step.loop:
+        return [step.loop]
+    match BEHAVIOURS[step.step].loops:
+        case "links first":
+            return sorted(rig.loops, key=lambda name: name not in rig.metrology_loops)
+        case "links last":
+            return sorted(rig.loops, key=lambda name: name in rig.metrology_loops)
+        case _:
+            return [next(iter(rig.loops))]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from math import nan
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,6 +38,10 @@ from fitctl.sequences.view import Figures, SequenceError
 NAME = "python"  # under which consoles see steps that a program runs
 
 T = TypeVar("T")
+
+
+def _figures_of(attempt: SequenceAttempt) -> dict[str, float | None]:
+    return msgspec.json.decode(attempt.figures_json, type=dict[str, float | None])
 
 
 class Instrument(StepMethods[Figures]):
@@ -130,18 +135,28 @@ class Instrument(StepMethods[Figures]):
         return load_sequence(find_sequence(Path(file)), self.rig)
 
     def _runner_of(self, name: str, todo: Sequence[steps.Step]) -> Runner:
-        return Runner(Contact(self._link, self.rig, name, len(todo)))
+        # A program's steps come one by one: what the collector does goes on between them.
+        contact = Contact(self._link, self.rig, name, len(todo))
+        return Runner(contact, motion_goes_on=name == NAME)
 
     def _run(self, runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
         """Run steps; the figures of each, NaN where a value could not be had."""
         self._runner = runner
-        # The last attempt at a step is the one that was done.
-        last = {attempt.step_number: attempt for attempt in run_steps(runner, todo)}
-        found = [
-            msgspec.json.decode(each.figures_json, type=dict[str, float | None])
-            for each in last.values()
+        # The last attempt at a step is the one that was done; a step may be for several loops.
+        last = {(each.step_number, each.loop): each for each in run_steps(runner, todo)}
+        loops: dict[int, list[SequenceAttempt]] = {}
+        for (number, _), attempt in last.items():
+            loops.setdefault(number, []).append(attempt)
+        return [
+            {
+                (f"{each.loop}_{key}" if len(attempts) > 1 else key): nan
+                if value is None
+                else value
+                for each in attempts
+                for key, value in _figures_of(each).items()
+            }
+            for attempts in loops.values()
         ]
-        return [{k: float("nan") if v is None else v for k, v in each.items()} for each in found]
 
     @property
     def attempts(self) -> list[SequenceAttempt]:

@@ -65,4 +65,6 @@ class StepMethods(ABC, Generic[R_co]):
     plate_scale: Callable[..., R_co] = _method(steps.PlateScale)
     dark: Callable[..., R_co] = _method(steps.Dark)
     wait: Callable[..., R_co] = _method(steps.Wait)
+    collector: Callable[..., R_co] = _method(steps.Collector)
+    visibility: Callable[..., R_co] = _method(steps.Visibility)
     off: Callable[..., R_co] = _method(steps.Off)

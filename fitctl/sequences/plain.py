@@ -47,8 +47,14 @@ def _wait_s(step: steps.Wait, _rig: Rig, _loop_name: str) -> float:
 
 
 PLAIN = {
-    "standby": Behaviour(POWERED | {Mode.OFF}, _standby_done, _run_standby),
+    "standby": Behaviour(
+        POWERED | {Mode.OFF}, _standby_done, _run_standby, loops="links last", of_beams=True
+    ),
     "controller": Behaviour(POWERED | {Mode.OFF}, _controller_done, _run_controller),
-    "wait": Behaviour(POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True),
-    "off": Behaviour(POWERED | {Mode.OFF}, _off_done, stop_tracking),
+    "wait": Behaviour(
+        POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True, loops="none", of_beams=True
+    ),
+    "off": Behaviour(
+        POWERED | {Mode.OFF}, _off_done, stop_tracking, loops="links last", of_beams=True
+    ),
 }

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fitctl.config import Rig
 from fitctl.figures.settling import settling
 from fitctl.messages.commands import SetTarget
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviour import Behaviour, Result, too_far
@@ -20,6 +20,7 @@ from fitctl.sequences.view import Figures, Squares, StepFailed, View, columns
 Floats = NDArray[np.float64]
 AXES = ("az", "el")
 _LEAST_SEEN = 0.9  # of the frames that were due
+_LEAST_SAMPLED = 0.25  # of the frames: a converter may take longer than a frame for its answer
 _NEEDS = frozenset({Mode.VERNIER})
 
 
@@ -34,9 +35,12 @@ class Offset(NamedTuple):
 
 
 def _hold_done(step: steps.Hold, view: View) -> Result | None:
-    if view.mode is not Mode.VERNIER or view.loop.since_s > view.began_s:
-        msg = f"the star was not held all the time: {view.why}"
+    of_beam = view.loop_name in view.rig.metrology_loops
+    if view.mode not in HOLDING or view.loop.since_s > view.began_s:
+        msg = f"the {'beam' if of_beam else 'star'} was not held all the time: {view.why}"
         raise StepFailed(msg)
+    if of_beam:
+        return _beam_held(step, view)
     due = round(step.duration_s * view.rig.camera.frame_rate_hz)
     if view.elapsed_s > step.settle_s:
         view.squares.add(columns(view.measurements)[: due - view.squares.frames, 3:5])
@@ -44,6 +48,43 @@ def _hold_done(step: steps.Hold, view: View) -> Result | None:
     if view.elapsed_s < step.settle_s + step.duration_s:
         return None
     return _evaluate(step, view, view.squares, due)
+
+
+def _beam_held(step: steps.Hold, view: View) -> Result | None:
+    """As for a star; a tick without a new sample of the photodiodes has no beam, and does not count."""
+    if view.elapsed_s > step.settle_s:
+        angles_arcsec = [
+            (tick.beam_az_arcsec, tick.beam_el_arcsec)
+            for tick in view.telemetry.metrology_ticks
+            if tick.loop == view.loop_name and tick.sampled_s >= view.began_s
+        ]
+        view.squares.add(np.reshape(angles_arcsec, (-1, 2)))
+    if view.elapsed_s < step.settle_s + step.duration_s:
+        return None
+    samples = view.squares.with_star
+    if samples < _LEAST_SAMPLED * step.duration_s * view.rig.camera.frame_rate_hz:
+        msg = f"the photodiodes gave {samples} samples in {step.duration_s:g} s; see fitctl status"
+        raise StepFailed(msg)
+    limit_arcsec = view.rig.metrology_loops[view.loop_name].requirement_arcsec
+    az_arcsec, el_arcsec = view.squares.rms_px.tolist()  # of what was added: angles
+    message = f"az {az_arcsec:.3f}, el {el_arcsec:.3f} arcsec RMS; required {limit_arcsec:g} arcsec"
+    if max(az_arcsec, el_arcsec) > limit_arcsec:
+        raise StepFailed(message)
+    figures = {
+        "rms_az_arcsec": az_arcsec,
+        "rms_el_arcsec": el_arcsec,
+        "limit_arcsec": limit_arcsec,
+        "samples": float(samples),
+    }
+    return Result(figures, message)
+
+
+def _check_hold(step: steps.Hold, rig: Rig, loop_name: str) -> list[str]:
+    if loop_name in rig.metrology_loops and step.rms_limit_px is not None:
+        return [
+            f"rms_limit_px is of a star; {loop_name} holds a metrology beam, to its requirement_arcsec"
+        ]
+    return []
 
 
 def _evaluate(step: steps.Hold | steps.Visiting, view: View, squares: Squares, due: int) -> Result:
@@ -174,7 +215,9 @@ def _stop_visit(_step: steps.Visiting, view: View) -> None:
 
 _VISIT = Behaviour(_NEEDS, _visit_done, _run_visit, _stop_visit, _check_visit, _visit_s)
 POINTING = {
-    "hold": Behaviour(_NEEDS, _hold_done, own_s=_hold_s, pausable=True),
+    "hold": Behaviour(
+        HOLDING, _hold_done, check=_check_hold, own_s=_hold_s, pausable=True, of_beams=True
+    ),
     "target": _VISIT,
     "jog": _VISIT,
     "raster": _VISIT,

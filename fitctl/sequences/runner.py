@@ -9,13 +9,13 @@ from typing import Literal
 import msgspec
 
 from fitctl.logging.records import SequenceAttempt
-from fitctl.messages.commands import Hold
-from fitctl.messages.modes import Mode
+from fitctl.messages.commands import Hold, MoveCollector
+from fitctl.messages.modes import METROLOGY_MODES, STELLAR_MODES, Mode
 from fitctl.sequences.behaviour import Behaviour, Calibration, Result
-from fitctl.sequences.behaviours import BEHAVIOURS, loop_of, problems
+from fitctl.sequences.behaviours import BEHAVIOURS, loops_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
 from fitctl.sequences.stars import evaluate, star_results, steps_of
-from fitctl.sequences.steps import Standby, Stars, Step
+from fitctl.sequences.steps import Collector, Standby, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 
 _RETRY_S = 1.0  # between attempts
@@ -30,9 +30,16 @@ class TimedOut(StepFailed):
 
 
 class Runner:
-    """Runs the steps of one sequence, one at a time, by its contact with the supervisor."""
+    """Runs the steps of one sequence, one at a time, by its contact with the supervisor.
 
-    def __init__(self, contact: Contact) -> None:
+    Parameters
+    ----------
+    contact : Contact
+    motion_goes_on : bool
+        A motion of the collector that a step began goes on after the last step, if that was done.
+    """
+
+    def __init__(self, contact: Contact, *, motion_goes_on: bool = False) -> None:
         self.attempts: list[SequenceAttempt] = []
         self.calibrations: list[Calibration] = []
         self.contact = contact
@@ -40,12 +47,20 @@ class Runner:
         self._rig = contact.rig
         self._loops: set[str] = set()
         self._star = ""  # of a list, that the step is for
+        self._moves_collector = False  # by a step of this sequence
+        self._motion_goes_on = motion_goes_on
 
     def hold_stages(self) -> None:
         """Stop tracking with every loop that had a step; one that does not track refuses, and may."""
         with suppress(ConnectionError):
             for name in self._loops:
                 self._link.send(Hold(loop=name))
+
+    def stop_collector(self, *, done: bool) -> None:
+        """Stop a motion of the collector that a step began."""
+        if self._moves_collector and not (done and self._motion_goes_on):
+            with suppress(ConnectionError):
+                self._link.send(MoveCollector(action="stop"))
 
     def run(self, step: Step) -> SequenceAttempt:
         """Run one step, as often as it may be tried.
@@ -62,11 +77,18 @@ class Runner:
         if wrong:
             msg = f"step {number} ({step.step}): {'; '.join(wrong)}"
             raise SequenceError(msg)
-        loop_name = loop_of(step, self._rig)
-        self._loops.add(loop_name)
+        loop_names = loops_of(step, self._rig)
+        if BEHAVIOURS[step.step].loops != "none" or len(self._rig.loops) == 1:
+            self._loops.update(loop_names)
         if isinstance(step, Stars):
-            return self._run_stars(step, loop_name, number)
-        return self._try(step, loop_name, number)
+            return self._run_stars(step, loop_names[0], number)
+        if isinstance(step, Collector) and step.action == "stop":
+            self._moves_collector = False
+        for loop_name in loop_names:
+            record = self._try(step, loop_name, number)
+        if isinstance(step, Collector) and step.action == "start":
+            self._moves_collector = True
+        return record
 
     def _run_stars(self, step: Stars, loop_name: str, number: int) -> SequenceAttempt:
         """Each star's steps, one star after the other; one that fails is skipped, if the step says so."""
@@ -143,6 +165,7 @@ class Runner:
         while True:
             paused = behaviour.pausable and self.contact.pause_wanted
             self.contact.next(view, paused=paused)
+            self._require_motion(view)
             if paused or self.contact.show_pause(paused=False):
                 continue
             if view.now_s >= view.fresh_s:
@@ -153,10 +176,19 @@ class Runner:
                 msg = f"not done within {limit_s:g} s; loop {view.loop_name} is in {view.mode.name}"
                 raise TimedOut(msg)
 
+    def _require_motion(self, view: View) -> None:
+        """Refuse to go on with a collector that stands still where a step has it move."""
+        collector = view.telemetry.collector
+        if self._moves_collector and (collector is None or not collector.motion):
+            why = "" if collector is None else collector.error
+            msg = f"the collector no longer moves: {why or 'somebody stopped it'}"
+            raise StepFailed(msg)
+
     def _wait_for_mode(self, step: Step, behaviour: Behaviour, view: View) -> None:
         begun_s = view.now_s
         while view.mode not in behaviour.needs:
-            needs = " or ".join(mode.name for mode in sorted(behaviour.needs))
+            of_kind = METROLOGY_MODES if view.loop.kind == "metrology" else STELLAR_MODES
+            needs = " or ".join(mode.name for mode in of_kind if mode in behaviour.needs)
             msg = f"{step.step} needs {needs}; loop {view.loop_name} is in {view.mode.name}"
             if view.mode not in _ON_THE_WAY:
                 raise StepFailed(msg)
@@ -207,20 +239,25 @@ def _ending(runner: Runner) -> Iterator[None]:
     except Stopped as stopped:
         if stopped.hold:
             runner.hold_stages()
+            runner.stop_collector(done=False)
         runner.contact.end("stopped", str(stopped))
         raise SequenceError(
             str(stopped), runner.attempts[-1] if runner.attempts else None
         ) from None
     except (SequenceError, ConnectionError) as error:
+        runner.stop_collector(done=False)
         runner.contact.end("failed", str(error))
         raise
     except KeyboardInterrupt:
         runner.hold_stages()
+        runner.stop_collector(done=False)
         runner.contact.end("stopped", "interrupted")
         raise
     except Exception as error:
+        runner.stop_collector(done=False)
         runner.contact.end("failed", repr(error))
         raise
+    runner.stop_collector(done=True)
     runner.contact.end("done")
 
 

@@ -6,13 +6,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from fitctl.config import Motion
 from fitctl.config.base import Count, Finite, NonNegative, Positive, Settings
 from fitctl.config.loops import ControllerName, FieldOverlap
 
 LONGEST_S = 86_400.0
 
 LoopName = Annotated[
-    str, Field(description="the loop that works; may be left out where the rig has only one")
+    str,
+    Field(
+        description="the loop that works; may be left out where the rig has only one, and where the step is "
+        "for every loop or for none"
+    ),
 ]
 TimeoutS = Annotated[
     float,
@@ -64,7 +69,7 @@ class Step(Settings):
 
 
 class Standby(Step):
-    """Devices on and ready, a star let go, the stages held where they are: STANDBY."""
+    """Devices on and ready, a star let go, the stages held where they are: STANDBY; without a loop, all."""
 
     step: Literal["standby"] = "standby"
     timeout_s: TimeoutS = 60.0
@@ -74,7 +79,8 @@ class Standby(Step):
 class Acquire(Step):
     """Devices on, search for the star, pull it in, until it is held; one that is held stays so.
 
-    Where it is expected somewhere, or has a flux of its own, a star that is held is let go first.
+    Where it is expected somewhere, or has a flux of its own, a star that is held is let go first. Of a
+    metrology loop it is the beam. Without a loop, every loop acquires, those that hold a link first.
     """
 
     step: Literal["acquire"] = "acquire"
@@ -96,7 +102,7 @@ class Acquire(Step):
 
 
 class Hold(Step):
-    """Hold the star for a time and compare the RMS of each axis with the requirement."""
+    """Hold the star or the beam for a time and compare the RMS of each axis with the requirement."""
 
     step: Literal["hold"] = "hold"
     duration_s: Annotated[DurationS, Field(description="for how long the RMS counts")]
@@ -263,8 +269,52 @@ class Wait(Step):
     duration_s: Annotated[DurationS, Field(description="how long")]
 
 
+class Collector(Step):
+    """Reference the hexapod, begin a motion of the collector, or end it.
+
+    A motion goes on during the steps that follow. The sequence stops it where it ends, however it ends.
+    """
+
+    step: Literal["collector"] = "collector"
+    action: Annotated[
+        Literal["reference", "start", "stop"], Field(description="as `fitctl send collector`")
+    ]
+    kind: Annotated[
+        Motion | None,
+        Field(description="of the motion; what is not given of it is the rig file's"),
+    ] = None
+    direction_deg: Annotated[
+        Finite | None, Field(description="from the link's azimuth towards elevation")
+    ] = None
+    range_mm: Annotated[
+        Positive | None, Field(description="drift and random motion turn back this far out")
+    ] = None
+    velocity_mm_s: Annotated[Positive | None, Field(description="of a drift")] = None
+    amplitude_mm: Annotated[Positive | None, Field(description="of a sine")] = None
+    frequency_hz: Annotated[Positive | None, Field(description="of a sine")] = None
+    rms_mm_s: Annotated[Positive | None, Field(description="of a random velocity")] = None
+    correlation_s: Annotated[Positive | None, Field(description="of a random velocity")] = None
+
+    @property
+    def motion(self) -> dict[str, object]:
+        """What is given of the motion."""
+        common = {"action", *Step.model_fields}
+        return {k: v for k, v in self.model_dump().items() if k not in common and v is not None}
+
+
+class Visibility(Step):
+    """The tilt between the two stars of `[fringes]`, and the visibility that it leaves, for a time."""
+
+    step: Literal["visibility"] = "visibility"
+    duration_s: Annotated[DurationS, Field(description="for how long it is measured")]
+    settle_s: SettleS = 10.0
+    least_visibility: Annotated[
+        Positive | None, Field(le=1, description="with a smaller mean, the step has failed")
+    ] = None
+
+
 class Off(Step):
-    """Hold, mirror to its bias, amplifiers disabled, devices let go: OFF."""
+    """Hold, mirror to its bias, amplifiers disabled, devices let go: OFF; without a loop, all."""
 
     step: Literal["off"] = "off"
 
@@ -283,6 +333,8 @@ AnyStep = (
     | PlateScale
     | Dark
     | Wait
+    | Collector
+    | Visibility
     | Off
 )
 

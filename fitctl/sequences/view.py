@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fitctl.config import Loop, Rig
 from fitctl.logging.records import FrameRecord, SequenceAttempt, Tick
 from fitctl.messages.commands import AnyCommand, Reply
-from fitctl.messages.modes import TRACKING, Mode
+from fitctl.messages.modes import HOLDING, TRACKING, Mode
 from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.sequences.links import Link
 
@@ -205,8 +205,8 @@ class View:
 
     @property
     def tracking(self) -> bool:
-        """The stages follow a star, or search for one."""
-        return self.mode in TRACKING
+        """The stages follow a star or a beam, or search for one."""
+        return self.mode in TRACKING | HOLDING
 
 
 def columns(measurements: list[Measurement]) -> Floats:

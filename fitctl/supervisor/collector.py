@@ -165,6 +165,7 @@ class CollectorWatch:
             self._failed(error)
         else:
             if moved:
+                self.error = ""
                 self._report("info", HEXAPOD, "the collector was stopped where it is")
 
     def _failed(self, error: Exception) -> None:

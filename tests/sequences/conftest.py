@@ -75,10 +75,10 @@ class Run:
 
 @pytest.fixture
 def tried():
-    """Make a run on the default rig, its star near, with some values replaced."""
+    """Make a run on a rig, its stars near, with some values replaced."""
 
-    def make(*overrides, seed=1):
-        rig = load_rig(default_rig_path(), [*NEAR, *overrides])
+    def make(*overrides, seed=1, rig="fit-mock.toml"):
+        rig = load_rig(default_rig_path().parent / rig, [*NEAR, *overrides])
         return Run(rig, MeddledLink(rig, seed))
 
     return make

@@ -16,7 +16,11 @@ from fitctl.sequences.reading import load_sequence
 ACQUIRE = {"step": "acquire"}
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
 RIG = load_rig(default_rig_path())
-SKIES = {"stars": load_rig(default_rig_path().parent / "star-field.toml")}
+RIGS = default_rig_path().parent
+SKIES = {
+    "stars": load_rig(RIGS / "star-field.toml"),
+    "testbed": load_rig(RIGS / "fit-testbed.toml"),
+}
 
 
 @pytest.mark.parametrize("path", shipped_sequences(), ids=lambda path: path.stem)
