@@ -33,7 +33,7 @@ from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger
 from fitctl.messages.telemetry import LoopLimits, LoopState, SpotPlace
 from fitctl.model.drives import Drive
-from fitctl.model.optics import saturate_diamond, scales
+from fitctl.model.optics import AzEl, saturate_diamond, scales
 from fitctl.stages.journal import Journal
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.periodic import Periodic
