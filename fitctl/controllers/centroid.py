@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -123,21 +124,36 @@ class StarSensor:
             return self.find(image)
         return star
 
-    def find(self, image: NDArray[np.uint16]) -> Star | None:
-        """Look over the whole frame, brightest spot first; None when this loop's star is not there."""
+    def find(
+        self, image: NDArray[np.uint16], near_px: tuple[float, float] | None = None
+    ) -> Star | None:
+        """Look over the whole frame, brightest spot first; None when this loop's star is not there.
+
+        Of several stars that could be this loop's, the nearest to `near_px`; without it, the brightest.
+        """
+        candidates = self._candidates(image)
+        if near_px is None:
+            return next(candidates, None)
+        return min(
+            candidates,
+            key=lambda star: math.dist((star.az_px, star.el_px), near_px),
+            default=None,
+        )
+
+    def _candidates(self, image: NDArray[np.uint16]) -> Iterator[Star]:
+        """All spots that could be this loop's star, brightest first."""
         search = self._dark.light(image, 0, 0, *image.shape)
         for _ in range(MAX_CANDIDATES):
             el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
             if search[el_px, az_px] < self.threshold_dn:
-                return None
+                return
             star = self.find_at(image, az_px, el_px)
             if star is not None:
-                return star
+                yield star
             search[
                 max(0, el_px - HALF_WINDOW_PX) : el_px + HALF_WINDOW_PX + 1,
                 max(0, az_px - HALF_WINDOW_PX) : az_px + HALF_WINDOW_PX + 1,
             ] = -math.inf
-        return None
 
     def find_at(self, image: NDArray[np.uint16], az_px: float, el_px: float) -> Star | None:
         """Measure this loop's star about a place; None when it is not there, or the frame cuts it."""

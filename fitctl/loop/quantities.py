@@ -115,10 +115,11 @@ class StellarQuantities(Quantities):
         readings, exposed_s = self.readings, frame.mid_exposure_s
         late_s = frame.received_s - exposed_s - self._delay_s
         readings["frame_late_s"] = (late_s, now_s, "")
-        if self._exposed_s is not None:
+        skipped = observation.frames_skipped - self._skipped
+        # Fewer than before: the camera was opened anew, for another loop.
+        if self._exposed_s is not None and skipped >= 0:
             # Frames that were skipped did come.
-            frames = 1 + observation.frames_skipped - self._skipped
-            periods = (exposed_s - self._exposed_s) / self._period_s / frames
+            periods = (exposed_s - self._exposed_s) / self._period_s / (1 + skipped)
             readings["frame_interval_periods"] = (periods, now_s, "")
         self._exposed_s, self._skipped = exposed_s, observation.frames_skipped
         if star is not None:

@@ -54,6 +54,7 @@ class StarFinder:
         self._other_spots = loop.other_spots
         self._star_flux_dn = loop.star_flux_dn
         self._diameter_px = loop.spot_diameter_px
+        self._is_shared = len(rig.stellar_loops) > 1
         self._report_event = report_event
 
     def expect_flux(self, flux_dn: float) -> None:
@@ -106,7 +107,9 @@ class StarFinder:
         if star is None and follows:
             star = self._sensor.follow(image, *self.estimator.predict_px(stages_px))
         elif star is None:
-            star = self._sensor.find(image)
+            # Two stars look alike: the other loop's may be on the frame before that loop follows it.
+            near_px = self.estimator.predict_px(stages_px) if self._is_shared else None
+            star = self._sensor.find(image, near_px)
         self.last, self._visible = star or self.last, star is not None
         if star is not None and mode in TRACKING:
             self.estimator.observe((star.az_px, star.el_px), stages_px)
