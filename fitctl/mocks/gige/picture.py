@@ -19,6 +19,7 @@ HOT_PIXEL = (0.25, 0.75)  # its place on the sensor, across and down, in parts o
 PICTURE_FAULTS = {
     "star_fading": FaultKind("starlight halves, again and again, each time within this", "s", 1.0),
     "star_dim": FaultKind("this part of the starlight is left", "of its light", 0.7),
+    "dark_half": FaultKind("no light comes to one half of the sensor", parts=("left", "right")),
     "star_jump": FaultKind("the whole picture is displaced by this, along both axes", "px", 4.0),
     "star_double": FaultKind("all light is there once more, this far off along az", "px", 8.0),
     "background_jump": FaultKind("every pixel reads more by this", "DN", 2000.0),
@@ -47,9 +48,14 @@ class Sensor:
     def expose(self, image: NDArray[np.uint16], host_s: float) -> NDArray[np.uint16]:
         """The rendered image of a host time with the active faults applied."""
         values = {kind: self._faults.value(kind) for kind in PICTURE_FAULTS}
-        if all(value is None for value in values.values()):
+        middle = image.shape[1] // 2
+        halves = {"left": np.s_[:, :middle], "right": np.s_[:, middle:]}
+        dark = [half for half in halves if self._faults.value("dark_half", half) is not None]
+        if not dark and all(value is None for value in values.values()):
             return image
         dn = image.astype(float)
+        for half in dark:
+            dn[halves[half]] = self._faded(dn[halves[half]], 0.0)
         halving_s = values["star_fading"]
         if halving_s is not None:
             fading_s = max(0.0, host_s - self._fading_since_s)

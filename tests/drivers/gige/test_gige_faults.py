@@ -215,6 +215,15 @@ def test_a_dim_star_has_part_of_its_light(serve: Serve, connect: Connect) -> Non
     assert 12 < dim[:10].std() < 23  # what is left of an image without noise
 
 
+def test_a_dark_half_has_noise_and_no_light(serve: Serve, connect: Connect) -> None:
+    served, camera = running(serve, connect, STAR)
+    served.fault("dark_half", part="right")
+    image = image_after(camera, time.monotonic())
+    np.testing.assert_array_equal(image[:, :20], STAR[:, :20])
+    assert abs(image[:, 20:].mean() - 1000) < 20
+    assert abs(int(image[:, 20:].max()) - 1000) < 150
+
+
 def test_a_star_that_jumps_is_elsewhere_on_a_dark_picture(serve: Serve, connect: Connect) -> None:
     served, camera = running(serve, connect, STAR)
     served.fault("star_jump", value=5.0)
