@@ -1,9 +1,10 @@
 """All entries, by the tables of docs/reliability.md."""
 
-from . import commands, devices, processes, surroundings
+from . import commands, devices, processes, surroundings, testbed
 
 GROUPS = {
     "devices": devices.ENTRIES,
+    "testbed": testbed.ENTRIES,
     "commands": commands.ENTRIES,
     "processes": processes.ENTRIES,
     "surroundings": surroundings.ENTRIES,

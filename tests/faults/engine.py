@@ -6,9 +6,11 @@ from itertools import pairwise
 
 from stalls import stalls
 
-from .entry import SEARCHES
+from .entry import HOLDS, SEARCHES, STAYED, WAITS
 from .strikes import strike
+from .watched import modes_of
 
+STAYING = {STAYED, HOLDS, WAITS}  # ends of other loops
 STAYS_S = 2.0  # a mode in which the loop stays is watched for so long, if the entry has the time
 SETTLE_S = 0.4  # from entering a mode of rest to standing still
 DEAD_SETTLE_S = (
@@ -36,7 +38,10 @@ TRIES = 3  # another only where the machine itself stood still
 
 
 def run(rig, entry, home):
-    """One entry, tried again only if the machine stood still meanwhile; what was measured."""
+    """One entry, tried again only if the machine stood still meanwhile; what was measured.
+
+    `home` has the mode to which each loop comes back, by its name.
+    """
     for attempt in range(1, TRIES + 1):
         with stalls() as stalled:
             try:
@@ -58,7 +63,8 @@ def supervisor_stalled_s(rig):
 
 
 def attempted(rig, entry, home, stalled):
-    rig.reach(entry.mode)
+    rig.loop = entry.loop
+    rig.reach(home | {entry.loop: entry.mode})
     if entry.struck in PROCESSES:
         rig.process(entry.struck)  # a console is opened, a recorder may just be starting
     deaf = entry.struck == "supervisor" and entry.how != "slowed"
@@ -75,7 +81,8 @@ def attempted(rig, entry, home, stalled):
     rig.reach(home)
     back_s = time.monotonic() - healed_s
     if entry.ends == SEARCHES:
-        came_back_by_itself(rig, struck_s)
+        came_back_by_itself(rig, entry.loop, struck_s)
+    measured |= went_on(rig, entry, struck_s)
     if not entry.moves:
         stood_still(rig, entry, struck_s, deaf)
     return measured | {"back_s": round(back_s, 1)}
@@ -84,6 +91,7 @@ def attempted(rig, entry, home, stalled):
 def watch(rig, entry, since_s, stalled):
     """Follow until it has ended as it should; the mode in which it was then, and how long that took."""
     stays = entry.mode in entry.modes
+    before = modes_of(rig.telemetry[-1])
     stays_s = min(STAYS_S, entry.within_s)
     modes, texts, done_s = [], [], []
 
@@ -91,10 +99,11 @@ def watch(rig, entry, since_s, stalled):
         if telemetry.time_s < since_s:  # it was on its way when we struck
             return False
         now_s = time.monotonic()
-        modes.append(telemetry.loops[0].mode)
+        modes.append(modes_of(telemetry)[entry.loop])
         texts.extend(said(telemetry, since_s))
         so_far = " ".join([*rig.heard, *texts])
-        if not done_s and (stays or modes[-1] in entry.modes) and entry.says in so_far:
+        ended = (stays or modes[-1] in entry.modes) and others_ended(telemetry, entry, before)
+        if not done_s and ended and entry.says in so_far:
             done_s.append(now_s)
         return bool(done_s) and (not stays or now_s > since_s + stays_s)
 
@@ -110,12 +119,43 @@ def watch(rig, entry, since_s, stalled):
     return {"took_s": round(took_s, 3), "ended": modes[-1]}
 
 
+def others_ended(telemetry, entry, before):
+    """Whether the other loops are as the entry says; `before` has their modes when it was struck."""
+    loops = {loop.name: loop for loop in telemetry.loops}
+    return all(
+        loops[name].mode == (before[name] if end in STAYING else end)
+        and (end != WAITS or loops[name].waits_for)
+        for name, end in entry.others
+    )
+
+
+def went_on(rig, entry, struck_s):
+    """The other loops that stay have stayed all the time; how far the stars were that are held, RMS in px."""
+    for name, end in entry.others:
+        changes = [
+            change
+            for telemetry in rig.telemetry
+            for change in telemetry.mode_changes
+            if change.loop == name and change.time_s > struck_s
+        ]
+        assert end not in STAYING or not changes, f"{name}: {changes}"
+    held_px = {
+        name: round(rig.residual_px(name, struck_s), 4)
+        for name, end in entry.others
+        if end == HOLDS
+    }
+    requirements_px = {loop.name: loop.requirement_px for loop in rig.telemetry[-1].loops}
+    assert all(rms_px <= requirements_px[name] for name, rms_px in held_px.items()), held_px
+    return {"held_px": held_px} if held_px else {}
+
+
 def said(telemetry, since_s):
     """All that a message tells people of what has happened since."""
-    loop = telemetry.loops[0]
     yield from (event.message for event in telemetry.events if event.time_s >= since_s)
     yield from (change.reason for change in telemetry.mode_changes if change.time_s >= since_s)
-    yield from (trip.name for trip in loop.interlocks if trip.since_s >= since_s)
+    yield from (
+        trip.name for loop in telemetry.loops for trip in loop.interlocks if trip.since_s >= since_s
+    )
 
 
 def ticks_went_on(rig, stalled):
@@ -144,9 +184,11 @@ def rests(rig, _entry, since_s, stalled):
     return {"took_s": round(took_s, 3)}
 
 
-def came_back_by_itself(rig, since_s):
+def came_back_by_itself(rig, loop, since_s):
     """A loop that lost its star gave the search up neither while the star was away nor afterwards."""
-    changes = [c for t in rig.telemetry for c in t.mode_changes if c.time_s > since_s]
+    changes = [
+        c for t in rig.telemetry for c in t.mode_changes if c.time_s > since_s and c.loop == loop
+    ]
     assert not {c.target for c in changes} & REST, changes
 
 
@@ -163,7 +205,9 @@ def near(place, other):
 
 def stood_still(rig, entry, struck_s, deaf):
     """Nothing moved in a mode of rest but the mirror, towards its bias."""
-    changes = {c.time_s: c.target for t in rig.telemetry for c in t.mode_changes}
+    changes = {
+        c.time_s: c.target for t in rig.telemetry for c in t.mode_changes if c.loop == entry.loop
+    }
     course = [(struck_s, entry.mode), *sorted(changes.items()), (time.monotonic(), "")]
     if deaf:
         course = [

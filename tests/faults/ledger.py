@@ -19,7 +19,8 @@ def settle(rig):
     logged, problems, finished = set(), [], 0
     for path in sorted(rig.logs.glob("*.mcap")):
         with suppress(LogError):  # a log without a tick
-            logged |= set(tick_arrays(path, "right")["time_s"].tolist())
+            for name in rig.stellar_loops:
+                logged |= set(tick_arrays(path, name)["time_s"].tolist())
         if path.stat().st_size and log_info(path).finished:
             finished += 1
             problems += [f"{path.name}: {problem}" for problem in verify(path).problems]

@@ -9,7 +9,7 @@ from documents import ROOT, table
 
 from .catalogue import GROUPS
 from .configuration import WRONG
-from .entry import STAYED
+from .entry import HOLDS, STAYED, WAITS
 
 PAGE = ROOT / "docs" / "reliability.md"
 HEADER = [
@@ -26,16 +26,21 @@ MEASURED = 2  # columns, the last ones
 ELSEWHERE = "fit-mock"  # where a rig is not named
 
 
+OTHERS = {STAYED: "stays", HOLDS: "holds its star", WAITS: "waits"}
+
+
 def promised(entry):
     """What the table says of an entry before anything is measured."""
     rig = "" if entry.rig == ELSEWHERE else f" ({entry.rig})"
     ends = " or ".join(sorted(entry.modes))
     moves = f"; {entry.moves}" if entry.moves else ""
+    name = f"{entry.loop} " if entry.others else ""
+    others = "".join(f"; {other} {OTHERS.get(end, end)}" for other, end in entry.others)
     return [
         f"{entry.struck}{rig}",
         entry.how,
-        entry.mode,
-        ends + moves,
+        name + entry.mode,
+        name + ends + others + moves,
         f"`{entry.says}`" if entry.says else "",
         f"{entry.within_s:g} s",
     ]

@@ -1,9 +1,10 @@
 """The rigs on which entries run: which file, what differs from it, and where it runs."""
 
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import pytest
@@ -56,15 +57,18 @@ def patched(patch, variable, file):
     return where
 
 
+HOLDS = MappingProxyType({"right": "VERNIER"})
+
+
 class Setup(NamedTuple):
-    """One rig; `home` is the mode to which it comes back, `where` says what it runs in.
+    """One rig; `home` is the mode to which each loop comes back, `where` says what it runs in.
 
     In settings, ``{folder}`` is a folder of its own, and ``{port}`` a free one, another in each.
     """
 
     file: str = "fit-mock"
     settings: tuple[str, ...] = ()
-    home: str = "VERNIER"
+    home: Mapping[str, str] = HOLDS
     where: Callable = plainly
 
 
@@ -76,18 +80,35 @@ BY_TCP = (
     "service.keys_folder={folder}/keys",
     "service.metrics_port={port}",
 )
+# Star and beam nearby, as the right star is by SOON; the collector moves at most 0.3 mm/s, and stays near.
+TESTBED = (
+    "plant.loops.left.star_offset_sky_arcsec_max=5.0",
+    "plant.loops.metrology.beam_offset_sky_arcsec_max=20.0",
+    "loops.left.coarse.gain_rad_per_m=9700.0",
+    "loops.left.coarse.reach_fraction=0.3",
+    "mocks.loops.left.mdt693.reply_s=0.005",
+    "mocks.hexapod.reference_s=0.5",
+    "collector.motion.kind=sine",
+    "collector.motion.amplitude_mm=0.4",
+    "collector.motion.frequency_hz=0.125",
+)
 SETUPS = {
     "fit-mock": Setup(),
+    "fit-testbed": Setup(
+        file="fit-testbed",
+        settings=TESTBED,
+        home={"metrology": "LOCKED", "right": "VERNIER", "left": "VERNIER"},
+    ),
     "short pauses": Setup(settings=("loops.right.acquisition.search_again_pause_s=0.4",)),
-    "never in reach": Setup(settings=NEVER_IN_REACH, home="COARSE"),
+    "never in reach": Setup(settings=NEVER_IN_REACH, home={"right": "COARSE"}),
     "ensemble": Setup(file="ensemble"),
     "fit-bal-analog": Setup(file="fit-bal-analog"),
     "fast telemetry": Setup(settings=("supervisor.telemetry_hz=100.0",)),
     # Alone, its drive goes on for half a second: at full speed, further than a search goes.
     "slow siderostat": Setup(settings=("loops.right.siderostat.velocity_limit_rad_s=6.0",)),
     # What is struck there is beside the tick, and no loop notices: the way back to the star is not asked for.
-    "by TCP": Setup(settings=BY_TCP, home="STANDBY"),
-    "by TCP, never in reach": Setup(settings=(*BY_TCP, *NEVER_IN_REACH), home="STANDBY"),
+    "by TCP": Setup(settings=BY_TCP, home={"right": "STANDBY"}),
+    "by TCP, never in reach": Setup(settings=(*BY_TCP, *NEVER_IN_REACH), home={"right": "STANDBY"}),
     "small disk": Setup(
         settings=("logging.queue_records=300", "logging.rotate_s=8.0"), where=on_a_disk_of_its_own
     ),

@@ -7,7 +7,7 @@ import time
 from contextlib import contextmanager, suppress
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Jog, Reset, Shutdown, Stop
+from fitctl.messages.commands import Jog, MoveCollector, Reset, Shutdown, Stop
 from fitctl.mocks.bench import ClearFaults, SetFault
 from fitctl.model.optics import scales
 
@@ -22,17 +22,31 @@ JOG_SKY_ARCSEC = 90.0  # nearly as far as one jog goes
 JOG_RAD = JOG_SKY_ARCSEC / scales(RIG, RIG.loops["right"]).motor_sky_arcsec_per_rad
 MOVED_RAD = 0.1  # of a motor
 BEGINS_S = 2.0  # a jog
+COLLECTOR_S = 10.0  # until the hexapod is referenced and moves
+FAULT = re.compile(
+    r"(?P<kind>\w+)( (?P<part>[a-zA-Z]\w*))??( (?P<value>-?[\d.]+))?( for (?P<for_s>[\d.]+) s)?"
+)
 
 
 @contextmanager
 def device(rig, entry):
-    """A fault of the mocks."""
-    kind, *value = entry.how.split()
-    rig.tell(SetFault(entry.struck, kind, value=float(value[0]) if value else None))
+    """A fault of the mocks: its kind, then its part, its value, and how long it lasts, where they are given."""
+    given = FAULT.fullmatch(entry.how)
+    fault = SetFault(
+        entry.struck,
+        given["kind"],
+        part=given["part"] or "",
+        value=None if given["value"] is None else float(given["value"]),
+        for_s=None if given["for_s"] is None else float(given["for_s"]),
+    )
+    ends_s = time.monotonic() + (fault.for_s or 0.0)
+    rig.tell(fault)
     try:
         yield
+        while time.monotonic() < ends_s:
+            rig.receive(0.1)
     finally:
-        rig.tell(ClearFaults(entry.struck, kind))
+        rig.tell(ClearFaults(entry.struck, fault.kind))
 
 
 # ---------------------------------------------------------------- processes
@@ -191,6 +205,67 @@ def many_messages(rig, entry):
         goes_on(rig, entry)
 
 
+# ---------------------------------------------------------------- the collector and several loops
+
+
+@contextmanager
+def moving(rig, entry):
+    """The collector moves when it is struck, and moves again once it is healed."""
+    move_collector(rig)
+    with STRIKES_ON_THE_WAY.get(entry.how, device)(rig, entry):
+        yield
+    move_collector(rig)
+    assert rig.client.send(MoveCollector(action="stop")).accepted
+
+
+def move_collector(rig):
+    """Start the collector's motion, referenced first where the hexapod asks for that."""
+    end_s = time.monotonic() + COLLECTOR_S
+    while True:
+        since_s = time.monotonic()
+        assert since_s < end_s, f"the collector does not move within {COLLECTOR_S:g} s"
+        if not rig.client.send(MoveCollector(action="start")).accepted:
+            rig.receive(0.1)
+            continue
+        answer = hexapod_event(rig, since_s)
+        if "begins to move" in answer:
+            return
+        if "reference it first" in answer:
+            rig.client.send(MoveCollector(action="reference"))
+            hexapod_event(rig, time.monotonic())
+
+
+def hexapod_event(rig, since_s):
+    """The next event about the hexapod."""
+    events = []
+
+    def reported(telemetry):
+        events.extend(
+            event.message
+            for event in telemetry.events
+            if event.source == "hexapod" and event.time_s >= since_s
+        )
+        return events
+
+    with suppress(AssertionError):
+        rig.follow(reported, COLLECTOR_S)
+    return " ".join(events)
+
+
+@contextmanager
+def stopped_by_operator(rig, entry):
+    """STOP for all loops."""
+    assert rig.client.send(Stop()).accepted
+    yield
+
+
+@contextmanager
+def turned_off(rig, entry):
+    """The operator turns one loop off."""
+    rig.turn_off(entry.loop)
+    yield
+
+
 # ---------------------------------------------------------------- commands, disk and clock
 
 
@@ -258,8 +333,8 @@ def not_told(rig, _entry):
         killed = rig.recorder()
         killed.kill()
         rig.follow(lambda _: rig.recorder().pid != killed.pid)
-        rig.reach("OFF")
-        rig.reach("STANDBY")
+        rig.reach({"right": "OFF"})
+        rig.reach({"right": "STANDBY"})
     finally:
         silent.unlink()
     rig.follow(lambda t: any("free space again" in event.message for event in t.events))
@@ -294,8 +369,14 @@ STRIKES = {
     "is not told": not_told,
     "command": command,
     "clock": clock,
+    "hexapod": moving,
+    "turned off by the operator": turned_off,
 }
 """By how, or by what is struck; everything else is a fault of a mock device."""
+
+
+STRIKES_ON_THE_WAY = {"all loops are stopped": stopped_by_operator}
+"""What else can become of a collector that moves, by how."""
 
 
 def strike(rig, entry):

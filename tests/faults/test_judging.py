@@ -21,7 +21,7 @@ def place(time_s, motor_rad=0.0, stack_v=BIAS):
 def rig(*places, changes=(), numbers=(), skipped=0):
     """A rig as far as judges look at it."""
     message = SimpleNamespace(
-        mode_changes=[SimpleNamespace(time_s=t, target=mode) for t, mode in changes],
+        mode_changes=[SimpleNamespace(time_s=t, target=mode, loop="right") for t, mode in changes],
         ticks=[
             SimpleNamespace(number=number, frames_skipped=skipped * (number == max(numbers)))
             for number in numbers

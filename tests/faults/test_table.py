@@ -7,9 +7,9 @@ from documents import between
 
 from fitctl.commands.shared.fault_kinds import kinds
 
+from . import devices, testbed
 from .catalogue import GROUPS
 from .configuration import WRONG
-from .devices import STRUCK
 from .report import MEASURED, promised, wrong_table
 
 # Which device each table of kinds is for.
@@ -20,9 +20,9 @@ DEVICES = {
     "drive (bal_analog)": ("fit-bal-analog", "right.drive"),
     "dac": ("fit-mock", "right.dac"),
     "mdt693": ("fit-mock", "right.mdt693"),
+    "labjack": ("fit-testbed", "metrology.labjack"),
+    "hexapod": ("fit-testbed", "hexapod"),
 }
-
-NOT_STRUCK = {"labjack", "hexapod"}  # no setup of the catalogue has them yet
 
 
 @pytest.mark.parametrize("name", GROUPS)
@@ -47,9 +47,20 @@ def test_no_two_entries_have_the_same_name():
     assert len(set(names)) == len(names) >= 60
 
 
+# What is no row: another client that sets a range of the T7 goes unnoticed while the beam is held.
+NO_ROW = {("labjack", "range_changed")}
+
+
 def test_every_fault_of_every_mock_is_in_the_catalogue():
     struck = {
-        (rig, device): {entry.how.split()[0] for entry in table} for rig, device, table in STRUCK
+        (entry.rig, entry.struck, entry.how.split()[0])
+        for entry in devices.ENTRIES + testbed.ENTRIES
     }
-    faults = {name: set(table) for name, table in kinds().items() if name not in NOT_STRUCK}
-    assert {DEVICES[name]: table for name, table in faults.items()} == struck
+    faults = {
+        (*DEVICES[name], kind)
+        for name, table in kinds().items()
+        for kind in table
+        if (name, kind) not in NO_ROW and kind != "dark_half"
+    }
+    assert faults <= struck
+    assert ("fit-testbed", "camera", "dark_half") in struck

@@ -15,6 +15,8 @@ from fitctl.messages.keys import new_key
 from fitctl.mocks.bench import (
     ClearFaults,
     FaultsNow,
+    Residual,
+    ResidualQuestion,
     SetFault,
     StagesNow,
     StagesQuestion,
@@ -30,11 +32,15 @@ ANSWER_S = 5.0  # to a command that is accepted
 OPENING_S = 20.0
 CALM_S = 10.0
 BUSY = {"servo_overrun", "loop_overrun", "frame_age"}
-HIDDEN = SetFault("camera", "star_fading", value=0.001)
-TRACKING = ("ACQUISITION", "COARSE", "VERNIER", "EXPERIMENT")
+HIDDEN = {
+    "right": SetFault("camera", "star_fading", value=0.001),
+    "metrology": SetFault("metrology.labjack", "laser_dim", value=0.0),
+}
+"""Keeps a loop in ACQUISITION."""
+TRACKING = ("ACQUISITION", "COARSE", "VERNIER", "LOCKED", "EXPERIMENT")
 
 
-def experiment():
+def experiment(loop):
     """Both stages move for longer than any entry takes, the siderostat without a rest."""
     drives = [
         Drive(channel="fsm_az", shape="sine", amplitude=0.5, frequency_hz=0.5, duration_s=120.0),
@@ -46,7 +52,7 @@ def experiment():
             duration_s=120.0,
         ),
     ]
-    return Experiment(name="fault catalogue", drives=drives)
+    return Experiment(loop=loop, name="fault catalogue", drives=drives)
 
 
 _UP = {"OFF": Standby, "SAFE": Recover, "STANDBY": Acquire}
@@ -55,9 +61,10 @@ TOWARDS = {
     "SAFE": dict.fromkeys(("OFF", "STANDBY", *TRACKING), Stop),
     "STANDBY": {"OFF": Standby, "SAFE": Recover} | dict.fromkeys(TRACKING, Hold),
     # By a first search, which moves at once; the one for a lost star begins with a pause.
-    "ACQUISITION": _UP | dict.fromkeys(("COARSE", "VERNIER", "EXPERIMENT"), Hold),
+    "ACQUISITION": _UP | dict.fromkeys(("COARSE", "VERNIER", "LOCKED", "EXPERIMENT"), Hold),
     "COARSE": _UP | {"EXPERIMENT": Hold},
     "VERNIER": _UP | {"EXPERIMENT": Hold},
+    "LOCKED": _UP,
     "EXPERIMENT": _UP | {"VERNIER": experiment},
 }
 """The command that leads towards a mode, by the mode of the loop; without one it gets there by itself."""
@@ -79,6 +86,7 @@ class WatchedRig(Rig):
         self.telemetry = []
         self.places = []
         self.bench_answers = True
+        self.loop = "right"  # whose stages are looked at
         self._looked_s = 0.0
         self.logs = folder
         self.errors = (folder / "errors.txt").open("a")
@@ -106,7 +114,8 @@ class WatchedRig(Rig):
 
     def place(self):
         """Where the stages truly are."""
-        stages = ask_bench(self.endpoints["mocks.bench_port"], StagesQuestion("right"), StagesNow)
+        question = StagesQuestion(self.loop)
+        stages = ask_bench(self.endpoints["mocks.bench_port"], question, StagesNow)
         return Place(time.monotonic(), stages.motor_rad, stages.stack_v)
 
     def start_supervisor(self):
@@ -124,8 +133,29 @@ class WatchedRig(Rig):
         answer = ask_bench(self.endpoints["mocks.bench_port"], question, FaultsNow)
         assert not answer.error, answer.error
 
-    def mode(self):
-        return self.follow(lambda _: True)[-1].loops[0].mode
+    def residual_px(self, loop, since_s):
+        """RMS of a loop's star from its target since then, in truth, on its worse axis."""
+        target_px = load_rig(self.file, self.settings).loops[loop].target_px
+        question = ResidualQuestion(loop, since_s, time.monotonic(), target_px.az, target_px.el)
+        residual = ask_bench(self.endpoints["mocks.bench_port"], question, Residual)
+        return max(residual.az_rms_px, residual.el_rms_px)
+
+    @property
+    def stellar_loops(self):
+        """Their names."""
+        return list(load_rig(self.file, self.settings).stellar_loops)
+
+    def modes(self):
+        """Of each loop, now."""
+        return modes_of(self.follow(lambda _: True)[-1])
+
+    def turn_off(self, loop):
+        """As an operator does: hold, then off, which the mirror's way to its bias delays."""
+        end_s = time.monotonic() + ANSWER_S
+        assert self.client.send(Hold(loop=loop)).accepted
+        while not self.client.send(Off(loop=loop)).accepted:
+            assert time.monotonic() < end_s, f"{loop} is not turned off within {ANSWER_S:g} s"
+            self.receive(LOOK_S)
 
     def process(self, name):
         """The process of a name, once it is there."""
@@ -193,32 +223,57 @@ class WatchedRig(Rig):
         return (self.folder / "errors.txt").read_text()
 
     def reach(self, wanted, limit_s=REACH_S):
-        """Bring the loop to a mode, whatever it is in; every fault is ended first.
+        """Bring loops to modes, whatever they are in; every fault is ended first.
 
-        Where the machine has no time for the loop just now, a better moment is waited for.
+        Where the machine has no time for a loop just now, a better moment is waited for.
+
+        Parameters
+        ----------
+        wanted : mapping of str to str
+            The mode of each loop by its name.
         """
         self.tell(ClearFaults())
-        if wanted == "ACQUISITION":
-            self.tell(HIDDEN)
+        for name, mode in wanted.items():
+            if mode == "ACQUISITION":
+                self.tell(HIDDEN[name])
         end_s, calm_s = time.monotonic() + limit_s, time.monotonic() + CALM_S
-        while (mode := self.mode()) != wanted or (self.is_busy() and time.monotonic() < calm_s):
-            assert time.monotonic() < end_s, f"{mode} instead of {wanted} after {limit_s} s"
-            if mode != wanted:
-                self._go_towards(wanted, mode)
+        while (elsewhere := self._elsewhere(wanted)) or (
+            self.is_busy() and time.monotonic() < calm_s
+        ):
+            assert time.monotonic() < end_s, f"{elsewhere} instead of {wanted} after {limit_s} s"
+            if elsewhere:
+                self._go_towards(wanted, elsewhere)
 
-    def _go_towards(self, wanted, mode):
-        """Give the command that leads there, if there is one, and wait for what comes of it."""
-        make = TOWARDS[wanted].get(mode)
-        accepted = make is None or self.client.send(make()).accepted
+    def _elsewhere(self, wanted):
+        """The loops that are in other modes than wanted, and in which."""
+        modes = self.modes()
+        return {name: modes[name] for name, mode in wanted.items() if modes[name] != mode}
+
+    def _go_towards(self, wanted, elsewhere):
+        """Give the commands that lead there, where there are any, and wait for what comes of them."""
+        made = {name: TOWARDS[wanted[name]].get(mode) for name, mode in elsewhere.items()}
+        accepted = [
+            make is None or self.client.send(make(loop=name)).accepted
+            for name, make in made.items()
+        ]
+        opening = not {Standby, Recover}.isdisjoint(made.values())
         with suppress(AssertionError):
             self.follow(
-                lambda t: t.loops[0].mode != mode or failed(t),
-                (OPENING_S if make in {Standby, Recover} else ANSWER_S) if accepted else 0.2,
+                lambda t: (
+                    (modes_of(t).items() & elsewhere.items() != elsewhere.items()) or failed(t)
+                ),
+                (OPENING_S if opening else ANSWER_S) if any(accepted) else 0.2,
             )
 
     def is_busy(self):
-        """The machine has no time for the loop just now."""
-        return bool({trip.name for trip in self.telemetry[-1].loops[0].interlocks} & BUSY)
+        """The machine has no time for a loop just now."""
+        loops = self.telemetry[-1].loops
+        return any({trip.name for trip in loop.interlocks} & BUSY for loop in loops)
+
+
+def modes_of(telemetry):
+    """The mode of each loop by its name."""
+    return {loop.name: loop.mode for loop in telemetry.loops}
 
 
 def failed(telemetry):
