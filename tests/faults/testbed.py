@@ -60,7 +60,6 @@ LABJACK_FAULTS = (
         "metrology.labjack", "swapped az",
         ends=("COARSE", "ACQUISITION", "SAFE"), says=LINK_LOST, within_s=6.0,
     ),
-    *metrology("metrology.labjack", "stuck_input AIN0", ends=HELD, others=LINK_HELD),
     *metrology("metrology.labjack", "offset_drift AIN0", "noise AIN0", ends=HELD, others=LINK_HELD),
 )  # fmt: skip
 HEXAPOD_FAULTS = hexapod(
@@ -93,8 +92,22 @@ LEFT_STAGES = (
     ),
 )  # fmt: skip
 STARS = (
-    *left("camera", "dark_half left", ends=SEARCHES, says="no star on", within_s=2.0),
-    *right("camera", "dark_half right", ends=SEARCHES, says="no star on", within_s=2.0),
+    *left(
+        "camera",
+        "dark_half left",
+        ends=SEARCHES,
+        says="no star on",
+        within_s=2.0,
+        others=(("right", STAYED), ("metrology", STAYED)),
+    ),
+    *right(
+        "camera",
+        "dark_half right",
+        ends=SEARCHES,
+        says="no star on",
+        within_s=2.0,
+        others=(("left", STAYED), ("metrology", STAYED)),
+    ),
     *right("camera", "drop", says=CAMERA, others=(("left", "SAFE"), ("metrology", STAYED))),
     *right("right.drive", "amplifier_fault", says=SIDEROSTAT),
 )
