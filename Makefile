@@ -13,13 +13,13 @@ COUNT ?= 200
 SOAK_S ?= 3600
 FAULT_RESULTS ?= .fault-results.json
 # Two instruments side by side: one takes less than half a core.
-FAULTS := -m fault tests/faults --numprocesses 2 --dist loadgroup
+FAULTS := tests/faults --numprocesses 2 --dist loadgroup
 
 # Compiled anew by every process, the code costs each worker and each fitctl that a test starts seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-loop bench-sim bench-testbed soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults test-faults-testbed reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-loop bench-sim bench-testbed soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -77,10 +77,13 @@ test-console: $(READY)  ## What people do: the tutorial, the console by keys (tm
 	$(BIN)/pytest -m terminal tests/system --numprocesses 2 $(ARGS)
 
 test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
-	$(BIN)/pytest $(FAULTS) $(ARGS)
+	$(BIN)/pytest -m "fault and not testbed" $(FAULTS) $(ARGS)
+
+test-faults-testbed: $(READY)  ## The fault catalogue's rows on the whole testbed
+	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)
 
 reliability: $(READY)  ## The fault catalogue, and its results into docs/reliability.md
-	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest $(FAULTS) $(ARGS)
+	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
 	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
 
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs

@@ -2,6 +2,7 @@
 
 import pytest
 
+from . import testbed
 from .catalogue import INSTRUMENTS
 from .conftest import RESULTS
 from .engine import run
@@ -15,7 +16,13 @@ pytestmark = [pytest.mark.fault, pytest.mark.timeout(200)]
     [
         # One worker has them all, one after the other: another has another instrument meanwhile.
         pytest.param(
-            instrument, entry, id=entry.name, marks=pytest.mark.xdist_group(", ".join(instrument))
+            instrument,
+            entry,
+            id=entry.name,
+            marks=[
+                pytest.mark.xdist_group(", ".join(instrument)),
+                *([pytest.mark.testbed] if entry.rig == testbed.RIG else []),
+            ],
         )
         for instrument, entries in INSTRUMENTS.items()
         for entry in entries

@@ -1,6 +1,5 @@
 """A stellar loop whose light comes over a link: held while the link moves, waiting while it is lost."""
 
-
 import numpy as np
 import pytest
 
