@@ -20,6 +20,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import RecorderStatus
 from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import (
+    MoveCollector,
     RecentEvents,
     RecorderReport,
     Reply,
@@ -68,12 +69,22 @@ _VALUES = {
     "drives": [_DRIVE],
     "action": "pause",
     "status": _STATUS,
+    "kind": "sine",
+    "direction_deg": 30.0,
+    "range_mm": 20.0,
+    "velocity_mm_s": 0.1,
+    "amplitude_mm": 1.0,
+    "frequency_hz": 0.05,
+    "rms_mm_s": 0.2,
+    "correlation_s": 5.0,
 }
 _RECORDER = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_written=9)
+# Where a field of one command means something else.
+_OWN_VALUES = {RecorderReport: {"status": _RECORDER}, MoveCollector: {"action": "start"}}
 _COMMANDS = [
     msgspec.msgpack.encode(
         {"type": row.name, "loop": "right"}
-        | {name: _RECORDER if row.make is RecorderReport else _VALUES[name] for name in row.fields}
+        | {name: (_VALUES | _OWN_VALUES.get(row.make, {}))[name] for name in row.fields}
     )
     for row in COMMANDS
 ]
