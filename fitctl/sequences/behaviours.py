@@ -5,7 +5,6 @@ from __future__ import annotations
 from fitctl.config import Rig
 from fitctl.sequences.acquiring import ACQUIRE
 from fitctl.sequences.behaviour import Behaviour
-from fitctl.sequences.collector import COLLECTOR
 from fitctl.sequences.dark import DARK
 from fitctl.sequences.open_loop import OPEN_LOOP
 from fitctl.sequences.plain import PLAIN
@@ -13,10 +12,10 @@ from fitctl.sequences.plate_scale import PLATE_SCALE
 from fitctl.sequences.pointing import POINTING
 from fitctl.sequences.stars import STARS
 from fitctl.sequences.steps import Step
-from fitctl.sequences.visibility import VISIBILITY
+from fitctl.sequences.testbed import TESTBED
 
 BEHAVIOURS: dict[str, Behaviour] = (
-    PLAIN | ACQUIRE | POINTING | OPEN_LOOP | PLATE_SCALE | DARK | STARS | COLLECTOR | VISIBILITY
+    PLAIN | ACQUIRE | POINTING | OPEN_LOOP | PLATE_SCALE | DARK | STARS | TESTBED
 )
 
 
