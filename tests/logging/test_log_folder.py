@@ -137,11 +137,9 @@ def test_the_oldest_go_until_the_rest_fits_but_never_one_in_use_or_kept(
     if deleted and free:  # the oldest went first
         ages = {path: age for age, path, _ in paths}
         assert min(ages[path] for path in deleted) >= max(age for age, *_ in free)
-    newest = max(
-        (entry for entry in paths if entry[1] in deleted), key=lambda e: -e[0], default=None
-    )
-    if newest is not None:  # and none went without need
-        assert newest[0] > retain_days or total + newest[2] > retain_bytes
+    if deleted:  # and none went without need
+        age, size = next((age, size) for age, path, size in paths if path == deleted[-1])
+        assert age > retain_days or total + size > retain_bytes
 
 
 def test_only_what_a_recorder_of_this_rig_named_is_deleted(tmp_path):
