@@ -14,7 +14,7 @@ from fitctl.config import Collector, CollectorMotion
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceError, DeviceFault, DeviceRefused, Hexapod, Pose
 from fitctl.model.collector_motion import Course, Displacement, course_of
-from fitctl.model.metrology.collector import transverse_axes
+from fitctl.model.metrology.geometry import transverse_axes
 
 PERIOD_S = 0.05
 """Between two targets."""

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from fitctl.config import CollectorGeometry, default_rig_path, load_rig
-from fitctl.model.metrology.collector import (
+from fitctl.model.metrology.geometry import (
     array_from_pose,
     array_lever,
     fold,

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fitctl.config import ARCSEC_PER_RAD, default_rig_path, load_rig
 from fitctl.model.hexapod_motion import at_rest
 from fitctl.model.metrology import part as metrology_part
-from fitctl.model.metrology.collector import array_lever, star_turn
+from fitctl.model.metrology.geometry import array_lever, star_turn
 from fitctl.model.metrology.photodiodes import diode_volts
 from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
