@@ -29,11 +29,13 @@ from benchmarks.recorder import processor_s
 from fitctl import demo
 from fitctl.config import default_rig_path
 from fitctl.messages.client import Client
+from fitctl.messages.modes import HOLDING
 from fitctl.messages.telemetry import Telemetry
 
 SETTLE_S = 8.0
 WAIT_S = 120.0
 NEAR = "plant.loops.right.star_offset_sky_arcsec_max=5.0"
+HOLDING_NAMES = {mode.name for mode in HOLDING}
 TICK_FIELDS = ("compute_s", "frame_age_s")
 
 
@@ -104,8 +106,8 @@ def spell(client: Client, duration_s: float, pids: list[int]) -> dict[str, float
     return figures
 
 
-def to_vernier(running: demo.Instrument) -> None:
-    """Acquire, and wait until the star is held.
+def hold(running: demo.Instrument) -> None:
+    """Acquire, and wait until every loop holds its star or its beam.
 
     Raises
     ------
@@ -115,19 +117,21 @@ def to_vernier(running: demo.Instrument) -> None:
     end_s = time.monotonic() + WAIT_S
     while time.monotonic() < end_s:
         telemetry = running.client.receive(0.5)
-        if telemetry is not None and telemetry.loops[0].mode == "VERNIER":
+        if telemetry is not None and {loop.mode for loop in telemetry.loops} <= HOLDING_NAMES:
             return
     raise TimeoutError
 
 
-def measure(duration_s: float, turns: int, keys: str, size: tuple[int, int]) -> dict[str, Any]:
+def measure(
+    duration_s: float, turns: int, keys: str, size: tuple[int, int], rig: Path
+) -> dict[str, Any]:
     """Take turns; the median of each figure, with and without."""
     spells: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
     written = 0.0
     with tempfile.TemporaryDirectory() as logs:
         settings = [NEAR, f"logging.folder={logs}"]
-        with demo.instrument(default_rig_path(), settings, seed=1) as running:
-            to_vernier(running)
+        with demo.instrument(rig, settings, seed=1) as running:
+            hold(running)
             for _ in range(turns):
                 spells["without"].append(spell(running.client, duration_s, []))
                 terminal = Terminal(running.sockets, keys, *size)
@@ -154,10 +158,13 @@ def main() -> None:
         "--keys", default="1", help="typed into the console first: 1 Operate, 3 Loop"
     )
     parser.add_argument("--size", default="120x40", help="of its terminal")
+    parser.add_argument("--testbed", action="store_true", help="three loops instead of one")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     columns, rows = map(int, options.size.split("x"))
-    result = measure(options.duration, options.turns, options.keys, (columns, rows))
+    rig = default_rig_path()
+    rig = rig.with_name("fit-testbed.toml") if options.testbed else rig
+    result = measure(options.duration, options.turns, options.keys, (columns, rows), rig)
     if options.json:
         print(json.dumps(result))
         return

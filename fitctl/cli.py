@@ -45,6 +45,7 @@ COMMANDS = {
     "run": Command("operate", "Supervise a rig"),
     "console": Command("operate", "Open the operator console"),
     "send": Command("operate", "Send one command to the supervisor"),
+    "rehearse": Command("operate", "Show what a command would do"),
     "status": Command("operate", "Show the state of the instrument"),
     "watch": Command("operate", "Print a line a second, and every event"),
     "simulate": Command("design", "Acquire and hold a star on a virtual clock"),

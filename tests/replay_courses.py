@@ -185,9 +185,17 @@ def two_loops():
     document = load_rig(default_rig_path(), [SOON]).model_dump(mode="json")
     for loops in (document[part]["loops"] for part in ("plant", "mocks")):
         loops["left"] = dict(loops["right"])
+    document["mocks"]["loops"]["left"] |= {"modbus_port": 29504, "mdt693_port": 29694}
+    siderostat, fsm = (document["loops"]["right"][stage] for stage in ("siderostat", "fsm"))
     document["loops"]["left"] = document["loops"]["right"] | {
         "star_flux_dn": 84000.0,
         "target_px": {"az": 10.0, "el": 19.5},
+        "siderostat": siderostat | {"device": siderostat["device"] | {"node_id": 2}},
+        "fsm": fsm
+        | {
+            "dac": fsm["dac"] | {"port": 29504},
+            "piezo": fsm["piezo"] | {"port": "socket://127.0.0.1:29694"},
+        },
     }
     (spot, *_) = document["plant"]["loops"]["left"]["spots"]
     document["plant"]["loops"]["left"]["spots"] = [spot | {"flux_dn": 84000.0}]
@@ -203,8 +211,14 @@ INTERLOCKS = [
 ]
 FAULT = {"STAR_FOUND", "IN_REACH", "FAULT", "RECOVER"}
 # What is done, with which rig, and what must have happened for it to say anything.
+MOVING = [
+    "loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}",
+    "plant.loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}",
+]
 COURSES = {
     "every command": (every_command, [], {"HOLD", "STOP", "RECOVER", "OFF", "IN_REACH"}),
+    "a star that moves": (every_command, MOVING, {"HOLD", "STOP", "RECOVER", "IN_REACH"}),
+    "experiments on a star that moves": (an_experiment, MOVING, {"EXPERIMENT", "EXPERIMENT_DONE"}),
     "another star": (another_star, [TWO_STARS], {"IN_REACH"}),
     "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),
     "a star that is away for long": (

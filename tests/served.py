@@ -69,6 +69,9 @@ class Served:
         self.client = self.client_of(self.folder)
 
     def start(self):
+        # The first steps load what is compiled, which takes longer than a client waits on a busy machine.
+        for _ in range(3):
+            self.simulation.supervisor.step()
         self.service.start()
         self.stepper.start()
         if self.tcp:

@@ -83,7 +83,7 @@ def test_an_override_that_cannot_be_is_refused(override, said):
         ("[loops.right.fsm]\nbias_x = 1.0", "loops.right.fsm.bias_x: unknown key"),
         ("[loops.right.siderostat]\nbacklash_sky_arcsec = -1.0", "(is -1.0)"),
         ("[loops.right.fsm.hysteresis]\nhalf_widths_v = [0.0, 1.0]", "half_widths_v 2"),
-        ("[loops.right.fsm]\nrange_rad = 1.0", "lower range_rad"),
+        ("[loops.right.fsm]\nrange_rad = 1.0", "range_rad: must be at most"),
         ('include = ["other.toml"]', "include: unknown key"),
         ("mocks = 3", "mocks: must be"),
         ("a = [", "not TOML"),

@@ -52,16 +52,18 @@ INSTALLED = {"rerun", "pymcap-cli", "pytest", "python", "ruff", "mypy"}
 NEARBY_PX = np.array([30.0, -10.0])  # a star that is found and held within 20 s
 # Every documented command that the test below does not run, and why; a test named here runs its like.
 NOT_RUN = {
-    "fitctl console*": "wants a terminal: tests/system/test_console.py",
+    "fitctl console*": "wants a terminal: tests/system/screens.py",
     "fitctl demo*": "a whole instrument, in real time: tests/system/test_demos.py",
     "fitctl fault clear": "needs running mocks: tests/commands/test_cli_fault.py",
     "fitctl fault now": "needs running mocks: tests/commands/test_cli_fault.py",
     "fitctl fault set *": "needs running mocks: tests/commands/test_cli_fault.py",
     "fitctl figures *": "takes minutes: tests/figures/test_figures.py makes them with --quick's amounts",
+    "fitctl identify feedforward *": "needs a scan's log: tests/sequences/behaviours/test_scans.py",
     "fitctl identify hysteresis*": "needs a rig with a star, or its log: tests/commands/test_cli_identify.py",
     "fitctl init my-rig.toml": "asks a person on a terminal: tests/commands/test_cli_init.py",
     "fitctl mocks*": "a server: tests/commands/test_cli_doctor.py, and below",
     "fitctl plot *--window": "opens a window: tests/commands/test_cli_report.py without a display",
+    "fitctl rehearse *": "needs an instrument that runs: tests/commands/test_rehearse.py",
     "fitctl report *--open": "opens a browser: tests/commands/test_cli_report.py with another in its place",
     "fitctl run*": "a server: tests/system/test_first_light.py",
     "fitctl send *": "needs a running supervisor: tests/system/test_tutorial.py, and below",
@@ -92,6 +94,7 @@ STATUSES = {
     "fitctl doctor": {0, 1},  # no device is there, unless somebody's mocks are
     "fitctl replay * --controller *": {1},  # another controller commands otherwise
     "* --set camera.frame_rate=50": {2},  # the document shows the mistake
+    "* --set camera.frame_delay_s=0.2": {2},  # likewise
 }
 
 
@@ -127,7 +130,7 @@ def parsed(name, arguments):
 
 @pytest.fixture(scope="module")
 def sample_log(tmp_path_factory):
-    """What a recorder would have written of the first 30 s, but on the virtual clock."""
+    """What a recorder would have written of the first 42 s, but on the virtual clock."""
     rig = load_rig(default_rig_path())
     path = tmp_path_factory.mktemp("sample") / "sample.mcap"
     info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
@@ -144,7 +147,7 @@ def sample_log(tmp_path_factory):
             record=lambda record: log.write(record, log_time_s()),
         )
         simulation.acquire()
-        simulation.run(30.0)
+        simulation.run(42.0)  # of which 20 s in VERNIER once it has settled, to learn from
         now_s = simulation.clock.now_s()
         status = RecorderStatus(time_s=now_s, path=str(path), records=1, lost=0, bytes_written=1)
         log.write(status, log_time_s())

@@ -15,7 +15,7 @@ from benchmarks.flood import hold
 from fitctl import demo
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
-from fitctl.controllers.design.bound import bound
+from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.logging.records import Tick
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 

@@ -50,9 +50,18 @@ from fitctl.config.mocks import (
     MetrologyMocks,
     SiderostatMocks,
 )
-from fitctl.config.plant import AirPath, HotPixel, Hysteresis, LinkAir, MetrologyPlant, Spot
+from fitctl.config.origins import default_rig_path
+from fitctl.config.plant import (
+    AirPath,
+    HotPixel,
+    Hysteresis,
+    Line,
+    LinkAir,
+    MetrologyPlant,
+    Spot,
+)
 from fitctl.config.reading import lay_over, load_rig, rig_from_document, rig_from_log
-from fitctl.config.rig import AnyLoop, Rig, default_rig_path
+from fitctl.config.rig import AnyLoop, Rig
 
 __all__ = [
     "AIN_RANGES_V",
@@ -93,6 +102,7 @@ __all__ = [
     "Interlock",
     "LabJackMock",
     "LabJackT7Device",
+    "Line",
     "LinkAir",
     "Logging",
     "Loop",

@@ -9,6 +9,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
 
+from fitctl.config.conflict import Conflict, Conflicts, above, below
+
 ARCSEC_PER_RAD = 180 * 3600 / math.pi
 
 
@@ -54,6 +56,20 @@ class AxisPair(Settings):
     el: Finite
 
 
+def _invertible(matrix: list[list[float]]) -> list[list[float]]:
+    (a, b), (c, d) = matrix
+    if a * d - b * c < _LEAST_DETERMINANT:
+        msg = f"must have a determinant of at least {_LEAST_DETERMINANT:g}; [[1.0, 0.0], [0.0, 1.0]] is even"
+        raise ValueError(msg)
+    return matrix
+
+
+_LEAST_DETERMINANT = 0.1
+_Row = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+AxisGains = Annotated[list[_Row], Field(min_length=2, max_length=2), AfterValidator(_invertible)]
+"""From a stage's angles, az and el, to those by which it turns the beam along its axes, row by row."""
+
+
 class Range(Settings):
     """A closed range."""
 
@@ -62,10 +78,21 @@ class Range(Settings):
 
     @model_validator(mode="after")
     def _ordered(self) -> Range:
-        if self.low >= self.high:
-            msg = "low must be below high"
-            raise ValueError(msg)
+        require_order(self.low, self.high)
         return self
+
+
+def require_order(low: float, high: float) -> None:
+    """Reject limits of which the low one is not below the high one.
+
+    Raises
+    ------
+    Conflicts
+        If so.
+    """
+    if low >= high:
+        parts = (below("low", low, high), above("high", high, low))
+        raise Conflicts([Conflict("a range goes from low to high", parts)])
 
 
 def _kind_of(settings: Any) -> str:

@@ -137,5 +137,5 @@ class Fringes(Settings):
     """Which two loops' stars interfere, and at what aperture and wavelength."""
 
     loops: Annotated[list[Name], Field(min_length=2, max_length=2)]
-    aperture_m: Positive
-    wavelength_m: Positive
+    aperture_m: Annotated[float, Field(ge=1e-3, le=100)]
+    wavelength_m: Annotated[float, Field(ge=1e-7, le=1e-4)]

@@ -4,28 +4,56 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from typing import Annotated, Generic, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from fitctl.config.base import AxisPair, Count, Finite, NonNegative, Positive, Settings, TimeoutS
+from fitctl.config.addresses import (
+    BaudRate,
+    CanInterface,
+    Host,
+    Ipv4,
+    SerialPort,
+    is_host,
+    is_serial_port,
+)
+from fitctl.config.base import (
+    ARCSEC_PER_RAD,
+    AxisGains,
+    AxisPair,
+    Count,
+    Finite,
+    NonNegative,
+    Positive,
+    Settings,
+    TimeoutS,
+)
+from fitctl.config.conflict import Conflict, Conflicts, Part, at_least, at_most
 
 HALF_WINDOW_PX = 3  # of Eq. 7's 7x7 window, about its central pixel
+FULL_SCALE_DN = {"Mono8": 255, "Mono12": 4095, "Mono16": 65535}
 AIN_RANGES_V = (10.0, 1.0, 0.1, 0.01)  # of a LabJack T7's inputs, either way from zero
+PIEZO_LIMITS_V = (75.5, 100.5, 150.5)  # that an MDT693's limit switch reads at 75, 100 and 150 V
+LIMIT_TOLERANCE_V = 1.0  # within which the driver compares limits
+_NETWORK_INTERFACE = re.compile(r"[^\s/:]{1,15}")
+_SLCAN_CHANNEL = "the adapter's serial port, such as /dev/ttyACM0, or socket://host:port"
+_SOCKETCAN_CHANNEL = "a network interface, such as can0"
+_OTHER_CHANNELS = "docs/wiring-a-rig.md lists interfaces and their channels"
 
 
 class Optics(Settings):
     """Optics that all loops share."""
 
-    compressor_ratio: Positive
-    focal_length_m: Positive
+    compressor_ratio: Annotated[float, Field(ge=0.1, le=100)]
+    focal_length_m: Annotated[float, Field(ge=0.01, le=100)]
 
 
 class GigeDevice(Settings):
     """Where a GigE Vision camera answers."""
 
     driver: Literal["gige", "aravis"]
-    address: str
+    address: Ipv4
     gvcp_port: Annotated[int, Field(ge=1, le=65535)]
     pixel_format: Literal["Mono8", "Mono12", "Mono16"]
     gain: NonNegative
@@ -41,16 +69,20 @@ class GigeDevice(Settings):
 
 
 class Camera(Settings):
-    """The focal plane and the camera that reads it."""
+    """The focal plane and the camera that reads it.
+
+    ``electrons_per_dn`` gives the noise of the star's own light; without it, light has none.
+    """
 
     width_px: Annotated[int, Field(ge=16, le=4096)]  # below, the search's field would vanish
     height_px: Annotated[int, Field(ge=16, le=4096)]
-    pixel_size_m: Annotated[float, Field(ge=1e-6, le=1e-3)]
+    pixel_size_m: Annotated[float, Field(ge=1e-6, le=1e-4)]
     frame_rate_hz: Annotated[float, Field(ge=1, le=2000)]
     exposure_s: Positive
     frame_delay_s: NonNegative
     bias_dn: NonNegative
     pixel_noise_dn: Positive
+    electrons_per_dn: Positive | None = None
     dark_file: str | None = None
     device: GigeDevice
 
@@ -81,9 +113,16 @@ class Camera(Settings):
     @model_validator(mode="after")
     def _exposure_fits(self) -> Camera:
         if self.exposure_s > self.period_s:
-            msg = f"exposure_s must not pass the frame period, {self.period_s:g} s"
-            raise ValueError(msg)
+            parts = (
+                at_most("exposure_s", self.exposure_s, self.period_s),
+                at_most("frame_rate_hz", self.frame_rate_hz, 1 / self.exposure_s),
+            )
+            raise Conflicts([Conflict("an exposure ends within its frame period", parts)])
         return self
+
+
+# Full scale of an analogue output: 10 V, and what stations that go a little beyond have.
+OutputV = Annotated[float, Field(gt=0, le=12)]
 
 
 class ServoSettings(Settings):
@@ -99,7 +138,7 @@ class Cia402Device(Settings):
     """A two-axis CANopen CiA 402 drive."""
 
     driver: Literal["cia402"]
-    interface: str
+    interface: CanInterface
     channel: str
     bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000]
     node_id: Annotated[int, Field(ge=1, le=127)]
@@ -107,6 +146,20 @@ class Cia402Device(Settings):
     drive_heartbeat_s: Annotated[float, Field(ge=0.01, le=10)]
     master_heartbeat_timeout_s: Annotated[float, Field(ge=0.02, le=10)]
     position_limit_rad: NonNegative
+
+    @model_validator(mode="after")
+    def _channel_is_of_the_interface(self) -> Cia402Device:
+        if self.interface == "slcan":
+            problem = None if is_serial_port(self.channel.split("@")[0]) else _SLCAN_CHANNEL
+        elif self.interface == "socketcan":
+            problem = None if _NETWORK_INTERFACE.fullmatch(self.channel) else _SOCKETCAN_CHANNEL
+        else:
+            problem = (
+                None if self.channel else f"what python-can calls a channel of {self.interface}"
+            )
+        if problem is not None:
+            raise Conflicts([Conflict(_OTHER_CHANNELS, (Part("channel", self.channel, problem),))])
+        return self
 
     @property
     def endpoint(self) -> str:
@@ -125,11 +178,19 @@ class EnsembleDevice(Settings):
     """
 
     driver: Literal["ensemble"]
-    port: str
-    baud_rate: Count
+    port: SerialPort
+    baud_rate: BaudRate
     axes: Annotated[list[Annotated[int, Field(ge=0, le=9)]], Field(min_length=2, max_length=2)]
     response_timeout_s: TimeoutS
     software_limits_verified: bool
+
+    @field_validator("axes")
+    @classmethod
+    def _two_axes(cls, axes: list[int]) -> list[int]:
+        if axes[0] == axes[1]:
+            msg = "must be two different axes, az and el, such as [0, 1]"
+            raise ValueError(msg)
+        return axes
 
     @property
     def endpoint(self) -> str:
@@ -153,13 +214,13 @@ class BalAnalogDevice(Settings):
     """
 
     driver: Literal["bal_analog"]
-    host: str
+    host: Host
     port: Annotated[int, Field(ge=1, le=65535)]
     device_id: Annotated[int, Field(ge=0, le=255)]
     first_output_register: Annotated[int, Field(ge=0, le=65533)]
     first_input_register: Annotated[int, Field(ge=0, le=65533)]
     full_scale_counts: Annotated[int, Field(ge=100, le=32767)]
-    full_scale_v: Positive
+    full_scale_v: OutputV
     velocity_rad_s_per_v: AxisPair
     enabled_level: Literal["high", "low"]
     fault_level: Literal["high", "low"]
@@ -196,14 +257,15 @@ RotationDeg = Annotated[float, Field(ge=-180, le=180)]
 class Siderostat(Settings, Generic[AmplifierDevice]):
     """The coarse stage: geometry, limits, servo, amplifiers; generic in what its amplifiers are."""
 
-    encoder_counts_per_rev: Count
-    spur_gear_ratio: Positive
-    ball_screw_m_per_rad: Positive
-    lever_arm_m: Positive
+    encoder_counts_per_rev: Annotated[int, Field(ge=16, le=2**26)]
+    spur_gear_ratio: Annotated[float, Field(ge=0.01, le=1e4)]
+    ball_screw_m_per_rad: Annotated[float, Field(ge=1e-6, le=0.02)]
+    lever_arm_m: Annotated[float, Field(ge=1e-3, le=10)]
     rotation_deg: RotationDeg
-    travel_sky_arcsec: Positive
-    velocity_limit_rad_s: Positive
-    acceleration_limit_rad_s2: Positive
+    axis_gains: AxisGains | None = None
+    travel_sky_arcsec: Annotated[float, Field(gt=0, le=72_000)]
+    velocity_limit_rad_s: Annotated[float, Field(gt=0, le=3000)]
+    acceleration_limit_rad_s2: Annotated[float, Field(gt=0, le=1e7)]
     servo: ServoSettings
     device: AmplifierDevice
     backlash_sky_arcsec: NonNegative | None = None
@@ -212,6 +274,16 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
     def encoder_count_rad(self) -> float:
         """Motor angle of one encoder count."""
         return 2 * math.pi / self.encoder_counts_per_rev
+
+    @property
+    def sky_rad_per_motor_rad(self) -> float:
+        """Beam angle on the sky by motor angle: it is a mirror, whose beam turns by twice its own angle."""
+        return 2 * self.ball_screw_m_per_rad / self.spur_gear_ratio / self.lever_arm_m
+
+    @property
+    def travel_rad(self) -> float:
+        """Travel of the motors, either way from the encoders' zero."""
+        return self.travel_sky_arcsec / (self.sky_rad_per_motor_rad * ARCSEC_PER_RAD)
 
 
 AnySiderostat = Siderostat[SiderostatDevice]
@@ -225,22 +297,33 @@ class ModbusDacDevice(Settings):
     host: str
     port: Annotated[int, Field(ge=1, le=65535)]
     serial_port: str
-    baud_rate: Annotated[int, Field(ge=1200, le=4_000_000)]
+    baud_rate: BaudRate
     serial_format: Literal["8E1", "8O1", "8N1", "8N2"]
     device_id: Annotated[int, Field(ge=0, le=255)]
     first_register: Annotated[int, Field(ge=0, le=65533)]
-    full_scale_v: Positive
+    full_scale_v: OutputV
     bits: Annotated[int, Field(ge=8, le=16)]
     response_timeout_s: TimeoutS
 
     @model_validator(mode="after")
     def _can_be_reached(self) -> ModbusDacDevice:
-        if self.transport == "rtu" and not self.serial_port:
-            msg = "serial_port must name a port, such as /dev/ttyUSB0, where transport is rtu"
-            raise ValueError(msg)
+        if self.transport == "rtu" and not is_serial_port(self.serial_port):
+            demand = "a serial port, such as /dev/ttyUSB0, or socket://host:port"
+            parts = (
+                Part("serial_port", self.serial_port, demand),
+                Part("transport", self.transport, "tcp"),
+            )
+            raise Conflicts([Conflict("rtu goes over a serial line", parts)])
+        if self.transport == "tcp" and not is_host(self.host):
+            demand = "an address such as 192.168.1.31, or a host name"
+            parts = (Part("host", self.host, demand), Part("transport", self.transport, "rtu"))
+            raise Conflicts([Conflict("tcp goes to a host", parts)])
         if self.transport == "rtu" and not 1 <= self.device_id <= 247:
-            msg = "device_id must be from 1 to 247 where transport is rtu: to 0, nobody answers"
-            raise ValueError(msg)
+            parts = (
+                Part("device_id", self.device_id, "from 1 to 247"),
+                Part("transport", self.transport, "tcp"),
+            )
+            raise Conflicts([Conflict("over rtu, no other station answers", parts)])
         return self
 
     @property
@@ -258,13 +341,24 @@ class Mdt693Device(Settings):
     """A Thorlabs MDT693A or MDT693B."""
 
     driver: Literal["mdt693"]
-    port: str
-    baud_rate: Count
+    port: SerialPort
+    baud_rate: BaudRate
     response_timeout_s: TimeoutS
-    gain: Positive
-    limit_v: Annotated[float, Field(gt=0, le=151)]
+    gain: Annotated[float, Field(ge=1, le=50)]
+    limit_v: float
     poll_s: Annotated[float, Field(ge=0.2, le=60)]
     follow_tolerance_v: Positive
+
+    @field_validator("limit_v")
+    @classmethod
+    def _is_of_the_switch(cls, limit_v: float) -> float:
+        if not any(abs(limit_v - one) <= LIMIT_TOLERANCE_V for one in PIEZO_LIMITS_V):
+            msg = (
+                "must be 75.5, 100.5 or 150.5, which the amplifier reads with its limit switch at 75, 100 or "
+                "150 V; choose it by the stacks' data sheet"
+            )
+            raise ValueError(msg)
+        return limit_v
 
 
 class LabJackT7Device(Settings):
@@ -285,7 +379,7 @@ class LabJackT7Device(Settings):
     """
 
     driver: Literal["labjack_t7"]
-    host: str
+    host: Host
     port: Annotated[int, Field(ge=1, le=65535)]
     serial_number: Count | None = None
     inputs: Annotated[list[Annotated[int, Field(ge=0, le=3)]], Field(min_length=4, max_length=4)]
@@ -358,8 +452,8 @@ class C887Device(Settings):
     """
 
     driver: Literal["c887"]
-    port: str
-    baud_rate: Count
+    port: SerialPort
+    baud_rate: BaudRate
     stage: str
     travel: HexapodTravel
     velocity_limit_mm_s: Positive
@@ -406,10 +500,11 @@ class StackHysteresis(Settings):
 class Fsm(Settings):
     """The fast steering mirror, its D/A and its piezo amplifier."""
 
-    stack_scale_m_per_v: Positive
-    stack_radius_m: Positive
-    beam_per_mirror: Positive
+    stack_scale_m_per_v: Annotated[float, Field(ge=1e-9, le=2e-5)]
+    stack_radius_m: Annotated[float, Field(ge=1e-3, le=0.5)]
+    beam_per_mirror: Annotated[float, Field(ge=0.1, le=4)]  # one reflection turns a beam by 2
     rotation_deg: RotationDeg
+    axis_gains: AxisGains | None = None
     bias_v: Positive
     range_rad: Positive
     slew_v_per_s: Positive
@@ -418,13 +513,32 @@ class Fsm(Settings):
     hysteresis: StackHysteresis | None = None
     structure: Structure | None = None
 
+    @property
+    def swing_v(self) -> float:
+        """Voltage at the D/A, either way from the bias, that tilts the mirror by its range."""
+        return self.stack_radius_m * self.range_rad / self.stack_scale_m_per_v
+
     @model_validator(mode="after")
     def _range_fits_the_dac(self) -> Fsm:
-        swing_v = self.stack_radius_m * self.range_rad / self.stack_scale_m_per_v
-        if self.bias_v - swing_v < 0 or self.bias_v + swing_v > self.dac.full_scale_v:
-            msg = (
-                f"range_rad needs {self.bias_v - swing_v:.3f} to {self.bias_v + swing_v:.3f} V, "
-                f"and the D/A gives 0 to {self.dac.full_scale_v:g} V; lower range_rad"
-            )
-            raise ValueError(msg)
-        return self
+        swing_v, full_v = self.swing_v, self.dac.full_scale_v
+        low_v, high_v = self.bias_v - swing_v, self.bias_v + swing_v
+        if low_v >= 0 and high_v <= full_v:
+            return self
+        fits = min(self.bias_v, full_v - self.bias_v) / swing_v
+        middle = f"from {swing_v:.4g} to {full_v - swing_v:.4g}" if 2 * swing_v <= full_v else ""
+        range_part = at_most("range_rad", self.range_rad, self.range_rad * fits)
+        if fits <= 0:
+            most = at_most("", 0, self.range_rad * full_v / 2 / swing_v).must_be
+            range_part = Part("range_rad", self.range_rad, f"{most}, with bias_v {full_v / 2:g}")
+        parts = [
+            range_part,
+            Part("bias_v", self.bias_v, middle),
+            at_most("stack_radius_m", self.stack_radius_m, self.stack_radius_m * fits),
+        ]
+        if fits > 0:
+            scale = self.stack_scale_m_per_v
+            parts.append(at_least("stack_scale_m_per_v", scale, scale / fits))
+        if low_v >= 0:
+            parts.append(at_least("dac.full_scale_v", full_v, high_v))
+        why = f"the range needs {low_v:.3f} to {high_v:.3f} V, and the D/A gives 0 to {full_v:g} V"
+        raise Conflicts([Conflict(why, tuple(parts))])

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, field_validator, model_validator
 
-from fitctl.config.base import Finite, NonNegative, Positive, Settings
+from fitctl.config.base import Finite, NonNegative, Positive, Settings, require_order
 
 ModeName = Literal[
     "OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT", "LOCKED"
@@ -184,7 +184,6 @@ class Interlock(Settings):
         if self.low is None and self.high is None and self.stale_s is None:
             msg = "needs low, high or stale_s, or it could never trip"
             raise ValueError(msg)
-        if self.low is not None and self.high is not None and self.low >= self.high:
-            msg = "low must be below high"
-            raise ValueError(msg)
+        if self.low is not None and self.high is not None:
+            require_order(self.low, self.high)
         return self

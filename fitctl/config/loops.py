@@ -19,6 +19,7 @@ from fitctl.config.base import (
     Range,
     Settings,
 )
+from fitctl.config.conflict import Conflict, Conflicts, Part, above, at_least, at_most, below
 from fitctl.config.devices import AnySiderostat, Fsm
 
 ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
@@ -28,9 +29,9 @@ FieldOverlap = Annotated[float, Field(ge=LEAST_OVERLAP, le=MOST_OVERLAP)]
 
 
 class Acquisition(Settings):
-    """How the star is searched for, and when it counts as found or lost.
+    """How a star or a metrology beam is searched for, and when it counts as found or lost.
 
-    Without ``search_again_s``, the search for a star that was followed and lost ends only on a command.
+    Without ``search_again_s``, the search for one that was followed and lost ends only on a command.
     """
 
     search_radius_sky_arcsec: Positive
@@ -38,9 +39,9 @@ class Acquisition(Settings):
     found_frames: Count
     lost_frames: Count
     field_overlap: FieldOverlap
-    settle_s: NonNegative
-    confirm_timeout_s: Positive
-    search_again_pause_s: NonNegative
+    settle_s: Annotated[float, Field(ge=0, le=60)]
+    confirm_timeout_s: Annotated[float, Field(gt=0, le=600)]
+    search_again_pause_s: Annotated[float, Field(ge=0, le=86_400)]
     search_again_s: NonNegative | None = None
 
 
@@ -147,7 +148,10 @@ class Loop(Settings):
     """One stellar loop.
 
     With ``link``, its star's light comes over the link that this metrology loop holds. ``spot_diameter_px`` is
-    the 1/e^2 diameter of its spots; other loops on the same camera subtract their light by it.
+    the 1/e^2 diameter of its spots; other loops on the same camera subtract their light by it. ``sensor`` is
+    how the star is measured: by Eq. 7's centre of gravity, or by a fit of a spot of that diameter.
+    ``star_rate_sky_arcsec_s`` is how fast the star is known to move along the axes of the siderostat, with the
+    stages at rest; the siderostat follows it.
     """
 
     kind: Literal["stellar"] = "stellar"
@@ -157,8 +161,10 @@ class Loop(Settings):
     star_flux_dn: Positive
     flux_range: Range
     spot_diameter_px: Positive = 3.0
+    sensor: Literal["centroid", "fit"] = "centroid"
     other_spots: Annotated[tuple[OtherSpot, ...], Field(strict=False)]
     requirement_px: Positive
+    star_rate_sky_arcsec_s: AxisPair | None = None
     siderostat: AnySiderostat
     fsm: Fsm
     acquisition: Acquisition
@@ -181,22 +187,31 @@ class Loop(Settings):
     @model_validator(mode="after")
     def _one_spot_is_the_star(self) -> Loop:
         low_dn, high_dn = self.flux_range_dn
+        found = []
         for spot in self.other_spots:
             if low_dn <= spot.flux_dn <= high_dn:
-                msg = (
-                    f"other_spots: {spot.name} with {spot.flux_dn:g} DN would be taken for the star, which "
-                    f"may have {low_dn:g} to {high_dn:g}; narrow flux_range"
+                star_dn, low, high = self.star_flux_dn, self.flux_range.low, self.flux_range.high
+                dimmer, brighter = spot.flux_dn / high, spot.flux_dn / low
+                parts = (
+                    Part("other_spots", spot.flux_dn, f"below {low_dn:g} or above {high_dn:g}"),
+                    Part("star_flux_dn", star_dn, f"below {dimmer:.5g} or above {brighter:.5g}"),
+                    above("flux_range.low", low, spot.flux_dn / star_dn),
+                    below("flux_range.high", high, spot.flux_dn / star_dn),
                 )
-                raise ValueError(msg)
+                found.append(
+                    Conflict(f"{spot.name} would be taken for the star, by its light", parts)
+                )
+        if found:
+            raise Conflicts(found)
         return self
 
 
 class Supervisor(Settings):
     """Time limits and rates of the supervisor."""
 
-    late_tick_s: Positive
-    stall_s: Positive
-    safe_disable_after_s: NonNegative
+    late_tick_s: Annotated[float, Field(gt=0, le=1)]
+    stall_s: Annotated[float, Field(gt=0, le=1)]
+    safe_disable_after_s: Annotated[float, Field(ge=0, le=3600)]
     telemetry_hz: Annotated[float, Field(ge=1, le=100)]
 
 
@@ -226,8 +241,11 @@ class Service(Settings):
     @model_validator(mode="after")
     def _two_ports(self) -> Service:
         if self.command_port == self.telemetry_port:
-            msg = "telemetry_port must differ from command_port"
-            raise ValueError(msg)
+            parts = tuple(
+                Part(key, self.command_port, "another port")
+                for key in ("telemetry_port", "command_port")
+            )
+            raise Conflicts([Conflict("each listens on a port of its own", parts)])
         return self
 
 
@@ -246,7 +264,17 @@ class Logging(Settings):
 
     @model_validator(mode="after")
     def _room_to_write(self) -> Logging:
-        if self.retain_bytes < 2 * self.rotate_bytes:
-            msg = "retain_bytes must be at least twice rotate_bytes, or no finished file would stay"
-            raise ValueError(msg)
+        retain, rotate = self.retain_bytes, self.rotate_bytes
+        if retain < 2 * rotate:
+            parts = (
+                at_least("retain_bytes", retain, 2 * rotate),
+                at_most("rotate_bytes", rotate, retain // 2),
+            )
+            raise Conflicts([Conflict("no finished file would stay", parts)])
+        if self.chunk_bytes > rotate:
+            parts = (
+                at_most("chunk_bytes", self.chunk_bytes, rotate),
+                at_least("rotate_bytes", rotate, self.chunk_bytes),
+            )
+            raise Conflicts([Conflict("a file has at least one whole chunk", parts)])
         return self

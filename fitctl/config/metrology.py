@@ -6,9 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fitctl.config.base import Count, NonNegative, Positive, Settings
+from fitctl.config.base import NonNegative, Positive, Settings
+from fitctl.config.conflict import Conflict, Conflicts, Part, above, at_least, at_most, below
 from fitctl.config.devices import AnySiderostat, LabJackT7Device
-from fitctl.config.loops import FieldOverlap
+from fitctl.config.loops import Acquisition
 
 FourVolts = Annotated[list[NonNegative], Field(min_length=4, max_length=4)]
 
@@ -46,11 +47,15 @@ class BeamSensor(Settings):
     def _on_axis_is_measured(self) -> BeamSensor:
         brightest_v = self.on_axis_v + max(self.ambient_v)
         if brightest_v >= self.saturated_v:
-            msg = (
-                f"on_axis_v and ambient_v give {brightest_v:g} V with the beam on the centre; "
-                f"must be below saturated_v, {self.saturated_v:g} V"
+            parts = (
+                below("on_axis_v", self.on_axis_v, self.saturated_v - max(self.ambient_v)),
+                above("saturated_v", self.saturated_v, brightest_v),
+                Part(
+                    "ambient_v", self.ambient_v, f"below {self.saturated_v - self.on_axis_v:g} each"
+                ),
             )
-            raise ValueError(msg)
+            why = f"with the beam on the centre a photodiode gives {brightest_v:g} V"
+            raise Conflicts([Conflict(why, parts)])
         return self
 
 
@@ -62,23 +67,6 @@ class MetrologySensor(BeamSensor):
 
     link_delay_s: NonNegative
     device: LabJackT7Device
-
-
-class BeamAcquisition(Settings):
-    """How the beam is searched for, and when it counts as found or lost.
-
-    Without ``search_again_s``, the search for a beam that was held and lost ends only on a command.
-    """
-
-    search_radius_sky_arcsec: Positive
-    detection_sigma: Annotated[float, Field(ge=3, le=100)]
-    found_frames: Count
-    lost_frames: Count
-    field_overlap: FieldOverlap
-    settle_s: NonNegative
-    confirm_timeout_s: Positive
-    search_again_pause_s: NonNegative
-    search_again_s: NonNegative | None = None
 
 
 class Hold(Settings):
@@ -98,11 +86,12 @@ class Hold(Settings):
     @model_validator(mode="after")
     def _second_is_slower(self) -> Hold:
         if self.second_integrator_hz > self.crossover_hz / 2:
-            msg = (
-                f"second_integrator_hz may be at most half of crossover_hz, {self.crossover_hz / 2:g}, "
-                "or the loop would swing"
+            second_hz = self.second_integrator_hz
+            parts = (
+                at_most("second_integrator_hz", second_hz, self.crossover_hz / 2),
+                at_least("crossover_hz", self.crossover_hz, 2 * second_hz),
             )
-            raise ValueError(msg)
+            raise Conflicts([Conflict("the loop would swing", parts)])
         return self
 
 
@@ -113,5 +102,5 @@ class MetrologyLoop(Settings):
     requirement_arcsec: Positive
     siderostat: AnySiderostat
     sensor: MetrologySensor
-    acquisition: BeamAcquisition
+    acquisition: Acquisition
     hold: Hold

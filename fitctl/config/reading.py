@@ -7,16 +7,27 @@ import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
 from pydantic import ValidationError
 
 from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings
+from fitctl.config.checks import rig_conflicts
+from fitctl.config.conflict import Conflict, Conflicts
 from fitctl.config.devices import DEVICE_BY_TAG
+from fitctl.config.origins import Layer, Marks, changed_by, layer_of, lies_on, mark_layer
 from fitctl.config.rig import Rig
 from fitctl.text import plain
 
 _EXAMPLE = "camera.frame_rate_hz=50.0"
+_SET = "--set"
+
+
+class LaidOver(NamedTuple):
+    """A rig's document, laid together from its files and overrides, and where each value comes from."""
+
+    document: dict[str, Any]
+    marks: Marks
 
 
 def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
@@ -38,31 +49,45 @@ def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     ConfigError
         One line for each thing that is wrong: file, key, what is allowed.
     """
+    return rig_from_parts(read_parts(path, overrides), str(path))
+
+
+def read_parts(path: Path, overrides: Sequence[str] = ()) -> LaidOver:
+    """Read a rig file and what it names, without validating the values; arguments as of :func:`load_rig`.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing or is not TOML, or an override has no value's key.
+    """
     document = _read_part(
         path, "no such rig file; copy rigs/fit-mock.toml or name another with --rig"
     )
     base = document.pop("base", None)
+    layers: list[tuple[str, str, dict[str, Any]]] = []
     if base is not None:
         if not isinstance(base, str):
             msg = f"{path}: base: must be a file name (is {base!r})"
             raise ConfigError(msg)
-        under = _read_part(path.parent / base, f"no such rig file; it is the base of {path}")
-        lay_over(under, document)
-        document = under
-    fragments = document.pop("include", [])
+        under_path = path.parent / base
+        under = _read_part(under_path, f"no such rig file; it is the base of {path}")
+        layers.append((str(under_path), "base", under))
+    layers.append((str(path), "", document))
+    in_base = layers[0][2].pop("include", [])
+    fragments = document.pop("include", in_base)
     if not isinstance(fragments, list) or not all(isinstance(name, str) for name in fragments):
         msg = f"{path}: include: must be a list of file names (is {fragments!r})"
         raise ConfigError(msg)
-    said_in = dict.fromkeys(_problems(document), str(path))
     for name in fragments:
-        fragment = path.parent / name
         missing = f"no such rig file; it is in the include list of {path}"
-        lay_over(document, _read_part(fragment, missing))
-        # What is wrong from here on, and was not before, is this fragment's.
-        said_in = {what: said_in.get(what, str(fragment)) for what in _problems(document)}
-    for override in overrides:
-        _override(document, override)
-    return rig_from_document(document, str(path), said_in)
+        layers.append((str(path.parent / name), "include", _read_part(path.parent / name, missing)))
+    laid = LaidOver({}, {})
+    for depth, (origin, role, part) in enumerate(layers):
+        mark_layer(laid.marks, laid.document, part, Layer(origin, role, depth))
+        lay_over(laid.document, part)
+    for depth, override in enumerate(overrides, start=len(layers)):
+        _override(laid, override, depth)
+    return laid
 
 
 def _read_part(path: Path, missing: str) -> dict[str, Any]:
@@ -72,15 +97,6 @@ def _read_part(path: Path, missing: str) -> dict[str, Any]:
     if isinstance(camera, dict) and isinstance(camera.get("dark_file"), str):
         camera["dark_file"] = str(path.parent / camera["dark_file"])
     return document
-
-
-def _problems(document: Mapping[str, Any]) -> list[tuple[tuple[int | str, ...], str]]:
-    """What is wrong with a document: where, and what kind of error."""
-    try:
-        Rig.model_validate(document)
-    except ValidationError as error:
-        return [(problem["loc"], problem["type"]) for problem in error.errors()]
-    return []
 
 
 def read_toml(path: Path, missing: str) -> dict[str, Any]:
@@ -123,38 +139,55 @@ def lay_over(document: dict[str, Any], fragment: Mapping[str, Any]) -> None:
     """
     for key, value in fragment.items():
         under = document.get(key)
-        if isinstance(value, dict) and isinstance(under, dict) and _same_device(value, under):
+        if lies_on(under, value):
             lay_over(under, value)
         else:
             document[key] = value
 
 
-def _same_device(table: dict[str, Any], under: dict[str, Any]) -> bool:
-    return "driver" not in table or table["driver"] == under.get("driver")
+def rig_from_document(document: Mapping[str, Any], origin: str) -> Rig:
+    """Validate a rig that is already a dictionary; `origin` is what errors call it.
 
-
-def rig_from_document(
-    document: Mapping[str, Any],
-    origin: str,
-    said_in: Mapping[tuple[tuple[int | str, ...], str], str] | None = None,
-) -> Rig:
-    """Validate a rig that is already a dictionary.
-
-    `origin` is what errors call it, but for those that `said_in` knows, by place and kind, from elsewhere.
+    Raises
+    ------
+    ConfigError
+        As :func:`load_rig`.
     """
-    known = said_in or {}
+    return rig_from_parts(_marked(document, origin), origin)
+
+
+def _marked(document: Mapping[str, Any], origin: str) -> LaidOver:
+    laid = LaidOver(dict(document), {})
+    mark_layer(laid.marks, {}, laid.document, Layer(origin, "", 0))
+    return laid
+
+
+def rig_from_parts(laid: LaidOver, origin: str) -> Rig:
+    """Validate a rig; errors name the file that has the value, or `origin` where no file has it.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`load_rig`.
+    """
+    rig = _valid(laid, origin)
+    if conflicts := list(rig_conflicts(rig)):
+        raise ConfigError("\n".join(map(plain, _blamed(laid, origin, conflicts, ""))))
+    return rig
+
+
+def _valid(laid: LaidOver, origin: str) -> Rig:
     try:
-        return Rig.model_validate(document)
+        return Rig.model_validate(laid.document)
     except ValidationError as error:
-        lines = [
-            plain(_explain(known.get((problem["loc"], problem["type"]), origin), problem))
-            for problem in error.errors()
-        ]
-        raise ConfigError("\n".join(lines)) from None
+        lines = [line for problem in error.errors() for line in _explain(laid, origin, problem)]
+        raise ConfigError("\n".join(map(plain, lines))) from None
 
 
 def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
     """Validate the rig that a log holds as JSON, without the files that it names.
+
+    Contradictions between its tables do not count: the rig has run, and its devices are not opened again.
 
     Anyone may have written the log, so no text in it becomes a path: the dark frame's file is left out, and a
     controller from a file is missing unless an override names one.
@@ -183,9 +216,10 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
         raise ConfigError(msg)
     for table, key in _files_of(document):
         del table[key]
-    for override in overrides:
-        _override(document, override)
-    return rig_from_document(document, origin)
+    laid = _marked(document, origin)
+    for depth, override in enumerate(overrides, start=1):
+        _override(laid, override, depth)
+    return _valid(laid, origin)
 
 
 def _files_of(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
@@ -202,18 +236,24 @@ def _files_of(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
     return found
 
 
-def _override(document: dict[str, Any], text: str) -> None:
+def _override(laid: LaidOver, text: str, depth: int) -> None:
     parts, value = parse_override(text, _EXAMPLE)
-    table: Any = document
-    for depth, part in enumerate(parts[:-1]):
+    table: Any = laid.document
+    marks: Any = laid.marks
+    for length, part in enumerate(parts[:-1], start=1):
         table = table.setdefault(part, {}) if isinstance(table, dict) else None
         if not isinstance(table, dict):
-            place = ".".join(parts[: depth + 1])
+            place = ".".join(parts[:length])
             msg = (
                 f"--set {text}: {place} is not a table; expected a value's key, such as {_EXAMPLE}"
             )
             raise ConfigError(msg)
-    table[parts[-1]] = value
+        marks = marks.setdefault(part, {})
+    last = parts[-1]
+    # A table that is given whole replaces the other one.
+    under = {} if isinstance(value, dict) else table
+    mark_layer(marks, under, {last: value}, Layer(_SET, "", depth))
+    table[last] = value
 
 
 def parse_override(text: str, example: str) -> tuple[list[str], Any]:
@@ -235,28 +275,54 @@ def parse_override(text: str, example: str) -> tuple[list[str], Any]:
         return parts, value_text
 
 
-def _explain(origin: str, problem: Any) -> str:
+def _explain(laid: LaidOver, origin: str, problem: Any) -> list[str]:
+    """What is wrong: a line, or one for each key that is to blame for a contradiction."""
     location = _without_tags([str(part) for part in problem["loc"]])
+    error = problem.get("ctx", {}).get("error")
+    if isinstance(error, Conflicts):
+        return _blamed(laid, origin, error.found, ".".join(location))
     if problem["type"] in {"union_tag_not_found", "union_tag_invalid"}:
         location.append("kind" if location[-2:-1] == ["loops"] else "driver")
+    missing = problem["type"] in {"missing", "union_tag_not_found"}
     key = ".".join(location)
+    # What concerns the whole file names its key itself.
+    place = _place(laid, origin, location, missing=missing)
+    where = f"{place}: {key}" if key else origin
+    return [f"{where}: {_said(problem, location, missing=missing)}"]
+
+
+def _said(problem: Any, location: list[str], *, missing: bool) -> str:
     if problem["type"] == "union_tag_invalid":
         context = problem["ctx"]
-        allowed_tags = context["expected_tags"]
-        return f"{origin}: {key}: must be one of {allowed_tags} (is {context['tag']!r})"
+        return f"must be one of {context['expected_tags']} (is {context['tag']!r})"
     if problem["type"] == "extra_forbidden":
         allowed = _allowed_keys([str(part) for part in problem["loc"][:-1]])
         near = difflib.get_close_matches(location[-1], allowed, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        return f"{origin}: {key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
-    if problem["type"] in {"missing", "union_tag_not_found"}:
-        return f"{origin}: {key}: is missing; rigs/fit-mock.toml shows every key with its unit"
-    message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+        return f"unknown key{hint} (allowed here: {', '.join(allowed)})"
+    if missing:
+        return "is missing; rigs/fit-mock.toml shows every key with its unit"
+    message = str(problem["msg"])
+    message = message.removeprefix("Value error, ").replace("Input should be", "must be")
     given = problem.get("input")
-    shown = f" (is {given!r})" if isinstance(given, str | int | float | list) else ""
-    # What concerns the whole file names its key itself.
-    where = f"{origin}: {key}" if key else origin
-    return f"{where}: {message}{shown}"
+    is_value = isinstance(given, str | int | float | list)
+    return f"{message} (is {given!r})" if is_value else message
+
+
+def _blamed(laid: LaidOver, origin: str, conflicts: Sequence[Conflict], under: str) -> list[str]:
+    """A line for each key to blame: of the keys of a conflict, the one that someone has changed."""
+    lines: dict[str, str] = {}
+    for conflict in conflicts:
+        whole = conflict.under(under) if under else conflict
+        blamed = whole.blaming(lambda key: changed_by(laid.marks, laid.document, key))
+        key = blamed.parts[0].key
+        lines.setdefault(key, f"{_place(laid, origin, key.split('.'))}: {blamed}")
+    return list(lines.values())
+
+
+def _place(laid: LaidOver, origin: str, path: Sequence[str], *, missing: bool = False) -> str:
+    layer = layer_of(laid.marks, path, missing=missing)
+    return origin if layer is None else layer.origin
 
 
 def _without_tags(location: Sequence[str]) -> list[str]:
@@ -287,6 +353,8 @@ def _allowed_keys(location: Sequence[str]) -> list[str]:
             annotation = annotation.model_fields[part].annotation
         elif get_origin(annotation) in {dict, list}:
             annotation = get_args(annotation)[-1]
+        elif get_origin(annotation) is tuple:
+            annotation = get_args(annotation)[0]
         annotation = _without_none(annotation)
     is_settings = isinstance(annotation, type) and issubclass(annotation, Settings)
     return sorted(annotation.model_fields) if is_settings else []

@@ -7,11 +7,28 @@ first alone leaves a standing error of its rate over the crossover; the second l
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.model.compiled import compilable
+
 Floats = NDArray[np.float64]
+
+
+@compilable()
+def pull_in_step(hold: Any, error: Any, duration_s: float) -> Any:
+    """One step of the first integrator alone, for an error of one axis, or an array of both."""
+    return -hold.gain_per_s * duration_s * error
+
+
+@compilable()
+def hold_step(hold: Any, rate: Any, error: Any, duration_s: float) -> Any:
+    """One step of both integrators, likewise: the step, and the rate that the second has learnt by then."""
+    pulled = pull_in_step(hold, error, duration_s)
+    rate = rate + hold.second_per_s * pulled
+    return pulled + rate * duration_s, rate
 
 
 class BeamHold:
@@ -26,13 +43,15 @@ class BeamHold:
 
     Attributes
     ----------
+    gain_per_s, second_per_s : float
+        Of both integrators.
     rate_rad_s : array, shape (2,)
         How fast the beam is turned though it is on the centre: what the second integrator has learnt.
     """
 
     def __init__(self, crossover_hz: float, second_integrator_hz: float) -> None:
-        self._gain_per_s = 2 * math.pi * crossover_hz
-        self._second_per_s = 2 * math.pi * second_integrator_hz
+        self.gain_per_s = 2 * math.pi * crossover_hz
+        self.second_per_s = 2 * math.pi * second_integrator_hz
         self.begin()
 
     def begin(self) -> None:
@@ -41,7 +60,7 @@ class BeamHold:
 
     def pull_in(self, error_rad: Floats, duration_s: float) -> Floats:
         """One step of the first integrator alone, for a beam that is far off; as :meth:`step`."""
-        return -self._gain_per_s * duration_s * error_rad
+        return np.asarray(pull_in_step(self, error_rad, duration_s))
 
     def step(self, error_rad: Floats | None, duration_s: float) -> Floats:
         """By how much to turn the beam, shape (2,).
@@ -56,6 +75,5 @@ class BeamHold:
         """
         if error_rad is None:
             return self.rate_rad_s * duration_s
-        pulled_rad = self.pull_in(error_rad, duration_s)
-        self.rate_rad_s = self.rate_rad_s + self._second_per_s * pulled_rad
-        return pulled_rad + self.rate_rad_s * duration_s
+        step_rad, self.rate_rad_s = hold_step(self, self.rate_rad_s, error_rad, duration_s)
+        return np.asarray(step_rad)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 from fitctl.controllers.dark import Dark
+from fitctl.controllers.spot_fit import SpotFit, spot_fit
 from fitctl.model.compiled import compilable
-from fitctl.model.light import light_below
+from fitctl.model.light import centroid_noise_px, light_below
 
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 # Eq. 7's three sums over a window, row by row: light, and its moments along azimuth and elevation.
@@ -25,7 +26,7 @@ _SUMS = np.array(
 )
 EDGE_PX = HALF_WINDOW_PX - 1.5  # nearer to its edge, the window would cut the spot
 MAX_CANDIDATES = 6
-_REACH_DIAMETERS = 1.0  # from the centre of a spot: beyond lies a part of its light in 10 000
+REACH_DIAMETERS = 1.0  # from the centre of a spot: beyond lies a part of its light in 10 000
 _EDGES_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 2.0) - 0.5
 LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
 
@@ -36,11 +37,14 @@ class Star(NamedTuple):
     Attributes
     ----------
     az_px, el_px : float
-        Centre of gravity, global pixel coordinates.
+        Centre of gravity, or the centre of the fitted spot, global pixel coordinates.
     flux_dn : float
         Sum over the window, dark subtracted.
     window_az_px, window_el_px : int
         Centre of the 7x7 window.
+    sigma_az_px, sigma_el_px : float
+        One standard deviation of the place, from pixel noise and photons; of a centroid, with the light that
+        is expected.
     """
 
     az_px: float
@@ -48,10 +52,12 @@ class Star(NamedTuple):
     flux_dn: float
     window_az_px: int
     window_el_px: int
+    sigma_az_px: float = math.nan
+    sigma_el_px: float = math.nan
 
     @property
     def position_px(self) -> NDArray[np.float64]:
-        """Centre of gravity, shape (2,)."""
+        """Where it is, shape (2,)."""
         return np.array([self.az_px, self.el_px])
 
     @property
@@ -88,6 +94,8 @@ class StarSensor:
     ----------
     excluded_px : list of pair of float
         Places of other loops' stars: a star whose window would hold one of these is not this loop's.
+    fit : SpotFit or None
+        How the star is measured; None for the centroid.
     other_light : list of OtherLight
         Spots of other loops. Their light is subtracted from a window, or it would pull this loop's star.
     """
@@ -98,6 +106,7 @@ class StarSensor:
         self._dark = Dark(camera)
         self.threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
         self._flux_range = loop.flux_range
+        self._camera, self._loop = camera, loop
         self.largest_az_px, self.largest_el_px = camera.largest_window_px
         self.expect(loop.star_flux_dn)
 
@@ -105,6 +114,10 @@ class StarSensor:
         """From now on the loop's star is the one with this flux, within the loop's range about it."""
         self.flux_low_dn = self._flux_range.low * star_flux_dn
         self.flux_high_dn = self._flux_range.high * star_flux_dn
+        self.fit = fit_for(self._camera, self._loop, star_flux_dn)
+        self._centroid_sigma_px = centroid_noise_px(
+            self._camera, star_flux_dn, _LEVER_PX.size, self._loop.spot_diameter_px
+        )
 
     def measure(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
@@ -115,32 +128,24 @@ class StarSensor:
     def follow(
         self, image: NDArray[np.uint16], expected_az_px: float, expected_el_px: float
     ) -> Star | None:
-        """:meth:`measure` where the star is expected; :meth:`find` it where that does not do.
+        """:meth:`measure` where the star is expected; :meth:`find` it where that does not do."""
+        return self.in_window(image, expected_az_px, expected_el_px) or self.find(image)
+
+    def in_window(
+        self, image: NDArray[np.uint16], expected_az_px: float, expected_el_px: float
+    ) -> Star | None:
+        """:meth:`measure` where the star is expected; None also where the window cuts it.
 
         What is expected may be half a window off after a jump.
         """
         star = self.measure(image, expected_az_px, expected_el_px)
-        if star is None or star.off_centre_px > EDGE_PX:
-            return self.find(image)
-        return star
+        return None if star is None or star.off_centre_px > EDGE_PX else star
 
-    def find(
-        self, image: NDArray[np.uint16], near_px: tuple[float, float] | None = None
-    ) -> Star | None:
-        """Look over the whole frame, brightest spot first; None when this loop's star is not there.
+    def find(self, image: NDArray[np.uint16]) -> Star | None:
+        """Look over the whole frame; the brightest of what may be this loop's star, or None."""
+        return next(self.candidates(image), None)
 
-        Of several stars that could be this loop's, the nearest to `near_px`; without it, the brightest.
-        """
-        candidates = self._candidates(image)
-        if near_px is None:
-            return next(candidates, None)
-        return min(
-            candidates,
-            key=lambda star: math.dist((star.az_px, star.el_px), near_px),
-            default=None,
-        )
-
-    def _candidates(self, image: NDArray[np.uint16]) -> Iterator[Star]:
+    def candidates(self, image: NDArray[np.uint16]) -> Iterator[Star]:
         """All spots that could be this loop's star, brightest first."""
         search = self._dark.light(image, 0, 0, *image.shape)
         for _ in range(MAX_CANDIDATES):
@@ -174,14 +179,23 @@ class StarSensor:
         side = _LEVER_PX.size
         light_dn = self._dark.light(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
         for spot in self.other_light:
-            reach_px = side / 2 + _REACH_DIAMETERS * spot.diameter_px
+            reach_px = side / 2 + REACH_DIAMETERS * spot.diameter_px
             if max(abs(spot.az_px - az), abs(spot.el_px - el)) < reach_px:
                 light_dn -= spot_light(spot, az, el)
         flux_dn, az_moment, el_moment = _SUMS.dot(light_dn.ravel()).tolist()
         peak_dn = light_dn.item(light_dn.argmax())  # `max` takes four times as long
         if flux_dn <= 0 or peak_dn > LARGEST_PEAK * flux_dn:
             return None
-        return Star(az + az_moment / flux_dn, el + el_moment / flux_dn, flux_dn, az, el)
+        az_px, el_px = az_moment / flux_dn, el_moment / flux_dn
+        if self.fit is None:
+            sigma_px = self._centroid_sigma_px
+            return Star(az + az_px, el + el_px, flux_dn, az, el, sigma_px, sigma_px)
+        good = self._dark.good(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
+        place = self.fit.place(light_dn, az_px, el_px, good)
+        if place is None:
+            return None
+        az_px, el_px, _, az_sigma_px, el_sigma_px = place
+        return Star(az + az_px, el + el_px, flux_dn, az, el, az_sigma_px, el_sigma_px)
 
     def _accepted(self, star: Star | None) -> Star | None:
         if star is None or not self.flux_low_dn <= star.flux_dn <= self.flux_high_dn:
@@ -190,6 +204,25 @@ class StarSensor:
             if max(abs(star.az_px - az_px), abs(star.el_px - el_px)) <= HALF_WINDOW_PX:
                 return None
         return star
+
+
+def fit_for(camera: Camera, loop: Loop, star_flux_dn: float) -> SpotFit | None:
+    """The fit of a loop's star with this flux; None where the loop's sensor is the centroid."""
+    if loop.sensor == "centroid":
+        return None
+    return spot_fit(
+        loop.spot_diameter_px, camera.pixel_noise_dn, star_flux_dn, camera.electrons_per_dn
+    )
+
+
+def sensor_noise_px(camera: Camera, loop: Loop, star_flux_dn: float) -> float:
+    """One standard deviation of where a loop's sensor finds a star of this flux, along one axis."""
+    fit = fit_for(camera, loop, star_flux_dn)
+    if fit is None:
+        return centroid_noise_px(
+            camera, star_flux_dn, 2 * HALF_WINDOW_PX + 1, loop.spot_diameter_px
+        )
+    return fit.noise_px(star_flux_dn)
 
 
 def spot_light(spot: OtherLight, az_px: int, el_px: int) -> NDArray[np.float64]:

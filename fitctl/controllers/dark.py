@@ -14,6 +14,7 @@ from fitctl.files import read_regular
 Floats = NDArray[np.float64]
 _MOST_BYTES = 64 << 20
 _MOST_BAD = 0.1  # of the pixels
+FULL_WELL_DN = 65535  # a pixel that reads this has more light than it can say
 _MEASURE = "measure it anew: fitctl sequence run dark"
 
 
@@ -55,6 +56,27 @@ class Dark:
                 near_dn = image[rows, columns] - self._dark_dn[rows, columns]
                 light_dn[row - top, column - left] = near_dn.mean()
         return light_dn
+
+    def good(
+        self, image: NDArray[np.uint16], top: int, left: int, height: int, width: int
+    ) -> NDArray[np.bool_] | None:
+        """Which pixels of a part are measurements, shape (height, width); None where all are.
+
+        Neither bad pixels nor saturated ones are.
+        """
+        part_dn = image[top : top + height, left : left + width]
+        is_full = part_dn.item(part_dn.argmax()) >= FULL_WELL_DN
+        bad = [
+            (row - top, column - left)
+            for row, column, *_ in self._bad
+            if top <= row < top + height and left <= column < left + width
+        ]
+        if not (is_full or bad):
+            return None
+        good = part_dn < FULL_WELL_DN
+        for place in bad:
+            good[place] = False
+        return good
 
 
 def read_dark(path: Path, shape: tuple[int, int]) -> Floats:

@@ -30,6 +30,7 @@ class StarEstimator:
         self._mirror_px = rows(scale.mirror_px_per_rad * scale.mirror_turn)
         az_px, el_px = target_px.tolist()
         self._origin_px = az_px, el_px
+        self._before_px: AzEl | None = None
         self._expected = False
 
     def expect(self, star_px: Floats, motor_rad: Floats, mirror_rad: Floats) -> None:
@@ -50,9 +51,24 @@ class StarEstimator:
         self._origin_px = star_px[0] - stages_px[0], star_px[1] - stages_px[1]
         self._expected = True
 
+    def suppose(self, star_px: AzEl, stages_px: AzEl) -> None:
+        """:meth:`observe` what may be another star, until :meth:`keep` or :meth:`withdraw`."""
+        if self._before_px is None:
+            self._before_px = self._origin_px
+        self.observe(star_px, stages_px)
+
+    def keep(self) -> None:
+        """It is this loop's star."""
+        self._before_px = None
+
+    def withdraw(self) -> None:
+        """It is not: the star is expected where it was before."""
+        if self._before_px is not None:
+            self._origin_px, self._before_px = self._before_px, None
+
     def forget(self) -> None:
         """The stages' zeros have changed: nothing is known of the star any more."""
-        self._expected = False
+        self._expected, self._before_px = False, None
 
     def predict_px(self, stages_px: AzEl) -> AzEl:
         """Where the star falls with the stages as given."""

@@ -47,3 +47,24 @@ def count_frame(counts: Any, star_visible: bool, need: float, reach_fraction: fl
     counts.lost = 0 if star_visible else counts.lost + 1
     counts.in_reach = counts.in_reach + 1 if star_visible and need <= reach_fraction else 0
     counts.out_of_reach = counts.out_of_reach + 1 if star_visible and need > 1.0 else 0
+
+
+@compilable()
+def count_sample(
+    counts: Any, lost: bool, measured: bool, error: float, in_reach: float, out_of_reach: float
+) -> None:
+    """Count a sample of a beam that is followed.
+
+    Parameters
+    ----------
+    counts : has lost, in_reach and out_of_reach
+        Samples in a row without the beam; with one measured within the error `in_reach`; without one measured
+        within the error `out_of_reach`.
+    lost, measured : bool
+        No photodiode has light, or all of them have.
+    error, in_reach, out_of_reach : float
+        In one unit; the error is ignored where the beam is not measured.
+    """
+    counts.lost = counts.lost + 1 if lost else 0
+    counts.in_reach = counts.in_reach + 1 if measured and error <= in_reach else 0
+    counts.out_of_reach = 0 if measured and error <= out_of_reach else counts.out_of_reach + 1

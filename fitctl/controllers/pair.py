@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.model.optics import Scales, rows, saturate_diamond, transformed
+from fitctl.model.optics import AzEl, Scales, rows, saturate_diamond, transformed
 
 Floats = NDArray[np.float64]
 
@@ -74,10 +74,10 @@ Designer = Callable[[Rig, str, str], Design]
 
 
 class Measurement(NamedTuple):
-    """Star and stages at one frame, each shape (2,): in pixels from the frame, in radians from the stages."""
+    """Star and stages at one frame: pairs in pixels from the frame, shapes (2,) in radians from the stages."""
 
-    error_px: Floats
-    target_px: Floats
+    error_px: AzEl
+    target_px: AzEl
     mirror_rad: Floats
     motor_rad: Floats
 
@@ -111,9 +111,9 @@ class Pair:
         self._siderostat_turn = rows(scale.siderostat_turn)
         self._given = np.zeros((len(self.system) + 3, 2))
         self._inputs = self._given[: len(INPUTS)].reshape(-1)  # a view: az and el of each
-        self.start(np.zeros(2), np.zeros(2), np.zeros(2))
+        self.start(np.zeros(2), np.zeros(2), (0.0, 0.0))
 
-    def start(self, mirror_rad: Floats, motor_rad: Floats, target_px: Floats) -> None:
+    def start(self, mirror_rad: Floats, motor_rad: Floats, target_px: AzEl) -> None:
         """Begin as if the mirror had long been held at `mirror_rad`, so that it goes on without a bump.
 
         What a design does not hold by itself without an error (Eq. 20 holds nothing so) is added to its
@@ -124,7 +124,7 @@ class Pair:
         self._given[-1] = mirror_px * self.left_at_rest
         self.excess_px = np.zeros(2)
         self.motor_origin_rad = np.array(motor_rad, dtype=float)
-        self.target_origin_px = np.array(target_px, dtype=float)
+        self.target_origin_px = target_px
 
     @property
     def saturated(self) -> bool:
@@ -138,10 +138,10 @@ class Pair:
         # The design's axes are the camera's; the stages' may be turned from them.
         motor_az_rad, motor_el_rad = measured.motor_rad.tolist()
         origin_az_rad, origin_el_rad = self.motor_origin_rad.tolist()
-        target_az_px, target_el_px = measured.target_px.tolist()
-        origin_az_px, origin_el_px = self.target_origin_px.tolist()
+        target_az_px, target_el_px = measured.target_px
+        origin_az_px, origin_el_px = self.target_origin_px
         self._inputs[:] = (
-            *measured.error_px.tolist(),
+            *measured.error_px,
             *self.excess_px.tolist(),
             *transformed(self._mirror_turn, *measured.mirror_rad.tolist()),
             *transformed(
@@ -152,13 +152,13 @@ class Pair:
         )
         made = self.system.dot(given)  # `@` takes twice as long
         given[len(INPUTS) :] = made[len(OUTPUTS) :]
-        wanted_rad = made[0].dot(scale.mirror_turn)
+        wanted_rad = made[0].dot(scale.mirror_back.T)
         mirror_rad = saturate_diamond(wanted_rad, self._range_rad)
         # Fed back a frame later, where the camera takes nearly two: much as the error would have been
         # had the mirror followed.
         within = mirror_rad is wanted_rad
         self.excess_px = _NO_EXCESS if within else scale.mirror_px(wanted_rad - mirror_rad)
-        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_turn))
+        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_back.T))
 
     def _in_rad(self) -> Floats:
         """The design with its hand-over, but the stages in radians, as they are measured and commanded."""

@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
 Volts = tuple[float, float, float, float]
@@ -29,6 +31,8 @@ class BeamState(IntEnum):
     MEASURED = 2
     SATURATED = 3
 
+
+LOST, EDGE, MEASURED, SATURATED = map(int, BeamState)
 
 MEANING = {
     BeamState.LOST: "no diode has more light than its noise may pretend",
@@ -99,6 +103,29 @@ class Beam(NamedTuple):
         return np.array([self.az_m, self.el_m])
 
 
+@compilable()
+def beam_state(array: Any, brightest_v: float, dimmest_v: float, highest_v: float) -> int:
+    """The number of the :class:`BeamState` of a sample.
+
+    By the brightest and the dimmest diode's volts above ambient light, and the highest volts of any with it.
+    """
+    if brightest_v < array.threshold_v:
+        return LOST
+    if highest_v >= array.saturated_v:
+        return SATURATED
+    return EDGE if dimmest_v < array.threshold_v else MEASURED
+
+
+@compilable()
+def place_m(array: Any, plus_v: float, minus_v: float) -> float:
+    """Place along one axis; a diode that is in the dark has the threshold's light at most."""
+    threshold_v = array.threshold_v
+    if plus_v < threshold_v > minus_v:
+        return 0.0
+    ratio = max(plus_v, threshold_v) / max(minus_v, threshold_v)
+    return float(array.metres_per_log * math.log(ratio))
+
+
 class PhotodiodeArray:
     """From volts to the beam's place.
 
@@ -114,6 +141,8 @@ class PhotodiodeArray:
         That, in volts.
     metres_per_log : float
         w^2 / (8 d): the beam's place for a ratio of e.
+    saturated_v : float
+        From here on a diode is at its limit.
     """
 
     def __init__(self, sensor: Sensor, detection_sigma: float) -> None:
@@ -121,33 +150,33 @@ class PhotodiodeArray:
         self.metres_per_log = sensor.beam_radius_m**2 / (8.0 * sensor.diode_offset_m)
         self._ambient_v = tuple(sensor.ambient_v)
         self._noise_v = sensor.noise_v
-        self._saturated_v = sensor.saturated_v
+        self.saturated_v = sensor.saturated_v
 
     def beam(self, volts: Volts) -> Beam:
         """What one sample says."""
         lights = [volt - dark for volt, dark in zip(volts, self._ambient_v, strict=True)]
         sum_v = sum(lights)
-        threshold_v = self.threshold_v
-        if max(lights) < threshold_v:
-            return Beam(BeamState.LOST, math.nan, math.nan, math.inf, math.inf, sum_v)
-        if max(volts) >= self._saturated_v:
-            state = BeamState.SATURATED
-        elif min(lights) < threshold_v:
-            state = BeamState.EDGE
-        else:
-            state = BeamState.MEASURED
-        az_m, noise_az_m = self._axis_m(lights[0], lights[1])
-        el_m, noise_el_m = self._axis_m(lights[2], lights[3])
-        return Beam(state, az_m, el_m, noise_az_m, noise_el_m, sum_v)
+        state = BeamState(beam_state(self, max(lights), min(lights), max(volts)))
+        if state is BeamState.LOST:
+            return Beam(state, math.nan, math.nan, math.inf, math.inf, sum_v)
+        az_plus_v, az_minus_v, el_plus_v, el_minus_v = lights
+        return Beam(
+            state,
+            place_m(self, az_plus_v, az_minus_v),
+            place_m(self, el_plus_v, el_minus_v),
+            self._noise_m(az_plus_v, az_minus_v),
+            self._noise_m(el_plus_v, el_minus_v),
+            sum_v,
+        )
 
-    def _axis_m(self, plus_v: float, minus_v: float) -> tuple[float, float]:
-        """Place and noise along one axis; a diode that is in the dark has the threshold's light at most."""
+    def _noise_m(self, plus_v: float, minus_v: float) -> float:
+        """Of :func:`place_m`."""
         threshold_v = self.threshold_v
         if plus_v < threshold_v > minus_v:
-            return 0.0, math.inf
+            return math.inf
         plus_v, minus_v = max(plus_v, threshold_v), max(minus_v, threshold_v)
         noise = self._noise_v * math.hypot(1.0 / plus_v, 1.0 / minus_v)
-        return self.metres_per_log * math.log(plus_v / minus_v), self.metres_per_log * noise
+        return self.metres_per_log * noise
 
 
 def reach_m(sensor: Sensor, detection_sigma: float) -> float:

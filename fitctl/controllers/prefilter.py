@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.model.compiled import compilable
+from fitctl.model.optics import AzEl
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +35,11 @@ class Prefilter:
     ----------
     time_constant_s, period_s : float
     initial_px : array, shape (2,)
+
+    Attributes
+    ----------
+    value_px : pair of float
+        The filtered command.
     """
 
     def __init__(self, time_constant_s: float, period_s: float, initial_px: Floats) -> None:
@@ -43,15 +49,16 @@ class Prefilter:
 
     def reset(self, value_px: Floats) -> None:
         """Rest at `value_px`, shape (2,)."""
-        self.value_px = np.array(value_px, dtype=float)
+        az_px, el_px = value_px.tolist()
+        self.value_px: AzEl = az_px, el_px
         self._rates = (0.0, 0.0)
 
-    def step(self, command_px: Floats) -> Floats:
-        """Go on by one period; returns the filtered command, shape (2,)."""
-        (az_px, el_px), (az_rate, el_rate) = self.value_px.tolist(), self._rates
+    def step(self, command_px: Floats) -> AzEl:
+        """Go on by one period towards a command, shape (2,); returns the filtered one."""
+        (az_px, el_px), (az_rate, el_rate) = self.value_px, self._rates
         to_az_px, to_el_px = command_px.tolist()
         periods, decay = self.periods, self.decay
         az_px, az_rate = filtered(to_az_px, az_px, az_rate, periods, decay)
         el_px, el_rate = filtered(to_el_px, el_px, el_rate, periods, decay)
-        self.value_px, self._rates = np.array([az_px, el_px]), (az_rate, el_rate)
+        self.value_px, self._rates = (az_px, el_px), (az_rate, el_rate)
         return self.value_px

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeVar
 
-from fitctl.drivers.interface import DeviceError
+import serial
+
+from fitctl.drivers.interface import DeviceError, DeviceUnreachable
 
 _Error = TypeVar("_Error", bound=DeviceError)
 
@@ -20,3 +22,33 @@ class Endpoint:
     def error(self, kind: type[_Error], expected: str, got: str, hint: str = "") -> _Error:
         """An error of this device; fields as in :class:`~fitctl.drivers.interface.DeviceError`."""
         return kind(self.device, self.address, expected, got, hint)
+
+    def open_serial(
+        self, expected: str, hint: str, *, baud_rate: int, poll_s: float, write_timeout_s: float
+    ) -> serial.Serial:
+        """Open the serial port or ``socket://`` at the address, which nobody else can then open.
+
+        Parameters
+        ----------
+        expected, hint : str
+            For the error.
+        baud_rate : int
+        poll_s : float
+            How long one read waits.
+        write_timeout_s : float
+
+        Raises
+        ------
+        DeviceUnreachable
+            If there is no such port, or nobody listens there.
+        """
+        try:
+            return serial.serial_for_url(
+                self.address,
+                baudrate=baud_rate,
+                timeout=poll_s,
+                write_timeout=write_timeout_s,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise self.error(DeviceUnreachable, expected, str(error), hint) from error

@@ -6,6 +6,7 @@ Every call returns or raises within the device's time limit. A driver is used by
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -188,6 +189,30 @@ class ServoAmplifiers(Protocol):
         ...
 
 
+class BusAmplifiers(ServoAmplifiers, Protocol):
+    """Amplifiers on a :class:`ServoBus`."""
+
+    def stage(self, velocity_rad_s: AzEl) -> None:
+        """Begin a servo period that :meth:`exchange` ends: have the command ready for the bus."""
+        ...
+
+
+class ServoBus(Protocol):
+    """A bus with the amplifiers of one or several loops; one thread servoes the loops of all buses.
+
+    Attributes
+    ----------
+    meanwhile : callable or None
+        Called again and again while amplifiers wait for an answer, as during their opening.
+    """
+
+    meanwhile: Callable[[], None] | None
+
+    def synchronize(self) -> None:
+        """Send all commands that are ready; all amplifiers act, and read their encoders, at once."""
+        ...
+
+
 class MirrorDac(Protocol):
     """The three D/A channels behind the fast steering mirror."""
 
@@ -351,13 +376,15 @@ class Hexapod(Protocol):
 class LoopDevices:
     """What one loop senses and acts through.
 
-    A loop without a mirror has neither D/A nor piezo amplifier; a metrology loop alone has photodiodes.
+    A loop without a mirror has neither D/A nor piezo amplifier; a metrology loop alone has photodiodes. With a
+    ``bus``, the amplifiers are :class:`BusAmplifiers`, and share a thread with those of other loops.
     """
 
     amplifiers: ServoAmplifiers
     dac: MirrorDac | None = None
     piezo: PiezoAmplifier | None = None
     photodiodes: Photodiodes | None = None
+    bus: ServoBus | None = None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fitctl.config import Rig
 from fitctl.figures.plate import Comparison, Plate, save
-from fitctl.identify.air_fit import Interval, fit_air_path
+from fitctl.identify.air_fit import fit_air_path
 from fitctl.identify.airpath import (
     RECOMMENDED_S,
     analyse,
@@ -17,8 +17,9 @@ from fitctl.identify.airpath import (
 )
 from fitctl.identify.frames import frames_of_records, track_spots
 from fitctl.identify.run import on_simulation
+from fitctl.learn.intervals import Interval
+from fitctl.model.light import centroid_noise_px
 from fitctl.model.plant import Plant
-from fitctl.model.scene import centroid_noise_px
 
 _PAPER_GAIN_PX, _PAPER_B1_S2, _PAPER_B2_S, _PAPER_NOISE_PX = 0.45, 0.517, 2.5, 0.01  # Eq. 9
 

@@ -85,13 +85,17 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
     """
     loop = rig.stellar_loops[loop_name]
     scale = scales(rig, loop)
-    angles_rad = _mirror_angles_rad(loop.fsm, ticks)
-    # A command acts from its tick's end until the next.
-    exposed_s = ticks["mid_exposure_s"]
-    in_force = np.searchsorted(ticks["time_s"], exposed_s, side="right") - 1
-    mirror_px = scale.mirror_px(angles_rad[np.maximum(in_force, 0)])
+    mirror_px = scale.mirror_px(mirror_at_exposure_rad(loop.fsm, ticks))
     motor_px = scale.motor_px(axis_pair(ticks, "siderostat_{}_rad"))
-    return np.where(np.isnan(exposed_s)[:, None], np.nan, mirror_px + motor_px)
+    return np.where(np.isnan(ticks["mid_exposure_s"])[:, None], np.nan, mirror_px + motor_px)
+
+
+def mirror_at_exposure_rad(fsm: Fsm, ticks: Ticks) -> Floats:
+    """Where the mirror was at mid-exposure, by its hysteresis where that is known, shape (ticks, 2)."""
+    angles_rad = _mirror_angles_rad(fsm, ticks)
+    # A command acts from its tick's end until the next.
+    in_force = np.searchsorted(ticks["time_s"], ticks["mid_exposure_s"], side="right") - 1
+    return angles_rad[np.maximum(in_force, 0)]
 
 
 def stacks_m(ticks: Ticks, fsm: Fsm, half_widths_v: Floats, gains_m_per_v: Floats) -> Floats:

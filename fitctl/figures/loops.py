@@ -10,7 +10,7 @@ from fitctl.controllers.design import lqg_ltr
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.draw import draw_loop_shapes
 from fitctl.controllers.design.eq20 import eq20_zpk
-from fitctl.controllers.design.loopshape import (
+from fitctl.controllers.design.linear_loop.loopshape import (
     coarse_response,
     compensator_response,
     delayed,

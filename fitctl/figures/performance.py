@@ -11,8 +11,8 @@ import numpy as np
 
 from fitctl.config import Rig
 from fitctl.controllers.design.basis import basis
-from fitctl.controllers.design.bound import bound
 from fitctl.controllers.design.choose import DESIGNS
+from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.controllers.design.standing import Standing, standing
 from fitctl.figures.attenuation import (
     Spectra,
@@ -36,6 +36,7 @@ from fitctl.figures.steps import (
 from fitctl.identify.record import tick_columns
 from fitctl.simulation.campaign import Results, run_seeds
 from fitctl.simulation.simulation import Simulation
+from fitctl.simulation.statistics import SimulationResult
 
 ROUGH_HYSTERESIS, ROUGH_BACKLASH_TIMES = 0.30, 2.0
 AT_HZ = 1.0
@@ -87,6 +88,8 @@ class Residual:
         True RMS about the target in continuous time, from `SETTLE_S` after VERNIER on: mean over seeds
         of the worst axis, and standard deviation over seeds; nan if a seed did not hold its star.
     ratio_to_bound : float
+    measured_px : float
+        The same axis' RMS as its sensor measured it, noise included: the only one that a real rig has.
     piston_m : float
         RMS about its mean of Eq. 4, for the true stack displacements.
     """
@@ -94,6 +97,7 @@ class Residual:
     rms_px: float
     seed_sd_px: float
     ratio_to_bound: float
+    measured_px: float
     piston_m: float
 
 
@@ -208,10 +212,12 @@ def rows(rig: Rig, loop_name: str, results: Sequence[tuple[Job, Any]]) -> list[R
 
 
 def _residual(results: Results, loop_name: str, least_px: float) -> Residual:
-    runs = [loops[loop_name] for loops in results.values()]
+    of_loop = [result.loops[loop_name] for result in results.values()]
+    runs = [run for run in of_loop if isinstance(run, SimulationResult)]
     rms_px = np.array([[run.rms_px["az"], run.rms_px["el"]] for run in runs])
     worst = int(rms_px.mean(axis=0).argmax())
     mean_px = float(rms_px[:, worst].mean())
     spread_px = float(rms_px[:, worst].std(ddof=1)) if len(runs) > 1 else math.nan
+    measured_px = float(np.mean([run.measured_rms_px[("az", "el")[worst]] for run in runs]))
     piston_m = math.sqrt(np.mean([run.piston_rms_m**2 for run in runs]))
-    return Residual(mean_px, spread_px, mean_px / least_px, piston_m)
+    return Residual(mean_px, spread_px, mean_px / least_px, measured_px, piston_m)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fitctl.config import Rig
 from fitctl.controllers.design.basis import basis
-from fitctl.controllers.design.bound import bound
+from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.figures.pages import write_json, write_page
 from fitctl.figures.performance import AT_HZ, ROUGH_BACKLASH_TIMES, ROUGH_HYSTERESIS, Row
 from fitctl.figures.plate import Plate

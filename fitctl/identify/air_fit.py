@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,12 @@ from scipy.optimize import minimize
 from fitctl.config import AirPathModel
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.noise_model import negative_log_likelihood
+from fitctl.learn.intervals import Z_95, Interval
 from fitctl.model.air_path import rms_px
 
 Floats = NDArray[np.float64]
 
 _PARAMETERS = ("gain_px", "b1_s2", "b2_s", "noise_px")
-_Z_95 = 1.96
 _LARGEST_CHANGE = 3.0  # of a logarithm from where the search begins: a factor of 20
 # Directions in the logarithms: strength gain / b1 above the poles, where the fast pole is (b2 / b1), where
 # the slow one is, and the noise. Gain, b1 and b2 by themselves are known almost only together.
@@ -26,21 +25,6 @@ _DIRECTIONS = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 _PROBE = 0.02  # of a logarithm, for the likelihood's curvature
-
-
-class Interval(NamedTuple):
-    """An estimate and its 95 % confidence interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def covers(self, truth: float) -> bool:
-        """Whether the interval holds a value."""
-        return self.low <= truth <= self.high
-
-    def __str__(self) -> str:
-        return f"{self.value:.4g} (95 %: {self.low:.4g} to {self.high:.4g})"
 
 
 @dataclass(frozen=True)
@@ -99,7 +83,7 @@ def fit_air_path(series_px: Floats, period_s: float, start: AirPathModel) -> Air
             "of 20 of the rig file's); expected a minute or more with the stages at rest; record longer"
         )
         raise IdentifyError(msg)
-    spread = _Z_95 * np.sqrt(np.diag(np.linalg.inv(curvature)))
+    spread = Z_95 * np.sqrt(np.diag(np.linalg.inv(curvature)))
     return AirFit(
         **{
             name: Interval(*np.exp([log, log - half, log + half]).tolist())

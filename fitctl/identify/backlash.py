@@ -177,7 +177,7 @@ def analyse(rig: Rig, record: ExperimentRecord) -> BacklashResult:
 def _analyse_axis(rig: Rig, record: ExperimentRecord, axis: int) -> AxisBacklash:
     scale = scales(rig, rig.stellar_loops[record.loop])
     nominal = scale.motor_px_per_rad
-    star_px = record.star_px.dot(scale.siderostat_turn)[:, axis]  # along the siderostat's axis
+    star_px = record.star_px.dot(scale.siderostat_back.T)[:, axis]  # along the siderostat's axis
     motor_px = record.motor_rad[:, axis] * nominal
     motor_px -= motor_px.mean()
     frames = _usable_frames(AXES[axis], motor_px, star_px)

@@ -9,8 +9,11 @@ from typing import NamedTuple
 from fitctl.config import Rig
 from fitctl.identify import airpath, backlash, delay, hysteresis, response
 from fitctl.identify.frames import TimedImage, frames_of_log, frames_of_records, track_spots
+from fitctl.identify.link import ambient, beam, feedforward
+from fitctl.identify.link.step_record import TickKind, gather_step_log
 from fitctl.identify.record import gather, gather_log
-from fitctl.logging.records import AnyRecord
+from fitctl.logging.reading import Columns
+from fitctl.logging.records import AnyRecord, MetrologyTick, Tick
 from fitctl.mocks.detector import DetectorBench
 from fitctl.model.drives import Drive
 
@@ -20,6 +23,10 @@ Finding = (
     | delay.DelayResult
     | airpath.AirPathResult
     | response.ResponseResult
+    | feedforward.FeedforwardResult
+    | beam.PhotodiodesResult
+    | beam.LinkDelayResult
+    | ambient.AmbientResult
 )
 """Each has `fragment`, to lay over the rig file, `lines`, for an operator, and `plot`, a PNG or SVG."""
 
@@ -30,16 +37,19 @@ class Identification(NamedTuple):
     Attributes
     ----------
     plan : callable or None
-        The motions, of a rig's loop; None for what is measured on the detector bench.
+        The motions, of a rig's loop; None for what is measured on the detector bench, or by a sequence's step.
     from_log : callable
         From a log that has the experiment, or from a bench's file.
     from_records : callable or None
         The same from records in hand.
+    step : str
+        The step of a sequence that records the data; empty where :attr:`plan` or a bench does.
     """
 
     plan: Callable[[Rig, str], list[Drive]] | None
     from_log: Callable[[Rig, str, Path], Finding]
     from_records: Callable[[Rig, str, list[AnyRecord]], Finding] | None
+    step: str = ""
 
 
 def _of_stages(
@@ -52,6 +62,20 @@ def _of_stages(
         plan=plan,
         from_log=lambda rig, loop, path: analyse(rig, gather_log(path, loop, name)),
         from_records=lambda rig, loop, records: analyse(rig, gather(records, loop, name)),
+    )
+
+
+def _of_step(
+    step: str, kind: TickKind, analyse: Callable[[Rig, str, Columns], Finding]
+) -> Identification:
+    """An identification from one loop's ticks during a step of a sequence."""
+    return Identification(
+        plan=None,
+        from_log=lambda rig, loop, path: analyse(
+            rig, loop, gather_step_log(path, kind, loop, step)
+        ),
+        from_records=None,
+        step=step,
     )
 
 
@@ -84,4 +108,16 @@ EXPERIMENTS: dict[str, Identification] = {
         lambda rig, loop, records: _air_path(rig, loop, frames_of_records(records, loop)),
     ),
     "response": Identification(None, _response_from_file, None),
+    "feedforward": _of_step(feedforward.STEP, Tick, feedforward.analyse),
+    "photodiodes": _of_step(
+        beam.STEP,
+        MetrologyTick,
+        lambda rig, loop, ticks: beam.analyse(rig, loop, ticks, beam.PhotodiodesResult),
+    ),
+    "link_delay": _of_step(
+        beam.STEP,
+        MetrologyTick,
+        lambda rig, loop, ticks: beam.analyse(rig, loop, ticks, beam.LinkDelayResult),
+    ),
+    "ambient": _of_step(ambient.STEP, MetrologyTick, ambient.analyse),
 }

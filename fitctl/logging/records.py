@@ -91,6 +91,12 @@ class Tick(Record, frozen=True, kw_only=True, gc=False):
     # Of the siderostat of the loop's link, when `siderostat_az_rad` was read; NaN without a link.
     link_az_rad: float = math.nan
     link_el_rad: float = math.nan
+    # How sure the sensor was of where the star is, one standard deviation; NaN without a star.
+    star_sigma_az_px: float = math.nan
+    star_sigma_el_px: float = math.nan
+    # Where the mirror was at mid-exposure, by the identified hysteresis.
+    mirror_az_rad: float = math.nan
+    mirror_el_rad: float = math.nan
 
 
 class MetrologyTick(Record, frozen=True, kw_only=True, gc=False):
@@ -327,6 +333,15 @@ class Losses(Record, frozen=True, kw_only=True):
         }
 
 
+class Snapshot(Record, frozen=True, kw_only=True):
+    """What consoles show and no other record has, about once a second, as MessagePack.
+
+    ``state_msgpack`` is a :class:`fitctl.messages.telemetry.Unlogged`.
+    """
+
+    state_msgpack: bytes
+
+
 class SequenceAttempt(Record, frozen=True, kw_only=True):
     """One attempt at one step of a sequence, when it ended; figures as JSON, units in their names.
 
@@ -367,6 +382,7 @@ AnyRecord = (
     | Losses
     | SequenceAttempt
     | CommandRecord
+    | Snapshot
 )
 
 

@@ -42,6 +42,7 @@ from fitctl.logging.records import (
     RecorderStatus,
     RunInfo,
     SequenceAttempt,
+    Snapshot,
     Tick,
 )
 
@@ -65,6 +66,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     Losses: "/fit/losses",
     SequenceAttempt: "/fit/sequence/attempts",
     CommandRecord: "/fit/commands",
+    Snapshot: "/fit/snapshots",
 }
 """RunInfo is missing because it is kept as metadata: see :func:`run_metadata`."""
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fitctl.config import Loop
 from fitctl.controllers.centroid import Star
 from fitctl.controllers.frame_counts import count_frame
+from fitctl.loop.pointing import error_from
 from fitctl.messages.modes import Finding, Mode, Trigger
-from fitctl.model.optics import Scales, rows, transformed
+from fitctl.model.optics import AzEl, Scales, rows, transformed
 
 
 class Following:
@@ -33,24 +31,19 @@ class Following:
         self._reach_frames = loop.coarse.reach_frames
         self._reach_fraction = loop.coarse.reach_fraction
         self._range_px = scale.mirror_px_per_rad * loop.fsm.range_rad
-        self._to_mirror = rows(scale.mirror_turn.T)
+        self._to_mirror = rows(scale.mirror_back)
         self.begin()
 
     def begin(self) -> None:
         """Count anew."""
         self.lost = self.in_reach = self.out_of_reach = 0
 
-    def evaluate(
-        self, mode: Mode, star: Star | None, target_px: NDArray[np.float64]
-    ) -> Finding | None:
-        """What a frame showed, if it leads to another mode; `target_px` has shape (2,)."""
+    def evaluate(self, mode: Mode, star: Star | None, target_px: AzEl) -> Finding | None:
+        """What a frame showed, if it leads to another mode."""
         need = math.nan
         if star is not None:
-            target_az_px, target_el_px = target_px.tolist()
             # The mirror's diamond lies along its own axes.
-            az_px, el_px = transformed(
-                self._to_mirror, star.az_px - target_az_px, star.el_px - target_el_px
-            )
+            az_px, el_px = transformed(self._to_mirror, *error_from(target_px, star))
             need = (abs(az_px) + abs(el_px)) / self._range_px
         count_frame(self, star is not None, need, self._reach_fraction)
         if self.lost >= self._lost_frames:

@@ -102,6 +102,10 @@ class Link:
         """From the origin, by the encoders as last read."""
         return self._matrix @ self.motor_rad - self.origin_rad
 
+    def turned_at(self, time_s: float) -> Floats:
+        """From the origin, by the encoders at a recent time."""
+        return self._matrix @ self.servo.position_at(time_s) - self.origin_rad
+
     @property
     def matrix(self) -> Floats:
         """From the motors of the link's siderostat to those of the own one, shape (2, 2)."""
@@ -168,7 +172,7 @@ class BacklashFeedforward:
         ]
         self._beams_rad = [stage.servo.position_rad for stage in self._stages]
         self._mirror_per_motor = -scale.motor_px_per_rad / scale.mirror_px_per_rad
-        self._turn = scale.siderostat_turn.T @ scale.mirror_turn
+        self._turn = scale.siderostat_turn.T @ scale.mirror_back.T
         self._lost_rad = np.zeros(2)
         self._origin_rad = np.zeros(2)
         self._in_force: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY_TICKS)

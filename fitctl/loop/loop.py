@@ -213,7 +213,8 @@ class Loop(ABC):
         row = transition(self.mode, trigger, self.transitions)
         if row is None:
             return False
-        now_s, motor_rad, link_rad = self._clock.now_s(), self.servo.position_rad, self._read_link()
+        now_s, motor_rad = self._clock.now_s(), self.servo.position_rad
+        link_rad = self._read_link(now_s)
         source, self.mode = self.mode, row.target
         if source is not self.mode:
             self.mode_since_s = now_s
@@ -239,7 +240,7 @@ class Loop(ABC):
         )
         return True
 
-    def _read_link(self) -> AzEl:
+    def _read_link(self, _now_s: float) -> AzEl:
         """Motor angles of the siderostat of the loop's link, read now; NaN without a link."""
         return math.nan, math.nan
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.config import MetrologyLoop as MetrologySettings
 from fitctl.controllers.beam_hold import BeamHold
+from fitctl.controllers.frame_counts import count_sample
 from fitctl.controllers.photodiodes import Beam, BeamState, PhotodiodeArray
 from fitctl.controllers.spiral import plan_beam_spiral
 from fitctl.drivers.interface import (
@@ -26,9 +27,10 @@ from fitctl.drivers.interface import (
     ServoReading,
 )
 from fitctl.logging.records import MetrologyTick
-from fitctl.loop.beam_search import BeamSearch
+from fitctl.loop.beam_search import beam_search
 from fitctl.loop.loop import Loop
 from fitctl.loop.quantities import MetrologyQuantities, metrology_places
+from fitctl.loop.spiral_search import SpiralSearch
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import (
     BEAM_FOLLOWING,
@@ -46,10 +48,10 @@ from fitctl.stages.siderostat import SiderostatStage
 Floats = NDArray[np.float64]
 IN_REACH = 3.0  # times the requirement: nearer to the centre than this, the beam is held (choice)
 OUT_OF_REACH = 20.0  # times the requirement: farther, it is pulled in again (choice)
-_PULL_IN = (
+PULL_IN = (
     0.5  # of the motors' velocity limit: faster, a beam that is far off is not pulled in (choice)
 )
-_MOST_TICK_S = 0.1  # a longer wait between two ticks counts as this: the law was not made for it
+MOST_TICK_S = 0.1  # a longer wait between two ticks counts as this: the law was not made for it
 _NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 _NO_SAMPLE = DiodeReading(math.nan, (math.nan,) * 4)
 _NO_BEAM = Beam(BeamState.LOST, math.nan, math.nan, math.nan, math.nan, math.nan)
@@ -84,8 +86,10 @@ class MetrologyLoop(Loop):
 
     Attributes
     ----------
-    search : BeamSearch
+    search : SpiralSearch
     hold : BeamHold
+    lost, in_reach, out_of_reach : int
+        Samples in a row, by :func:`fitctl.controllers.frame_counts.count_sample`.
     zeros_lost : int
         How often the encoders were found to read elsewhere than before, when the devices were opened.
     """
@@ -111,7 +115,7 @@ class MetrologyLoop(Loop):
         self.settings: MetrologySettings = rig.metrology_loops[name]
         settings = self.settings
         self.quantities: MetrologyQuantities
-        self.search = BeamSearch(rig, name)
+        self.search: SpiralSearch = beam_search(rig, name)
         self.hold = BeamHold(settings.hold.crossover_hz, settings.hold.second_integrator_hz)
         self._array = PhotodiodeArray(settings.sensor, settings.acquisition.detection_sigma)
         self._photodiodes = photodiodes
@@ -120,15 +124,15 @@ class MetrologyLoop(Loop):
         self.zeros_lost = 0
         self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
         self._turn = rotation(settings.siderostat.rotation_deg)
-        self._pull_in_rad_s = _PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
+        self._pull_in_rad_s = PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
         self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._period_s = rig.camera.period_s
         self._sky_arcsec_per_px = ARCSEC_PER_RAD / sky_px_per_rad(rig)
-        self._limits = _limits(rig, name)
+        self._limits = metrology_limits(rig, name)
         self._ready = False
         self._sampled_s = math.nan
         self._ticked_s = self._requested_s = math.nan
-        self._lost = self._in_reach = self._out_of_reach = 0  # samples in a row
+        self.lost = self.in_reach = self.out_of_reach = 0  # samples in a row
         self._laws: dict[Mode, Callable[[_Sensed, float], None]] = {
             Mode.ACQUISITION: self._search,
             Mode.COARSE: self._pull_in,
@@ -171,7 +175,7 @@ class MetrologyLoop(Loop):
             quantities.record_sample_age(now_s - self._sampled_s, now_s)
         self._evaluate_interlocks(now_s)
         since_s = 0.0 if math.isnan(self._ticked_s) else now_s - self._ticked_s
-        duration_s = min(since_s, _MOST_TICK_S)
+        duration_s = min(since_s, MOST_TICK_S)
         self._ticked_s = now_s
         law = self._laws.get(self.mode)
         if law is not None and self.interlocks.action not in {"hold", "flatten"}:
@@ -214,23 +218,20 @@ class MetrologyLoop(Loop):
     def _find_trigger(self, sample: DiodeReading, beam: Beam, motor_rad: Floats) -> Finding | None:
         if self.mode is Mode.ACQUISITION:
             has_light = beam.state is not BeamState.LOST
-            return self.search.evaluate(has_light, motor_rad, sample.time_s)
+            return self.search.look(has_light, motor_rad, sample.time_s)
         return self._follow(beam) if self.mode in BEAM_FOLLOWING else None
 
     def _follow(self, beam: Beam) -> Finding | None:
         """Whether a beam that is followed is still there, and near the centre."""
         acquisition = self.settings.acquisition
-        measured = beam.state is BeamState.MEASURED
         error = self._error_arcsec(beam) / self.settings.requirement_arcsec
-        self._lost = self._lost + 1 if beam.state is BeamState.LOST else 0
-        self._in_reach = self._in_reach + 1 if measured and error <= IN_REACH else 0
-        near = measured and error <= OUT_OF_REACH
-        self._out_of_reach = 0 if near else self._out_of_reach + 1
-        if self._lost >= acquisition.lost_frames:
-            return Finding(Trigger.BEAM_LOST, f"no beam on {self._lost} samples in a row")
-        if self.mode is Mode.COARSE and self._in_reach >= acquisition.found_frames:
+        lost, measured = beam.state is BeamState.LOST, beam.state is BeamState.MEASURED
+        count_sample(self, lost, measured, error, IN_REACH, OUT_OF_REACH)
+        if self.lost >= acquisition.lost_frames:
+            return Finding(Trigger.BEAM_LOST, f"no beam on {self.lost} samples in a row")
+        if self.mode is Mode.COARSE and self.in_reach >= acquisition.found_frames:
             return Finding(Trigger.IN_REACH, "the beam is near the centre of the photodiodes")
-        if self.mode is Mode.LOCKED and self._out_of_reach >= acquisition.lost_frames:
+        if self.mode is Mode.LOCKED and self.out_of_reach >= acquisition.lost_frames:
             state = beam.state.name.lower()
             return Finding(Trigger.OUT_OF_REACH, f"the beam is {state}, and not near the centre")
         return None
@@ -242,7 +243,7 @@ class MetrologyLoop(Loop):
     # ------------------------------------------------------------ modes
 
     def _enter(self, source: Mode, motor_rad: Floats) -> None:
-        self._lost = self._in_reach = self._out_of_reach = 0
+        self.lost = self.in_reach = self.out_of_reach = 0
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
             self._start_search(motor_rad, again=source in BEAM_FOLLOWING)
@@ -260,7 +261,7 @@ class MetrologyLoop(Loop):
         if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
             expected = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
             centre_rad = expected / ARCSEC_PER_RAD / self._motor_sky
-        self.search.begin(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
+        self.search.start(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
 
     # ------------------------------------------------------------ control laws
 
@@ -407,29 +408,8 @@ def metrology_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) 
     return MetrologyLoop(name, rig, SiderostatStage(rig, name, servo), devices.photodiodes, journal)
 
 
-def refused_beam_search(settings: MetrologySettings, name: str, asked: Acquire) -> str:
-    """Why a search for the beam cannot be made as asked, or nothing."""
-    expected = [asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec]
-    given = [place for place in expected if place is not None]
-    if len(given) == 1:
-        return "expected_az_sky_arcsec and expected_el_sky_arcsec belong together"
-    radius = asked.search_radius_sky_arcsec
-    if radius is not None and not 0 < radius < math.inf:
-        return f"search_radius_sky_arcsec must be above 0 (is {radius:g})"
-    if radius is None and not given:
-        return ""
-    radius = radius or settings.acquisition.search_radius_sky_arcsec
-    travel = settings.siderostat.travel_sky_arcsec
-    reach = max((abs(place) for place in given), default=0.0) + radius
-    if not reach <= travel:
-        return (
-            f"the search would reach {reach:g} arcsec from where the encoders read zero; "
-            f"travel_sky_arcsec of loops.{name}.siderostat is {travel:g}"
-        )
-    return ""
-
-
-def _limits(rig: Rig, name: str) -> LoopLimits:
+def metrology_limits(rig: Rig, name: str) -> LoopLimits:
+    """How far the loop's stages go, and what its search does."""
     loop = rig.metrology_loops[name]
     pitch_px = plan_beam_spiral(rig, name).pitch_px
     return LoopLimits(

@@ -31,7 +31,8 @@ class Observation(NamedTuple):
     now_s : float
         When that is: the tick's beginning.
     link_rad : array, shape (2,), or None
-        Motor angles that turn the star as far as the siderostat of the loop's link did; None without one.
+        Motor angles that turn the star as far as the siderostat of the loop's link and the sky did; None
+        without either.
     link_motor_rad : array, shape (2,), or None
         Angles of the motors of the link's siderostat at the same time as `motor_rad`; None without a link.
     backlash_rad : array, shape (2,), or None
@@ -57,5 +58,5 @@ class Observation(NamedTuple):
 
     @property
     def beam_rad(self) -> NDArray[np.float64]:
-        """Motor angles that turn the star as far as all siderostats did, shape (2,)."""
+        """Motor angles that turn the star as far as all siderostats and the sky did, shape (2,)."""
         return self.motor_rad if self.link_rad is None else self.motor_rad + self.link_rad

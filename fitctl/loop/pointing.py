@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.controllers.centroid import Star
 from fitctl.controllers.pair import Design, Measurement, Pair, PairCommand
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.loop.observation import Observation
-from fitctl.model.optics import scales
-from fitctl.stages.mirror import MirrorStage
+from fitctl.model.optics import AzEl, scales
 
 Floats = NDArray[np.float64]
 
@@ -52,8 +52,8 @@ class Pointing:
         return self.pair.design
 
     @property
-    def command_px(self) -> Floats:
-        """The target as the prefilter has it now, shape (2,)."""
+    def command_px(self) -> AzEl:
+        """The target as the prefilter has it now."""
         return self.prefilter.value_px
 
     @property
@@ -69,16 +69,8 @@ class Pointing:
         """Rest on the target, shape (2,)."""
         self.prefilter.reset(target_px)
 
-    def start_pair(
-        self, mirror: MirrorStage, motor_rad: Floats, offset_rad: Floats | None = None
-    ) -> None:
-        """Go on from where the mirror is held, with the motors at `motor_rad`, shape (2,).
-
-        `offset_rad` is the part of the mirror's angles, shape (2,), that is added to the pair's.
-        """
-        held_rad = mirror.held_rad(hysteresis_inverse=self.design.hysteresis_inverse)
-        if offset_rad is not None:
-            held_rad = held_rad - offset_rad
+    def start_pair(self, held_rad: Floats, motor_rad: Floats) -> None:
+        """Go on with the mirror held at `held_rad` and the motors at `motor_rad`, each shape (2,)."""
         self.pair.start(held_rad, motor_rad, self.command_px)
 
     def step_coarse(self, observation: Observation, target_px: Floats) -> Floats | None:
@@ -86,15 +78,20 @@ class Pointing:
         command_px = self.prefilter.step(target_px)
         if observation.star is None:
             return None
-        error_px = observation.star.position_px - command_px
-        return -self.coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_turn)
+        error_px = np.array(error_from(command_px, observation.star))
+        return -self.coarse_step_rad_per_px * error_px.dot(self._scale.siderostat_back.T)
 
     def step_pair(self, observation: Observation, target_px: Floats) -> PairCommand | None:
         """One frame: what both stages shall do; None where no star is visible."""
         command_px = self.prefilter.step(target_px)
         if observation.star is None:
             return None
-        error_px = observation.star.position_px - command_px
+        error_px = error_from(command_px, observation.star)
         return self.pair.step(
             Measurement(error_px, command_px, observation.law_mirror_rad, observation.beam_rad)
         )
+
+
+def error_from(target_px: AzEl, star: Star) -> AzEl:
+    """How far a star is from a target."""
+    return star.az_px - target_px[0], star.el_px - target_px[1]

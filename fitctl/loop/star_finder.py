@@ -11,6 +11,7 @@ from fitctl.config import Rig
 from fitctl.controllers.centroid import OtherLight, Star, StarSensor
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.logging.records import Severity
+from fitctl.loop.attribution import Attribution
 from fitctl.messages.modes import TRACKING, WITH_WINDOW, Mode
 from fitctl.model.optics import AzEl, scales
 
@@ -32,6 +33,8 @@ class StarFinder:
     Attributes
     ----------
     estimator : StarEstimator
+    attribution : Attribution or None
+        None where no other loop's star is on the frame.
     look_at_px : tuple of float or None
         Where the star is looked for on the next frame, and then no more.
     last : Star or None
@@ -47,6 +50,9 @@ class StarFinder:
     ) -> None:
         loop = rig.stellar_loops[loop_name]
         self.estimator = StarEstimator(scales(rig, loop), target_px)
+        self.attribution: Attribution | None = None
+        if len(rig.stellar_loops) > 1:
+            self.attribution = Attribution(rig, loop_name, self.estimator)
         self.look_at_px: AzEl | None = None
         self.last: Star | None = None
         self._visible = False
@@ -54,27 +60,33 @@ class StarFinder:
         self._other_spots = loop.other_spots
         self._star_flux_dn = loop.star_flux_dn
         self._diameter_px = loop.spot_diameter_px
-        self._is_shared = len(rig.stellar_loops) > 1
         self._report_event = report_event
 
     def expect_flux(self, flux_dn: float) -> None:
         """What the star's light is to be from now on."""
         self._sensor.expect(flux_dn)
 
-    def exclude(self, others: Iterable[list[OtherLight]]) -> None:
+    def exclude(
+        self, followed: Iterable[list[OtherLight]], candidates: Iterable[list[OtherLight]]
+    ) -> None:
         """From now on no star is looked for where other loops follow theirs, and their light is subtracted.
 
-        Each loop's list begins with its star.
+        So is the light of their candidates, but each of these may be this loop's star. Each loop's list begins
+        with its star.
         """
-        spots = [spots for spots in others if spots]
+        spots = [spots for spots in followed if spots]
         self._sensor.excluded_px = [(star.az_px, star.el_px) for star, *_ in spots]
-        self._sensor.other_light = [spot for of_loop in spots for spot in of_loop]
+        self._sensor.other_light = [spot for of_loop in (*spots, *candidates) for spot in of_loop]
 
-    def spots(self) -> list[OtherLight]:
-        """The star when it was last found, then what moves with it; dark if the last frame lacks it."""
+    def spots(self, moved_px: AzEl = (0.0, 0.0)) -> list[OtherLight]:
+        """The star when it was last found, then what moves with it; dark if the last frame lacks it.
+
+        `moved_px` is how far the stages have taken all of it since.
+        """
         if self.last is None:
             return []
         az_px, el_px, flux_dn, *_ = self.last
+        az_px, el_px = az_px + moved_px[0], el_px + moved_px[1]
         flux_dn *= self._visible
         return [
             OtherLight(az_px, el_px, flux_dn, self._diameter_px),
@@ -104,16 +116,32 @@ class StarFinder:
         """
         stages_px = self.estimator.stages_px(motor_rad, mirror_rad)
         star = self._looked_for(image, mode)
-        if star is None and follows:
+        if star is None and self.attribution is not None:
+            star = self._find_own(self.attribution, image, mode, stages_px, follows=follows)
+        elif star is None and follows:
             star = self._sensor.follow(image, *self.estimator.predict_px(stages_px))
         elif star is None:
-            # Two stars look alike: the other loop's may be on the frame before that loop follows it.
-            near_px = self.estimator.predict_px(stages_px) if self._is_shared else None
-            star = self._sensor.find(image, near_px)
+            star = self._sensor.find(image)
         self.last, self._visible = star or self.last, star is not None
-        if star is not None and mode in TRACKING:
+        if star is not None and self.attribution is not None:
+            self.attribution.observe(star, mode, stages_px)
+        elif star is not None and mode in TRACKING:
             self.estimator.observe((star.az_px, star.el_px), stages_px)
         return star
+
+    def _find_own(
+        self,
+        attribution: Attribution,
+        image: NDArray[np.uint16],
+        mode: Mode,
+        stages_px: AzEl,
+        *,
+        follows: bool,
+    ) -> Star | None:
+        """The loop's own star on a frame on which other stars may be that look alike."""
+        expected_px = self.estimator.predict_px(stages_px)
+        star = self._sensor.in_window(image, *expected_px) if follows else None
+        return star or attribution.choose(self._sensor.candidates(image), mode, expected_px)
 
     def _looked_for(self, image: NDArray[np.uint16], mode: Mode) -> Star | None:
         """The star where somebody told the loop to look, if there is one."""

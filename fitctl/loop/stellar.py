@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Rig
 from fitctl.config import Loop as LoopSettings
+from fitctl.config import Rig
 from fitctl.controllers.centroid import OtherLight, Star
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
@@ -26,7 +26,8 @@ from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.quantities import StellarQuantities, stellar_places
-from fitctl.loop.search import Search
+from fitctl.loop.search import StarSearch
+from fitctl.loop.sky import Sky
 from fitctl.loop.star_finder import StarFinder
 from fitctl.loop.tick_record import TickRecords, TickTimes
 from fitctl.messages.commands import Acquire
@@ -77,6 +78,7 @@ class StellarLoop(Loop):
         self.settings: LoopSettings = rig.stellar_loops[name]
         self.quantities: StellarQuantities
         self.link: Link | None = None
+        self.sky: Sky | None = None
         self.backlash: BacklashFeedforward | None = None
         self.others: list[StellarLoop] = []
         self.waits_for = ""
@@ -84,10 +86,12 @@ class StellarLoop(Loop):
         self.target_px = np.array([self.settings.target_px.az, self.settings.target_px.el])
         scale = scales(rig, self.settings)
         self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
-        self.search = Search(rig, name, self.star_finder.estimator)
+        self.search = StarSearch(rig, name, self.star_finder)
         self.following = Following(self.settings, scale)
         self.pointing = Pointing(rig, name, self.target_px, design)
-        self._limits = _limits(rig, name)
+        self._limits = stellar_limits(rig, name)
+        if self.settings.star_rate_sky_arcsec_s is not None:
+            self.sky = Sky(self.settings, scale, rig.camera.period_s)
         self._scale = scale
         self._period_s = rig.camera.period_s
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
@@ -95,7 +99,7 @@ class StellarLoop(Loop):
         self._flattened = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
         self._has_held = False  # since the devices were opened
-        self._held_undone_rad = np.zeros(2)  # of the link, as an experiment began
+        self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
             Mode.STANDBY: self._stand_by,
@@ -124,6 +128,10 @@ class StellarLoop(Loop):
         if self.link is not None:
             self.link.read_at(time_s)
             link_rad, link_motor_rad = self.link.turned_rad, self.link.motor_rad
+        if self.sky is not None:
+            self.sky.read_at(time_s)
+            self.search.sky_rad = self.sky.turned_rad
+            link_rad = self.sky.turned_rad if link_rad is None else link_rad + self.sky.turned_rad
         if frame is not None:
             beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
             star = self._find(frame, mirror_rad, beam_rad)
@@ -188,6 +196,8 @@ class StellarLoop(Loop):
         action = self.interlocks.action if self.mode in TRACKING else None
         if self.link is not None and action not in {"hold", "flatten"}:
             self._follow_link(self.link)
+        if self.sky is not None and action not in {"hold", "flatten"}:
+            self._follow_sky(self.sky, observation.now_s)
         if action == "flatten":
             self.mirror.step_to_bias()
         elif self._flattened and self.mode is Mode.VERNIER:
@@ -199,7 +209,10 @@ class StellarLoop(Loop):
             self._laws[self.mode](observation)
 
     def _find(self, frame: Frame, mirror_rad: Floats, beam_rad: Floats) -> Star | None:
-        self.star_finder.exclude(other.spots for other in self.others)
+        self.star_finder.exclude(
+            (other.spots for other in self.others),
+            (other.candidate_spots(frame.mid_exposure_s) for other in self.others),
+        )
         if self.mode is Mode.ACQUISITION and (
             self.waits_for or not self.search.has_arrived(beam_rad)
         ):
@@ -211,6 +224,17 @@ class StellarLoop(Loop):
     def spots(self) -> list[OtherLight]:
         """What other loops must not measure: the star, then what moves with it; empty if none is followed."""
         return self.star_finder.spots() if self.mode in FOLLOWING else []
+
+    def candidate_spots(self, time_s: float) -> list[OtherLight]:
+        """What a search looks at a second time, where the stages have it at a recent time; empty without."""
+        attribution = self.star_finder.attribution
+        searches = self.mode is Mode.ACQUISITION and not self.waits_for
+        if not searches or attribution is None or attribution.candidate is None:
+            return []
+        motor_rad = self.servo.position_at(time_s)
+        beam_rad = sum((part.turned_at(time_s) for part in self._beside()), motor_rad)
+        stages_px = self.star_finder.estimator.stages_px(beam_rad, self.mirror.at(time_s))
+        return self.star_finder.spots(attribution.moved_px(stages_px))
 
     def _evaluate_findings(self, observation: Observation) -> None:
         """Errors of devices, and what the frame means for the mode."""
@@ -255,21 +279,31 @@ class StellarLoop(Loop):
 
     def _start_pair(self, beam_rad: Floats) -> None:
         """The pair goes on from where the mirror is, with all siderostats at `beam_rad`, shape (2,)."""
-        if self.backlash is None:
-            self.pointing.start_pair(self.mirror, beam_rad)
-        else:
+        held_rad = self.mirror.held_rad(hysteresis_inverse=self._inverts_hysteresis)
+        if self.backlash is not None:
             self.backlash.begin(self.backlash.offset_rad)
-            self.pointing.start_pair(self.mirror, beam_rad, self.backlash.offset_rad)
+            held_rad = held_rad - self.backlash.offset_rad
+        self.pointing.start_pair(held_rad, beam_rad)
+
+    @property
+    def _inverts_hysteresis(self) -> bool:
+        """As the design asks; but no measurement corrects what makes up for backlash, so that must be exact."""
+        return self.backlash is not None or self.pointing.design.hysteresis_inverse
 
     def _beam_rad(self, motor_rad: Floats) -> Floats:
-        """Motor angles that turn the star as far as all siderostats, the link's as last read, shape (2,)."""
-        if self.link is None:
-            return motor_rad
-        return motor_rad + self.link.turned_rad
+        """Motor angles that turn the star as far as all siderostats and the sky, as last read, shape (2,)."""
+        return sum((part.turned_rad for part in self._beside()), motor_rad)
 
-    def _read_link(self) -> AzEl:
+    def _beside(self) -> list[Link | Sky]:
+        """What turns the star beside the loop's own motors."""
+        return [part for part in (self.link, self.sky) if part is not None]
+
+    def _read_link(self, now_s: float) -> AzEl:
+        if self.sky is not None:
+            self.sky.read_at(now_s)
+            self.search.sky_rad = self.sky.turned_rad
         if self.link is None:
-            return super()._read_link()
+            return super()._read_link(now_s)
         self.link.read_now()
         az_rad, el_rad = self.link.motor_rad.tolist()
         return az_rad, el_rad
@@ -289,7 +323,7 @@ class StellarLoop(Loop):
             self.link.set_origin()
             self.star_finder.estimator.forget()
         self.star_finder.estimator.expect(self.target_px, self._beam_rad(motor_rad), np.zeros(2))
-        self.search.begin(again=again)
+        self.search.start_where_expected(again=again)
 
     # ------------------------------------------------------------ the link, and other loops
 
@@ -318,23 +352,18 @@ class StellarLoop(Loop):
             loop = self.link.loop
             return f"the link of {loop.name}, which is in {loop.mode.name}"
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
-            # Two stars that are both searched for look alike, and a star that is found comes to the middle.
+            # Two stars look alike: only the own one moves while the other loop's stages stand still.
             busy = [other.name for other in self.others if other.is_acquiring]
             if busy:
-                return f"{', '.join(busy)}, whose star is on its way to its target"
+                return f"{', '.join(busy)}, which searches for its star"
         return ""
 
     @property
     def is_acquiring(self) -> bool:
-        """Its star is searched for, and was not followed before, or is not yet near its target."""
-        if self.waits_for:
+        """Its star is searched for, and was not followed before."""
+        if self.mode is not Mode.ACQUISITION or self.waits_for:
             return False
-        if self.mode is Mode.ACQUISITION:
-            return self._search_due is None and not self.search.again
-        star = self.star_finder.last
-        if self.mode is not Mode.COARSE or star is None:
-            return False
-        return float(np.abs(self.target_px - star.position_px).max()) > HALF_WINDOW_PX
+        return self._search_due is None and not self.search.again
 
     def _evaluate_waiting(self, observation: Observation) -> None:
         """Wait where the stages are, or go on, and report which."""
@@ -371,6 +400,13 @@ class StellarLoop(Loop):
         elif link.holds and self._search_due is None:
             self.siderostat.move_by(link.step_rad())
 
+    def _follow_sky(self, sky: Sky, now_s: float) -> None:
+        """Undo what the star moves by itself, as long as it is tracked."""
+        if self.mode not in TRACKING:
+            sky.begin(now_s)
+        elif not self.waits_for and self._search_due is None:
+            self.siderostat.move_by(sky.step_rad(now_s))
+
     # ------------------------------------------------------------ control laws
 
     def _rest(self, _observation: Observation) -> None:
@@ -383,9 +419,11 @@ class StellarLoop(Loop):
 
     def _search(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
-        wanted_rad = self.search.advance(self._period_s, observation.beam_rad)
+        wanted_rad = self.search.advance_from(observation.beam_rad, self._period_s)
         if self.link is not None:
             wanted_rad = wanted_rad - self.link.undone_from_origin_rad
+        if self.sky is not None:
+            wanted_rad = wanted_rad - self.sky.undone_rad
         self.siderostat.move_to(wanted_rad)
 
     def _pull_in(self, observation: Observation) -> None:
@@ -404,9 +442,7 @@ class StellarLoop(Loop):
                 mirror_rad = saturate_diamond(
                     mirror_rad + self.backlash.offset_rad, self.settings.fsm.range_rad
                 )
-            self.mirror.move_to(
-                mirror_rad, hysteresis_inverse=self.pointing.design.hysteresis_inverse
-            )
+            self.mirror.move_to(mirror_rad, hysteresis_inverse=self._inverts_hysteresis)
 
     def _run_experiment(self, observation: Observation) -> None:
         setpoint_rad = self._experiments.setpoint_rad(observation.now_s)
@@ -416,8 +452,12 @@ class StellarLoop(Loop):
             self.siderostat.move_to(setpoint_rad + self._undone_since_held())
 
     def _undone_since_held(self) -> Floats:
-        """How far the link has moved the siderostat since an experiment began, shape (2,)."""
-        return np.zeros(2) if self.link is None else self._held_undone_rad - self.link.undone_rad
+        """How far link and sky have moved the siderostat since an experiment began, shape (2,)."""
+        return self._held_undone_rad - self._undone_rad()
+
+    def _undone_rad(self) -> Floats:
+        """What the siderostat undoes of link and sky, shape (2,), from a zero that is always the same."""
+        return sum((part.undone_rad for part in self._beside()), np.zeros(2))
 
     # ------------------------------------------------------------ designs and experiments
 
@@ -428,7 +468,8 @@ class StellarLoop(Loop):
 
     def use(self, design: Design) -> None:
         """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
-        before, motor_rad, link_rad = self.controller, self.servo.position_rad, self._read_link()
+        now_s, before, motor_rad = self._clock.now_s(), self.controller, self.servo.position_rad
+        link_rad = self._read_link(now_s)
         self.pointing.use(design)
         if self.mode is Mode.VERNIER:
             self._start_pair(self._beam_rad(motor_rad))
@@ -436,7 +477,7 @@ class StellarLoop(Loop):
         link_az_rad, link_el_rad = link_rad
         self._journal.record(
             ControllerChange(
-                time_s=self._clock.now_s(),
+                time_s=now_s,
                 loop=self.name,
                 source=before,
                 target=design.name,
@@ -453,8 +494,7 @@ class StellarLoop(Loop):
         now_s = self._clock.now_s()
         if not self.fire(Trigger.EXPERIMENT, name):
             return False
-        if self.link is not None:
-            self._held_undone_rad = self.link.undone_rad
+        self._held_undone_rad = self._undone_rad()
         self._experiments.begin(name, drives, self.siderostat, self.mirror, now_s)
         return True
 
@@ -473,7 +513,8 @@ class StellarLoop(Loop):
     def state(self, now_s: float) -> LoopState:
         """The newest of everything, for consoles."""
         scale, mode = self._scale, self.mode
-        centre_sky_arcsec = (self.search.centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
+        centre_rad = self.search.centre_rad - self.search.sky_rad
+        centre_sky_arcsec = (centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
         az_urad, el_urad = (1e6 * self.mirror.bias_offset_rad).tolist()
         return LoopState(
             name=self.name,
@@ -558,7 +599,8 @@ def stellar_loop(
     return StellarLoop(name, rig, siderostat, mirror, journal, design(rig, name, ""))
 
 
-def _limits(rig: Rig, name: str) -> LoopLimits:
+def stellar_limits(rig: Rig, name: str) -> LoopLimits:
+    """How far the loop's stages go, and what its search does."""
     loop = rig.stellar_loops[name]
     return LoopLimits(
         fsm_range_rad=loop.fsm.range_rad,

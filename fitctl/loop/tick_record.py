@@ -10,7 +10,7 @@ from fitctl.drivers.interface import ServoReading
 from fitctl.logging.records import Tick
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
-from fitctl.loop.search import Search
+from fitctl.loop.spiral_search import SpiralSearch
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.stages.mirror import MirrorStage
@@ -50,7 +50,7 @@ class TickRecords:
         siderostat: SiderostatStage,
         mirror: MirrorStage,
         pointing: Pointing,
-        search: Search,
+        search: SpiralSearch,
         times: TickTimes,
     ) -> Tick:
         """What a tick was decided by, and what it did."""
@@ -60,10 +60,11 @@ class TickRecords:
         read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or _NO_READING
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
         star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
-        target_az_px, target_el_px = pointing.command_px.tolist()
+        target_az_px, target_el_px = pointing.command_px
         fsm_az_rad, fsm_el_rad = mirror.command_rad.tolist()
         stack1_v, stack2_v, stack3_v = mirror.stack_v.tolist()
         motor_az_rad, motor_el_rad = observation.motor_rad.tolist()
+        mirror_az_rad, mirror_el_rad = observation.mirror_rad.tolist()
         setpoint_az_rad, setpoint_el_rad = siderostat.setpoint_rad.tolist()
         link_rad = observation.link_motor_rad
         link_az_rad, link_el_rad = (math.nan, math.nan) if link_rad is None else link_rad.tolist()
@@ -115,4 +116,8 @@ class TickRecords:
             frames_skipped=observation.frames_skipped,
             link_az_rad=link_az_rad,
             link_el_rad=link_el_rad,
+            star_sigma_az_px=math.nan if star is None else star.sigma_az_px,
+            star_sigma_el_px=math.nan if star is None else star.sigma_el_px,
+            mirror_az_rad=mirror_az_rad,
+            mirror_el_rad=mirror_el_rad,
         )

@@ -159,11 +159,35 @@ class CollectorState(msgspec.Struct, frozen=True, kw_only=True):
     error: str
 
 
+class Unlogged(msgspec.Struct, frozen=True, kw_only=True):
+    """The part of telemetry that is in no record but :class:`fitctl.logging.records.Snapshot`.
+
+    Fields as in :class:`Telemetry`.
+    """
+
+    loops: list[LoopState]
+    scheduling: str = ""
+    running_sequence: SequenceStatus | None = None
+    commander: str = ""
+    collector: CollectorState | None = None
+    stopped_by: str = ""
+    fringes: FringeOptics | None = None
+
+
+class FringeOptics(msgspec.Struct, frozen=True, kw_only=True):
+    """Which two loops' stars interfere, and at what aperture and wavelength, from the rig file."""
+
+    loops: tuple[str, str]
+    aperture_m: float
+    wavelength_m: float
+
+
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """Sent `telemetry_hz` times a second.
 
     Ticks, events and mode changes are those since the last message; of everything else it has the newest.
     ``commander`` is who has the instrument, empty while nobody has.
+    ``stopped_by`` is who sent the last `stop`, empty before the first one.
     ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
     """
 
@@ -189,6 +213,13 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     metrology_ticks: list[MetrologyTick] = []
     overlaps: list[Overlap] = []
     collector: CollectorState | None = None
+    stopped_by: str = ""
+    fringes: FringeOptics | None = None
+
+    @property
+    def unlogged(self) -> Unlogged:
+        """What no other record has."""
+        return Unlogged(**{name: getattr(self, name) for name in Unlogged.__struct_fields__})
 
     @property
     def records_lost(self) -> int:

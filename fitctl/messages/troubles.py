@@ -13,7 +13,7 @@ from fitctl.logging.records import DeviceHealth
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
-FIND_STAR = "check shutter and clouds; hold, stop or another acquire ends the search"
+FIND_STAR = "check shutter and clouds; hold, stop or acquire ends the search"
 RECORDER_SILENT_S = 10.0  # it reports about once a second
 
 _DID = {

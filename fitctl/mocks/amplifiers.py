@@ -7,6 +7,7 @@ from typing import Any, Protocol
 from fitctl.config import Siderostat, SiderostatMocks
 from fitctl.mocks.bal_analog.station import BalAnalogMockStation
 from fitctl.mocks.cia402.drive import Cia402DriveMock
+from fitctl.mocks.cia402.slcan import SlcanAdapter
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock
 from fitctl.mocks.faults import Faults
 from fitctl.mocks.motors import Motors
@@ -27,16 +28,22 @@ class AmplifierMock(Protocol):
 
 
 def amplifier_mock(
-    siderostat: Siderostat[Any], mocks: SiderostatMocks, motors: Motors
+    siderostat: Siderostat[Any],
+    mocks: SiderostatMocks,
+    motors: Motors,
+    adapter: SlcanAdapter | None = None,
 ) -> AmplifierMock:
-    """The mock that speaks what the rig's driver speaks; the rig file has its settings, if it needs any."""
+    """The mock that speaks what the rig's driver speaks; the rig file has its settings, if it needs any.
+
+    A drive whose CAN bus has others too is on `adapter`.
+    """
     match siderostat.device.driver:
         case "ensemble" if mocks.ensemble is not None:
             return EnsembleControllerMock(siderostat, mocks.ensemble, motors)
         case "bal_analog" if mocks.bal_analog is not None:
             return BalAnalogMockStation(siderostat, mocks.bal_analog, motors)
         case _:
-            return Cia402DriveMock(siderostat, motors, port=mocks.slcan_port)
+            return Cia402DriveMock(siderostat, motors, port=mocks.slcan_port, adapter=adapter)
 
 
 def endpoint_keys(driver: str, loop: str, listening: Any) -> dict[str, Any]:

@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import LoopMocks, Rig
+from fitctl.config import Cia402Device, LoopMocks, Rig
 from fitctl.mocks.amplifiers import amplifier_mock, endpoint_keys
 from fitctl.mocks.bench import Bench, FaultTable
 from fitctl.mocks.c887.platform import Platform
 from fitctl.mocks.c887.server import C887ControllerMock
+from fitctl.mocks.cia402.slcan import SlcanAdapter
+from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.server import Mdt693Mock
@@ -91,9 +93,13 @@ class LivePlant:
             change()
         self.plant.advance(now_s)
 
-    def spots_px(self, host_s: float) -> NDArray[np.float64]:
-        """All spots at a recent host time, shape (spots, 2)."""
-        return self.plant.spots_px(host_s - self.started_s)[0]
+    def exposure_px(self, middle_s: float) -> NDArray[np.float64]:
+        """All spots at all instants of a recent exposure, by its host time, shape (instants * spots, 2)."""
+        return self.plant.exposure_px(middle_s - self.started_s)[0]
+
+    def pixel_noise_dn(self, host_s: float) -> float:
+        """Standard deviation of the camera's dark pixels at a host time."""
+        return self.plant.pixel_noise_dn(host_s - self.started_s)
 
     def diode_volts(self, loop_name: str, host_s: float) -> list[float]:
         """Volts of one loop's photodiodes with their noise at a recent host time: az+, az-, el+, el-."""
@@ -176,6 +182,15 @@ class LiveSiderostat:
         self.velocity_rad_s[:] = np.where(self._enabled, self._commanded_rad_s, 0.0)
 
 
+class _SharedAdapter:
+    """The SLCAN adapter of a bus with several drives; its wire has faults of its own."""
+
+    def __init__(self, drives: dict[str, Cia402Device]) -> None:
+        self.drives = drives
+        self.faults = Faults(WIRE_FAULTS)
+        self.adapter = SlcanAdapter(next(iter(drives.values())).bitrate, self.faults)
+
+
 class StarTestbed:
     """Mock D/A and piezo amplifier of one stellar loop, wired to its mirror's stacks."""
 
@@ -226,10 +241,15 @@ class Testbed:
             name: self._live.siderostat(name, loop.drive_command_timeout_s)
             for name, loop in mocks.loops.items()
         }
+        self._buses = [_SharedAdapter(drives) for drives in rig.can_buses if len(drives) > 1]
+        on_buses = {name: bus.adapter for bus in self._buses for name in bus.drives}
         self._drives = {
-            name: amplifier_mock(loop.siderostat, mocks.loops[name], self._siderostats[name])
+            name: amplifier_mock(
+                loop.siderostat, mocks.loops[name], self._siderostats[name], on_buses.get(name)
+            )
             for name, loop in rig.loops.items()
         }
+        self._slcan_ports = {name: loop.slcan_port for name, loop in mocks.loops.items()}
         self._stars = {
             name: StarTestbed(rig, name, loop, self._live)
             for name, loop in mocks.stellar_loops.items()
@@ -252,16 +272,22 @@ class Testbed:
             rig.camera,
             [spot for name in rig.stellar_loops for spot in truth.stellar_loops[name].spots],
             truth.hot_pixels,
+            truth.exposure_instants,
         )
         self._exposures = 0
         self._camera = GigeCameraMock(
-            rig.true_camera, mocks.camera, picture or self._render, port=mocks.gvcp_port
+            rig.true_camera,
+            mocks.camera,
+            picture or self._render,
+            port=mocks.gvcp_port,
+            smears=truth.exposure_instants > 1,
         )
         self._fault_plan = mocks.faults
         devices = {"camera": self._camera.faults}
         devices |= {f"{name}.drive": drive.faults for name, drive in self._drives.items()}
         for name, star in self._stars.items():
             devices |= {f"{name}.dac": star.dac.faults, f"{name}.mdt693": star.piezo.faults}
+        devices |= {f"{next(iter(bus.drives))}.adapter": bus.faults for bus in self._buses}
         devices |= {f"{name}.labjack": one.faults for name, one in self._labjacks.items()}
         if self._hexapod is not None:
             devices["hexapod"] = self._hexapod.faults
@@ -301,6 +327,10 @@ class Testbed:
         }
         for name, drive in self._drives.items():
             endpoints |= endpoint_keys(self._drive_names[name], name, await drive.start())
+        for bus in self._buses:
+            port = await bus.adapter.start(self._slcan_ports[next(iter(bus.drives))])
+            for name in bus.drives:
+                endpoints |= endpoint_keys("cia402", name, port)
         for name, star in self._stars.items():
             piezo = await star.piezo.start()
             dac = await star.dac.start()
@@ -334,6 +364,8 @@ class Testbed:
         await self._camera.stop()
         for drive in self._drives.values():
             await drive.stop()
+        for bus in self._buses:
+            await bus.adapter.stop()
         for star in self._stars.values():
             await star.dac.stop()
             await star.piezo.stop()
@@ -346,7 +378,10 @@ class Testbed:
     def _render(self, mid_exposure_s: float) -> NDArray[np.uint16]:
         self._exposures += 1
         return self._scene.frame(
-            self._live.spots_px(mid_exposure_s), self._live.plant.pixel_key, self._exposures
+            self._live.exposure_px(mid_exposure_s),
+            self._live.plant.pixel_key,
+            self._exposures,
+            self._live.pixel_noise_dn(mid_exposure_s),
         )
 
     async def _keep_up(self) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import Camera
 from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
@@ -75,3 +76,21 @@ def light_fractions(
             fraction[edge - 1] = above - below
         below = above
     return low, max(low, high)
+
+
+def centroid_noise_px(
+    camera: Camera, flux_dn: float, window_px: int, diameter_px: float = math.nan
+) -> float:
+    """Standard deviation of Eq. 7 over a square window: 14 x 20 / F_total px for 7x7 px.
+
+    Where the camera's photons have noise, a spot of this 1/e^2 diameter adds its own, on the mean of its
+    places within a pixel: the second moment of its light about the window's centre.
+    """
+    half = window_px // 2
+    lever_px2 = window_px * 2 * sum(k * k for k in range(1, half + 1))
+    variance_px2 = lever_px2 * (camera.pixel_noise_dn / flux_dn) ** 2
+    if camera.electrons_per_dn is not None:
+        # Width, the pixel's own, and how far the middle of the window is from the spot.
+        moment_px2 = (diameter_px / 4) ** 2 + 1 / 12 + 1 / 12
+        variance_px2 += moment_px2 / (camera.electrons_per_dn * flux_dn)
+    return math.sqrt(variance_px2)

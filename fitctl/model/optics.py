@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Loop, Rig, Siderostat
+from fitctl.config import ARCSEC_PER_RAD, AxisPair, Loop, Rig, Siderostat
 from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
@@ -37,7 +37,12 @@ class Scales:
     mirror_px_per_rad : float
         Fast steering mirror to focal plane: k_FSM f_i / pixel.
     siderostat_turn, mirror_turn : arrays, shape (2, 2)
-        Rotations from each stage's axes to the camera's; the identity where they agree.
+        From each stage's axes to the camera's: its rotation, and what its axes have of different gains; the
+        identity where they agree.
+    siderostat_back, mirror_back : arrays, shape (2, 2)
+        Their inverses.
+    sky_turn : array, shape (2, 2)
+        Rotation of the siderostat's axes to the camera's.
     pixel_size_m : float
         One pixel.
     """
@@ -48,6 +53,9 @@ class Scales:
     mirror_px_per_rad: float
     siderostat_turn: Floats
     mirror_turn: Floats
+    siderostat_back: Floats
+    mirror_back: Floats
+    sky_turn: Floats
     pixel_size_m: float
 
     @property
@@ -72,7 +80,7 @@ class Scales:
 
     def motor_rad(self, star_px: Floats) -> Floats:
         """Motor angles that move the star so far."""
-        return star_px.dot(self.siderostat_turn) / self.motor_px_per_rad
+        return star_px.dot(self.siderostat_back.T) / self.motor_px_per_rad
 
     def mirror_px(self, mirror_rad: Floats) -> Floats:
         """How far mirror angles move the star."""
@@ -80,11 +88,11 @@ class Scales:
 
     def sky_px(self, sky_arcsec: Floats) -> Floats:
         """An angle on the sky, along the siderostat's axes, on the focal plane."""
-        return sky_arcsec.dot(self.siderostat_turn.T) / self.sky_arcsec_per_px
+        return sky_arcsec.dot(self.sky_turn.T) / self.sky_arcsec_per_px
 
     def sky_arcsec(self, star_px: Floats) -> Floats:
         """What is so far on the focal plane, as an angle on the sky along the siderostat's axes."""
-        return star_px.dot(self.siderostat_turn) * self.sky_arcsec_per_px
+        return star_px.dot(self.sky_turn) * self.sky_arcsec_per_px
 
 
 def scales(rig: Rig, loop: Loop) -> Scales:
@@ -93,15 +101,38 @@ def scales(rig: Rig, loop: Loop) -> Scales:
     siderostat = loop.siderostat
     px_per_rad = sky_px_per_rad(rig)
     motor_sky = motor_sky_rad_per_rad(siderostat)
+    siderostat_turn = stage_turn(siderostat.rotation_deg, siderostat.axis_gains)
+    mirror_turn = stage_turn(loop.fsm.rotation_deg, loop.fsm.axis_gains)
     return Scales(
         sky_px_per_rad=px_per_rad,
         motor_sky_rad_per_rad=motor_sky,
         motor_px_per_rad=motor_sky * px_per_rad,
         mirror_px_per_rad=loop.fsm.beam_per_mirror * rig.optics.focal_length_m / pixel_size_m,
-        siderostat_turn=rotation(siderostat.rotation_deg),
-        mirror_turn=rotation(loop.fsm.rotation_deg),
+        siderostat_turn=siderostat_turn,
+        mirror_turn=mirror_turn,
+        siderostat_back=_back(siderostat_turn, siderostat.axis_gains),
+        mirror_back=_back(mirror_turn, loop.fsm.axis_gains),
+        sky_turn=rotation(siderostat.rotation_deg),
         pixel_size_m=pixel_size_m,
     )
+
+
+def stage_turn(rotation_deg: float, axis_gains: list[list[float]] | None) -> Floats:
+    """From a stage's axes to the camera's, shape (2, 2)."""
+    turn = rotation(rotation_deg)
+    return turn if axis_gains is None else turn @ np.array(axis_gains)
+
+
+def _back(turn: Floats, axis_gains: list[list[float]] | None) -> Floats:
+    """From the camera's axes to a stage's; exact where it is a rotation."""
+    return turn.T if axis_gains is None else np.asarray(np.linalg.inv(turn), float)
+
+
+def star_rate_px_s(rate_sky_arcsec_s: AxisPair | None, scale: Scales) -> Floats:
+    """How fast a star moves on the camera with the stages at rest, shape (2,); without a rate it stands."""
+    if rate_sky_arcsec_s is None:
+        return np.zeros(2)
+    return scale.sky_px(np.array([rate_sky_arcsec_s.az, rate_sky_arcsec_s.el]))
 
 
 def sky_px_per_rad(rig: Rig) -> float:
@@ -111,7 +142,7 @@ def sky_px_per_rad(rig: Rig) -> float:
 
 def motor_sky_rad_per_rad(siderostat: Siderostat[Any]) -> float:
     """Siderostat motor to beam on the sky: it is a mirror, whose beam turns by twice its own angle."""
-    return 2 * siderostat.ball_screw_m_per_rad / siderostat.spur_gear_ratio / siderostat.lever_arm_m
+    return siderostat.sky_rad_per_motor_rad
 
 
 def rotation(angle_deg: float) -> Floats:

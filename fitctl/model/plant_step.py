@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fitctl.model.compiled import compilable, compiled, numba_installed
 from fitctl.model.hysteresis import play_output
 from fitctl.model.optics import turned
-from fitctl.model.plant_constants import PlantConstants
+from fitctl.model.plant_constants import CREEP_TIMES_S, PlantConstants
 
 Floats = NDArray[np.float64]
 # One row a run. `stack_v` is what the stacks get, `stacks_at_v` what they have been moved to.
@@ -27,6 +27,9 @@ _ROW = np.dtype(
         ("stack_v", "f8", (3,)),
         ("stacks_at_v", "f8", (3,)),
         ("displacement_m", "f8", (3,)),
+        ("carried_m", "f8", (3,)),
+        ("creep_m", "f8", (3, len(CREEP_TIMES_S))),
+        ("crept_m", "f8", (3,)),
     ]
 )
 
@@ -46,6 +49,12 @@ class PlantState:
         Position and rate of each structural mode.
     displacement_m : shape (runs, 3)
         Of the stacks, about where they rest at the bias.
+    carried_m : shape (runs, 3)
+        What a changed hysteresis would have moved them by when it changed, had they not stayed.
+    creep_m : shape (runs, 3, decades)
+        Of each stack: by how much each of its relaxations has crept.
+    crept_m : shape (runs, 3)
+        Their sum at the last node, which is part of `displacement_m`.
     plays_v : shape (runs, 3, elements)
         Play operators of the three stacks.
     velocity_rad_s, stack_v : shapes (runs, 2) and (runs, 3)
@@ -62,6 +71,7 @@ class PlantState:
         self.beam_motor_rad = self.rows["beam_motor_rad"]
         self.modes = self.rows["modes"]
         self.displacement_m = self.rows["displacement_m"]
+        self.carried_m = self.rows["carried_m"]
         self.velocity_rad_s = self.rows["velocity_rad_s"]
         self.stack_v = self.rows["stack_v"]
         self.plays_v = np.zeros((runs, 3, elements))
@@ -76,13 +86,37 @@ class PlantTrace(NamedTuple):
 
 @compilable(inline=True)
 def move_stacks(c: Any, s: Any, plays_v: Floats, half_v: Floats, gain_m_per_v: Floats) -> None:
-    """Take the stacks of one run to their volts. They are static: without a change nothing moves."""
+    """Take the stacks of one run to their volts. Without a change nothing moves but by creep."""
     for stack in range(3):
         volts = s.stack_v[stack]
         if volts != s.stacks_at_v[stack]:
             s.stacks_at_v[stack] = volts
             output_m = play_output(plays_v[stack], volts, half_v, gain_m_per_v)
-            s.displacement_m[stack] = output_m - c.mid_stroke_m
+            rested_m = output_m - c.mid_stroke_m + s.carried_m[stack]
+            s.displacement_m[stack] = rested_m + s.crept_m[stack]
+
+
+@compilable(inline=True, fused=True)
+def step_motor(
+    motor_rad: float,
+    lead_rad_s: float,
+    beam_rad: float,
+    moved_rad: float,
+    catch_up_s: float,
+    decay: float,
+    half_rad: float,
+) -> tuple[float, float, float]:
+    """A step of one axis of a siderostat: its motor behind the amplifier's lag, its mirror behind the backlash.
+
+    `lead_rad_s` is the motor's rate beyond the command, `moved_rad` the way of the command in a step. Returns
+    the first three as they are a step later.
+    """
+    motor_rad += moved_rad + lead_rad_s * catch_up_s
+    return (
+        motor_rad,
+        lead_rad_s * decay,
+        max(motor_rad - half_rad, min(motor_rad + half_rad, beam_rad)),
+    )
 
 
 @compilable(inline=True, fused=True)
@@ -126,12 +160,12 @@ def step_run(c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats)
     for row in range(spot_px.shape[0]):
         place1, rate1 = to_place1 + b1 * rate1 + a1 * place1, to_rate1 + d1 * rate1 + c1 * place1
         place2, rate2 = to_place2 + b2 * rate2 + a2 * place2, to_rate2 + d2 * rate2 + c2 * place2
-        motor_az += moved_az + lead_az * catch_up_s
-        motor_el += moved_el + lead_el * catch_up_s
-        lead_az *= decay
-        lead_el *= decay
-        beam_az = max(motor_az - half, min(motor_az + half, beam_az))
-        beam_el = max(motor_el - half, min(motor_el + half, beam_el))
+        motor_az, lead_az, beam_az = step_motor(
+            motor_az, lead_az, beam_az, moved_az, catch_up_s, decay, half
+        )
+        motor_el, lead_el, beam_el = step_motor(
+            motor_el, lead_el, beam_el, moved_el, catch_up_s, decay, half
+        )
         turned_az, turned_el = turned(c.siderostat_turn, beam_az, beam_el)
         spot_px[row, 0] = (
             still_az_px + az_px1 * place1 + az_px2 * place2 + motor_px * turned_az
@@ -144,6 +178,39 @@ def step_run(c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats)
     s.modes[0, 0], s.modes[0, 1], s.modes[1, 0], s.modes[1, 1] = place1, rate1, place2, rate2
     s.motor_rad[0], s.motor_rad_s[0], s.beam_motor_rad[0] = motor_az, command_az + lead_az, beam_az
     s.motor_rad[1], s.motor_rad_s[1], s.beam_motor_rad[1] = motor_el, command_el + lead_el, beam_el
+
+
+@compilable()
+def creep(c: Any, s: Any, first: int, steps: int) -> None:
+    """Let the stacks creep for some steps from `first` on; what has crept shows at the next node.
+
+    Relaxations a decade apart, each of the same part of the way, are a logarithm of time.
+    """
+    for stack in range(3):
+        rested_m = s.displacement_m[stack] - s.crept_m[stack]
+        crept_m = 0.0
+        for decade in range(s.creep_m.shape[1]):
+            wanted_m = c.creep_per_decade * rested_m
+            left_m = (s.creep_m[stack, decade] - wanted_m) * c.creep_kept[decade] ** steps
+            s.creep_m[stack, decade] = wanted_m + left_m
+            crept_m += wanted_m + left_m
+        if (first + steps) % c.creep_steps == 0:
+            s.crept_m[stack] = crept_m
+            s.displacement_m[stack] = rested_m + crept_m
+
+
+@compilable()
+def step_creeping_run(
+    c: Any, s: Any, origin_px: Floats, air_px: Floats, spot_px: Floats, piston_m: Floats, first: int
+) -> None:
+    """:func:`step_run` from the step `first` on with stacks that creep, node by node, and their piston."""
+    row, rows = 0, spot_px.shape[0]
+    while row < rows:
+        end = min(rows, row + c.creep_steps - (first + row) % c.creep_steps)
+        step_run(c, s, origin_px, air_px[row:end], spot_px[row:end])
+        piston_m[row:end] = stack_piston_m(s)
+        creep(c, s, first + row, end - row)
+        row = end
 
 
 @compilable()
@@ -166,7 +233,7 @@ def advance(
     first: int,
     steps: int,
 ) -> None:
-    """Advance all runs by some steps; stacks go to their volts first, and stand still.
+    """Advance all runs by some steps; stacks go to their volts first, and stand still but for their creep.
 
     Parameters
     ----------
@@ -187,11 +254,18 @@ def advance(
     for run in range(trace_px.shape[1]):
         s = state[run]
         move_stacks(c, s, plays_v[run], play_half_v, play_gain_m_per_v)
-        step_run(
-            c, s, origin_px[run, 0], air_px[air_from : air_from + steps, run, 0],
-            trace_px[trace_from : trace_from + steps, run, 0],
-        )  # fmt: skip
-        trace_piston_m[trace_from : trace_from + steps, run] = stack_piston_m(s)
+        piston_m = trace_piston_m[trace_from : trace_from + steps, run]
+        if c.creep_per_decade > 0:
+            step_creeping_run(
+                c, s, origin_px[run, 0], air_px[air_from : air_from + steps, run, 0],
+                trace_px[trace_from : trace_from + steps, run, 0], piston_m, first,
+            )  # fmt: skip
+        else:
+            step_run(
+                c, s, origin_px[run, 0], air_px[air_from : air_from + steps, run, 0],
+                trace_px[trace_from : trace_from + steps, run, 0],
+            )  # fmt: skip
+            piston_m[:] = stack_piston_m(s)
         for spot in range(1, trace_px.shape[2]):
             for axis in range(2):
                 apart_px = origin_px[run, spot, axis] - origin_px[run, 0, axis]
@@ -208,12 +282,14 @@ def bound_step(
     state: PlantState,
     air_px: Floats,
     trace: PlantTrace,
+    play_gain_m_per_v: Floats | None = None,
     *,
     machine_code: bool | None = None,
 ) -> Callable[[int, int], None]:
     """:func:`advance` on a plant's own arrays: from a step on, by some steps.
 
-    Compiled where numba is installed, unless `machine_code` is False.
+    `play_gain_m_per_v` is in place of the constants' own. Compiled where numba is installed, unless
+    `machine_code` is False.
     """
     step: Callable[..., None] = advance
     constant_rows: Any = [constants]
@@ -223,7 +299,8 @@ def bound_step(
     else:
         names = state.rows.dtype.names or ()
         state_rows = [SimpleNamespace(**{name: row[name] for name in names}) for row in state.rows]
-    plays = constants.play_half_v, constants.play_gain_m_per_v
+    gains = constants.play_gain_m_per_v if play_gain_m_per_v is None else play_gain_m_per_v
+    plays = constants.play_half_v, gains
     origin_px = constants.spot_origin_px
     return partial(
         step, constant_rows, *plays, state_rows, state.plays_v, origin_px, air_px, *trace

@@ -12,6 +12,7 @@ from fitctl.model.optics import scales
 from fitctl.model.pixel_noise import noise_key
 
 Floats = NDArray[np.float64]
+_SEEDS_APART = 1000  # of two loops of one run
 
 
 class RunRandomness(NamedTuple):
@@ -25,20 +26,29 @@ class RunRandomness(NamedTuple):
         Key of the pixel noise.
     place : Generator
         Of the star at the start.
+    lines : int
+        Key of what drives the vibration lines.
     """
 
     air: list[np.random.Generator]
     pixels: int
     place: np.random.Generator
+    lines: int
+
+
+def loop_seeds(rig: Rig, seed: int) -> dict[str, int]:
+    """The seed of each loop of a run, by name."""
+    return {name: seed + _SEEDS_APART * index for index, name in enumerate(rig.loops)}
 
 
 def run_randomness(seed: int, spots: int) -> RunRandomness:
     """The streams of one run; no stream depends on how much of another is used."""
-    air, pixels, place = np.random.SeedSequence(seed).spawn(3)
+    air, pixels, place, lines = np.random.SeedSequence(seed).spawn(4)
     return RunRandomness(
         [np.random.default_rng(child) for child in air.spawn(spots)],
         noise_key(pixels),
         np.random.default_rng(place),
+        noise_key(lines),
     )
 
 

@@ -28,17 +28,24 @@ class Scene:
         Their order is that of the positions given to :meth:`expected`.
     hot_pixels : sequence of HotPixel
         They read so much more on every frame.
+    instants : int
+        Of an exposure: positions are all spots' at the first, then at the next.
     """
 
     def __init__(
-        self, camera: Camera, spots: Sequence[Spot], hot_pixels: Sequence[HotPixel] = ()
+        self,
+        camera: Camera,
+        spots: Sequence[Spot],
+        hot_pixels: Sequence[HotPixel] = (),
+        instants: int = 1,
     ) -> None:
         self._shape = (camera.height_px, camera.width_px)
         self._bias_dn = camera.bias_dn
         self._noise_dn = camera.pixel_noise_dn
-        self._flux_dn = np.array([spot.flux_dn for spot in spots])
+        self._photon_dn = photon_dn(camera)
+        self._flux_dn = np.array([spot.flux_dn / instants for spot in spots] * instants)
         # The 1/e^2 diameter of a Gaussian is four standard deviations.
-        self._sigma_px = np.array([spot.diameter_px / 4 for spot in spots])
+        self._sigma_px = np.array([spot.diameter_px / 4 for spot in spots] * instants)
         self._light_dn = np.empty(self._shape)
         self._down, self._across = np.empty(self._shape[0]), np.empty(self._shape[1])
         self._edges_x: Floats = np.arange(camera.width_px + 1.0) - 0.5
@@ -51,14 +58,16 @@ class Scene:
         down = self._pixel_fractions(self._edges_y, positions_px[..., 1])
         return self._bias_dn + (down * self._flux_dn[:, None]).swapaxes(-1, -2) @ across
 
-    def frame(self, positions_px: Floats, key: int, number: int) -> NDArray[np.uint16]:
+    def frame(
+        self, positions_px: Floats, key: int, number: int, noise_dn: float | None = None
+    ) -> NDArray[np.uint16]:
         """One frame with pixel noise, shape (height, width), of spots at (spots, 2).
 
         The noise is that of frame `number` of the run whose key is given
-        (:mod:`fitctl.model.pixel_noise`).
+        (:mod:`fitctl.model.pixel_noise`); its standard deviation is the camera's, if none is given.
         """
         if not numba_installed():
-            return self.frame_reference(positions_px, key, number)
+            return self.frame_reference(positions_px, key, number, noise_dn)
         compiled(render)(
             self._light_dn,
             0,
@@ -69,7 +78,8 @@ class Scene:
             self._sigma_px,
             len(self._flux_dn),
             self._bias_dn,
-            self._noise_dn,
+            self._noise_dn if noise_dn is None else noise_dn,
+            self._photon_dn,
             FULL_WELL_DN,
             np.uint64(key),
             number,
@@ -80,10 +90,15 @@ class Scene:
         )
         return self._with_hot_pixels(self._light_dn)
 
-    def frame_reference(self, positions_px: Floats, key: int, number: int) -> NDArray[np.uint16]:
+    def frame_reference(
+        self, positions_px: Floats, key: int, number: int, noise_dn: float | None = None
+    ) -> NDArray[np.uint16]:
         """:meth:`frame` in NumPy; the compiled one is held to this."""
         noise = pixel_normals(key, number, math.prod(self._shape)).reshape(self._shape)
-        noisy = self.expected(positions_px) + self._noise_dn * noise
+        expected_dn = self.expected(positions_px)
+        dark_dn = self._noise_dn if noise_dn is None else noise_dn
+        noise_dn2 = dark_dn**2 + self._photon_dn * (expected_dn - self._bias_dn)
+        noisy = expected_dn + np.sqrt(noise_dn2) * noise
         return self._with_hot_pixels(np.clip(np.rint(noisy), 0, FULL_WELL_DN))
 
     def _with_hot_pixels(self, read_dn: Floats) -> NDArray[np.uint16]:
@@ -109,6 +124,7 @@ def render(
     spots: int,
     bias_dn: float,
     noise_dn: float,
+    photon_dn: float,
     full_dn: float,
     key: Any,
     number: int,
@@ -119,7 +135,8 @@ def render(
 ) -> None:
     """:meth:`Scene.frame`, or a part of it, whole numbers into `light_dn`.
 
-    A spot at NaN is left out. `down` and `across` are room for a column and a row.
+    A spot at NaN is left out. Where photons have noise, it is taken for normal: from some ten electrons on it
+    is, and fewer are lost in a camera's own noise. `down` and `across` are room for a column and a row.
     """
     rows, columns = light_dn.shape
     for row in range(rows):
@@ -142,12 +159,15 @@ def render(
         pixel = (first_row + row) * width_px + first_column + 1
         for column in range(columns):
             bits = mix(frame + np.uint64(pixel + column) * GOLDEN)
-            noisy = light_dn[row, column] + noise_dn * table[bits >> QUANTILE_SHIFT]
+            deviation_dn = noise_dn
+            if photon_dn > 0:
+                deviation_dn = math.sqrt(
+                    noise_dn**2 + photon_dn * (light_dn[row, column] - bias_dn)
+                )
+            noisy = light_dn[row, column] + deviation_dn * table[bits >> QUANTILE_SHIFT]
             light_dn[row, column] = min(max(np.rint(noisy), 0.0), full_dn)
 
 
-def centroid_noise_px(camera: Camera, flux_dn: float, window_px: int) -> float:
-    """Standard deviation of Eq. 7 over a square window: 14 x 20 / F_total px for 7x7 px."""
-    half = window_px // 2
-    lever = math.sqrt(window_px * 2 * sum(k * k for k in range(1, half + 1)))
-    return lever * camera.pixel_noise_dn / flux_dn
+def photon_dn(camera: Camera) -> float:
+    """What one electron reads, in DN; 0 where photons are taken to have no noise."""
+    return 0.0 if camera.electrons_per_dn is None else 1 / camera.electrons_per_dn

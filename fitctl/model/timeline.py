@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,9 +108,15 @@ class Part(ABC):
     ----------
     timeline : Timeline
         Advances it.
+
+    Attributes
+    ----------
+    advance : callable
+        :meth:`Timeline.advance`, of the whole plant.
     """
 
     def __init__(self, timeline: Timeline) -> None:
+        self.advance = timeline.advance
         self._timeline = timeline
         timeline.add(self)
 
@@ -131,9 +138,17 @@ class Part(ABC):
         """The earliest time that the history still holds."""
         return self._timeline.oldest_s
 
-    def advance(self, time_s: float) -> None:
-        """Advance the whole plant, as :meth:`Timeline.advance`."""
-        self._timeline.advance(time_s)
+
+def pieces(from_nodes: Sequence[int], first: int) -> Iterator[tuple[int, int, int]]:
+    """Epochs of the block of nodes that begins at `first`: number, and first and last node within the block.
+
+    `from_nodes` says where each epoch begins; the first at 0.
+    """
+    ends = [*from_nodes[1:], first + BLOCK_NODES]
+    for number, (from_node, to_node) in enumerate(zip(from_nodes, ends, strict=True)):
+        begin, end = max(from_node - first, 0), min(to_node - first, BLOCK_NODES)
+        if begin < end:
+            yield number, begin, end
 
 
 class Air:
@@ -141,7 +156,8 @@ class Air:
 
     Parameters
     ----------
-    constants : AirConstants
+    epochs : sequence of pair of int and AirConstants
+        From which node on the air is like that; the first from 0.
     streams : list of list of Generator
         Of each run, and in it of each air path. One draw for each, so that a run is the same whichever others
         are beside it.
@@ -150,26 +166,33 @@ class Air:
     """
 
     def __init__(
-        self, constants: AirConstants, streams: list[list[np.random.Generator]], motion: Floats
+        self,
+        epochs: Sequence[tuple[int, AirConstants]],
+        streams: list[list[np.random.Generator]],
+        motion: Floats,
     ) -> None:
-        self._constants = constants
+        self._from_nodes = [from_node for from_node, _ in epochs]
+        self._epochs = [constants for _, constants in epochs]
         self._streams = streams
         self._motion = motion
+        self._nodes = 0
         started = [[random.standard_normal((2, 2)) for random in stream] for stream in streams]
-        self._state = np.array(started) @ constants.initial.T
+        self._state = np.array(started) @ self._epochs[0].initial.T
 
     def draw(self) -> None:
         """The motion of the next block."""
-        constants, air_motion = self._constants, compiled(air_path.air_motion)
-        shape = (BLOCK_NODES, 2, 2)
-        for run, randoms in enumerate(self._streams):
-            for path, random in enumerate(randoms):
-                air_motion(
-                    self._state[run, path],
-                    random.standard_normal(shape),
-                    constants.transition,
-                    constants.noise_gain,
-                    constants.weights,
-                    self._motion[:, run, path],
-                )
-        self._motion[:, :, 1:] *= constants.relative
+        air_motion, steps = compiled(air_path.air_motion), len(self._epochs[0].weights)
+        for number, begin, end in pieces(self._from_nodes, self._nodes):
+            constants, rows = self._epochs[number], slice(begin * steps, end * steps)
+            for run, randoms in enumerate(self._streams):
+                for path, random in enumerate(randoms):
+                    air_motion(
+                        self._state[run, path],
+                        random.standard_normal((end - begin, 2, 2)),
+                        constants.transition,
+                        constants.noise_gain,
+                        constants.weights,
+                        self._motion[rows, run, path],
+                    )
+        self._motion[:, :, 1:] *= self._epochs[0].relative
+        self._nodes += BLOCK_NODES

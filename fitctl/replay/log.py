@@ -103,6 +103,20 @@ class LoggedStep:
         elif whole:
             self.older.append(message)
 
+    def add_report(self, kind: type[AnyRecord], message: Any) -> None:
+        """A loop's timing, what the recorder says it lost, or when the camera was last reported on."""
+        if kind is LoopTiming:
+            self.timing[message.loop] = message
+        elif kind is RecorderStatus:
+            self.records_lost = message.lost
+        elif kind is DeviceHealth and message.device == CAMERA:
+            self.reported_s = message.time_s
+
+    @property
+    def is_torn(self) -> bool:
+        """Whether ticks have lost their frame: a log that was torn may end between the two."""
+        return self.frame is None and any(tick.number >= 0 for tick in self.ticks.values())
+
     def of(self, kind: type[AnyRecord], loop: str | None = None) -> list[Any]:
         """Messages of one kind, of the beginning, or of what came before a loop's tick."""
         records = self.begin if loop is None else self.before_tick[loop]
@@ -170,13 +184,10 @@ def read_steps(info: LogInfo, rig: Rig) -> Iterator[LoggedStep]:
             step.overlap = message
         elif kind is FrameRecord:
             step.add_frame(message, sequence)
-        elif kind is LoopTiming:
-            step.timing[loop] = message
-        elif kind is RecorderStatus:
-            step.records_lost = message.lost
-        elif kind is DeviceHealth and message.device == CAMERA:
-            step.reported_s = message.time_s
-    yield step
+        else:
+            step.add_report(kind, message)
+    if not step.is_torn:
+        yield step
 
 
 def _records(info: LogInfo, rig: Rig) -> Iterator[tuple[Logged, int]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fitctl.error_budget import CAUSES
 from fitctl.report import tables
 from fitctl.report.drawing import SERIES, Plot, decimal, limit, panels, styled
 from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
@@ -68,7 +69,7 @@ def _loop(name: str, nights: list[Night]) -> Section:
     plots = [_spectra(name, stars)] if stars else []
     plots.append(_residuals(f"{name}-{quantity.of}", nights))
     title = f"Loop {name}" if stars else f"Loop {name}: {quantity.of}"
-    return Section(title, plots, [_figures(nights)])
+    return Section(title, plots, [_figures(nights), *([_budgets(stars)] if stars else [])])
 
 
 def _figures(nights: list[Night]) -> Table:
@@ -115,6 +116,31 @@ _OF_STARS: dict[str, Callable[[StarFindings], str]] = {
     "mirror's range, worst": lambda loop: number(loop.stages.range_worst, ".1f", "%", 100),
     "piston, RMS": lambda loop: number(loop.stages.piston_rms_m, ".1f", "nm", 1e9),
 }
+
+
+def _budgets(nights: list[tuple[str, StarFindings]]) -> Table:
+    """The error budget of each night, under each controller."""
+    budgets = [
+        (f"{letter}, {one.controller}", one.budget)
+        for letter, loop in nights
+        for one in loop.rejections
+        if one.budget is not None
+    ]
+    rows = [
+        ["RMS of an axis, px", *(f"{b.measured_px:.4f} ({b.expected_px:.4f})" for _, b in budgets)]
+    ]
+    rows += [
+        [
+            cause,
+            *(
+                f"{b.percent[cause]} % ({100 * b.expected_fractions[cause]:.0f} %)"
+                for _, b in budgets
+            ),
+        ]
+        for cause in CAUSES
+    ]
+    title = "Where the error comes from: parts of its mean square, and in brackets what design and rig expect"
+    return Table(title, ["cause", *(name for name, _ in budgets)], rows if budgets else [])
 
 
 def _spectra(name: str, nights: list[tuple[str, StarFindings]]) -> Plot:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.identify.drawing import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, new_figure
+from fitctl.tui.inks import FAULT, MODE_COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +39,11 @@ VARIABLES = {
     PURPLE: "purple",
     SKY: "sky",
 }
+VARIABLES |= {
+    color.light: f"mode-{name.lower()}"
+    for name, color in MODE_COLOURS.items()
+    if color.light not in VARIABLES
+} | {FAULT.light: "mode-fault"}
 _DPI = 120
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 BINS = 900  # of a trace: about as many as a page shows
@@ -76,13 +82,14 @@ class Plot(NamedTuple):
     name : str
         Of its files, without suffix; see :attr:`stem`.
     title, caption : str
-    figure : Figure
+        Without a figure, the caption says why there is nothing to draw.
+    figure : Figure or None
     """
 
     name: str
     title: str
     caption: str
-    figure: Figure
+    figure: Figure | None
 
     @property
     def stem(self) -> str:
@@ -168,13 +175,6 @@ def legend_above(axes: Axes, columns: int) -> None:
     axes.legend(ncols=columns, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
 
 
-def nothing(axes: Axes, why: str = "no data that count") -> None:
-    """Why there is nothing to see."""
-    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", color=FAINT)
-    if not axes.lines:  # numbers would be of nothing
-        axes.set(xticks=[], yticks=[])
-
-
 def span(axes: Sequence[Axes], time: TimeAxis, duration_s: float) -> None:
     """All of the run, no more: times of several plots then stand below each other."""
     for one in axes:
@@ -204,6 +204,8 @@ def decimal(axis: Axis, *, dense: bool = False) -> None:
 def draw(plot: Plot, folder: Path) -> str:
     """Write a plot as PNG and SVG, on white as they are printed; returns it as SVG to stand within a page.
 
+    A plot without a figure is an empty text.
+
     Raises
     ------
     OSError
@@ -211,11 +213,14 @@ def draw(plot: Plot, folder: Path) -> str:
     """
     import matplotlib
 
+    figure = plot.figure
+    if figure is None:
+        return ""
     with matplotlib.rc_context({"svg.hashsalt": plot.stem}):
-        plot.figure.savefig(folder / f"{plot.stem}.png", dpi=_DPI, metadata={"Software": None})
-        plot.figure.set_layout_engine("none")  # it is laid out: once is slow enough
+        figure.savefig(folder / f"{plot.stem}.png", dpi=_DPI, metadata={"Software": None})
+        figure.set_layout_engine("none")  # it is laid out: once is slow enough
         text = io.StringIO()
-        plot.figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
+        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
     svg = text.getvalue()
     on_white = re.sub(r"(<svg[^>]*>)", r'\1<rect width="100%" height="100%" fill="#ffffff"/>', svg)
     (folder / f"{plot.stem}.svg").write_text(on_white, encoding="utf-8")

@@ -19,7 +19,6 @@ from fitctl.report.drawing import (
     SERIES,
     Plot,
     decimal,
-    nothing,
     panels,
 )
 from fitctl.report.findings import AXES, LoopFindings, StarFindings
@@ -28,6 +27,7 @@ from fitctl.report.fringes import FringeFindings, density
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TOO_SHORT = "no stretch that counts is as long as a segment of 8 s."
 _POINTS = 900  # of a path in the plane
 _DIRECTIONS = (
     (1, "^", AZ, "came from below"),
@@ -38,6 +38,8 @@ _DIRECTIONS = (
 
 def spectra(loop: StarFindings) -> Plot:
     """Spectral densities before and after, and what they add up to."""
+    if not loop.rejections:
+        return Plot(f"{loop.name}-psd", "Before and after", TOO_SHORT, None)
     figure, (densities, sums) = panels(1, 3.8, 2)
     for found, color in zip(loop.rejections, itertools.cycle(SERIES), strict=False):
         frequency_hz = found.spectra.frequency_hz
@@ -52,10 +54,7 @@ def spectra(loop: StarFindings) -> Plot:
     sums.set_yscale("log")
     for axis in (densities.xaxis, densities.yaxis, sums.xaxis, sums.yaxis):
         decimal(axis)
-    if loop.rejections:
-        densities.legend(loc="lower left")
-    else:
-        nothing(densities)
+    densities.legend(loc="lower left")
     caption = (
         "Mean of both axes, Welch's method, segments of 8 s. Dashed: the disturbance, which is the open loop "
         "rebuilt from the log, the error less where both stages had moved the star at mid-exposure. Solid: "
@@ -72,6 +71,8 @@ def beam_spectrum(loop: LoopFindings, period_s: float) -> Plot:
         "Welch's method, segments of 8 s. The error is that of the samples: the photodiodes' noise is in it. "
         "Dotted: the requirement."
     )
+    if not len(found[0]):
+        return Plot(f"{loop.name}-psd", "Spectrum of the error", TOO_SHORT, None)
     figure = _axes_spectra(*found, loop.requirement)
     return Plot(f"{loop.name}-psd", "Spectrum of the error", caption, figure)
 
@@ -82,6 +83,8 @@ def tilt_spectrum(fringes: FringeFindings) -> Plot:
         "Welch's method, segments of 8 s. Both stars are measured, so both stars' noise of the camera is in "
         "the tilt."
     )
+    if not len(fringes.frequency_hz):
+        return Plot("fringes-psd", "Spectrum of the tilt", TOO_SHORT, None)
     figure = _axes_spectra(fringes.frequency_hz, fringes.density, math.nan)
     return Plot("fringes-psd", "Spectrum of the tilt", caption, figure)
 
@@ -91,16 +94,12 @@ def _axes_spectra(
 ) -> Figure:
     """Both axes' densities, arcsec²/Hz, and what they add up to."""
     figure, (densities, sums) = panels(1, 3.8, 2)
-    for number, axis in enumerate(AXES if len(frequency_hz) else ()):
+    for number, axis in enumerate(AXES):
         densities.loglog(frequency_hz, power[:, number], color=COLORS[axis], label=axis)
         total = np.sqrt(np.cumsum(power[:, number]) * frequency_hz[0])
         sums.loglog(frequency_hz, total, color=COLORS[axis], label=axis)
     densities.set(title="Power spectral density", xlabel="Hz", ylabel="arcsec²/Hz")
     sums.set(title="Cumulative RMS: of all below a frequency", xlabel="Hz", ylabel="arcsec")
-    if not len(frequency_hz):
-        nothing(densities)
-        nothing(sums)
-        return figure
     if not math.isnan(requirement):
         sums.axhline(requirement, color=INK, linestyle=":")
     densities.legend(loc="lower left")
@@ -112,6 +111,8 @@ def _axes_spectra(
 
 def rejection(loop: StarFindings) -> Plot:
     """Measured rejection over the design's."""
+    if not loop.rejections:
+        return Plot(f"{loop.name}-rejection", "Rejection against the design", TOO_SHORT, None)
     figure, (axes,) = panels(1, 3.8)
     for found, color in zip(loop.rejections, itertools.cycle(SERIES), strict=False):
         name, frequency_hz = found.controller, found.spectra.frequency_hz
@@ -127,10 +128,7 @@ def rejection(loop: StarFindings) -> Plot:
     )
     decimal(axes.xaxis, dense=True)
     decimal(axes.yaxis, dense=True)
-    if loop.rejections:
-        axes.legend(loc="upper right")
-    else:
-        nothing(axes)
+    axes.legend(loc="upper right")
     caption = (
         "Root of the ratio of both spectra, beside the sensitivity of the linear sampled loop of the logged "
         "design. Eq. 20 knows nothing of the stacks' hysteresis, which takes from its gain."
@@ -139,48 +137,55 @@ def rejection(loop: StarFindings) -> Plot:
 
 
 def hysteresis(loop: StarFindings) -> Plot:
-    """Command against target, and displacement against voltage."""
-    figure, (*commands, stack) = panels(1, 3.6, 3)
-    dwells_of = [gap.dwells for gap in loop.stages.gaps] or [[], []]
-    for axis, axes, dwells in zip(AXES, commands, dwells_of, strict=True):
-        moved = any(dwell.direction for dwell in dwells)
-        middle_px = float(np.mean([dwell.command_px for dwell in dwells])) if dwells else 0.0
-        for direction, sign, color, label in _DIRECTIONS if moved else ():
-            its = [dwell for dwell in dwells if dwell.direction == direction]
-            axes.plot(
-                [dwell.target_px for dwell in its],
-                [dwell.command_px - middle_px for dwell in its],
+    """Command against target, and displacement against voltage; of these, what there is."""
+    moved = [
+        (axis, gap.dwells)
+        for axis, gap in zip(AXES, loop.stages.gaps, strict=False)
+        if any(dwell.direction for dwell in gap.dwells)
+    ]
+    rows = loop.selection.rows
+    stacks = loop.stacks if len(rows) else None
+    name, title = f"{loop.name}-hysteresis", "Hysteresis in the commands"
+    columns = len(moved) + (stacks is not None)
+    if not columns:
+        return Plot(
+            name, title, "the target did not move, and no model of the stacks is known.", None
+        )
+    figure, axes = panels(1, 3.4, columns)
+    for (axis, dwells), its in zip(moved, axes, strict=False):
+        middle_px = float(np.mean([dwell.command_px for dwell in dwells]))
+        for direction, sign, color, label in _DIRECTIONS:
+            some = [dwell for dwell in dwells if dwell.direction == direction]
+            its.plot(
+                [dwell.target_px for dwell in some],
+                [dwell.command_px - middle_px for dwell in some],
                 sign,
                 color=color,
                 markersize=5,
                 label=label,
             )
-        if moved:
-            axes.legend(loc="best")
-        else:
-            nothing(axes, *(["the target did not move"] if dwells else []))
-        axes.set(
+        its.legend(loc="best")
+        its.set(
             title=f"Command where it stood, {axis}",
             xlabel="target (px)",
-            ylabel="stages told, from their mean (px)",
+            ylabel="command, from its mean (px)",
         )
-    rows = loop.selection.rows
-    if loop.stacks is not None and len(rows):
-        some = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(int)]
+    if stacks is not None:
+        shown = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(int)]
         for number, color in enumerate((AZ, EL, GREEN)):
-            stack.plot(
-                loop.ticks[f"stack{number + 1}_v"][some],
-                1e6 * loop.stacks.displacement_m[some, number],
+            axes[-1].plot(
+                loop.ticks[f"stack{number + 1}_v"][shown],
+                1e6 * stacks.displacement_m[shown, number],
                 ".",
                 color=color,
                 markersize=1.6,
                 label=f"stack {number + 1}",
             )
-        stack.legend(loc="upper left", markerscale=4)
-    else:
-        nothing(stack)
-    stack.set(title="Stacks, by their model", xlabel="voltage told (V)", ylabel="displacement (µm)")
-    return Plot(f"{loop.name}-hysteresis", "Hysteresis in the commands", _gap_text(loop), figure)
+        axes[-1].legend(loc="upper left", markerscale=4)
+        axes[-1].set(
+            title="Stacks, by their model", xlabel="voltage (V)", ylabel="displacement (µm)"
+        )
+    return Plot(name, title, _gap_text(loop), figure)
 
 
 def _gap_text(loop: StarFindings) -> str:
@@ -196,8 +201,12 @@ def _gap_text(loop: StarFindings) -> str:
         if gaps
         else "The target did not come to one place from both sides, so the commands cannot show hysteresis."
     )
-    return (
-        "Left, middle: what both stages were told in the mean while the target stood; if it depends on where "
-        f"the target came from, that is hysteresis and backlash, within what the air adds. {found} Right: what "
-        "their model makes of the voltages; the width of each path is its hysteresis."
+    of_commands = (
+        "The commands are those of both stages, in the mean while the target stood still. If they depend on "
+        f"where the target came from, that is hysteresis and backlash, within what the air adds. {found}"
     )
+    of_stacks = (
+        "The stacks are as their model has them for the voltages; a path's width is its hysteresis."
+    )
+    moved = any(dwell.direction for gap in loop.stages.gaps for dwell in gap.dwells)
+    return " ".join([of_commands] * moved + [of_stacks] * (loop.stacks is not None) or [found])

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from fitctl.error_budget import LONGEST_GAP_S, regular
 from fitctl.figures.attenuation import SEGMENT_S
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
-from fitctl.report.selection import LONGEST_GAP_S, Selection, regular
+from fitctl.report.selection import Selection
 
 Floats = NDArray[np.float64]
 _WORST_PERCENT = 5.0  # of the frames have less visibility

@@ -72,6 +72,8 @@ TICK_FIELDS: dict[str, Any] = {
     ),
 }
 
+LINK_FIELDS: dict[str, Any] = dict.fromkeys(("link_az_rad", "link_el_rad"), np.float64)
+"""Of the ticks of a loop with a link, besides."""
 
 BEAM_FIELDS: dict[str, Any] = {
     "time_s": np.float64,
@@ -187,7 +189,10 @@ def gather(run: Run) -> Gathered:
 def _series(run: Run) -> dict[str, tuple[str, dict[str, Any]]]:
     """What comes with every frame: by topic, the loop (none for the overlap) and the fields."""
     rig = run.rig
-    series = {TOPICS[Tick].format(loop=loop): (loop, TICK_FIELDS) for loop in rig.stellar_loops}
+    series = {
+        TOPICS[Tick].format(loop=name): (name, TICK_FIELDS | (LINK_FIELDS if loop.link else {}))
+        for name, loop in rig.stellar_loops.items()
+    }
     for loop in rig.metrology_loops:
         series[TOPICS[MetrologyTick].format(loop=loop)] = (loop, BEAM_FIELDS)
     if rig.fringes is not None:

@@ -6,13 +6,14 @@ import importlib.metadata
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fitctl.figures.pages import write_json, write_page
 from fitctl.report import tables
-from fitctl.report.drawing import draw, styled
+from fitctl.report.drawing import Plot, draw, styled
 from fitctl.report.findings import Findings, LoopFindings, StarFindings
-from fitctl.report.page import EVALUATION, SIGNS, Section, sections
+from fitctl.report.page import EVALUATION, SIGNS, Section, first_plot, sections
+from fitctl.tui.inks import FAULT, MODE_COLOURS
 
 PAGE = "report.html"
 
@@ -28,14 +29,25 @@ def make_report(findings: Findings, folder: Path) -> Path:
     run = findings.run
     title = f"{run.rig.name}, {tables.utc(run)}" if run.start_ns else f"{run.name}: no records"
     with styled():
-        parts = sections(findings)
+        parts, first = sections(findings), first_plot(findings)
     facts = [f"{len(run.logs)} files" if len(run.logs) > 1 else run.logs[0].path.name]
     facts += [tables.seconds(run.duration_s), f"requirement {findings.word}"]
-    cards = [
-        (loop, [tables.residual(loop), tables.key_figures(loop)])
-        for loop in findings.loops.values()
-    ]
-    return write(folder, title, facts, parts, plain(findings), cards)
+    cards = [Card(loop, tables.headline(loop)) for loop in findings.loops.values()]
+    return write(folder, title, facts, parts, plain(findings), cards, first)
+
+
+class Card(NamedTuple):
+    """What the first screen has of a loop."""
+
+    loop: LoopFindings
+    headline: str
+
+    @property
+    def sources(self) -> str:
+        """Where the error came from, under the last controller; nothing where it is not known."""
+        rejections = self.loop.rejections if isinstance(self.loop, StarFindings) else []
+        budgets = [found.budget for found in rejections if found.budget is not None]
+        return budgets[-1].parts if budgets else ""
 
 
 def write(
@@ -44,7 +56,8 @@ def write(
     facts: Sequence[str],
     parts: list[Section],
     figures: dict[str, Any],
-    cards: Sequence[tuple[LoopFindings, list[tables.Table]]] = (),
+    cards: Sequence[Card] = (),
+    first: Plot | None = None,
 ) -> Path:
     """Page, plots and ``report.json``; returns the page, which is one file and needs nothing from elsewhere.
 
@@ -54,7 +67,8 @@ def write(
         If something cannot be written.
     """
     with styled():
-        drawings = {plot.name: draw(plot, folder) for part in parts for plot in part.plots}
+        plots = [*([first] if first else []), *(plot for part in parts for plot in part.plots)]
+        drawings = {plot.name: draw(plot, folder) for plot in plots}
     page = folder / PAGE
     write_page(
         page,
@@ -63,6 +77,8 @@ def write(
         title=title,
         facts=facts,
         cards=cards,
+        first=first,
+        modes={name.lower(): color for name, color in MODE_COLOURS.items()} | {"fault": FAULT},
         sections=parts,
         drawings=drawings,
         signs=SIGNS,
@@ -131,6 +147,14 @@ def _plain_star(loop: StarFindings) -> dict[str, Any]:
                 if found.predicted is None
                 else found.predicted.residual_px,
                 "bound_px": math.nan if found.predicted is None else found.predicted.bound_px,
+                "error_budget": None
+                if found.budget is None
+                else {
+                    "measured_px": found.budget.measured_px,
+                    "expected_px": found.budget.expected_px,
+                    "as_expected": found.budget.as_expected,
+                    "fractions": found.budget.fractions,
+                },
                 "rejection": [
                     {"hz": at_hz, "measured": measured, "design": design}
                     for at_hz, measured, design in found.table()

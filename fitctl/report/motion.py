@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.identify.drawing import GREEN, PURPLE, SKY
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import FOLLOWING, Mode
 from fitctl.report.drawing import (
     AZ,
     COLORS,
@@ -36,34 +36,40 @@ Floats = NDArray[np.floating]
 
 
 def mirror(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
-    """How much of its range the mirror uses, and its piston."""
-    ticks = loop.ticks
-    ready = ticks["mode_number"] >= Mode.COARSE
-    figure, (fraction, piston) = panels(2, 3.8)
-    at_s = ticks["time_s"][ready]
-    trace(fraction, time, at_s, 100 * ticks["fsm_range_fraction"][ready], AZ, "range")
-    limit(fraction, 100.0)
-    fraction.set(
+    """How much of its range the mirror uses, and its piston where that is known."""
+    ticks, found = loop.ticks, loop.stacks
+    following = np.isin(ticks["mode_number"], sorted(FOLLOWING))
+    name, title = f"{loop.name}-mirror", "Mirror: range and piston"
+    if not following.any():
+        return Plot(name, title, "the loop never followed its star.", None)
+    figure, axes = panels(1 if found is None else 2, 2.2 if found is None else 3.8)
+    at_s = ticks["time_s"][following]
+    trace(axes[0], time, at_s, 100 * ticks["fsm_range_fraction"][following], AZ, "range")
+    limit(axes[0], 100.0)
+    axes[0].set(
         title="Range of the fast steering mirror: 100 % is the edge of what three stacks reach",
         ylabel="% of the diamond",
         ylim=(0, 105),
     )
-    if loop.stacks is not None:
-        trace(piston, time, at_s, 1e9 * loop.stacks.piston_m[ready], PURPLE, "piston")
-    else:
-        why = "not known: no hysteresis in the rig file"
-        piston.text(0.5, 0.5, why, transform=piston.transAxes, ha="center")
-    piston.set(title="Piston of the mirror (Eq. 4)", xlabel=time.label, ylabel="nm")
-    span([piston], time, findings.run.duration_s)
-    source = (
-        ""
-        if loop.stacks is None
-        else f" Piston is by {loop.stacks.source}, from the logged voltages."
-    )
-    caption = (
-        f"From COARSE on.{source} Ideal stacks have none; the middle does not matter, changes do."
-    )
-    return Plot(f"{loop.name}-mirror", "Mirror: range and piston", caption, figure)
+    source = " Piston is not known: no hysteresis is in the rig file."
+    if found is not None:
+        piston_nm = 1e9 * found.piston_m
+        trace(axes[1], time, at_s, piston_nm[following], PURPLE, "piston")
+        axes[1].set(title="Piston of the mirror (Eq. 4)", ylabel="nm")
+        # What counts sets the scale, and no ramp from a fault or to a star.
+        shown_nm = (
+            piston_nm[loop.selection.rows] if len(loop.selection.rows) else piston_nm[following]
+        )
+        low_nm, high_nm = float(shown_nm.min()), float(shown_nm.max())
+        room_nm = max(1.0, 0.15 * (high_nm - low_nm))
+        axes[1].set_ylim(low_nm - room_nm, high_nm + room_nm)
+        source = (
+            f" Piston is by {found.source}, from the logged voltages, on the scale of the part that counts."
+            " Ideal stacks have none; the middle does not matter, changes do."
+        )
+    axes[-1].set_xlabel(time.label)
+    span(axes[-1:], time, findings.run.duration_s)
+    return Plot(name, title, f"In COARSE and VERNIER.{source}", figure)
 
 
 def siderostat(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
@@ -133,27 +139,33 @@ def tilt(findings: Findings, fringes: FringeFindings, time: TimeAxis) -> Plot:
 
 
 def timing(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
-    """Age of frames, time of computation, lateness of the servo."""
+    """Age of frames, time of computation, and lateness of the servo where it is logged."""
     ticks = loop.ticks
     seconds = findings.gathered.timing[loop.name]
     frames = ticks["number"] >= 0
-    figure, (age, compute, servo, distribution) = panels(2, 4.6, 2)
+    name, title = f"{loop.name}-timing", "Loop timing"
+    if not frames.any():
+        return Plot(name, title, "no frame came.", None)
+    with_servo = bool(np.isfinite(seconds.get("servo_late_worst_s", np.empty(0))).any())
+    figure, (age, compute, distribution, *servo) = (
+        panels(2, 4.6, 2) if with_servo else panels(1, 2.6, 3)
+    )
     at_s = ticks["time_s"][frames]
     age_ms, compute_ms = 1e3 * ticks["frame_age_s"][frames], 1e3 * ticks["compute_s"][frames]
     trace(age, time, at_s, age_ms, AZ, "age")
     trace(compute, time, at_s, compute_ms, GREEN, "compute")
-    if len(seconds.get("servo_late_worst_s", ())):
-        for name, color in (("worst", EL), ("median", AZ)):
-            values = 1e3 * seconds[f"servo_late_{name}_s"]
-            servo.plot(seconds["time_s"] / time.s_per_unit, values, color=color, label=name)
-        servo.legend(ncols=2, loc="upper right")
-    for axes, title in (
-        (age, "Frame's age when it was used"),
-        (compute, "Tick: from frame to command"),
-        (servo, "Servo's wake-ups: late, a second at a time"),
-    ):
-        axes.set(title=title, xlabel=time.label, ylabel="ms")
-    span((age, compute, servo), time, findings.run.duration_s)
+    age.set_title("Frame's age when it was used")
+    compute.set_title("Tick: from frame to command")
+    for its in servo:
+        for which, color in (("worst", EL), ("median", AZ)):
+            values = 1e3 * seconds[f"servo_late_{which}_s"]
+            its.plot(seconds["time_s"] / time.s_per_unit, values, color=color, label=which)
+        its.legend(ncols=2, loc="upper right")
+        its.set_title("Servo's wake-ups: late, a second at a time")
+    over_time = (age, compute, *servo)
+    for its in over_time:
+        its.set(xlabel=time.label, ylabel="ms")
+    span(over_time, time, findings.run.duration_s)
     _exceeding(distribution, age_ms, AZ, "age")
     _exceeding(distribution, compute_ms, GREEN, "tick")
     distribution.set(title="How many take longer", xlabel="ms", ylabel="part of the frames")
@@ -164,7 +176,7 @@ def timing(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
         "Controllers are designed for one fixed age of the frames. Where the machine stood still, all rise "
         "together."
     )
-    return Plot(f"{loop.name}-timing", "Loop timing", caption, figure)
+    return Plot(name, title, caption, figure)
 
 
 def _exceeding(axes: Axes, values: Floats, color: str, label: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from fitctl.report import frequency, motion, tables, timeline
@@ -26,6 +27,9 @@ EVALUATION = (
 )
 
 
+_LINE_COLUMNS = 100
+
+
 class Section(NamedTuple):
     """A part of a page.
 
@@ -34,6 +38,9 @@ class Section(NamedTuple):
     title : str
     plots : list of Plot
     tables : list of Table
+        After the plots.
+    lead : list of Table
+        Before them.
     text : str
     fold : str
         Long text that is opened on demand.
@@ -42,6 +49,7 @@ class Section(NamedTuple):
     title: str
     plots: list[Plot]
     tables: list[Table]
+    lead: Sequence[Table] = ()
     text: str = ""
     fold: str = ""
 
@@ -53,7 +61,7 @@ class Section(NamedTuple):
 
 def _star(findings: Findings, loop: StarFindings, time: TimeAxis) -> Section:
     plots = [
-        timeline.timeline(findings, loop, time),
+        *_own_timeline(findings, loop, time),
         timeline.traces(findings, loop, time),
         frequency.spectra(loop),
         frequency.rejection(loop),
@@ -71,23 +79,41 @@ def _star(findings: Findings, loop: StarFindings, time: TimeAxis) -> Section:
             f"{link}'s siderostat turned, and the rejection what the feedforward undid of it."
         )
     measured = [tables.rejected(loop), tables.timings(loop)]
-    return Section(f"Loop {loop.name}", plots, measured, " ".join(texts))
+    lead = [tables.residual(loop), tables.error_budget(loop), tables.key_figures(loop)]
+    return Section(f"Loop {loop.name}", plots, measured, lead, " ".join(texts))
 
 
 def _beam(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Section:
     plots = [
-        timeline.timeline(findings, loop, time),
+        *_own_timeline(findings, loop, time),
         timeline.beam_traces(findings, loop, time),
         frequency.beam_spectrum(loop, findings.run.rig.camera.period_s),
         motion.timing(findings, loop, time),
     ]
-    return Section(f"Loop {loop.name}", plots, [tables.timings(loop)])
+    lead = [tables.residual(loop), tables.key_figures(loop)]
+    return Section(f"Loop {loop.name}", plots, [tables.timings(loop)], lead)
+
+
+def _own_timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> list[Plot]:
+    """A loop's own timeline; a run's only loop has it on the first screen."""
+    return [timeline.timeline(findings, loop, time)] if len(findings.loops) > 1 else []
+
+
+def first_plot(findings: Findings) -> Plot | None:
+    """The timeline of the whole run, for the first screen; None for a run without ticks."""
+    loops = [loop for loop in findings.loops.values() if len(loop.ticks["time_s"])]
+    if not loops:
+        return None
+    time = time_axis(findings.run.duration_s, tables.utc(findings.run, form="%H:%M:%S UTC"))
+    if len(findings.loops) == 1:
+        return timeline.timeline(findings, loops[0], time)
+    return timeline.overview(findings, time)
 
 
 def _fringes(findings: Findings, fringes: FringeFindings, time: TimeAxis) -> Section:
     if not len(fringes.overlap["time_s"]):
         text = "No frame with a measured tilt is in the log, so there is nothing to draw."
-        return Section("Fringes", [], [], text)
+        return Section("Fringes", [], [], text=text)
     plots = [motion.tilt(findings, fringes, time), frequency.tilt_spectrum(fringes)]
     return Section("Fringes", plots, [tables.fringes(fringes)])
 
@@ -100,7 +126,8 @@ def sections(findings: Findings) -> list[Section]:
     for loop in findings.loops.values():
         if not len(loop.ticks["time_s"]):
             text = "No tick of this loop is in the log, so there is nothing to draw."
-            found.append(Section(f"Loop {loop.name}", [], [], text))
+            lead = [tables.residual(loop), tables.key_figures(loop)]
+            found.append(Section(f"Loop {loop.name}", [], [], lead, text))
             continue
         found.append(
             _star(findings, loop, time)
@@ -125,7 +152,17 @@ def sections(findings: Findings) -> list[Section]:
             "Configuration and versions",
             [],
             [tables.versions(findings)],
-            f"Rig {rig.name}: {rig.description}",
-            json.dumps({"rig": rig.model_dump(mode="json"), "designs": designs}, indent=1),
+            text=f"Rig {rig.name}: {rig.description}",
+            fold=_json({"rig": rig.model_dump(mode="json"), "designs": designs}),
         ),
     ]
+
+
+def _json(value: object) -> str:
+    """JSON for people: lists of plain values, and small objects of them, each stand on one line."""
+
+    def in_one_line(found: re.Match[str]) -> str:
+        line = " ".join(found[0].split())
+        return line if line[0] == "[" or len(line) <= _LINE_COLUMNS else found[0]
+
+    return re.sub(r"[\[{][^\[\]{}]*[\]}]", in_one_line, json.dumps(value, indent=1))

@@ -11,25 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import ConfigError, Rig
-from fitctl.controllers.design.basis import Basis, basis
-from fitctl.controllers.design.bound import bound, linear_residual
+from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
 from fitctl.controllers.design.choose import DESIGNS, design_for
 from fitctl.controllers.design.files import design_of
-from fitctl.controllers.design.loopshape import sampled_response
+from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.loopshape import sampled_response
+from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
+from fitctl.error_budget import Budget, LoopTheory, budget, motion, regular
 from fitctl.figures.attenuation import (
     SEGMENT_S,
     Rebuilt,
     Spectra,
     attenuation,
     mean_spectra,
+    mirror_at_exposure_rad,
     spectra,
     stages_px,
 )
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
-from fitctl.report.selection import Selection, regular
+from fitctl.report.selection import Selection
 
 Floats = NDArray[np.float64]
 AT_HZ = (0.25, 0.5, 1.0, 2.0, 5.0)
@@ -64,6 +67,9 @@ class Rejection(NamedTuple):
         Of error and rebuilt disturbance, the mean of both axes, above frequency zero.
     predicted : Predicted or None
         None where the design cannot be made again; then `why` says why.
+    why : str
+    budget : Budget or None
+        Where the error of all evaluated frames under this controller came from; None without `predicted`.
     """
 
     controller: str
@@ -71,6 +77,7 @@ class Rejection(NamedTuple):
     spectra: Spectra
     predicted: Predicted | None
     why: str
+    budget: Budget | None
 
     @property
     def measured(self) -> Floats:
@@ -99,6 +106,8 @@ def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list
     if not selection.pieces:
         return []
     error_px = axis_pair(ticks, "error_{}_px")
+    fsm = rig.stellar_loops[loop_name].fsm
+    mirror_rad = mirror_at_exposure_rad(fsm, ticks)
     disturbance_px = error_px - stages_px(rig, loop_name, ticks)
     period_s = rig.camera.period_s
     controllers = _controllers(gathered, loop_name)
@@ -106,7 +115,8 @@ def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list
     for name in dict.fromkeys(name for _, _, name in controllers):
         spans = [(begin_s, end_s) for begin_s, end_s, its in controllers if its == name]
         its_spectra, segments, seconds = [], [], 0.0
-        for piece in _within(selection, ticks, spans):
+        pieces = _within(selection, ticks, spans)
+        for piece in pieces:
             time_s = ticks["mid_exposure_s"][piece]
             if time_s[-1] - time_s[0] < SEGMENT_S:
                 continue
@@ -119,9 +129,26 @@ def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list
         if its_spectra:
             # Not at rest, where the siderostat integrates and a logarithm ends.
             measured = Spectra(*(of[1:] for of in mean_spectra(its_spectra, segments)))
-            predicted, why = _predicted(gathered, loop_name, name, measured.frequency_hz)
-            found.append(Rejection(name, seconds, measured, predicted, why))
+            predicted, theory, why = _predicted(gathered, loop_name, name, measured.frequency_hz)
+            its_budget = (
+                None
+                if theory is None
+                else budget(theory, ticks, motion(theory, ticks, mirror_rad), pieces)
+            )
+            found.append(Rejection(name, seconds, measured, predicted, why, its_budget))
     return found
+
+
+def last_design(gathered: Gathered, loop_name: str) -> Design:
+    """The design that drove a loop at the end of a run.
+
+    Raises
+    ------
+    ConfigError
+        If its matrices are not in the log and cannot be made again.
+    """
+    name = _controllers(gathered, loop_name)[-1][2]
+    return _design(gathered, loop_name, name, basis(gathered.run.rig, loop_name))
 
 
 def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float, str]]:
@@ -155,15 +182,17 @@ def _within(
 
 def _predicted(
     gathered: Gathered, loop_name: str, name: str, frequency_hz: Floats
-) -> tuple[Predicted | None, str]:
+) -> tuple[Predicted | None, LoopTheory | None, str]:
     try:
         its_basis = basis(gathered.run.rig, loop_name)
         design = _design(gathered, loop_name, name, its_basis)
+        its_basis = on_its_mirror(its_basis, design.parameters)
     except ConfigError as error:
-        return None, str(error)
+        return None, None, str(error)
     rejection = np.abs(1 + sampled_response(design, its_basis)(2 * math.pi * frequency_hz))
     least_px = bound(its_basis).residual_px
-    return Predicted(rejection, linear_residual(design, its_basis), least_px), ""
+    predicted = Predicted(rejection, linear_residual(design, its_basis), least_px)
+    return predicted, loop_theory(gathered.run.rig, loop_name, design), ""
 
 
 def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> Design:

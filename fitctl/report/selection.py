@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.error_budget import LONGEST_GAP_S
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.messages.modes import BEAM_FOLLOWING, FOLLOWING, Mode
 from fitctl.simulation.statistics import SETTLE_S
 
 TARGET_SETTLE_S = 2.0
-LONGEST_GAP_S = 0.5
-"""Frames missing for longer end a piece; shorter gaps are bridged, linearly, for spectra alone."""
 _TARGET_MOVES = 0.5  # requirements a second: slower is no motion
 
 
@@ -146,14 +145,3 @@ def _moves(ticks: Columns, rows: NDArray[np.intp], requirement_px: float) -> NDA
     step_px = np.abs(np.diff(target_px, axis=0, prepend=target_px[:1])).max(axis=1)
     step_s = np.diff(ticks["time_s"][rows], prepend=ticks["time_s"][rows[0]] - 1.0)
     return step_px > _TARGET_MOVES * requirement_px * np.maximum(step_s, 1e-6)
-
-
-def regular(
-    time_s: NDArray[np.float64], values: NDArray[np.floating], period_s: float
-) -> NDArray[np.float64]:
-    """Values, shape (frames, n), once a period: what is missing is bridged by straight lines."""
-    frames = 1 + round((time_s[-1] - time_s[0]) / period_s)
-    if frames == len(time_s):
-        return np.asarray(values, dtype=float)
-    grid_s = np.linspace(time_s[0], time_s[-1], frames)
-    return np.column_stack([np.interp(grid_s, time_s, column) for column in values.T])

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from fitctl.error_budget import CAUSES
 from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
 from fitctl.report.fringes import FringeFindings
 from fitctl.report.residual import Estimate
@@ -80,6 +81,37 @@ def residual(loop: LoopFindings) -> Table:
             for axis, found in loop.residual.items()
         ],
     )
+
+
+def headline(loop: LoopFindings) -> str:
+    """The one number of a loop: the RMS of its worse axis."""
+    worse = max(
+        (found.rms for found in loop.residual.values()),
+        key=lambda rms: -math.inf if math.isnan(rms) else rms,
+    )
+    unit = loop.quantity.unit
+    if math.isnan(worse):
+        return f"requirement {loop.requirement:g} {unit} RMS"
+    return f"{worse:.4f} of {loop.requirement:g} {unit} RMS"
+
+
+def error_budget(loop: StarFindings) -> Table:
+    """Where the error came from, under each controller, beside what its design and the rig file expect."""
+    budgets = [
+        (found.controller, found.budget) for found in loop.rejections if found.budget is not None
+    ]
+    head = [part for name, _ in budgets for part in (name, f"{name}, expected")]
+    rows = [["RMS of an axis"]]
+    for _, budget in budgets:
+        rows[0] += [f"{budget.measured_px:.4f} px", f"{budget.expected_px:.4f} px"]
+    for cause in CAUSES:
+        row = [cause]
+        for _, budget in budgets:
+            row += [f"{budget.percent[cause]} %", f"{100 * budget.expected_fractions[cause]:.0f} %"]
+        rows.append(row)
+    verdicts = "; ".join(f"{name}: {budget.verdict}" for name, budget in budgets)
+    caption = f"Where the error comes from: parts of its mean square. {verdicts}"
+    return Table(caption.strip(), ["cause", *head], rows if budgets else [])
 
 
 def key_figures(loop: LoopFindings) -> Table:

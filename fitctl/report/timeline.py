@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.identify.drawing import GREEN, ORANGE, PURPLE, SKY
-from fitctl.messages.modes import Mode
+from fitctl.identify.drawing import GREEN, ORANGE, SKY
+from fitctl.messages.modes import Mode, Trigger
 from fitctl.report.drawing import (
     AZ,
     COLORS,
     EL,
-    FAINT,
+    SERIES,
     Plot,
     TimeAxis,
     decimal,
@@ -24,21 +26,12 @@ from fitctl.report.drawing import (
     trace,
 )
 from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
+from fitctl.tui.inks import FAULT, MODE_COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Floats = NDArray[np.floating]
-_MODE_COLORS = {
-    Mode.OFF: FAINT,
-    Mode.STANDBY: SKY,
-    Mode.ACQUISITION: ORANGE,
-    Mode.COARSE: PURPLE,
-    Mode.VERNIER: GREEN,
-    Mode.LOCKED: GREEN,
-    Mode.SAFE: EL,
-    Mode.EXPERIMENT: AZ,
-}
 _SIGNS = {3: ("v", ORANGE, "warning"), 4: ("X", EL, "error")}  # by foxglove.Log's level
 WINDOW_S = 10.0
 DIODES = ("az_plus", "az_minus", "el_plus", "el_minus")
@@ -66,26 +59,8 @@ def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
 
 def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     """Modes, events and the residual, ten seconds at a time."""
-    figure, (modes, residual) = panels(2, 3.6, heights=(1, 2.4))
-    for begin_s, end_s, mode in _spans(loop):
-        modes.barh(
-            0,
-            (end_s - begin_s) / time.s_per_unit,
-            left=begin_s / time.s_per_unit,
-            height=0.6,
-            color=_MODE_COLORS[mode],
-            linewidth=0,
-        )
-    for mode in dict.fromkeys(mode for *_, mode in _spans(loop)):
-        modes.barh(0, 0, color=_MODE_COLORS[mode], label=mode.name)
-    for level, (sign, color, label) in _SIGNS.items():
-        times_s = [event["time_s"] for event in findings.gathered.events if event["level"] == level]
-        if times_s:
-            at = np.array(times_s) / time.s_per_unit
-            modes.plot(at, np.full(len(at), 0.55), sign, color=color, markersize=6, label=label)
-    modes.set(title="Modes and events", ylim=(-0.45, 0.8), yticks=[])
-    modes.legend(ncols=9, loc="lower left", bbox_to_anchor=(0.18, 0.98), borderaxespad=0)
-    modes.grid(visible=False, axis="y")
+    figure, (modes, residual) = panels(2, 3.2, heights=(1, 2.6))
+    _modes_and_events(modes, findings, [loop], time)
     at_s, rms = running_rms(loop)
     for axis in AXES:
         line = "o-" if len(at_s) < 60 else "-"
@@ -107,6 +82,68 @@ def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
         "target, steps and hand-over included."
     )
     return Plot(f"{loop.name}-timeline", "Timeline", caption, figure)
+
+
+def overview(findings: Findings, time: TimeAxis) -> Plot:
+    """Modes of all loops below each other, events, and each loop's residual as a part of its requirement."""
+    loops = [loop for loop in findings.loops.values() if len(loop.ticks["time_s"])]
+    figure, (modes, residual) = panels(2, 2.6 + 0.3 * len(loops), heights=(len(loops), 4))
+    _modes_and_events(modes, findings, loops, time)
+    modes.set(yticks=-np.arange(len(loops)), yticklabels=[loop.name for loop in loops])
+    for loop, color in zip(loops, itertools.cycle(SERIES), strict=False):
+        at_s, rms = running_rms(loop)
+        worse = np.fmax(rms["az"], rms["el"]) / loop.requirement
+        residual.plot(at_s / time.s_per_unit, 100 * worse, color=color, label=loop.name)
+    limit(residual, 100.0)
+    residual.set_yscale("log")
+    decimal(residual.yaxis, dense=True)
+    residual.set(
+        title=f"RMS of the worse axis, {WINDOW_S:g} s at a time",
+        xlabel=time.label,
+        ylabel="% of requirement",
+    )
+    legend_above(residual, len(loops))
+    span([residual], time, findings.run.duration_s)
+    caption = (
+        "Above: modes; marks are warnings and errors of the whole instrument. Below: while a loop holds its "
+        "star or beam, steps and hand-over included."
+    )
+    return Plot("timeline", "Timeline", caption, figure)
+
+
+def _modes_and_events(
+    axes: Axes, findings: Findings, loops: Sequence[LoopFindings], time: TimeAxis
+) -> None:
+    """Bars of modes, a row a loop, and the warnings and errors above them."""
+    labels: dict[str, str] = {}
+    for row, loop in enumerate(loops):
+        faults_s = [
+            change["time_s"]
+            for change in findings.gathered.modes
+            if change["loop"] == loop.name and change["trigger"] == Trigger.FAULT.name
+        ]
+        for begin_s, end_s, mode in _spans(loop):
+            fault = mode is Mode.SAFE and any(abs(at_s - begin_s) < 1.0 for at_s in faults_s)
+            color = FAULT.light if fault else MODE_COLOURS[mode.name].light
+            labels["SAFE after a fault" if fault else mode.name] = color
+            axes.barh(
+                -row,
+                (end_s - begin_s) / time.s_per_unit,
+                left=begin_s / time.s_per_unit,
+                height=0.6,
+                color=color,
+                linewidth=0,
+            )
+    for label, color in labels.items():
+        axes.barh(0, 0, color=color, label=label)
+    for level, (sign, color, label) in _SIGNS.items():
+        times_s = [event["time_s"] for event in findings.gathered.events if event["level"] == level]
+        if times_s:
+            at = np.array(times_s) / time.s_per_unit
+            axes.plot(at, np.full(len(at), 0.55), sign, color=color, markersize=6, label=label)
+    axes.set(title="Modes and events", ylim=(-len(loops) + 0.55, 0.8), yticks=[])
+    axes.legend(ncols=9, loc="lower left", bbox_to_anchor=(0.18, 0.98), borderaxespad=0)
+    axes.grid(visible=False, axis="y")
 
 
 def _spans(loop: LoopFindings) -> list[tuple[float, float, Mode]]:

@@ -26,7 +26,7 @@ from fitctl.messages.running import only_running_rig, rig_of_environment
 from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.waiting import wait_for_outcomes
 from fitctl.sequences import steps
-from fitctl.sequences.calibration import write_calibration
+from fitctl.sequences.behaviours.calibration import write_calibration
 from fitctl.sequences.contact import Contact
 from fitctl.sequences.files import find_sequence
 from fitctl.sequences.links import Link, SimulatedLink

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
 
 from fitctl.config import Rig
@@ -19,14 +20,18 @@ _TURN_S = 0.01
 class SimulatedLink:
     """The instrument on the virtual clock: waiting for telemetry is what moves the time on.
 
-    As with a running rig, telemetry is received on one thread, and commands may be sent from any.
+    As with a running rig, telemetry is received on one thread, and commands may be sent from any. `prepare`
+    may change the simulation before it begins.
     """
 
-    def __init__(self, rig: Rig, seed: int) -> None:
+    def __init__(
+        self, rig: Rig, seed: int, prepare: Callable[[Simulation], object] = lambda _: None
+    ) -> None:
         self._stepping = threading.Lock()
         self._buffer = TelemetryBuffer()
         self._period_s = 1.0 / rig.supervisor.telemetry_hz
         self._simulation = Simulation(rig, seed, record=self._buffer.add, history_s=1.0)
+        prepare(self._simulation)
         self._state = ServiceState(
             pid=os.getpid(),
             wall_minus_monotonic_s=0.0,

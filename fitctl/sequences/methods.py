@@ -67,4 +67,8 @@ class StepMethods(ABC, Generic[R_co]):
     wait: Callable[..., R_co] = _method(steps.Wait)
     collector: Callable[..., R_co] = _method(steps.Collector)
     visibility: Callable[..., R_co] = _method(steps.Visibility)
+    collector_scan: Callable[..., R_co] = _method(steps.CollectorScan)
+    beam_scan: Callable[..., R_co] = _method(steps.BeamScan)
+    ambient: Callable[..., R_co] = _method(steps.Ambient)
+    overlap: Callable[..., R_co] = _method(steps.Overlap)
     off: Callable[..., R_co] = _method(steps.Off)

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings
 from fitctl.config.reading import parse_override
-from fitctl.sequences.behaviours import problems
+from fitctl.sequences.behaviours.table import problems
 from fitctl.sequences.files import read_document, read_table, shipped_sequences
 from fitctl.sequences.steps import AnyStep, Sequence, Star, Stars, Step
 

@@ -11,10 +11,10 @@ import msgspec
 from fitctl.logging.records import SequenceAttempt
 from fitctl.messages.commands import Hold, MoveCollector
 from fitctl.messages.modes import METROLOGY_MODES, STELLAR_MODES, Mode
-from fitctl.sequences.behaviour import Behaviour, Calibration, Result
-from fitctl.sequences.behaviours import BEHAVIOURS, loops_of, problems
+from fitctl.sequences.behaviours.behaviour import Behaviour, Calibration, Result
+from fitctl.sequences.behaviours.stars import evaluate, star_results, steps_of
+from fitctl.sequences.behaviours.table import BEHAVIOURS, loops_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
-from fitctl.sequences.stars import evaluate, star_results, steps_of
 from fitctl.sequences.steps import Collector, Standby, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 

@@ -313,6 +313,63 @@ class Visibility(Step):
     ] = None
 
 
+class CollectorScan(Step):
+    """Move the collector to and fro along both axes of the link; its log is for `fitctl identify feedforward`.
+
+    The loop holds its star over the link meanwhile. The collector ends where it began.
+    """
+
+    step: Literal["collector_scan"] = "collector_scan"
+    amplitude_mm: Annotated[Positive, Field(description="to either side")] = 3.0
+    frequency_hz: Annotated[Positive, Field(description="of the sine")] = 0.15
+    cycles: Annotated[Count, Field(le=100, description="along each axis")] = 6
+
+
+class BeamScan(Step):
+    """Move the beam over the photodiodes; its log is for `fitctl identify photodiodes` and `link_delay`.
+
+    The beam is let go, and goes to and fro along one axis after the other, fast and slowly. It ends in STANDBY.
+    """
+
+    step: Literal["beam_scan"] = "beam_scan"
+    span_sky_arcsec: Annotated[
+        Positive, Field(description="to either side of where it is held")
+    ] = 400.0
+    fast_sky_arcsec_s: Annotated[Positive, Field(description="faster sweeps")] = 240.0
+    slow_sky_arcsec_s: Annotated[Positive, Field(description="slower sweeps")] = 80.0
+    cycles: Annotated[Count, Field(le=20, description="at each speed along each axis")] = 2
+
+
+class Ambient(Step):
+    """Sample the photodiodes without the beam, for `fitctl identify ambient`: block the laser before."""
+
+    step: Literal["ambient"] = "ambient"
+    duration_s: Annotated[DurationS, Field(le=600, description="for how long")] = 20.0
+
+
+class Overlap(Moving):
+    """Move the target so that the fringe spots of both stars of `[fringes]` lie on each other; stay there.
+
+    The target steps aside, to both sides of where it is, so that the camera separates the two fringe spots.
+    Each is measured from its own star. The target then moves by what was found, and the step measures again.
+    """
+
+    step: Literal["overlap"] = "overlap"
+    max_offset_px: Annotated[
+        Positive, Field(description="a step that goes farther than this is refused")
+    ] = 10.0
+    separation_px: Annotated[
+        Positive, Field(ge=7, description="how far the target steps to either side")
+    ] = 7.0
+    dwell_s: Annotated[DurationS, Field(description="at each of five places")] = 20.0
+    steady_after_s: Annotated[
+        NonNegative, Field(description="of a dwell: from then on its frames count")
+    ] = 5.0
+    max_error_px: Annotated[
+        Positive, Field(description="largest standard deviation of an offset that is accepted")
+    ] = 0.1
+
+
 class Off(Step):
     """Hold, mirror to its bias, amplifiers disabled, devices let go: OFF; without a loop, all."""
 
@@ -335,6 +392,10 @@ AnyStep = (
     | Wait
     | Collector
     | Visibility
+    | CollectorScan
+    | BeamScan
+    | Ambient
+    | Overlap
     | Off
 )
 

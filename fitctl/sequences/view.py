@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import NamedTuple
@@ -97,6 +98,8 @@ class View:
         For the step's own use too: those that it keeps.
     squares : Squares
         And this: what it adds up.
+    rows : dict of str to list
+        And these: rows of numbers that it measures, by names of its own.
     attempt : int
         Which one it is, from 1.
     fresh_s : float
@@ -115,6 +118,7 @@ class View:
     marks: list[float] = field(default_factory=list)
     frames: list[FrameRecord] = field(default_factory=list)
     squares: Squares = field(default_factory=Squares)
+    rows: dict[str, list[tuple[float, ...]]] = field(default_factory=lambda: defaultdict(list))
 
     @property
     def settings(self) -> Loop:

@@ -21,6 +21,7 @@ import zmq
 
 from fitctl.clock import Clock
 from fitctl.config import ConfigError
+from fitctl.logging.records import Snapshot
 from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
     AnyCommand,
@@ -52,6 +53,7 @@ _ROUND_MS = 5
 _MESSAGES_A_ROUND = 8
 _JOINED_STOPS = 1000
 _REPORT_PERIOD_S = 0.25
+_SNAPSHOT_PERIOD_S = 1.0  # of what a console shows of a log
 
 
 class Waiting(NamedTuple):
@@ -109,6 +111,7 @@ class Service(threading.Thread):
         for path, bare in self._bound.items():
             bare.bind(f"ipc://{path}")
         self._files = {path: file_identity(path) for path in self._bound}
+        self._snapshot_s = clock.now_s()
         self._unmade = ""  # why the folder cannot be made anew, as last reported
 
     def stop(self) -> None:
@@ -306,6 +309,11 @@ class Service(threading.Thread):
     def _publish(self, now_s: float) -> None:
         self._state.sequence += 1
         self._state.commander = self._admission.commander(now_s)
-        payload = self._encode(self._buffer.telemetry(self._supervisor, self._state, now_s))
+        telemetry = self._buffer.telemetry(self._supervisor, self._state, now_s)
+        payload = self._encode(telemetry)
+        if now_s >= self._snapshot_s:
+            self._snapshot_s = now_s + _SNAPSHOT_PERIOD_S
+            state = self._encode(telemetry.unlogged)
+            self._supervisor.leave(Snapshot(time_s=now_s, state_msgpack=state))
         with suppress(zmq.Again):
             self._publisher.send(payload, zmq.NOBLOCK)

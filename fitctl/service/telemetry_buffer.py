@@ -9,7 +9,9 @@ from typing import Generic, TypeVar
 
 import msgspec
 
+from fitctl.config import Rig
 from fitctl.logging.records import (
+    CommandRecord,
     DeviceHealth,
     Event,
     FrameRecord,
@@ -23,7 +25,7 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.telemetry import FringeOptics, Telemetry
 from fitctl.supervisor.supervisor import Supervisor
 
 _BUFFERED_TICKS = 2000
@@ -68,6 +70,7 @@ class TelemetryBuffer:
     def __init__(self) -> None:
         self.frame: FrameRecord | None = None
         self.recorder: RecorderStatus | None = None
+        self.stopped_by = ""
         self._ticks = CountingBuffer[Tick](_BUFFERED_TICKS)
         self._metrology_ticks = CountingBuffer[MetrologyTick](_BUFFERED_TICKS)
         self._overlaps = CountingBuffer[Overlap](_BUFFERED_TICKS)
@@ -101,6 +104,8 @@ class TelemetryBuffer:
                 self._timing[record.loop] = record
             case RecorderStatus():
                 self.recorder = record
+            case CommandRecord() if record.command == "Stop" and record.accepted:
+                self.stopped_by = record.sender
 
     def telemetry(self, supervisor: Supervisor, state: ServiceState, now_s: float) -> Telemetry:
         """Everything since the last call."""
@@ -130,6 +135,8 @@ class TelemetryBuffer:
             metrology_ticks=self._metrology_ticks.drain(),
             overlaps=self._overlaps.drain(),
             collector=None if supervisor.collector is None else supervisor.collector.state,
+            stopped_by=self.stopped_by,
+            fringes=_fringe_optics(supervisor.rig),
         )
 
     def recent_events(self) -> list[Event]:
@@ -154,6 +161,17 @@ class TelemetryBuffer:
             mode_changes_unsent=self._changes.lost,
             replies_unsent=state.replies_unsent,
         )
+
+
+def _fringe_optics(rig: Rig) -> FringeOptics | None:
+    if rig.fringes is None:
+        return None
+    one, other = rig.fringes.loops
+    return FringeOptics(
+        loops=(one, other),
+        aperture_m=rig.fringes.aperture_m,
+        wavelength_m=rig.fringes.wavelength_m,
+    )
 
 
 class ServiceState(msgspec.Struct):

@@ -23,8 +23,8 @@ import numpy as np
 from fitctl.config import ConfigError, Rig
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.batch.settings import BatchRefusalError
-from fitctl.simulation.simulation import simulate
-from fitctl.simulation.statistics import SimulationResult
+from fitctl.simulation.simulation import simulate_rig
+from fitctl.simulation.statistics import MetrologyResult, RigResult, SimulationResult
 
 PERCENTILES = (5, 50, 95, 99)
 _WORST_SEEDS = 5
@@ -33,7 +33,7 @@ _MOST_RUNS_PER_TASK = 50
 _RETRIES = 10  # of a task whose worker was lost
 _CONNECT_TIMEOUT_S = 10.0
 
-Results = dict[int, dict[str, SimulationResult]]
+Results = dict[int, RigResult]
 
 
 class CampaignError(Exception):
@@ -58,8 +58,16 @@ class SeedRms:
 
 
 @dataclass(frozen=True)
+class SeedBeamRms:
+    """One run's true RMS of a metrology beam, of its worst axis."""
+
+    seed: int
+    rms_arcsec: float
+
+
+@dataclass(frozen=True)
 class LoopSummary:
-    """Statistics of one loop over all runs.
+    """Statistics of one stellar loop over all runs.
 
     Attributes
     ----------
@@ -85,10 +93,42 @@ class LoopSummary:
     worst_seeds: list[SeedRms]
 
 
+@dataclass(frozen=True)
+class BeamSummary:
+    """Statistics of one metrology loop over all runs.
+
+    Attributes
+    ----------
+    runs, held, judged : int
+        How many there were, how many came to hold their beam, and how many for long enough to be judged.
+    rms_arcsec : dict
+        True RMS of the beam from the centre of the photodiodes: ``az``, ``el``, and ``worst_axis``.
+    acquired_s, locked_s : Statistics
+    worst_seeds : list of SeedBeamRms
+        Runs that could not be judged come first, with nan.
+    """
+
+    runs: int
+    held: int
+    judged: int
+    rms_arcsec: dict[str, Statistics]
+    acquired_s: Statistics
+    locked_s: Statistics
+    worst_seeds: list[SeedBeamRms]
+
+
+@dataclass(frozen=True)
+class CampaignSummary:
+    """Statistics of all runs: each loop's, and the mean visibility of each run, nan without fringes."""
+
+    loops: dict[str, LoopSummary | BeamSummary]
+    visibility: Statistics
+
+
 class _Runner(NamedTuple):
     """The quickest way to a rig's runs, and why that is not the batch."""
 
-    run: Callable[[int, float], dict[str, SimulationResult]]
+    run: Callable[[int, float], RigResult]
     refusal: str
 
 
@@ -110,9 +150,8 @@ def _runner(rig_json: str) -> _Runner:
     try:
         batch = Batch(rig)
     except BatchRefusalError as refusal:
-        return _Runner(partial(simulate, rig), str(refusal))
-    (name,) = rig.loops
-    return _Runner(lambda seed, duration_s: {name: batch.result(seed, duration_s)}, "")
+        return _Runner(partial(simulate_rig, rig), str(refusal))
+    return _Runner(batch.result, "")
 
 
 def run_campaign(
@@ -224,33 +263,63 @@ def dask_executor(address: str, workers: int = 1) -> Iterator[tuple[Executor, in
             yield executor, threads
 
 
-def summarize(results: Results) -> dict[str, LoopSummary]:
+def summarize(results: Results) -> CampaignSummary:
     """Statistics of each loop over all runs."""
-    loops = next(iter(results.values()))
-    return {
-        name: _summarize({seed: loops[name] for seed, loops in results.items()}) for name in loops
-    }
+    loops: dict[str, LoopSummary | BeamSummary] = {}
+    for name, first in next(iter(results.values())).loops.items():
+        runs = {seed: run.loops[name] for seed, run in results.items()}
+        if isinstance(first, MetrologyResult):
+            beams = {s: one for s, one in runs.items() if isinstance(one, MetrologyResult)}
+            loops[name] = _summarize_beam(beams)
+        else:
+            stars = {s: one for s, one in runs.items() if isinstance(one, SimulationResult)}
+            loops[name] = _summarize(stars)
+    return CampaignSummary(loops, _statistics([run.visibility for run in results.values()]))
 
 
 def _summarize(runs: dict[int, SimulationResult]) -> LoopSummary:
     all_runs = list(runs.values())
-    worst_axis = {seed: max(run.rms_px.values()) for seed, run in runs.items()}
-    ranked = sorted(worst_axis, key=lambda seed: -np.nan_to_num(worst_axis[seed], nan=np.inf))
-    axes = ("az", "el")
+    rms_px = {seed: run.rms_px for seed, run in runs.items()}
+    worst_axis, worst = _worst(rms_px)
     return LoopSummary(
         runs=len(all_runs),
         held=sum(not math.isnan(run.vernier_s) for run in all_runs),
         judged=sum(not math.isnan(value) for value in worst_axis.values()),
-        rms_px={axis: _statistics([run.rms_px[axis] for run in all_runs]) for axis in axes}
+        rms_px=_by_axis(list(rms_px.values()))
         | {"worst_axis": _statistics(list(worst_axis.values()))},
-        measured_rms_px={
-            axis: _statistics([run.measured_rms_px[axis] for run in all_runs]) for axis in axes
-        },
+        measured_rms_px=_by_axis([run.measured_rms_px for run in all_runs]),
         acquired_s=_statistics([run.acquired_s for run in all_runs]),
         vernier_s=_statistics([run.vernier_s for run in all_runs]),
         piston_rms_m=_statistics([run.piston_rms_m for run in all_runs]),
-        worst_seeds=[SeedRms(seed, worst_axis[seed]) for seed in ranked[:_WORST_SEEDS]],
+        worst_seeds=[SeedRms(seed, worst_axis[seed]) for seed in worst],
     )
+
+
+def _summarize_beam(runs: dict[int, MetrologyResult]) -> BeamSummary:
+    all_runs = list(runs.values())
+    rms_arcsec = {seed: run.rms_arcsec for seed, run in runs.items()}
+    worst_axis, worst = _worst(rms_arcsec)
+    return BeamSummary(
+        runs=len(all_runs),
+        held=sum(not math.isnan(run.locked_s) for run in all_runs),
+        judged=sum(not math.isnan(value) for value in worst_axis.values()),
+        rms_arcsec=_by_axis(list(rms_arcsec.values()))
+        | {"worst_axis": _statistics(list(worst_axis.values()))},
+        acquired_s=_statistics([run.acquired_s for run in all_runs]),
+        locked_s=_statistics([run.locked_s for run in all_runs]),
+        worst_seeds=[SeedBeamRms(seed, worst_axis[seed]) for seed in worst],
+    )
+
+
+def _worst(rms: dict[int, dict[str, float]]) -> tuple[dict[int, float], list[int]]:
+    """The worst axis of each seed, and the worst seeds; those that could not be judged come first."""
+    worst_axis = {seed: max(axes.values()) for seed, axes in rms.items()}
+    ranked = sorted(worst_axis, key=lambda seed: -np.nan_to_num(worst_axis[seed], nan=np.inf))
+    return worst_axis, ranked[:_WORST_SEEDS]
+
+
+def _by_axis(rms: list[dict[str, float]]) -> dict[str, Statistics]:
+    return {axis: _statistics([one[axis] for one in rms]) for axis in ("az", "el")}
 
 
 def _statistics(values: Sequence[float]) -> Statistics:

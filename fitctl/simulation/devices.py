@@ -34,7 +34,8 @@ from fitctl.model.scene import Scene
 from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]
-_DIODE_BITS = 16  # of a LabJack T7's converter at its fastest; others are finer
+_STILL: AzEl = (0.0, 0.0)
+DIODE_BITS = 16  # of a LabJack T7's converter at its fastest; others are finer
 
 
 def _identity(model: str) -> DeviceIdentity:
@@ -63,13 +64,17 @@ class SimulatedAmplifiers:
         self._plant = plant
         self._clock = clock
         self._motor_rad = plant.state.motor_rad[0]
+        self._motor_rad_s = plant.state.motor_rad_s[0]
         self._velocity_rad_s = plant.inputs.velocity_rad_s[0]
-        self._commanded_rad_s: AzEl = (0.0, 0.0)
+        self._commanded_rad_s: AzEl = _STILL
+        self._position_rad: AzEl = _STILL
+        self._at_rest = False
         self._rad_per_count = 2 * math.pi / counts_per_rev
         self._enabled = False
 
     def open(self) -> DeviceIdentity:
-        """Nothing to connect."""
+        """Nothing to connect; whoever turned the motors meanwhile is noticed at the next exchange."""
+        self._at_rest = False
         return _identity("amplifiers")
 
     def enable(self) -> None:
@@ -79,22 +84,36 @@ class SimulatedAmplifiers:
     def disable(self) -> None:
         """Stand still."""
         self._enabled = False
-        self._velocity_rad_s[:] = self._commanded_rad_s = (0.0, 0.0)
+        self._velocity_rad_s[:] = self._commanded_rad_s = _STILL
 
     def reset_fault(self) -> None:
         """There are none."""
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading:
-        """Command and read at the present virtual time."""
+        """Command and read at the present virtual time.
+
+        Motors that stand still stay where they are, so that the plant need not go on for their sake.
+        """
         now_s = self._clock.now_s()
-        self._plant.advance(now_s)
-        if self._enabled and velocity_rad_s != self._commanded_rad_s:
-            self._velocity_rad_s[0], self._velocity_rad_s[1] = velocity_rad_s
-            self._commanded_rad_s = velocity_rad_s
+        if not self._at_rest or velocity_rad_s != _STILL:
+            self._plant.advance(now_s)
+            if self._enabled and velocity_rad_s != self._commanded_rad_s:
+                self._velocity_rad_s[0], self._velocity_rad_s[1] = velocity_rad_s
+                self._commanded_rad_s = velocity_rad_s
+            self._read()
+        return ServoReading(now_s, self._position_rad, self._enabled, "")
+
+    def _read(self) -> None:
+        """Count, and notice whether the motors have come to rest: to the last bit, for a rate only decays."""
         az_rad, el_rad = self._motor_rad.tolist()
+        az_rad_s, el_rad_s = self._motor_rad_s.tolist()
         count = self._rad_per_count
-        position_rad = (math.floor(az_rad / count) * count, math.floor(el_rad / count) * count)
-        return ServoReading(now_s, position_rad, self._enabled, "")
+        self._position_rad = (
+            math.floor(az_rad / count) * count,
+            math.floor(el_rad / count) * count,
+        )
+        coasted_rad = az_rad + az_rad_s, el_rad + el_rad_s  # in a second, which no motor coasts
+        self._at_rest = self._commanded_rad_s == _STILL and coasted_rad == (az_rad, el_rad)
 
     def close(self) -> None:
         """Stand still."""
@@ -152,7 +171,7 @@ class SimulatedPhotodiodes:
         self._clock = clock
         self._round_trip_s = truth.metrology_loops[loop_name].link_round_trip_s
         self._range_v = rig.metrology_loops[loop_name].sensor.device.range_v
-        self._step_v = 2 * self._range_v / 2**_DIODE_BITS
+        self._step_v = 2 * self._range_v / 2**DIODE_BITS
         self._requested_s: deque[float] = deque()
         self._samples = 0  # never starts again: noise must not repeat
 
@@ -275,6 +294,7 @@ class SimulatedCamera:
             rig.camera,
             [spot for name in plant.stellar_loops for spot in truth.stellar_loops[name].spots],
             truth.hot_pixels,
+            truth.exposure_instants,
         )
         self._pixel_key = plant.pixel_key
         self._exposures = 0  # never starts again, as the frames' numbers do: noise must not repeat
@@ -306,8 +326,9 @@ class SimulatedCamera:
         self._go_on_to(arrives_s)
         self._frames += 1
         self._exposures += 1
-        spots = self._plant.spots_px(exposed_s)[0]
-        image = self._scene.frame(spots, self._pixel_key, self._exposures)
+        spots = self._plant.exposure_px(exposed_s)[0]
+        noise_dn = self._plant.pixel_noise_dn(exposed_s)
+        image = self._scene.frame(spots, self._pixel_key, self._exposures, noise_dn)
         return Frame(self._frames, exposed_s, self._clock.now_s(), image)
 
     def counts(self) -> CameraCounts:
@@ -322,10 +343,11 @@ class SimulatedCamera:
 
     def _go_on_to(self, time_s: float) -> None:
         due, works, sleep_until = self._due, self.on_servo_period, self._clock.sleep_until
-        while due[0][0] <= time_s:
-            due_s, which = due[0]
+        due_s, which = due[0]
+        while due_s <= time_s:
             period_s, run = works[which]
             sleep_until(due_s)
             run()
             heapq.heapreplace(due, (due_s + period_s, which))
+            due_s, which = due[0]
         sleep_until(time_s)

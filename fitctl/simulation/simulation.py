@@ -32,10 +32,12 @@ from fitctl.simulation.devices import (
 )
 from fitctl.simulation.statistics import (
     SETTLE_S,
+    TILT_EVERY,
     MetrologyResult,
     RigResult,
     SimulationResult,
     mode_times,
+    motion_start_s,
     pair,
     piston_rms_m,
     rms,
@@ -45,7 +47,6 @@ from fitctl.stages.collector import CollectorDrive
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
-_EVERY = 10  # steps of the plant from one sample of the visibility to the next: 5 ms
 
 
 class Simulation:
@@ -87,7 +88,13 @@ class Simulation:
         loops = {name: self._loop_devices(name) for name in rig.loops}
         self.devices = Devices(self.camera, loops, self.hexapod)
         self.supervisor = Supervisor(
-            rig, self.devices, self.clock, InlineExecutor(), self._receive, design_for
+            rig,
+            self.devices,
+            self.clock,
+            InlineExecutor(),
+            self._receive,
+            design_for,
+            record_frames=record is not None,
         )
         if self.supervisor.collector is not None and rig.collector and self.hexapod is not None:
             # A random course is the run's own.
@@ -198,13 +205,6 @@ def simulate_rig(
     return RigResult(loops, _visibility(simulation), speed_x)
 
 
-def motion_start_s(rig: Rig) -> float:
-    """When a simulated run begins to move the collector; infinite if it never does."""
-    if rig.collector is None or rig.collector.motion.kind == "still":
-        return math.inf
-    return rig.collector.motion.start_s
-
-
 def _judged_from_s(simulation: Simulation, name: str) -> float:
     """From when on a loop is judged: it has settled, and the collector moves where it will; nan without."""
     held = Mode.LOCKED if name in simulation.rig.metrology_loops else Mode.VERNIER
@@ -260,7 +260,7 @@ def _visibility(simulation: Simulation) -> float:
     if not start_s < simulation.clock.now_s():
         return math.nan
     one_px, other_px = (
-        simulation.plants[name].history_px(start_s, simulation.clock.now_s())[::_EVERY, 0, 0]
+        simulation.plants[name].history_px(start_s, simulation.clock.now_s())[::TILT_EVERY, 0, 0]
         - simulation.supervisor.stellar_loops[name].target_px
         for name in fringes.loops
     )

@@ -9,12 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import Rig
 from fitctl.logging.records import ModeChange
 from fitctl.messages.modes import STELLAR_MODES, Mode
 from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]
 SETTLE_S = 10.0  # after vernier is reached, before its residual counts
+TILT_EVERY = 10  # steps of the plant from one sample of the visibility to the next: 5 ms
 
 
 class SimulationResult(NamedTuple):
@@ -58,6 +60,13 @@ class RigResult(NamedTuple):
     loops: dict[str, SimulationResult | MetrologyResult]
     visibility: float
     speed_x: float
+
+
+def motion_start_s(rig: Rig) -> float:
+    """When a simulated run begins to move the collector; infinite if it never does."""
+    if rig.collector is None or rig.collector.motion.kind == "still":
+        return math.inf
+    return rig.collector.motion.start_s
 
 
 def true_residual_rms(

@@ -6,14 +6,12 @@ only uses the driver; the other threads leave wishes (a set-point, a stop, a req
 
 from __future__ import annotations
 
-import bisect
 import math
-import operator
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +21,7 @@ from fitctl.config import AnyLoop
 from fitctl.controllers.position_servo import position_servo
 from fitctl.drivers.interface import (
     AzEl,
+    BusAmplifiers,
     DeviceError,
     DeviceFault,
     DeviceIdentity,
@@ -34,7 +33,6 @@ from fitctl.drivers.interface import (
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3
 _REQUEST_TIMEOUT_S = 15.0
-_READ_AT = operator.itemgetter(0)  # of a reading: when
 _STILL = (0.0, 0.0)
 FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
@@ -124,6 +122,7 @@ class SiderostatServo:
         self.turned_on_rad = 0.0
         self._last_rad_s = _STILL
         self._disabling = False
+        self._staged: tuple[float, AzEl] | None = None
         self.late_s: deque[float] = deque(maxlen=4096)
         self.skipped = 0
         self.round_trip_s = 0.0
@@ -135,6 +134,11 @@ class SiderostatServo:
     def position_rad(self) -> Floats:
         """Motor angles as last read, shape (2,)."""
         return np.array(self._position_rad)
+
+    @property
+    def requested(self) -> bool:
+        """Something is asked for that :meth:`serve_requests` does."""
+        return bool(self._requests)
 
     def move_to(self, setpoint_rad: Floats) -> None:
         """Wanted motor angles one set-point period from now, shape (2,)."""
@@ -167,13 +171,17 @@ class SiderostatServo:
 
     def position_at(self, time_s: float) -> Floats:
         """Motor angles at a recent time, shape (2,), interpolated between readings."""
-        history = list(self._history)  # at once: the servo's thread appends
-        later = bisect.bisect_right(history, time_s, key=_READ_AT)
-        if later == 0:
-            return np.array(history[0].position_rad if history else self._position_rad)
-        before_s, (az_rad, el_rad), *_ = history[later - 1]
-        if later < len(history):
-            after_s, (after_az_rad, after_el_rad), *_ = history[later]
+        # The newest first: what is asked for is near, and 150 readings are 150 places in memory. One that the
+        # servo's thread appends meanwhile has another come twice.
+        history, back, after = self._history, 1, None
+        try:
+            while (before := history[-back]).time_s > time_s:
+                back, after = back + 1, before
+        except IndexError:
+            return np.array(self._position_rad if after is None else after.position_rad)
+        before_s, (az_rad, el_rad), *_ = before
+        if after is not None:
+            after_s, (after_az_rad, after_el_rad), *_ = after
             part = (time_s - before_s) / (after_s - before_s)
             az_rad += part * (after_az_rad - az_rad)
             el_rad += part * (after_el_rad - el_rad)
@@ -205,31 +213,57 @@ class SiderostatServo:
 
     def period(self) -> None:
         """One servo period: requests, then command and read both axes."""
+        self.serve_requests()
+        if self.opened:
+            asked_s = self._clock.now_s()
+            self._exchange(asked_s, self._wanted_rad_s(asked_s))
+
+    def serve_requests(self) -> None:
+        """Do what other threads have asked for; it may take seconds."""
         while self._requests:
             action, future = self._requests.popleft()
             try:
                 future.set_result(action())
             except Exception as error:
                 future.set_exception(error)
+
+    def stage(self) -> None:
+        """Begin a period on a shared bus, which :meth:`finish` ends: have the command ready for the bus."""
         if not self.opened:
             return
-        if self.fault is not None:
-            # The drive must go on hearing that it shall stand still, and that we live.
-            with suppress(Exception):
-                self._amplifiers.exchange(_STILL)
-            return
+        asked_s = self._clock.now_s()
+        velocity_rad_s = self._wanted_rad_s(asked_s)
         try:
-            self._exchange()
+            cast(BusAmplifiers, self._amplifiers).stage(velocity_rad_s)
+            self._staged = asked_s, velocity_rad_s
         except Exception as error:
-            self._fail(error)
+            if self.fault is None:
+                self._fail(error)
+
+    def finish(self) -> None:
+        """End a period on a shared bus: read both axes."""
+        staged, self._staged = self._staged, None
+        if staged is not None:
+            self._exchange(*staged)
 
     def wait(self) -> None:
         """There is always work."""
 
-    def _exchange(self) -> None:
-        asked_s = self._clock.now_s()
-        velocity_rad_s = self._velocity_rad_s(asked_s)
-        reading = self._amplifiers.exchange(velocity_rad_s)
+    def _wanted_rad_s(self, now_s: float) -> AzEl:
+        # In a fault, the drive must go on hearing that it shall stand still, and that we live.
+        return _STILL if self.fault is not None else self._velocity_rad_s(now_s)
+
+    def _exchange(self, asked_s: float, velocity_rad_s: AzEl) -> None:
+        if self.fault is not None:
+            with suppress(Exception):
+                self._amplifiers.exchange(velocity_rad_s)
+            return
+        try:
+            self._servo_by(self._amplifiers.exchange(velocity_rad_s), asked_s, velocity_rad_s)
+        except Exception as error:
+            self._fail(error)
+
+    def _servo_by(self, reading: ServoReading | None, asked_s: float, velocity_rad_s: AzEl) -> None:
         now_s = self._clock.now_s()
         self.round_trip_s = now_s - asked_s
         if reading is None:

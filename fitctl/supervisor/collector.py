@@ -22,6 +22,7 @@ from fitctl.stages.collector import CollectorDrive
 from fitctl.stages.journal import error_text
 
 HEXAPOD = "hexapod"
+_STOPPED_FIRST = "nothing began to move: a stop came first; start it again when it may move"
 _CLOSE_TIMEOUT_S = 5.0
 _STILL_CONNECTED = (DeviceRefused, DeviceFault, ConfigError)  # the others end the connection
 
@@ -67,6 +68,8 @@ class CollectorWatch:
         self._report = report
         self._busy = False
         self._stops = 0
+        self._stopping = 0
+        self._stopping_lock = threading.Lock()
         self._fault: Exception | None = None
         self._threads: list[threading.Thread] = []
 
@@ -77,10 +80,8 @@ class CollectorWatch:
         if command.action == "stop":
             self.stop()
             return ""
-        if self._busy:
-            return "the hexapod is being opened or referenced; wait for the event that reports it"
-        if self.drive.running:
-            return "the collector moves; stop it first"
+        if occupied := self._occupied():
+            return occupied
         try:
             motion = self._motion.changed(command.motion) if command.action == "start" else None
         except ConfigError as error:
@@ -89,11 +90,21 @@ class CollectorWatch:
         self._beside(partial(self._work, motion, self._stops))
         return ""
 
+    def _occupied(self) -> str:
+        """Why nothing can begin now, or nothing."""
+        if self._busy:
+            return "the hexapod is being opened or referenced; wait for the event that reports it"
+        if self._stopping:  # whose last word would stop the new motion
+            return "the hexapod is being stopped; wait until it has stopped"
+        return "the collector moves; stop it first" if self.drive.running else ""
+
     def stop(self) -> None:
         """Stop the hexapod where it is, at once; from any thread. A start that is under way ends too."""
         self._stops += 1
         if self.is_open:
-            self._beside(self._stop)
+            with self._stopping_lock:
+                self._stopping += 1
+            self._beside(self._stop_at_once)
 
     def check(self) -> None:
         """Report a course that has ended by itself."""
@@ -141,6 +152,7 @@ class CollectorWatch:
                 self.identity = self._hexapod.open()
                 self.is_open = True
             if stops != self._stops:
+                self._report("warning", HEXAPOD, _STOPPED_FIRST)
                 return
             if motion is None:
                 self._hexapod.reference()
@@ -149,6 +161,7 @@ class CollectorWatch:
                 self.drive.start(motion)
                 if stops != self._stops:  # a stop has the last word
                     self.drive.stop()
+                    self._report("warning", HEXAPOD, _STOPPED_FIRST)
                     return
                 self._report("info", HEXAPOD, f"the collector begins to move: {motion.kind}")
             self.error = ""
@@ -156,6 +169,13 @@ class CollectorWatch:
             self._failed(error)
         finally:
             self._busy = False
+
+    def _stop_at_once(self) -> None:
+        try:
+            self._stop()
+        finally:
+            with self._stopping_lock:
+                self._stopping -= 1
 
     def _stop(self) -> None:
         moved = self.drive.running

@@ -9,8 +9,9 @@ import numpy as np
 
 from fitctl.config import Rig
 from fitctl.loop.loop import Loop
-from fitctl.loop.metrology import MetrologyLoop, refused_beam_search
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.search import refused_search
+from fitctl.loop.spiral_search import refused_area
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import (
@@ -76,7 +77,7 @@ def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
 def why_no_search(rig: Rig, loops: Loops, command: Acquire) -> str:
     """Why a search cannot be as it is asked for; empty if it can."""
     refused = (
-        refused_beam_search(loop.settings, loop.name, command)
+        refused_area(loop.settings, loop.name, command)
         if isinstance(loop, MetrologyLoop)
         else refused_search(rig, loop.name, command)
         for loop in loops

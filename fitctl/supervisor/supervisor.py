@@ -49,6 +49,7 @@ from fitctl.messages.commands import (
 from fitctl.messages.modes import POINTING, Mode, Trigger
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
+from fitctl.stages.servo_group import servo_groups
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.collector import CollectorWatch
 from fitctl.supervisor.device_jobs import DeviceJobs, Ended, Job
@@ -113,6 +114,8 @@ class Supervisor:
         Makes a loop of its name, the rig, its devices, the journal and `design`.
     design_executor : Executor, optional
         Makes designs beside the device work, which cannot wait for them; by default `executor`.
+    record_frames : bool
+        Whether `record` wants the frames too.
     """
 
     def __init__(
@@ -125,6 +128,8 @@ class Supervisor:
         design: Designer,
         make_loop: MakeLoop = loop_of_kind,
         design_executor: Executor | None = None,
+        *,
+        record_frames: bool = True,
     ) -> None:
         self.rig = rig
         journal = Journal(clock, record)
@@ -147,6 +152,7 @@ class Supervisor:
         self._design_executor = design_executor or executor
         self._journal = journal
         self._record = record
+        self._record_frames = record_frames
         self._design = design
         self._commands: deque[Posted] = deque()
         self._left: deque[AnyRecord] = deque()
@@ -168,6 +174,7 @@ class Supervisor:
             else None
         )
         self._timing = TimingBook(clock, rig, self._timed)
+        self._servo_groups = servo_groups(devices, self.servos, clock)
 
     # ------------------------------------------------------------ from any thread
 
@@ -212,7 +219,9 @@ class Supervisor:
     def periodic(self) -> list[Periodic]:
         """What runs at a pace of its own, beside the frames."""
         drives = [] if self.collector is None else [self.collector.drive]
-        return [work for loop in self.loops.values() for work in loop.periodic] + drives
+        grouped = [servo for group in self._servo_groups for servo in group.servos]
+        each = [work for loop in self.loops.values() for work in loop.periodic]
+        return [*self._servo_groups, *(work for work in each if work not in grouped), *drives]
 
     # ------------------------------------------------------------ once a frame
 
@@ -245,10 +254,11 @@ class Supervisor:
             self.collector.check()
         if frame is not None and self._overlap is not None and self.pointing:
             self._record(self._overlap.measure(frame))
-        for older in self._camera.older:
-            self._record_frame(older)
-        if frame is not None:
-            self._record_frame(frame)
+        if self._record_frames:
+            for older in self._camera.older:
+                self._record_frame(older)
+            if frame is not None:
+                self._record_frame(frame)
         if not self._device_jobs.busy:
             for piezo in self.piezos.values():
                 piezo.ask()

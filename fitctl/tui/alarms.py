@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from fitctl.messages.troubles import Trouble, troubles
 from fitctl.tui.state import ConsoleState
 
 BELL_EVERY_S = 10.0
+STOPPED = "stopped by the operator"  # as `troubles` has it, who does not know who it was
 
 
 @dataclass
@@ -67,6 +68,10 @@ class AlarmBook:
             self._rang_s = state.now_s
         return rings
 
+    def become(self, other: AlarmBook) -> None:
+        """Hold what another book holds; panels keep the object that they draw."""
+        vars(self).update(vars(other))
+
     @property
     def unacknowledged(self) -> bool:
         """There are alarms that were not acknowledged."""
@@ -82,9 +87,18 @@ class AlarmBook:
         """The weightiest first: not acknowledged, errors, the newest."""
         return sorted(self.alarms.values(), key=lambda a: (a.acknowledged, not a.error, -a.since_s))
 
-    def acknowledge(self) -> None:
-        """Acknowledge all of them; what is over goes."""
+    def acknowledge(self, shown: Mapping[str, int]) -> None:
+        """Acknowledge the alarms that the operator was shown; of these, what is over goes.
+
+        Parameters
+        ----------
+        shown : mapping of str to int
+            The keys that were on the screen, each with its `count` as it was then: an alarm that has grown
+            since is not acknowledged.
+        """
         for key, alarm in list(self.alarms.items()):
+            if alarm.count > shown.get(key, -1):
+                continue
             alarm.acknowledged = True
             if alarm.over_s is not None:
                 del self.alarms[key]
@@ -93,6 +107,35 @@ class AlarmBook:
         """No bell for these any more; a new one rings again."""
         for alarm in self.alarms.values():
             alarm.silenced = True
+
+
+def counts(alarms: Iterable[Alarm]) -> dict[str, int]:
+    """What :meth:`AlarmBook.acknowledge` needs to know of alarms that are on the screen."""
+    return {alarm.key: alarm.count for alarm in alarms}
+
+
+def notes(state: ConsoleState) -> list[Alarm]:
+    """What an operator wanted so and may have forgotten: a loop that was stopped, no recording in OFF.
+
+    They ring no bell, and nobody acknowledges them.
+    """
+    if state.newest is None or state.stale:
+        return []
+    found = [trouble for trouble in troubles(state.newest) if trouble.severity == "note"]
+    safe = [trouble for trouble in found if trouble.is_safe]
+    causes = dict.fromkeys(trouble.what for trouble in safe)
+    stops = [_stop(state, [trouble for trouble in safe if trouble.what == what]) for what in causes]
+    return stops + [_alarm(trouble) for trouble in found if not trouble.is_safe]
+
+
+def _stop(state: ConsoleState, stopped: list[Trouble]) -> Alarm:
+    """Loops that are SAFE for one reason, by somebody's wish; where it is known, with who it was."""
+    alarm, loops = _alarm(stopped[0]), [name for each in stopped for name in each.loops]
+    stopped_by = state.newest.stopped_by if state.newest else ""
+    if stopped_by and alarm.what == STOPPED:
+        alarm.what = f"stopped by {stopped_by}"
+    alarm.what, alarm.did = f"{', '.join(loops)} SAFE: {alarm.what}", ""
+    return alarm
 
 
 def _time_s(state: ConsoleState) -> float:
@@ -129,7 +172,7 @@ def _no_data(state: ConsoleState) -> Alarm:
         True,
         f"NO DATA for {state.silent_s:.0f} s" + ("; what you see is old" if state.newest else ""),
         state.received_s,
-        "the console goes on trying to connect",
-        "is the supervisor running? STOP may not reach it: be ready to cut the power",
+        "the console reconnects by itself",
+        "check the supervisor; STOP may not reach it: be ready to cut power",
         latches=False,
     )

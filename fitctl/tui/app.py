@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -15,7 +16,7 @@ from textual.screen import Screen
 
 from fitctl.config import CONTROLLERS
 from fitctl.messages.client import Client
-from fitctl.messages.command_table import ROWS, command_of
+from fitctl.messages.command_table import ROWS, WORDS, command_of
 from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
@@ -30,12 +31,16 @@ from fitctl.messages.commands import (
 from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
-from fitctl.tui.dialogs import Alarms, Confirm, Reader, events_text
+from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader, Running, events_text
 from fitctl.tui.graphics import Graphics, PictureSender
 from fitctl.tui.jobs import Job
 from fitctl.tui.pace import Pace
 from fitctl.tui.palette import PlaceProvider
+from fitctl.tui.rewind.moment import Recording
+from fitctl.tui.rewind.playback import BEFORE_S, Playback
+from fitctl.tui.rewind.recent import Recent
 from fitctl.tui.state import ConsoleState
+from fitctl.tui.terminal import TerminalDriver
 from fitctl.tui.views.devices import DevicesView
 from fitctl.tui.views.help import HelpView
 from fitctl.tui.views.logs import LogsView
@@ -43,7 +48,9 @@ from fitctl.tui.views.loop import LoopScreen
 from fitctl.tui.views.operate import OperateView
 from fitctl.tui.views.sequences import SequencesView
 from fitctl.tui.views.view import View
-from fitctl.tui.wire import UNREADABLE_NOTICE_S, Wire
+from fitctl.tui.widgets.alarmbar import AlarmBar
+from fitctl.tui.widgets.keys import StopKey
+from fitctl.tui.wire import UNREADABLE_NOTICE_S, NoLink, Wire
 
 BEAT_S = 0.1
 """How often something is drawn, if the machine allows; a panel says at which of these beats."""
@@ -55,7 +62,7 @@ class ConsoleApp(App[None]):
 
     Parameters
     ----------
-    link : Client
+    link : Client or NoLink
         The connection to the supervisor; closed at the end.
     quit_shuts_down : bool
         Quitting ends the instrument too (which the caller does); only the help says so here.
@@ -72,6 +79,9 @@ class ConsoleApp(App[None]):
         Starts another fitctl command.
     graphics : Graphics
         How the focal plane is drawn; not `auto`.
+    log : Recording, optional
+        Shown instead of what the link receives.
+    log_name : str
     """
 
     CSS_PATH = Path(__file__).with_name("console.tcss")
@@ -103,7 +113,7 @@ class ConsoleApp(App[None]):
 
     def __init__(
         self,
-        link: Client,
+        link: Client | NoLink,
         *,
         quit_shuts_down: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -112,8 +122,11 @@ class ConsoleApp(App[None]):
         log_folder: Path | None = Path("logs"),
         start_job: Callable[..., Job] = Job,
         graphics: Graphics = Graphics.HALF_BLOCKS,
+        log: Recording | None = None,
+        log_name: str = "",
     ) -> None:
-        super().__init__()
+        # A page in a browser brings a driver of its own.
+        super().__init__(None if "TEXTUAL_DRIVER" in os.environ else TerminalDriver)
         self.quit_shuts_down = quit_shuts_down
         self.clock = clock
         self.rig_arguments = rig_arguments
@@ -125,6 +138,16 @@ class ConsoleApp(App[None]):
             self.pictures = PictureSender(graphics, self._write_to_terminal)
         self.state = ConsoleState(clock())
         self.alarms = AlarmBook()
+        self._recent = Recent(lambda: tuple(self.playback.live.events))
+        self.playback = Playback(
+            self.state,
+            self.alarms,
+            log or self._recent,
+            log_name,
+            from_thread=self.call_later,
+            notify=partial(self.notify, timeout=4, markup=False),
+            draw=self.draw_all,
+        )
         self._beat = 0
         self._pace = Pace()
         self._wire = Wire(
@@ -144,10 +167,14 @@ class ConsoleApp(App[None]):
         """Begin to read and to draw."""
         self.set_interval(BEAT_S, self._draw_due)
         self.set_interval(KEEP_S, self._keep)
-        self._wire.start()
+        if self.playback.log_name:
+            self.playback.oldest()
+        else:
+            self._wire.start()
 
     def on_unmount(self) -> None:
         """Let go of everything."""
+        self.playback.close()
         self._wire.close()
 
     # ------------------------------------------------------------ telemetry
@@ -155,12 +182,14 @@ class ConsoleApp(App[None]):
     def _accept(self, telemetry: Telemetry) -> None:
         """Remember; draw at once only what must not wait."""
         self._wire.processed()
-        before, was_stale = self.state.mode, self.state.stale
-        known = self.state.newest
-        self.state.accept(telemetry, self.clock())
+        live, now_s = self.playback.live, self.clock()
+        before, was_stale = live.mode, live.stale
+        known = live.newest
+        live.accept(telemetry, now_s)
+        self._recent.add(telemetry, now_s)
         if known is None or known.pid != telemetry.pid:
             self._ask_for_events()
-        if before != self.state.mode or was_stale:
+        if before != live.mode or was_stale:
             self.draw_all()
 
     def _notify_unreadable(self, problem: str) -> None:
@@ -189,9 +218,13 @@ class ConsoleApp(App[None]):
         self._draw(None)
 
     def _draw(self, beat: int | None) -> None:
-        self.state.now_s = self.clock()
-        if self.alarms.update(self.state):
+        playback = self.playback
+        playback.live.now_s = self.clock()
+        if not playback.log_name and playback.live_alarms.update(playback.live):
             self.bell()
+        for dialog in self.screen_stack[1:]:  # also those that Textual opens, such as the palette
+            if dialog.is_attached and not dialog.query(StopKey):
+                dialog.mount(StopKey())
         if self.view is not None:
             with self.batch_update():
                 self.view.draw(beat)
@@ -199,19 +232,26 @@ class ConsoleApp(App[None]):
     # ------------------------------------------------------------ commands
 
     def send(self, command: AnyCommand) -> None:
-        """Send a command for the shown loop; a stop goes to all loops."""
+        """Send a command for the shown loop; a stop goes to all loops. In the past only a stop is sent."""
+        why_not = self.playback.why_not(command)
+        if why_not:
+            title = f"▲ {type(command).__name__} is not sent"
+            self.notify(why_not, title=title, severity="warning", timeout=6, markup=False)
+            return
         loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
         self._wire.send(msgspec.structs.replace(command, loop=loop))
 
     def _keep(self) -> None:
         """Keep the instrument; hear what was missed."""
-        self.send(Status())
-        if self.state.events_missing:
+        if self.playback.log_name:
+            return
+        self._wire.send(Status())
+        if self.playback.live.events_missing:
             self._ask_for_events()
 
     def _ask_for_events(self) -> None:
-        self.state.events_missing = False
-        self.send(RecentEvents())
+        self.playback.live.events_missing = False
+        self._wire.send(RecentEvents())
 
     def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
         """Do something once the operator has said yes."""
@@ -251,9 +291,9 @@ class ConsoleApp(App[None]):
 
     def _recall(self, reply: Reply | None) -> None:
         if reply is None or not reply.accepted:
-            self.state.events_missing = True  # they are asked for again
+            self.playback.live.events_missing = True  # they are asked for again
         else:
-            self.state.recall(reply.events)
+            self.playback.live.recall(reply.events)
             self.draw_all()
 
     def action_command(self, name: str) -> None:
@@ -277,24 +317,101 @@ class ConsoleApp(App[None]):
         self.state.show_next_loop()
         self.draw_all()
 
+    def action_show_loop(self, name: str) -> None:
+        """Show a loop."""
+        if name in self.state.loops:
+            self.state.shown = name
+            self.draw_all()
+
     def action_window(self) -> None:
         """Show the next window of RMS and traces."""
         self.state.next_window()
         self.draw_all()
 
     def action_acknowledge(self) -> None:
-        """The operator has seen the alarms."""
-        self.alarms.acknowledge()
-        self.draw_all()
+        """The operator has seen the alarms that the screen shows."""
+        if self.view is not None and self._is_now("Acknowledge"):
+            self.alarms.acknowledge(self.view.query_one(AlarmBar).shown)
+            self.draw_all()
+
+    def _is_now(self, what: str) -> bool:
+        """Whether the screen shows the present; if not, a notice says what has to wait."""
+        if not self.state.live:
+            self.notify(f"{what}: the console shows the past; press end first", timeout=4)
+        return self.state.live
+
+    def action_rewind(self, by_s: float) -> None:
+        """Show the past: back or forward by some seconds."""
+        self.playback.step(by_s)
+
+    def action_oldest(self) -> None:
+        """Show the oldest moment."""
+        self.playback.oldest()
+
+    def action_now(self) -> None:
+        """Show what is now again."""
+        self.playback.now()
+
+    def action_jump(self, direction: int) -> None:
+        """Show the moment before the next or the previous warning or error."""
+        self.playback.jump(direction)
+
+    def action_at_time(self) -> None:
+        """Show the moment of a time that is typed."""
+
+        def refused(value: str) -> str:
+            return (
+                "" if self.playback.time_of(value) is not None else "a time is 03:14:07, or -2:30"
+            )
+
+        def show(value: str | None) -> None:
+            time_s = self.playback.time_of(value) if value else None
+            if time_s is not None:
+                self.playback.to(time_s)
+
+        prompt = "UTC, such as 03:14:07; or before the newest data, such as -2:30"
+        self.push_screen(Ask("Show the moment", prompt, "-1:00", refused), show)
+
+    def _show_alarm(self, since_s: float | None) -> None:
+        if since_s is not None:
+            self.playback.to(since_s - BEFORE_S)
 
     def action_silence(self) -> None:
         """No bell for these alarms."""
+        if not self._is_now("Silence"):
+            return
         self.alarms.silence()
         self.notify("no bell for these alarms; a new one rings", timeout=3)
 
+    def action_rehearse(self) -> None:
+        """Ask for a command, and show what it would do, computed by a process of its own."""
+        rig_arguments = self.rig_arguments
+        if not self._is_now("Rehearse"):
+            return
+        if rig_arguments is None:
+            text = "a rehearsal needs the rig file: leave the console, and give it that file too, with --rig"
+            self.notify(text, severity="warning", timeout=8)
+            return
+
+        def refused(text: str) -> str:
+            word = next(iter(text.split()), "")
+            return "" if word in WORDS else f"{word or 'nothing'} is no command: {', '.join(WORDS)}"
+
+        def rehearse(text: str | None) -> None:
+            if text:
+                where = ["--loop", self.state.shown, *rig_arguments, *self.remote_arguments]
+                job = self.start_job(["rehearse", *text.split(), *where])
+                self.push_screen(Running(f"Rehearse {text}", job))
+
+        prompt = (
+            "what to rehearse: a command with its values, as fitctl send has it; nothing is sent"
+        )
+        words = self.view.to_rehearse() if self.view else ""
+        self.push_screen(Ask("Rehearse", prompt, words, refused), rehearse)
+
     def action_alarms(self) -> None:
         """Open the alarms in full."""
-        self.push_screen(Alarms(self.state, self.alarms))
+        self.push_screen(Alarms(self.state, self.alarms), self._show_alarm)
 
     def action_events(self) -> None:
         """Open the events at full length."""

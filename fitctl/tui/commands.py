@@ -34,6 +34,10 @@ VIEWS = (
 )
 
 
+def _always(_state: ConsoleState, _alarms: AlarmBook) -> bool:
+    return True
+
+
 class Key(NamedTuple):
     """A key of the console itself.
 
@@ -60,7 +64,12 @@ class Key(NamedTuple):
     action: str
     help: str
     view: str = ""
-    matters: Callable[[ConsoleState, AlarmBook], bool] = lambda *_: True
+    matters: Callable[[ConsoleState, AlarmBook], bool] = _always
+
+    @property
+    def always(self) -> bool:
+        """It matters at any time."""
+        return self.matters is _always
 
     def binding(self) -> Binding:
         """For Textual."""
@@ -72,23 +81,32 @@ def _several_loops(state: ConsoleState, _alarms: AlarmBook) -> bool:
 
 
 def _by_hand(state: ConsoleState, _alarms: AlarmBook) -> bool:
-    return state.mode in {"STANDBY", "COARSE", "VERNIER"}
+    return (state.live and state.mode == "STANDBY") or _has_star(state, _alarms)
 
 
 def _has_star(state: ConsoleState, _alarms: AlarmBook) -> bool:
-    return state.mode in {"COARSE", "VERNIER"}
+    is_stellar = state.loop is not None and state.loop.state.kind == "stellar"
+    return is_stellar and _live(state, _alarms) and state.mode in {"COARSE", "VERNIER"}
+
+
+def _live(state: ConsoleState, _alarms: AlarmBook) -> bool:
+    return state.live and not state.stale
+
+
+def _past(state: ConsoleState, _alarms: AlarmBook) -> bool:
+    return not state.live
 
 
 def _sequence(state: ConsoleState, _alarms: AlarmBook) -> bool:
-    return bool(state.newest and state.newest.running_sequence)
+    return bool(state.live and state.newest and state.newest.running_sequence)
 
 
-def _unacknowledged(_state: ConsoleState, alarms: AlarmBook) -> bool:
-    return alarms.unacknowledged
+def _unacknowledged(state: ConsoleState, alarms: AlarmBook) -> bool:
+    return state.live and alarms.unacknowledged
 
 
-def _loud(_state: ConsoleState, alarms: AlarmBook) -> bool:
-    return alarms.loud
+def _loud(state: ConsoleState, alarms: AlarmBook) -> bool:
+    return state.live and alarms.loud
 
 
 # In the footer these come before a screen's own keys.
@@ -107,10 +125,51 @@ ALARM_KEYS = (
         _unacknowledged,
     ),
 )
+# The console's past. Where they mean something else on a screen, the screen has them.
+TIME_KEYS = (
+    Key(
+        "end", "end", "Now", "app.now", "follow the instrument again; of a log, its end", "", _past
+    ),
+    Key("comma", ",", "Back", "app.rewind(-1)", "the console as it was 1 s earlier"),
+    Key("full_stop", ".", "Forward", "app.rewind(1)", "1 s later", "", _past),
+    Key("less_than_sign", "<", "Back 10 s", "app.rewind(-10)", "10 s earlier", "", _past),
+    Key("greater_than_sign", ">", "Forward 10 s", "app.rewind(10)", "10 s later", "", _past),
+    Key("left_curly_bracket", "{", "Back 1 min", "app.rewind(-60)", "1 min earlier", "", _past),
+    Key("right_curly_bracket", "}", "Forward 1 min", "app.rewind(60)", "1 min later", "", _past),
+    Key(
+        "left_parenthesis",
+        "(",
+        "Alarm before",
+        "app.jump(-1)",
+        "5 s before the previous warning or error",
+        "",
+        _past,
+    ),
+    Key(
+        "right_parenthesis",
+        ")",
+        "Alarm after",
+        "app.jump(1)",
+        "5 s before the next warning or error",
+        "",
+        _past,
+    ),
+    Key("at", "@", "Time", "app.at_time", "the console as it was at a time", "", _past),
+    Key("home", "home", "Oldest", "app.oldest", "the oldest moment that is kept", "", _past),
+)
 KEYS = (
     Key("t", "t", "Target", "screen.aim", "put a cursor on the focal plane", "operate", _has_star),
     Key("i", "i", "Look", "screen.look", "follow the star at the cursor", "operate", _has_star),
     Key("j", "j", "Jog", "screen.jog", "move a stage by the arrow keys", "operate", _by_hand),
+    Key(
+        "d",
+        "d",
+        "Rehearse",
+        "app.rehearse",
+        "what a command would do, without giving it",
+        "operate",
+        _live,
+    ),
     Key("w", "w", "Window", "app.window", "RMS and traces over 10, 60 or 1 s", "operate"),
     Key("x", "x", "Stretch", "screen.stretch", "grey scale: asinh, square root, linear", "operate"),
     Key("c", "c", "Colours", "screen.colours", "colour map of the focal plane", "operate"),
@@ -134,7 +193,9 @@ KEYS = (
     Key("f", "f", "Verify", "screen.tool('verify')", "whether it is whole", "logs"),
     Key("t", "t", "Report", "screen.tool('report')", "one page about it", "logs"),
     Key("y", "y", "Replay", "screen.tool('replay')", "decide its frames again", "logs"),
+    Key("slash", "/", "Find", "screen.filter", "only what has the words that you type", "help"),
     *ALARM_KEYS,
+    *TIME_KEYS,
     Key("e", "e", "Events", "app.events", "all events at full length"),
     Key("l", "l", "Loop", "app.next_loop", "show the next loop", "", _several_loops),
     Key("ctrl+p", "^p", "Palette", "app.command_palette", "every command by its name"),

@@ -10,6 +10,7 @@ from fitctl.messages.commands import AnyCommand
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.graphics import PictureSender
 from fitctl.tui.jobs import Job
+from fitctl.tui.rewind.playback import Playback
 from fitctl.tui.state import ConsoleState
 
 
@@ -25,6 +26,7 @@ class Console(Protocol):
     remote_arguments: list[str]
     log_folder: Path | None
     start_job: Callable[..., Job]
+    playback: Playback
 
     def send(self, command: AnyCommand) -> None:
         """Send a command for the shown loop."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,19 +14,21 @@ from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
-from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.look import DIM, INK, ORANGE, RED, SKY, Line, wall
+from fitctl.text import plain
+from fitctl.tui.alarms import AlarmBook, counts
+from fitctl.tui.inks import DIM, INK, ORANGE, RED, SKY
+from fitctl.tui.jobs import Job
+from fitctl.tui.look import Line, wall
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.events import event_lines
 
+ResultT = TypeVar("ResultT")
 
-class Reader(ModalScreen[None]):
-    """A text to scroll through; any of its closing keys goes back."""
+
+class Sheet(ModalScreen[ResultT]):
+    """A text to scroll through."""
 
     HINT = "esc closes · s stops"
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape,q,question_mark,e,v,enter", "dismiss", "Close", show=False),
-    ]
 
     def __init__(self, title: str, content: Table | Text) -> None:
         super().__init__()
@@ -41,37 +43,95 @@ class Reader(ModalScreen[None]):
             yield Static(self._content, id="text")
 
 
-class Alarms(Reader):
-    """Every alarm in full; acknowledges and silences."""
+class Reader(Sheet[None]):
+    """A text; any of its closing keys goes back."""
 
-    HINT = "k acknowledges · u silences · esc closes · s stops"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape,q,v,enter", "dismiss", "Close", show=False),
+        Binding("escape,q,question_mark,e,v,enter", "dismiss", "Close", show=False),
+    ]
+
+
+class Alarms(Sheet[float | None]):
+    """Every alarm in full; acknowledges and silences.
+
+    The result is when the chosen alarm began, to show that moment.
+    """
+
+    HINT = "↑↓ · enter: 5 s before · k acknowledges · u silences · esc closes"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,q,v", "dismiss", "Close", show=False),
         Binding("k", "acknowledge", "Acknowledge", show=False),
         Binding("u", "silence", "Silence", show=False),
+        Binding("up", "choose(-1)", "Choose", show=False, priority=True),
+        Binding("down", "choose(1)", "Choose", show=False, priority=True),
+        Binding("enter", "show", "Show", show=False),
     ]
 
     def __init__(self, state: ConsoleState, book: AlarmBook) -> None:
-        super().__init__("Alarms", alarms_text(state, book))
+        super().__init__("Alarms", alarms_text(state, book, 0))
         self._state = state
         self._book = book
+        self._chosen = 0
+        self._shown = counts(book.in_order)
 
     def on_mount(self) -> None:
         """Keep up with what happens meanwhile."""
-        self.set_interval(0.5, self._show)
+        self.set_interval(0.5, self._draw)
 
-    def _show(self) -> None:
-        self.query_one("#text", Static).update(alarms_text(self._state, self._book))
+    def _draw(self) -> None:
+        self._shown = counts(self._book.in_order)
+        self._chosen = max(0, min(self._chosen, len(self._book.alarms) - 1))
+        text = alarms_text(self._state, self._book, self._chosen)
+        self.query_one("#text", Static).update(text)
+
+    def action_choose(self, by: int) -> None:
+        """Choose another alarm."""
+        self._chosen += by
+        self._draw()
+
+    def action_show(self) -> None:
+        """Show the console as it was before the chosen alarm."""
+        alarms = self._book.in_order
+        self.dismiss(alarms[self._chosen].since_s if alarms else None)
 
     def action_acknowledge(self) -> None:
-        """Acknowledge all of them."""
-        self._book.acknowledge()
-        self._show()
+        """Acknowledge all that the list shows."""
+        if self._state.live:
+            self._book.acknowledge(self._shown)
+            self._draw()
 
     def action_silence(self) -> None:
         """No bell for these."""
-        self._book.silence()
-        self._show()
+        if self._state.live:
+            self._book.silence()
+            self._draw()
+
+
+class Running(Sheet[None]):
+    """What another fitctl command prints, while it is at work and after; leaving ends the command."""
+
+    HINT = "esc closes, and ends what is at work · s stops the instrument"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,q,enter", "dismiss", "Close", show=False),
+    ]
+
+    def __init__(self, title: str, job: Job) -> None:
+        super().__init__(title, Text("at work", DIM))
+        self._job = job
+
+    def on_mount(self) -> None:
+        """Keep up with it."""
+        self.set_interval(0.2, self._draw)
+        self._draw()
+
+    def on_unmount(self) -> None:
+        """Leave no child behind."""
+        self._job.end()
+
+    def _draw(self) -> None:
+        printed = "\n".join(map(plain, self._job.text().splitlines()))
+        state = "\n◌ at work" if self._job.status is None else ""
+        self.query_one("#text", Static).update(Text(f"{printed}{state}", INK))
 
 
 class Confirm(ModalScreen[bool]):
@@ -148,19 +208,20 @@ def events_text(state: ConsoleState, columns: int) -> Text:
     lines = [
         line
         for event in state.events
-        for line in event_lines(event, state.wall_s(event.time_s), columns)
+        for line in event_lines(event, state.wall_s(event.time_s), columns, state.loops)
     ]
     return Text("\n").join(map(as_text, lines)) if lines else Text("no events yet", DIM)
 
 
-def alarms_text(state: ConsoleState, book: AlarmBook) -> Text:
-    """Every alarm: what, since when, what was done, what to do."""
+def alarms_text(state: ConsoleState, book: AlarmBook, chosen: int = -1) -> Text:
+    """Every alarm: what, since when, what was done, what to do; the chosen one is marked."""
     if not book.alarms:
         return Text("all is well: no alarm", DIM)
     text = Text()
-    for alarm in book.in_order:
+    for row, alarm in enumerate(book.in_order):
         colour = RED if alarm.error else ORANGE
-        text.append(f"{'✗' if alarm.error else '▲'} {alarm.what}\n", f"bold {colour}")
+        mark = "▸ " if row == chosen and len(book.alarms) > 1 else ""
+        text.append(f"{mark}{'✗' if alarm.error else '▲'} {alarm.what}\n", f"bold {colour}")
         since = wall(state.wall_s(alarm.since_s))
         over = f", over {wall(state.wall_s(alarm.over_s))}" if alarm.over_s else ""
         known = "acknowledged" if alarm.acknowledged else "not acknowledged"

@@ -22,11 +22,12 @@ class Stage(NamedTuple):
     steps: tuple[float, ...]
 
 
+MODES_WITH_STAR = frozenset({"COARSE", "VERNIER"})
 _STANDBY = frozenset({"STANDBY"})
 STAGES = (
     Stage("siderostat", "coarse", _STANDBY, "″ on the sky", (0.5, 2.0, 10.0, 50.0)),
     Stage("mirror", "fine, about its bias", _STANDBY, "µrad", (1.0, 5.0, 20.0)),
-    Stage("target", "the star follows it", frozenset({"COARSE", "VERNIER"}), "px", (0.1, 0.5, 2.0)),
+    Stage("target", "the star follows it", MODES_WITH_STAR, "px", (0.1, 0.5, 2.0)),
 )
 
 
@@ -42,9 +43,18 @@ class JogPad:
     pressed_s: float = -math.inf
     place: tuple[float, float] = (0.0, 0.0)
 
-    def stage(self, mode: str) -> Stage | None:
-        """What the arrow keys move in a mode; None where nothing may be moved."""
-        there = [stage for stage in STAGES if mode in stage.modes]
+    def stages(self, loop: LoopView | None) -> list[Stage]:
+        """What the arrow keys can move now; a metrology loop has a siderostat, no mirror and no target."""
+        if loop is None:
+            return []
+        there = [stage for stage in STAGES if loop.state.mode in stage.modes]
+        return (
+            there if loop.state.kind == "stellar" else [s for s in there if s.name == "siderostat"]
+        )
+
+    def stage(self, loop: LoopView | None) -> Stage | None:
+        """What the arrow keys move; None where nothing may be moved."""
+        there = self.stages(loop)
         return there[self.number % len(there)] if there else None
 
     def step(self, stage: Stage) -> float:
@@ -71,7 +81,7 @@ class JogPad:
         self, loop: LoopView, right: int, up: int, now_s: float
     ) -> Jog | SetBiasOffset | SetTarget | None:
         """The command of an arrow key; None where nothing may be moved."""
-        stage = self.stage(loop.state.mode)
+        stage = self.stage(loop)
         if stage is None:
             return None
         step = self.step(stage)

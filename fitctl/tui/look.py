@@ -1,8 +1,4 @@
-"""How the console looks: colours, symbols, and segments made of them.
-
-The colours are those of Okabe and Ito, which people of every colour vision tell apart; beside each
-colour stands a symbol or a word that says the same.
-"""
+"""How the console looks: symbols, and segments of text in the colours of :mod:`fitctl.tui.inks`."""
 
 from __future__ import annotations
 
@@ -12,23 +8,24 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import NamedTuple
 
+from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
 from textual.strip import Strip
 
 from fitctl.text import plain
-
-INK = "#d7dde5"
-DIM = "#7d8896"
-FAINT = "#39424e"
-PAPER = "#0b0e13"
-SKY = "#56b4e9"
-ORANGE = "#e69f00"
-GREEN = "#2fbf8f"
-YELLOW = "#f0e442"
-RED = "#ff6b4a"
-PINK = "#cc79a7"
-WHITE = "#ffffff"
+from fitctl.tui.inks import (
+    DIM,
+    FAINT,
+    GREEN,
+    INK,
+    MODE_COLOURS,
+    ORANGE,
+    PAPER,
+    PINK,
+    RED,
+    SKY,
+)
 
 
 class Look(NamedTuple):
@@ -38,16 +35,17 @@ class Look(NamedTuple):
     colour: str
 
 
-MODES = {
-    "OFF": Look("○", "#9aa4b0"),
-    "STANDBY": Look("◐", SKY),
-    "ACQUISITION": Look("◎", YELLOW),
-    "COARSE": Look("◇", ORANGE),
-    "VERNIER": Look("◆", GREEN),
-    "LOCKED": Look("◉", GREEN),
-    "SAFE": Look("■", RED),
-    "EXPERIMENT": Look("◈", PINK),
+_MODE_SYMBOLS = {
+    "OFF": "○",
+    "STANDBY": "◐",
+    "ACQUISITION": "◎",
+    "COARSE": "◇",
+    "VERNIER": "◆",
+    "LOCKED": "◉",
+    "SAFE": "■",
+    "EXPERIMENT": "◈",
 }
+MODES = {name: Look(symbol, MODE_COLOURS[name].dark) for name, symbol in _MODE_SYMBOLS.items()}
 UNKNOWN_MODE = Look("?", PINK)
 
 DEVICES = {
@@ -98,11 +96,47 @@ def cap(key: str, label: str, action: str, *, on: str = SKY) -> Line:
     return clickable([text(key, PAPER, on=on, bold=True), text(f" {label} ", INK)], action)
 
 
+@lru_cache(maxsize=4096)
+def _faded(original: Style, *, words: bool) -> Style:
+    """The style in greys: words as dim as can still be read, pictures by half."""
+    if words:
+        return Style(
+            color=DIM, bgcolor=PAPER if original.bgcolor else None, meta=original.meta or None
+        )
+    return Style(color=_grey(original.color), bgcolor=_grey(original.bgcolor))
+
+
+def _grey(colour: Color | None) -> Color | None:
+    if colour is None:
+        return None
+    red, green, blue = colour.get_truecolor()
+    level = round(0.5 * (0.2126 * red + 0.7152 * green + 0.0722 * blue))
+    return Color.from_rgb(level, level, level)
+
+
+def faded(line: Iterable[Segment]) -> Line:
+    """The same in greys, for what is old."""
+    return [
+        Segment(part.text, _faded(part.style or Style(), words=has_words(part.text)))
+        for part in line
+    ]
+
+
+def has_words(content: str) -> bool:
+    """Whether there is anything to read: letters, digits or signs, and not only lines, blocks or dots."""
+    return any(
+        not (c == " " or "\u2500" <= c <= "\u259f" or "\u2800" <= c <= "\u28ff") for c in content
+    )
+
+
 def wall(seconds: float) -> str:
     """Unix time as UTC ``hh:mm:ss``; not-a-number is dashes."""
     if not math.isfinite(seconds):
         return "--:--:--"
-    return datetime.fromtimestamp(seconds, UTC).strftime("%H:%M:%S")
+    try:
+        return datetime.fromtimestamp(seconds, UTC).strftime("%H:%M:%S")
+    except (ValueError, OverflowError, OSError):  # a log's times may be anything
+        return "--:--:--"
 
 
 def in_columns(left: list[Line], columns: int, right: list[Line]) -> list[Line]:
@@ -160,6 +194,8 @@ def number(value: float, form: str) -> str:
 
 def duration(seconds: float) -> str:
     """Seconds as ``m:ss`` or ``h:mm:ss``."""
+    if not math.isfinite(seconds):
+        return "-:--"
     whole = max(0, int(seconds))
     hours, minutes = divmod(whole // 60, 60)
     return f"{hours}:{minutes:02}:{whole % 60:02}" if hours else f"{minutes}:{whole % 60:02}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections import deque
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeVar
@@ -10,7 +11,15 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.logging.records import Event, LoopTiming, ModeChange, PiezoReading, Tick
+from fitctl.logging.records import (
+    Event,
+    LoopTiming,
+    MetrologyTick,
+    ModeChange,
+    Overlap,
+    PiezoReading,
+    Tick,
+)
 from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.tui.history import Past
 
@@ -18,6 +27,32 @@ STALE_S = 1.0
 EVENTS_KEPT = 500
 RATE_MESSAGES = 60
 TRAIL_STEP_SKY_ARCSEC = 3.0
+READING_STEP_S = 1.0
+READINGS_KEPT = 600
+TICK_FIELDS = (
+    "time_s",
+    "error_az_px",
+    "error_el_px",
+    "fsm_az_rad",
+    "fsm_el_rad",
+    "frame_age_s",
+    "compute_s",
+    "sense_s",
+    "decide_s",
+    # For the error budget, from here on.
+    "mid_exposure_s",
+    "star_flux_dn",
+    "mirror_az_rad",
+    "mirror_el_rad",
+    "siderostat_az_rad",
+    "siderostat_el_rad",
+    "link_az_rad",
+    "link_el_rad",
+)
+FRINGE_FIELDS = ("time_s", "tilt_az_arcsec", "tilt_el_arcsec", "visibility")
+_NO_BUDGET = (math.nan,) * (len(TICK_FIELDS) - TICK_FIELDS.index("star_flux_dn"))
+_tick_row = operator.attrgetter(*TICK_FIELDS)
+_fringe_row = operator.attrgetter(*FRINGE_FIELDS)
 
 
 class Window(NamedTuple):
@@ -42,33 +77,78 @@ def _last_of(loop: str, records: list[RecordT]) -> RecordT | None:
     return next((record for record in reversed(records) if record.loop == loop), None)
 
 
+def _beam_row(tick: MetrologyTick, sky_arcsec_per_px: float) -> tuple[float, ...]:
+    """A metrology tick in the columns of `TICK_FIELDS`: the beam's error in the camera's pixels, no mirror."""
+    return (
+        tick.time_s,
+        -tick.beam_az_arcsec / sky_arcsec_per_px,
+        -tick.beam_el_arcsec / sky_arcsec_per_px,
+        math.nan,
+        math.nan,
+        tick.frame_age_s,
+        tick.compute_s,
+        tick.sense_s,
+        tick.decide_s,
+        tick.time_s,  # for mid-exposure
+        *_NO_BUDGET,
+    )
+
+
 @dataclass
 class LoopView:
-    """One loop: its newest state and tick, its past, and the way of its search."""
+    """One loop: its newest state and tick, its past, and the path of its search.
+
+    Attributes
+    ----------
+    tick : Tick or None
+        The newest of a stellar loop.
+    beam : MetrologyTick or None
+        The newest of a metrology loop.
+    past : Past
+        `TICK_FIELDS` of each tick, also of a metrology loop, whose error is the beam's in the camera's pixels.
+    readings : dict of deque
+        Time and value of each row of the table of interlocks, once in `READING_STEP_S`, the oldest first.
+    """
 
     state: LoopState
     tick: Tick | None = None
-    past: Past = field(default_factory=Past)
+    beam: MetrologyTick | None = None
+    past: Past = field(default_factory=lambda: Past(TICK_FIELDS))
     change: ModeChange | None = None
     timing: LoopTiming | None = None
     piezo: PiezoReading | None = None
     search_trail_sky_arcsec: list[tuple[float, float]] = field(default_factory=list)
+    readings: dict[str, deque[tuple[float, float]]] = field(default_factory=dict)
 
     def accept(self, state: LoopState, message: Telemetry) -> None:
-        """Take what a message holds of this loop."""
+        """Remember what a message has of this loop."""
         name = state.name
         if state.mode == "ACQUISITION" and state.since_s != self.state.since_s:
             self.search_trail_sky_arcsec.clear()
         self.state = state
         ticks = [tick for tick in message.ticks if tick.loop == name]
-        self.past.add(ticks, message.time_s)
+        beams = [tick for tick in message.metrology_ticks if tick.loop == name]
+        scale = state.sky_arcsec_per_px
+        rows = [*map(_tick_row, ticks), *(_beam_row(tick, scale) for tick in beams)]
+        self.past.add(rows, message.time_s)
         self.tick = ticks[-1] if ticks else self.tick
+        self.beam = beams[-1] if beams else self.beam
+        self.remember_readings(state, message.time_s)
         self.change = state.last_change
         self.timing = _last_of(name, message.timing) or self.timing
         self.piezo = _last_of(name, message.piezo) or self.piezo
         if state.mode == "ACQUISITION":
-            for tick in ticks:
-                self._extend_trail(tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec)
+            walked: list[Tick | MetrologyTick] = [*ticks, *beams]
+            for tick in walked:
+                if tick.time_s >= state.since_s:
+                    self._extend_trail(tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec)
+
+    def remember_readings(self, state: LoopState, time_s: float) -> None:
+        """Keep what the interlocks read."""
+        for row in state.watched:
+            kept = self.readings.setdefault(row.name, deque(maxlen=READINGS_KEPT))
+            if not kept or time_s - kept[-1][0] >= READING_STEP_S:
+                kept.append((time_s, row.value))
 
     def _extend_trail(self, az_sky_arcsec: float, el_sky_arcsec: float) -> None:
         trail = self.search_trail_sky_arcsec
@@ -78,8 +158,7 @@ class LoopView:
 
     def errors(self, span_s: float) -> NDArray[np.float64]:
         """Time in s and errors az, el in px, one row a tick; shape (ticks, 3), oldest first."""
-        newest_s = self.tick.time_s if self.tick else 0.0
-        return self.past.since(newest_s - span_s, "time_s", "error_az_px", "error_el_px")
+        return self.past.since(self.past.newest_s - span_s, "time_s", "error_az_px", "error_el_px")
 
 
 @dataclass
@@ -124,6 +203,12 @@ class ConsoleState:
         One of `WINDOWS`, as the operator chose.
     missed : int
         Messages of this supervisor that did not come, because this console or its link was too slow.
+    overlap : Overlap or None
+        The newest tilt between the two stars, and the visibility that it leaves.
+    fringes : Past
+        `FRINGE_FIELDS` of each overlap.
+    live : bool
+        Whether it follows the supervisor; otherwise it is of the past.
     """
 
     def __init__(self, started_s: float) -> None:
@@ -136,6 +221,9 @@ class ConsoleState:
         self.shown = ""
         self.window = WINDOWS[0]
         self.missed = 0
+        self.live = True
+        self.overlap: Overlap | None = None
+        self.fringes = Past(FRINGE_FIELDS)
         self._arrivals_s: deque[float] = deque(maxlen=RATE_MESSAGES)
 
     @property
@@ -149,6 +237,7 @@ class ConsoleState:
         """Take in one message that came at `now_s`."""
         if self.newest is not None and self.newest.pid != message.pid:
             self.loops.clear()  # another supervisor: its past is not this one's
+            self.overlap, self.fringes = None, Past(FRINGE_FIELDS)
             if message.time_s < self.newest.time_s:
                 self.events.clear()  # of a clock that has begun anew: their times mean nothing now
             self.newest = None
@@ -163,6 +252,8 @@ class ConsoleState:
         self._arrivals_s.append(now_s)
         self.newest, self.received_s = message, now_s
         self.events.extendleft(message.events)
+        self.fringes.add(map(_fringe_row, message.overlaps), message.time_s)
+        self.overlap = message.overlaps[-1] if message.overlaps else self.overlap
         views = self.loops
         self.loops = {loop.name: views.get(loop.name, LoopView(loop)) for loop in message.loops}
         for loop in message.loops:
@@ -188,8 +279,17 @@ class ConsoleState:
 
     @property
     def usable_commands(self) -> set[str]:
-        """Commands that mean something now; none while nothing is known."""
-        return set(self.loop.state.usable_commands) if self.loop and not self.stale else set()
+        """Commands that are possible now; none while nothing is known, or in the past."""
+        known = self.live and self.loop and not self.stale
+        return set(self.loop.state.usable_commands) if self.loop and known else set()
+
+    def become(self, other: ConsoleState) -> None:
+        """Hold what another state holds, for the panels that draw from this one; loop and window stay."""
+        shown, window = self.shown, self.window
+        vars(self).update(vars(other))
+        self.window = window
+        if shown in self.loops:
+            self.shown = shown
 
     @property
     def silent_s(self) -> float:

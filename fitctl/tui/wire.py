@@ -22,12 +22,29 @@ UNREADABLE_NOTICE_S = 10.0  # at most one notice in this time
 UNREADABLE_PAUSE_S = 0.01  # a link that fails at once must not keep a processor busy
 
 
+class NoLink:
+    """The link of a console that shows a log."""
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        """Nothing comes."""
+        time.sleep(timeout_s)
+        return None
+
+    def send(self, command: AnyCommand) -> Reply:
+        """Nothing goes."""
+        msg = f"{type(command).__name__}: no instrument is attached to a log"
+        raise ConnectionError(msg)
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
 class Wire:
     """What comes and goes over a link. The callbacks are called on its threads.
 
     Parameters
     ----------
-    link : Client
+    link : Client or NoLink
         Called by the reader's thread, and by a thread for each command, so that a stop never waits for the
         reply to an earlier command. Closed at the end.
     clock : callable
@@ -42,7 +59,7 @@ class Wire:
 
     def __init__(
         self,
-        link: Client,
+        link: Client | NoLink,
         clock: Callable[[], float],
         on_telemetry: Callable[[Telemetry], object],
         on_unreadable: Callable[[str], object],

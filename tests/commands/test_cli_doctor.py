@@ -6,20 +6,44 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
+from contextlib import contextmanager
 
 import pytest
 from served import Served
 
 from fitctl.cli import main
 from fitctl.commands.set_up.doctor import PROBES
+from fitctl.config import default_rig_path
+from fitctl.drivers.interface import DeviceIdentity
+from fitctl.drivers.probe import Probe
 from fitctl.messages.commands import Standby
+
+TESTBED = default_rig_path().with_name("fit-testbed.toml")
+PORTS_WITHOUT_MOCKS = [
+    part
+    for setting in (
+        "camera.device.gvcp_port=1",
+        "camera.device.response_timeout_s=0.1",
+        "loops.right.siderostat.device.channel=socket://127.0.0.1:1",
+        "loops.right.fsm.dac.port=1",
+        "loops.right.fsm.piezo.port=socket://127.0.0.1:2",
+    )
+    for part in ("--set", setting)
+]
 
 
 @pytest.fixture(scope="module")
 def mocks():
     """Where mock devices listen, as --set arguments."""
+    with listening() as endpoints:
+        yield endpoints
+
+
+@contextmanager
+def listening(*arguments):
     process = subprocess.Popen(
-        [sys.executable, "-m", "fitctl", "mocks", "--free-ports", "--json"],
+        [sys.executable, "-m", "fitctl", "mocks", "--free-ports", "--json", *arguments],
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -65,6 +89,49 @@ def test_every_device_says_who_it_is_and_how_soon(doctor, mocks):
     assert found["right piezo amplifier"]["round_trip_ms"] > 30  # after which it answers
 
 
+@pytest.fixture
+def testbed(tmp_path):
+    """The testbed's rig, without a supervisor."""
+    return ["--rig", str(TESTBED), "--set", f"service.folder={tmp_path / 'none'}"]
+
+
+def test_the_testbed_has_photodiodes_and_a_hexapod_too(doctor, testbed):
+    with listening("--rig", str(TESTBED)) as endpoints:
+        status, out = doctor("--json", *testbed, *endpoints)
+    found = devices(out)
+    assert status == 1
+    assert found["metrology photodiodes"]["identity"]["model"] == "T7"
+    assert "C-887" in found["hexapod"]["identity"]["model"]
+    assert len(found) == 10
+    complaints = {
+        device: one["disagreements"] for device, one in found.items() if one["disagreements"]
+    }
+    assert list(complaints) == ["hexapod"]
+    assert "not referenced" in complaints["hexapod"][0]
+
+
+def test_drives_on_one_adapter_that_serves_one_client_are_all_found(doctor, testbed, monkeypatch):
+    at_once, most = [], []
+
+    def probe(siderostat):
+        at_once.append(siderostat)
+        time.sleep(0.05)
+        most.append(len(at_once))
+        at_once.remove(siderostat)
+        return Probe(DeviceIdentity("", f"node {siderostat.device.node_id}", "", ""), 0.001)
+
+    monkeypatch.setitem(PROBES, "cia402", probe)
+    on_one_bus = [
+        f"loops.{loop}.siderostat.device.{setting}"
+        for node, loop in enumerate(("right", "metrology", "left"), 1)
+        for setting in (f"node_id={node}", "channel=socket://127.0.0.1:1")
+    ]
+    _, out = doctor("--json", *testbed, *(part for each in on_one_bus for part in ("--set", each)))
+    found = [one for device, one in devices(out).items() if device.endswith("siderostat")]
+    assert [one["identity"]["model"] for one in found] == ["node 1", "node 2", "node 3"]
+    assert most == [1, 1, 1]
+
+
 def test_people_get_a_table_that_fits_their_terminal(doctor, mocks):
     status, out = doctor(*mocks)
     assert status == 0
@@ -73,7 +140,9 @@ def test_people_get_a_table_that_fits_their_terminal(doctor, mocks):
 
 
 def test_what_is_not_as_the_rig_file_says_is_told_with_what_to_do(doctor, mocks):
-    status, out = doctor("--json", *mocks, "--set", "loops.right.fsm.piezo.limit_v=100.5")
+    fsm = "loops.right.fsm"
+    other = (f"{fsm}.piezo.limit_v=100.5", f"{fsm}.bias_v=3.33", f"{fsm}.range_rad=1.181e-4")
+    status, out = doctor("--json", *mocks, *(part for each in other for part in ("--set", each)))
     (told,) = devices(out)["right piezo amplifier"]["disagreements"]
     assert status == 1
     assert devices(out)["right piezo amplifier"]["found"]
@@ -88,6 +157,22 @@ def test_what_is_not_there_is_not_found_and_told_where_it_was_looked_for(doctor,
     assert not found["right D/A"]["found"]
     assert "127.0.0.1:1" in found["right D/A"]["disagreements"][0]
     assert found["camera"]["found"]
+
+
+def test_mocks_that_are_not_started_are_no_failure_of_the_hardware(doctor, tmp_path):
+    away = ("--set", f"service.folder={tmp_path / 'none'}", *PORTS_WITHOUT_MOCKS)
+    status, out = doctor("--json", *away)
+    found = devices(out)
+    assert status == 0
+    assert not any(one["found"] or one["disagreements"] for one in found.values())
+    assert all("fitctl mocks" in one["note"] for one in found.values())
+
+    status, out = doctor("--json", *away, "--set", "loops.right.fsm.piezo.port=/dev/no-such-port")
+    found = devices(out)
+    assert status == 1
+    assert [device for device, one in found.items() if one["disagreements"]] == [
+        "right piezo amplifier"
+    ]
 
 
 def test_asking_changes_nothing(doctor, mocks):

@@ -11,8 +11,17 @@ import pytest
 
 from fitctl.cli import main
 from fitctl.commands.shared.welcome import rig_files
-from fitctl.config import default_rig_path, load_rig
-from fitctl.config.new_rig import DEVICES, MOCK, chosen, forms, new_rig_text
+from fitctl.config import default_rig_path, load_rig, rig_from_document
+from fitctl.config.new_rig import (
+    DEVICES,
+    MOCK,
+    ONE_STAR,
+    TESTBED,
+    Chosen,
+    chosen,
+    forms,
+    new_rig_text,
+)
 
 
 @pytest.fixture
@@ -64,38 +73,115 @@ def test_what_is_no_rig_file_is_not_taken_for_one(tmp_path):
 # ---------------------------------------------------------------- what is written
 
 
-def kinds_of(device):
-    return [chosen(device, form) for form in forms(device)]
+def kinds_of(rig, device):
+    return [chosen(rig, device, form) for form in forms(rig, device)]
 
 
-COMBINATIONS = list(itertools.product(*(kinds_of(device) for device in DEVICES)))
+def only(rig, device, choice):
+    return {each: choice if each == device else Chosen() for each in DEVICES[rig]}
 
 
-@pytest.mark.parametrize("choices", COMBINATIONS, ids=lambda c: "+".join(each.kind for each in c))
-def test_every_combination_of_hardware_is_a_rig_with_just_that(choices, tmp_path):
-    devices = dict(zip(DEVICES, choices, strict=True))
+ONE_STAR_DEVICES = [
+    (ONE_STAR, dict(zip(DEVICES[ONE_STAR], choices, strict=True)))
+    for choices in itertools.product(*(kinds_of(ONE_STAR, device) for device in DEVICES[ONE_STAR]))
+]
+# All combinations of the testbed would be 27 648.
+TESTBED_DEVICES = [
+    *(
+        (TESTBED, {device: kinds_of(TESTBED, device)[n] for device in DEVICES[TESTBED]})
+        for n in (0, -1)
+    ),
+    *(
+        (TESTBED, only(TESTBED, device, choice))
+        for device in DEVICES[TESTBED]
+        for choice in kinds_of(TESTBED, device)[:-1]
+    ),
+]
+
+
+def identified(value):
+    return "+".join(choice.kind for choice in value.values()) if isinstance(value, dict) else value
+
+
+@pytest.mark.parametrize(
+    ("begun_with", "devices"), ONE_STAR_DEVICES + TESTBED_DEVICES, ids=identified
+)
+def test_every_combination_of_hardware_is_a_rig_with_just_that(begun_with, devices, tmp_path):
     path = tmp_path / "new.toml"
-    path.write_text(new_rig_text("new", devices))
+    path.write_text(new_rig_text(begun_with, "new", devices))
     rig = load_rig(path)
 
     assert rig.name == "new"
     text = path.read_text()
     for device, (kind, answers) in devices.items():
-        for asked, answer in zip(
-            DEVICES[device][kind].asked if kind != MOCK else (), answers, strict=True
-        ):
-            value = tomllib.loads(text)
-            for part in asked.key.split("."):
-                value = value[part]
-            assert value == answer
+        if kind == MOCK:
+            continue
+        hardware = DEVICES[begun_with][device].kinds[kind]
+        for asked, answer in zip(hardware.asked, answers, strict=True):
+            for key, expected in asked.values(answer):
+                value = tomllib.loads(text)
+                for part in hardware.of_loop(key).split("."):
+                    value = value[part]
+                assert value == expected
     simulated = [kind == MOCK for kind, _ in devices.values()]
     assert (rig.mocks is not None) == (rig.plant is not None) == any(simulated)
-    assert text.count("# -----") == text.count("\n# -----") <= 12
-    assert not [line for line in text.splitlines() if line != line.rstrip()]
+    headings = [line for line in text.splitlines() if line.startswith("# -----")]
+    assert len(headings) == len(set(headings)) == text.count("# -----")
+    assert not [
+        line for line in text.splitlines() if line != line.rstrip() or line.startswith("#<")
+    ]
+
+
+def test_the_testbed_of_mocks_is_the_shipped_one():
+    devices = {device: Chosen() for device in DEVICES[TESTBED]}
+    new = rig_from_document(tomllib.loads(new_rig_text(TESTBED, "new", devices)), "new")
+    shipped = load_rig(default_rig_path().with_name("fit-testbed.toml"))
+
+    assert new == shipped.model_copy(update={"name": "new", "description": new.description})
+
+
+def test_every_section_of_the_testbed_stands_under_its_own_heading():
+    text = new_rig_text(TESTBED, "new", {device: Chosen() for device in DEVICES[TESTBED]})
+    headings = {}
+    for line in text.splitlines():
+        if line.startswith("# -----"):
+            heading = line.strip("# -")
+        elif line.startswith("["):
+            headings[line.split("]")[0].strip("[")] = heading
+
+    assert headings["loops.metrology"] == "the metrology loop"
+    assert headings["loops.left"].startswith("the left stellar loop")
+    assert headings["supervisor"] == "what the supervisor insists on"
+    assert headings["collector.hexapod"] == "the collector bench"
+
+
+def test_drives_on_one_can_bus_get_different_nodes_and_drives_on_several_the_first():
+    siderostats = [device for device in DEVICES[TESTBED] if device.endswith("siderostat")]
+
+    def nodes(*forms):
+        devices = dict.fromkeys(DEVICES[TESTBED], Chosen()) | {
+            device: chosen(TESTBED, device, form)
+            for device, form in zip(siderostats, forms, strict=True)
+        }
+        document = tomllib.loads(new_rig_text(TESTBED, "new", devices))
+        return [loop["siderostat"]["device"]["node_id"] for loop in document["loops"].values()]
+
+    assert nodes(*["cia402:socketcan:can0"] * 3) == [1, 2, 3]
+    assert nodes(*(f"cia402:socketcan:can{n}" for n in range(3))) == [1, 1, 1]
+
+
+def test_mocks_of_amplifiers_of_one_kind_listen_at_different_ports():
+    devices = {
+        device: next((c for c in kinds_of(TESTBED, device) if c.kind == "ensemble"), Chosen())
+        for device in DEVICES[TESTBED]
+    }
+    mocks = tomllib.loads(new_rig_text(TESTBED, "new", devices))["mocks"]["loops"]
+
+    assert len({loop["ensemble"]["tcp_port"] for loop in mocks.values()}) == 3
 
 
 def test_what_is_not_asked_is_as_in_the_shipped_rig_with_its_comments(tmp_path):
-    text = new_rig_text("new", {device: chosen(device, MOCK) for device in DEVICES})
+    text = new_rig_text(ONE_STAR, "new", {device: Chosen() for device in DEVICES[ONE_STAR]})
     shipped = default_rig_path().read_text()
 
     after_name = "\n[optics]" if "\n[optics]" in shipped else "# ---"
@@ -103,9 +189,8 @@ def test_what_is_not_asked_is_as_in_the_shipped_rig_with_its_comments(tmp_path):
 
 
 def test_a_comment_stays_in_its_column_behind_another_value():
-    devices = {device: chosen(device, MOCK) for device in DEVICES}
-    devices["mdt693"] = chosen("mdt693", "mdt693:/dev/ttyS7")
-    lines = new_rig_text("new", devices).splitlines()
+    devices = only(ONE_STAR, "mdt693", chosen(ONE_STAR, "mdt693", "mdt693:150:/dev/ttyS7"))
+    lines = new_rig_text(ONE_STAR, "new", devices).splitlines()
     shipped = default_rig_path().read_text().splitlines()
 
     def column(lines):
@@ -129,6 +214,20 @@ def test_a_script_says_all_by_options(fitctl, tmp_path):
     assert "well" in out
 
 
+def test_a_testbed_with_photodiodes_and_hexapod_of_its_own(fitctl, tmp_path):
+    devices = ("--photodiodes", "labjack_t7:10.0.0.5", "--hexapod", "c887:socket://10.0.0.6:50000")
+    status, out, _ = fitctl("init", "bed.toml", "--testbed", "--mocks", "--no-doctor", *devices)
+
+    assert status == 0
+    rig = load_rig(tmp_path / "bed.toml")
+    assert rig.loops["metrology"].sensor.device.endpoint == "10.0.0.5:502"
+    assert rig.collector.hexapod.port == "socket://10.0.0.6:50000"
+    written = out.splitlines()[0]
+    assert "simulated: camera, siderostat, dac" in written
+    assert "photodiodes" not in written
+    assert "fitctl mocks --rig bed.toml" in out
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -137,6 +236,16 @@ def test_a_script_says_all_by_options(fitctl, tmp_path):
         (("--mocks", "--dac", "tcp"), "--dac tcp: must be like one of tcp:"),
         (("--mocks", "--dac", "mock:1"), "--dac mock:1: must be"),
         (("--mocks", "--mdt693", "mdt693:"), "--mdt693 mdt693:: must be"),
+        (("--mocks", "--mdt693", "mdt693:/dev/ttyUSB0"), "must be like one of mdt693:150:/dev/"),
+        (("--mocks", "--mdt693", "mdt693:120:/dev/ttyUSB0"), "'120' must be one of 75, 100, 150"),
+        (("--mocks", "--mdt693", "mdt693:75:10.0.0.5"), "piezo.port: must be a serial port"),
+        (("--mocks", "--camera", "gige:10.0.0.500"), "camera.device.address: must be the IPv4"),
+        (
+            ("--mocks", "--hexapod", "c887:/dev/ttyS0"),
+            "--hexapod is a device of the testbed; give --testbed",
+        ),
+        (("--testbed", "--camera", "mock"), "--hexapod c887:socket://192.168.1.40:50000 or mock"),
+        (("--testbed", "--mocks", "--photodiodes", "u3:1"), "must be like one of labjack_t7:"),
         (("--mocks", "--name", "two words"), "name: "),
         (("no/such/folder/rig.toml", "--mocks"), "cannot be written"),
     ],
@@ -153,6 +262,37 @@ def test_what_cannot_be_is_one_line_and_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("answer", "port"),
+    [
+        ("10.0.0.5", "socket://10.0.0.5:8000"),
+        ("10.0.0.5:8001", "socket://10.0.0.5:8001"),
+        ("ensemble.observatory.org", "socket://ensemble.observatory.org:8000"),
+        ("socket://10.0.0.5:8000", "socket://10.0.0.5:8000"),
+        ("/dev/ttyS4", "/dev/ttyS4"),
+    ],
+)
+def test_an_address_becomes_the_socket_of_the_device(fitctl, tmp_path, answer, port):
+    device = ("--siderostat", f"ensemble:{answer}")
+    status, out, _ = fitctl("init", "mine.toml", "--mocks", "--no-doctor", *device)
+
+    assert status == 0
+    assert load_rig(tmp_path / "mine.toml").loops["right"].siderostat.device.port == port
+    assert "warning: loop right: right siderostat real, camera simulated" in out
+
+
+@pytest.mark.parametrize(("volts", "limit_v"), [("75", 75.5), ("100", 100.5), ("150", 150.5)])
+def test_the_stacks_limit_also_bounds_what_the_mirror_may_do(fitctl, tmp_path, volts, limit_v):
+    device = ("--mdt693", f"mdt693:{volts}:/dev/ttyUSB2")
+    status, _, _ = fitctl("init", "mine.toml", "--mocks", "--no-doctor", *device)
+
+    assert status == 0
+    fsm = load_rig(tmp_path / "mine.toml").loops["right"].fsm
+    assert fsm.piezo.limit_v == limit_v
+    highest_v = (fsm.bias_v + fsm.swing_v) * fsm.piezo.gain
+    assert 0.97 * limit_v < highest_v <= limit_v
+
+
 def test_nothing_is_overwritten(fitctl, tmp_path):
     path = tmp_path / "my-rig.toml"
     path.write_text("precious")
@@ -164,7 +304,14 @@ def test_nothing_is_overwritten(fitctl, tmp_path):
 
 
 def test_questions_are_asked_on_a_terminal_and_asked_again_when_the_answer_is_none(tmp_path):
-    answers = ["night", "webcam", "gige", "10.0.0.9", "ensemble", "", "tcp", "10.0.0.8", ""]
+    answers = ["night", "webcam", "gige", "10.0.0.9", "ensemble", "", "tcp", "10.0.0.8"]
+    answers += [
+        "mdt693",
+        "",
+        "120",
+        "75",
+        "",
+    ]  # no limit is offered, and only the switch's are possible
     master, slave = pty.openpty()
     try:
         os.write(master, "".join(f"{answer}\n" for answer in answers).encode())
@@ -187,7 +334,8 @@ def test_questions_are_asked_on_a_terminal_and_asked_again_when_the_answer_is_no
     assert rig.camera.device.address == "10.0.0.9"
     assert rig.loops["right"].siderostat.device.port == "/dev/ttyUSB0"  # as it was offered
     assert rig.loops["right"].fsm.dac.host == "10.0.0.8"
-    assert "simulated: mdt693" in done.stdout
+    assert rig.loops["right"].fsm.piezo.limit_v == 75.5
+    assert "simulated: nothing" in done.stdout
     assert done.stdout.count("Camera") == 2
 
 
@@ -195,7 +343,7 @@ def test_at_its_end_the_devices_are_asked_and_one_that_is_not_there_shows_in_the
     fitctl, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("COLUMNS", "200")  # no line of the table is folded
-    status, out, _ = fitctl("init", "--mocks", "--mdt693", "mdt693:/dev/no-such-port")
+    status, out, _ = fitctl("init", "--mocks", "--mdt693", "mdt693:150:/dev/no-such-port")
 
     assert status == 1
     assert "/dev/no-such-port" in out

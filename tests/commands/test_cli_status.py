@@ -91,7 +91,7 @@ def test_a_lost_star_is_one_trouble_as_long_as_it_is_searched_for():
 
     assert found == [
         "right: star lost 133 s ago; the loop searches again, round 2, within 108 arcsec of its last place; "
-        "check shutter and clouds; hold, stop or another acquire ends the search",
+        "check shutter and clouds; hold, stop or acquire ends the search",
         "interlock disk_space: full",
     ]
 

@@ -61,13 +61,17 @@ def listens(address):
 
 def ask(address, path=None, **headers):
     """Status and headers of an answer."""
+    return answered(address, path, **headers)[:2]
+
+
+def answered(address, path=None, **headers):
+    """Status, headers and content of an answer."""
     parts = urlsplit(address)
     connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=LIMIT_S)
     try:
         connection.request("GET", parts.path if path is None else path, headers=headers)
         answer = connection.getresponse()
-        answer.read()
-        return answer.status, answer.headers
+        return answer.status, answer.headers, answer.read()
     finally:
         connection.close()
 
@@ -82,6 +86,11 @@ def test_who_has_the_address_gets_the_page_and_all_of_its_parts(page):
 
     assert ask(page)[0] == 200
     assert ask(page, f"{key}static/js/textual.js")[0] == 200
+
+
+def test_the_page_takes_keys_before_a_click(page):
+    content = answered(page)[2].decode()
+    assert ".focus()" in content.rpartition('id="terminal"')[2]
 
 
 def test_who_has_no_key_gets_nothing(page):

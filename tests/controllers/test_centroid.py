@@ -115,14 +115,6 @@ def test_noise_alone_is_never_a_star(sensor, expose):
     assert not any(sensor.find(expose(NOWHERE, seed=seed)) for seed in range(300))
 
 
-def test_of_two_stars_alike_the_nearest_to_where_it_is_expected_is_found(sensor, expose):
-    one, other = (12.3, 19.7), (28.1, 20.2)
-    image = np.maximum(expose(one), expose(other))
-    for near in (one, other):
-        star = sensor.find(image, near)
-        assert (star.az_px, star.el_px) == pytest.approx(near, abs=0.1)
-
-
 @given(
     beyond=st.floats(-2.0, 1.5),
     along=st.floats(0.0, 39.0),

@@ -41,7 +41,7 @@ def test_a_step_is_approached_without_overshoot():
 
 def test_it_starts_and_rests_where_it_is_told():
     prefilter = Prefilter(1.0, PERIOD_S, np.array([24.0, 19.5]))
-    assert prefilter.step(np.array([24.0, 19.5])).tolist() == [24.0, 19.5]
+    assert prefilter.step(np.array([24.0, 19.5])) == (24.0, 19.5)
     prefilter.step(np.array([0.0, 0.0]))
     prefilter.reset(np.array([10.0, 11.0]))
-    assert prefilter.step(np.array([10.0, 11.0])).tolist() == [10.0, 11.0]
+    assert prefilter.step(np.array([10.0, 11.0])) == (10.0, 11.0)

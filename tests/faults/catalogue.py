@@ -1,4 +1,4 @@
-"""All entries, by the tables of docs/reliability.md."""
+"""All entries, by the tables of docs/fault-catalogue.md."""
 
 from . import commands, devices, processes, surroundings, testbed
 

@@ -29,6 +29,8 @@ BESIDE = {
 """What stands beside the tick, which goes on whatever becomes of them."""
 PROCESSES = {"mocks", "supervisor", "recorder", "gateway", "metrics server", "console"}
 REST = {"OFF", "STANDBY", "SAFE"}
+HELD_S = 1.0  # a loop must have held its star for so long before it is struck
+HOLDS_WITHIN_S = 20.0
 STILL_RAD = 0.02  # of a motor: 0.3 arcsec on the sky
 STILL_V = 0.1
 BIAS_V = 5.0
@@ -67,6 +69,7 @@ def attempted(rig, entry, home, stalled):
     rig.reach(home | {entry.loop: entry.mode})
     if entry.struck in PROCESSES:
         rig.process(entry.struck)  # a console is opened, a recorder may just be starting
+    hold_first(rig, entry)
     deaf = entry.struck == "supervisor" and entry.how != "slowed"
     del rig.telemetry[:-1], rig.places[:], rig.heard[:]
     struck_s = time.monotonic()
@@ -86,6 +89,27 @@ def attempted(rig, entry, home, stalled):
     if not entry.moves:
         stood_still(rig, entry, struck_s, deaf)
     return measured | {"back_s": round(back_s, 1)}
+
+
+def hold_first(rig, entry):
+    """Wait until all loops hold their stars: one that has just come to VERNIER is far off, or still waits."""
+    if not entry.others:
+        return
+    end_s = time.monotonic() + HOLDS_WITHIN_S
+    while away := [name for name in rig.stellar_loops if not holds(rig, name)]:
+        assert time.monotonic() < end_s, f"{away} do not hold their stars within {HOLDS_WITHIN_S} s"
+        rig.receive(0.1)
+
+
+def holds(rig, name):
+    """Whether a loop waits for nothing, and its star has been within its requirement."""
+    (loop,) = (loop for loop in rig.telemetry[-1].loops if loop.name == name)
+    rms_px = rig.residual_px(name, time.monotonic() - HELD_S)
+    return not loop.waits_for and rms_px <= loop.requirement_px
+
+
+def requirement_px(rig, name):
+    return next(loop.requirement_px for loop in rig.telemetry[-1].loops if loop.name == name)
 
 
 def watch(rig, entry, since_s, stalled):
@@ -144,8 +168,7 @@ def went_on(rig, entry, struck_s):
         for name, end in entry.others
         if end == HOLDS
     }
-    requirements_px = {loop.name: loop.requirement_px for loop in rig.telemetry[-1].loops}
-    assert all(rms_px <= requirements_px[name] for name, rms_px in held_px.items()), held_px
+    assert all(rms_px <= requirement_px(rig, name) for name, rms_px in held_px.items()), held_px
     return {"held_px": held_px} if held_px else {}
 
 

@@ -1,4 +1,4 @@
-"""The tables of docs/reliability.md from the results of a run: ``python -m faults.report FILE``."""
+"""The tables of docs/fault-catalogue.md from the results of a run: ``python -m faults.report FILE``."""
 
 import json
 import re
@@ -11,7 +11,9 @@ from .catalogue import GROUPS
 from .configuration import WRONG
 from .entry import HOLDS, STAYED, WAITS
 
-PAGE = ROOT / "docs" / "reliability.md"
+DOCS = ROOT / "docs"
+TOTALS = DOCS / "reliability.md"
+CATALOGUE = DOCS / "fault-catalogue.md"
 HEADER = [
     "what is struck",
     "how",
@@ -100,26 +102,32 @@ RECORDS = ("shown", "missing", "counted", "with a killed supervisor", "logs")
 
 
 def tables(results):
-    """Every table by its name in the page."""
-    return (
-        {name: running_table(entries, results) for name, entries in GROUPS.items()}
-        | {"wrong-configuration": wrong_table()}
-        | {"records": records_table(results), "run": run_line(results)}
-    )
+    """Every table of the catalogue's page by its name there."""
+    return {name: running_table(entries, results) for name, entries in GROUPS.items()} | {
+        "wrong-configuration": wrong_table(),
+        "records": records_table(results),
+    }
 
 
-def main():
-    """Put the tables into the page."""
-    text = PAGE.read_text(encoding="utf-8")
-    for name, lines in tables(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))).items():
+def fill(page, contents):
+    """Put contents between the comments of a page that have their names."""
+    text = page.read_text(encoding="utf-8")
+    for name, lines in contents.items():
         begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"
         pattern = re.escape(begin) + ".*?" + re.escape(end)
         text, found = re.subn(
             pattern, lambda _, new=begin + lines + "\n" + end: new, text, flags=re.DOTALL
         )
         if found != 1:
-            sys.exit(f"{PAGE}: {found} places for the table {name}; expected one")
-    PAGE.write_text(text, encoding="utf-8")
+            sys.exit(f"{page}: {found} places for the table {name}; expected one")
+    page.write_text(text, encoding="utf-8")
+
+
+def main():
+    """Put the tables into their page, and the totals into the other."""
+    results = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    fill(CATALOGUE, tables(results))
+    fill(TOTALS, {"run": run_line(results)})
 
 
 if __name__ == "__main__":

@@ -92,11 +92,21 @@ TESTBED = (
     "collector.motion.amplitude_mm=0.4",
     "collector.motion.frequency_hz=0.125",
 )
+CAN_BUS = tuple(
+    f"loops.{name}.siderostat.device.{setting}"
+    for node, name in enumerate(("right", "metrology", "left"), 1)
+    for setting in ("channel=socket://127.0.0.1:29536", f"node_id={node}")
+)
 SETUPS = {
     "fit-mock": Setup(),
     "fit-testbed": Setup(
         file="fit-testbed",
         settings=TESTBED,
+        home={"metrology": "LOCKED", "right": "VERNIER", "left": "VERNIER"},
+    ),
+    "one bus": Setup(
+        file="fit-testbed",
+        settings=(*TESTBED, *CAN_BUS),
         home={"metrology": "LOCKED", "right": "VERNIER", "left": "VERNIER"},
     ),
     "short pauses": Setup(settings=("loops.right.acquisition.search_again_pause_s=0.4",)),

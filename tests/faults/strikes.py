@@ -372,7 +372,7 @@ STRIKES = {
     "hexapod": moving,
     "turned off by the operator": turned_off,
 }
-"""By how, or by what is struck; everything else is a fault of a mock device."""
+"""By what is struck, or how; everything else is a fault of a mock device."""
 
 
 STRIKES_ON_THE_WAY = {"all loops are stopped": stopped_by_operator}
@@ -381,4 +381,4 @@ STRIKES_ON_THE_WAY = {"all loops are stopped": stopped_by_operator}
 
 def strike(rig, entry):
     """The entry's strike, as a context."""
-    return (STRIKES.get(entry.how) or STRIKES.get(entry.struck) or device)(rig, entry)
+    return (STRIKES.get(entry.struck) or STRIKES.get(entry.how) or device)(rig, entry)

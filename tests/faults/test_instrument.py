@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.fault, pytest.mark.timeout(200)]
             id=entry.name,
             marks=[
                 pytest.mark.xdist_group(", ".join(instrument)),
-                *([pytest.mark.testbed] if entry.rig == testbed.RIG else []),
+                *([pytest.mark.testbed] if entry in testbed.ENTRIES else []),
             ],
         )
         for instrument, entries in INSTRUMENTS.items()

@@ -3,12 +3,13 @@
 from .devices import CAMERA, DAC, PIEZO, SIDEROSTAT
 from .entry import HOLDS, SEARCHES, STAYED, WAITS, Entry
 
-RIG = "fit-testbed"
+RIG, ONE_BUS_RIG = "fit-testbed", "one bus"
 LABJACK, HEXAPOD = "LabJack T7 at", "hexapod at"
 HELD, SAFE = (STAYED,), ("SAFE",)
 LINK_LOST = "waits for the link of metrology"
 # What the other loops do when a loop is struck; the right one goes on whatever becomes of the link.
 LINK_HELD = (("right", HOLDS), ("left", HOLDS))
+LINK_FREED = (("right", HOLDS), ("left", STAYED))  # an axis that comes free jumps to its set-point
 LINK_AWAY = (("right", HOLDS), ("left", WAITS))
 LEFT_AWAY = (("right", HOLDS), ("metrology", STAYED))
 RIGHT_AWAY = (("left", HOLDS), ("metrology", STAYED))
@@ -46,7 +47,7 @@ LABJACK_FAULTS = (
     *metrology(
         "metrology.labjack",
         "drop", "corrupt", "disconnect", "freeze", "reboot", "exception", "not_a_number AIN0",
-        "wrong_value AIN2",
+        "wrong_value AIN2", "range_changed",
         says=LABJACK,
     ),
     *metrology(
@@ -75,7 +76,7 @@ LINK_DRIVE = metrology(
     "metrology.drive",
     "drop", "disconnect", "freeze", "reboot", "amplifier_fault", "encoder_jump", "link_loss", "following_error",
     says=SIDEROSTAT,
-) + metrology("metrology.drive", "stuck_axis", ends=HELD, others=LINK_HELD)  # fmt: skip
+) + metrology("metrology.drive", "stuck_axis", ends=HELD, others=LINK_FREED)  # fmt: skip
 LEFT_STAGES = (
     *left(
         "left.drive",
@@ -98,7 +99,7 @@ STARS = (
         ends=SEARCHES,
         says="no star on",
         within_s=2.0,
-        others=(("right", STAYED), ("metrology", STAYED)),
+        others=LEFT_AWAY,
     ),
     *right(
         "camera",
@@ -106,14 +107,33 @@ STARS = (
         ends=SEARCHES,
         says="no star on",
         within_s=2.0,
-        others=(("left", STAYED), ("metrology", STAYED)),
     ),
     *right("camera", "drop", says=CAMERA, others=(("left", "SAFE"), ("metrology", STAYED))),
     *right("right.drive", "amplifier_fault", says=SIDEROSTAT),
 )
+# All three drives are on one CAN adapter: what strikes one of them concerns its own loop, the adapter all.
+ONE_BUS = tuple(
+    entry._replace(rig=ONE_BUS_RIG)
+    for entry in (
+        *left("left.drive", "reboot", "link_loss", "amplifier_fault", says=SIDEROSTAT),
+        *right(
+            "right.adapter", "disconnect",
+            says=SIDEROSTAT, others=(("left", "SAFE"), ("metrology", "SAFE")),
+        ),
+    )
+)  # fmt: skip
 OPERATOR = (
     *left("loop left", "turned off by the operator", ends=("OFF",)),
     *metrology("loop metrology", "turned off by the operator", ends=("OFF",), says=LINK_LOST),
     *right("loop right", "turned off by the operator", ends=("OFF",)),
 )
-ENTRIES = LABJACK_FAULTS + HEXAPOD_FAULTS + COLLECTOR + LINK_DRIVE + LEFT_STAGES + STARS + OPERATOR
+ENTRIES = (
+    LABJACK_FAULTS
+    + HEXAPOD_FAULTS
+    + COLLECTOR
+    + LINK_DRIVE
+    + LEFT_STAGES
+    + STARS
+    + OPERATOR
+    + ONE_BUS
+)

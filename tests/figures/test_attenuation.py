@@ -4,7 +4,7 @@ from scipy.signal import lfilter
 
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import DESIGNS
-from fitctl.controllers.design.loopshape import sampled_response
+from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.daemon.run import run_info
 from fitctl.figures.attenuation import (
     Rebuilt,

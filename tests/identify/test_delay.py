@@ -8,9 +8,9 @@ from fitctl.identify import delay
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.record import ExperimentRecord
 from fitctl.model.drives import FSM, channel_values, experiment_s
+from fitctl.model.light import centroid_noise_px
 from fitctl.model.optics import scales, stack_volts
 from fitctl.model.plant import Plant
-from fitctl.model.scene import centroid_noise_px
 
 HOLD_S = 0.0073  # as the supervisor's injector: no common measure with the frames
 STARTED_S = 5000.0

@@ -57,7 +57,9 @@ def test_a_gear_train_without_play_has_a_width_of_about_zero(rig):
 
 def test_a_gear_ratio_that_the_rig_file_has_wrong_is_seen(rig, record):
     document = rig.model_dump()
-    document["loops"]["right"]["siderostat"]["spur_gear_ratio"] *= 1.1
+    siderostat = document["loops"]["right"]["siderostat"]
+    siderostat["spur_gear_ratio"] *= 1.1
+    siderostat["device"]["position_limit_rad"] *= 1.1
     found = backlash.analyse(rig_from_document(document, "test"), record)
     for axis in found.axes.values():
         assert axis.px_per_motor_rad / found.nominal_px_per_rad == pytest.approx(1.1, rel=0.01)

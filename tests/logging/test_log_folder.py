@@ -287,7 +287,7 @@ def test_recording_goes_on_where_something_else_has_an_old_logs_name(tmp_path):
 
 def test_a_limit_that_would_leave_no_finished_file_is_refused():
     document = SETTINGS.model_dump() | {"rotate_bytes": 1_000_000, "retain_bytes": 1_999_999}
-    with pytest.raises(ValidationError, match="retain_bytes must be at least twice rotate_bytes"):
+    with pytest.raises(ValidationError, match="retain_bytes: must be at least"):
         Logging(**document)
 
 

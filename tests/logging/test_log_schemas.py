@@ -1,4 +1,5 @@
 import io
+import math
 
 import msgspec
 import numpy as np
@@ -52,6 +53,15 @@ def test_topics_carry_the_loop():
         "/fit/devices/health",
         "/fit/recorder/status",
     ]
+
+
+def test_what_a_tick_lacks_is_not_a_number():
+    given = [
+        field for field in msgspec.structs.fields(Tick) if field.default is not msgspec.NODEFAULT
+    ]
+    floats = {field.name: field.default for field in given if field.type is float}
+    assert "link_az_rad" in floats
+    assert all(math.isnan(default) for default in floats.values()), floats
 
 
 def test_a_frame_is_a_16_bit_image_that_viewers_know():

@@ -71,6 +71,11 @@ def test_records_arrive_numbered_and_in_order(queue, recorders):
     ]
 
 
+def test_on_the_wire_the_version_comes_first_for_recorders_of_other_versions():
+    wire = msgspec.msgpack.decode(msgspec.msgpack.encode(Envelope(RECORD_VERSION, 7, tick(0))))
+    assert wire[:2] == [RECORD_VERSION, 7]
+
+
 def test_what_is_offered_before_the_recorder_comes_is_kept_up_to_the_size(queue, recorders):
     assert [queue.offer(tick(n)) for n in range(SIZE + 5)] == [True] * SIZE + [False] * 5
     assert queue.lost == 5

@@ -25,7 +25,7 @@ from fitctl.messages.troubles import troubles
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.state import ConsoleState
 
-LOST = [("right: star lost", "another acquire ends the search")]
+LOST = [("right: star lost", "acquire ends the search")]
 # What each strike's alarms begin with, and how they tell what to do; the last word is what resets it.
 OF_STRIKES = {
     "star_lost": LOST,

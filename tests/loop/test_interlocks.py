@@ -259,12 +259,12 @@ def test_the_modes_of_a_row_are_the_modes_there_are():
     ("override", "said"),
     [
         ("interlocks.flux_low.quantity=moon", "nobody measures that; there are star_flux_fraction"),
-        ("interlocks.flux_low.high=0.5", "low must be below high"),
+        ("interlocks.flux_low.high=0.5", "interlocks.flux_low.high: must be above 0.75"),
         ("interlocks.flux_low.modes=[]", "interlocks.flux_low.modes"),
         ("interlocks.flux_low.modes=['ON']", "interlocks.flux_low.modes"),
         ("interlocks.flux_low.action=shout", "interlocks.flux_low.action"),
         ("interlocks.flux_low.limit=1.0", "unknown key"),
-        ("interlocks.frame_missing.stale_s=0.05", "frame_missing.stale_s must be above 0.075 s"),
+        ("interlocks.frame_missing.stale_s=0.05", "frame_missing.stale_s: must be above 0.075"),
         (
             "interlocks.new={quantity='clock_step_s', for_s=0.0, modes=['OFF'], action='warn', reset='hand'}",
             "needs low, high or stale_s",

@@ -79,10 +79,10 @@ def test_the_beam_is_held_within_its_requirement(collector_m, bound_arcsec):
 
 def test_the_second_integrator_removes_the_standing_error_of_a_drift():
     without = bench(collector_m=drift)
-    without.loop.hold._second_per_s = 0.0
+    without.loop.hold.second_per_s = 0.0
     without.held().run(20.0)
     assert abs(without.beam_arcsec()[0]) == pytest.approx(
-        10e-6 * 206265 / without.loop.hold._gain_per_s, rel=0.3
+        10e-6 * 206265 / without.loop.hold.gain_per_s, rel=0.3
     )
     with_it = bench(collector_m=drift).held().run(20.0)
     assert abs(with_it.beam_arcsec()[0]) < 0.1

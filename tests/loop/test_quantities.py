@@ -24,3 +24,10 @@ def test_a_camera_that_was_opened_anew_for_another_loop_gives_no_interval():
     for skipped in (1, 0):  # it counts from zero again
         quantities.record_observation(observation(1, 9.0, skipped))
         assert quantities.readings["frame_interval_periods"] == interval
+
+
+def test_only_a_fault_has_words(vernier):
+    vernier.run(2.0)
+    readings = vernier.supervisor.loops["right"].quantities.readings
+    assert "siderostat_travel_fraction" in readings
+    assert {name: words for name, (_, _, words) in readings.items() if words} == {}

@@ -139,6 +139,12 @@ def test_an_acquire_during_a_search_begins_it_anew_as_asked():
     assert "no star within 50 arcsec" in simulation.mode_changes[-1].reason
 
 
+def test_a_search_may_reach_as_far_as_the_siderostat_travels():
+    simulation = star_at(0.0, 0.0)
+
+    assert simulation.command(Acquire(search_radius_sky_arcsec=1200.0)).accepted
+
+
 def test_a_finer_search_takes_longer():
     times_s = []
     for overlap in (None, 0.5):

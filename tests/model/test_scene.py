@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from fitctl.controllers.centroid import StarSensor
 from fitctl.model.compiled import numba_installed
-from fitctl.model.scene import FULL_WELL_DN, Scene, centroid_noise_px
+from fitctl.model.light import centroid_noise_px
+from fitctl.model.scene import FULL_WELL_DN, Scene
 
 within = st.floats(6.0, 33.0)  # a spot's light is all on the frame
 

@@ -147,10 +147,16 @@ def fake_camera(*options: str) -> list[str]:
 SIZE = ("camera.width_px=128", "camera.height_px=128")
 
 
-@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono16"])
-def test_the_driver_takes_aravis_camera_by_its_own_description(pixel_format: str) -> None:
+# Of a star that fits into a pixel of 8 bits.
+DARKER = ("camera.bias_dn=10", "camera.pixel_noise_dn=1", "loops.right.star_flux_dn=900")
+
+
+@pytest.mark.parametrize(("pixel_format", "settings"), [("Mono8", DARKER), ("Mono16", ())])
+def test_the_driver_takes_aravis_camera_by_its_own_description(
+    pixel_format: str, settings: tuple[str, ...]
+) -> None:
     setting = f"camera.device.pixel_format={pixel_format}"
-    found = ours(*SIZE, setting, mock=False, beside=fake_camera())
+    found = ours(*SIZE, setting, *settings, mock=False, beside=fake_camera())
     assert found["identity"] == ["Aravis", "Fake", "FIT01"]
     assert found["discovered"] == "FIT01"
     assert (found["frames"], found["lost"], found["shape"]) == (100, 0, [128, 128])

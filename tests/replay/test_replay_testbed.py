@@ -145,7 +145,7 @@ def test_a_testbed_s_run_replayed_is_the_same_to_the_last_bit(
     for name, loop in result.loops.items():
         kind = MetrologyTick if name == "metrology" else Tick
         ticks = [record for record in records if isinstance(record, kind) and record.loop == name]
-        assert loop.ticks == len(ticks) > 300
+        assert loop.ticks == len(ticks) > 200
         assert all(found.compared > 0.9 * loop.ticks for found in loop.differences.values())
     overlaps = [record.visibility for record in records if isinstance(record, Overlap)]
     assert result.loops["left"].differences["visibility"].compared == len(overlaps)
@@ -172,7 +172,10 @@ def test_without_feedforward_the_left_set_points_differ_and_nothing_else_of_the_
     path, _ = testbed_log(hold_and_drift, DRIFT)
     loops = replayed(path, change=["loops.left.feedforward.gain=0.0"]).loops
 
-    assert loops["right"].same
+    # Where left expects its candidate, whose light is taken from right's window, depends on the link.
+    assert loops["right"].mode.ticks == 0
+    assert all(found.ticks < 10 for found in loops["right"].differences.values())
+    assert loops["right"].differences["star_px"].worst < 0.01
     assert loops["metrology"].same
     setpoint = loops["left"].differences["siderostat_setpoint_rad"]
     assert setpoint.ticks > 200

@@ -4,7 +4,7 @@ from report_samples import record
 
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
-from fitctl.controllers.design.loopshape import sampled_response
+from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.figures.rigs import with_controller
 from fitctl.messages.commands import SetController
 from fitctl.model.hysteresis import half_widths_v, stack_gains

@@ -1,22 +1,38 @@
 """The page and what is beside it."""
 
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
 
 import msgspec
+import numpy as np
 import pytest
 from report_samples import record
 
 from fitctl.config import ConfigError
 from fitctl.daemon.run import run_info
+from fitctl.error_budget import CAUSES
 from fitctl.logging.records import Event
 from fitctl.logging.writer import LogWriter
+from fitctl.messages.commands import Standby
+from fitctl.messages.modes import Mode
 from fitctl.report.compare import make_comparison
-from fitctl.report.drawing import VARIABLES, Plot, draw, envelope, panels, plain_number, styled
+from fitctl.report.drawing import (
+    VARIABLES,
+    Plot,
+    draw,
+    envelope,
+    panels,
+    plain_number,
+    styled,
+    time_axis,
+)
 from fitctl.report.findings import find
 from fitctl.report.make import make_report
+from fitctl.report.motion import mirror
 from fitctl.report.run import find_run
+from fitctl.tui.inks import MODE_COLOURS
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
@@ -98,6 +114,90 @@ def test_it_says_the_verdict_and_every_part_that_was_asked_for(made):
         assert part in text
 
 
+def test_the_first_screen_has_the_verdict_one_number_and_the_timeline(made, findings):
+    _, page = made
+    worse = max(found.rms for found in findings.loops["right"].residual.values())
+
+    first = page[page.index("<main>") : page.index("<nav")]
+
+    text = " ".join(Reader(first).text)
+    assert "✓ met" in " ".join(text.split())
+    assert f"{worse:.4f} of 0.1 px RMS" in text
+    assert "camera noise" in text
+    assert first.count("<svg") == 1
+    assert "Modes and events" in text
+    assert "<table" not in first
+
+
+def test_the_error_budget_is_on_the_page_and_in_the_figures(made, findings):
+    folder, page = made
+    (controller,) = json.loads((folder / "report.json").read_text())["loops"]["right"][
+        "controllers"
+    ]
+    text = " ".join(Reader(page).text)
+
+    told = controller["error_budget"]
+
+    assert sum(told["fractions"].values()) == pytest.approx(1.0)
+    assert list(told["fractions"]) == list(CAUSES)
+    assert told["measured_px"] == findings.loops["right"].rejections[0].budget.measured_px
+    for cause in CAUSES:
+        assert cause in text
+
+
+def test_modes_have_the_colours_of_the_console(made):
+    folder, page = made
+    assert "var(--mode-coarse)" in page
+    assert MODE_COLOURS["COARSE"].light in (folder / "right-timeline.svg").read_text()
+    light, dark = page.split("prefers-color-scheme: dark")
+    assert f"--mode-coarse: {MODE_COLOURS['COARSE'].light};" in light
+    assert f"--mode-coarse: {MODE_COLOURS['COARSE'].dark};" in dark
+
+
+def test_what_safe_does_to_the_mirror_does_not_set_the_scale_of_its_piston(findings):
+    loop = findings.loops["right"]
+    safe, jumped_m = loop.ticks["mode_number"].copy(), loop.stacks.piston_m.copy()
+    safe[-50:], jumped_m[-50:] = Mode.SAFE, 1e-3
+    after = dataclasses.replace(
+        loop,
+        ticks=loop.ticks | {"mode_number": safe},
+        stacks=loop.stacks._replace(piston_m=jumped_m),
+        selection=loop.selection._replace(pieces=[loop.selection.rows[:-50]]),
+    )
+
+    with styled():
+        figure = mirror(findings, after, time_axis(60.0, "")).figure
+
+    _, piston = figure.axes
+    low_nm, high_nm = piston.get_ylim()
+    counted_nm = 1e9 * loop.stacks.piston_m[loop.selection.rows[:-50]]
+    assert low_nm < counted_nm.min() < counted_nm.max() < high_nm
+    assert high_nm - low_nm < 2 * max(2.0, np.ptp(counted_nm))
+
+
+def test_a_plot_without_data_is_a_line_that_says_why(rig, tmp_path):
+    path = tmp_path / "standby.mcap"
+
+    def course(simulation):
+        simulation.run(0.1)
+        simulation.command(Standby(loop="right"))
+        simulation.run(3.0)
+
+    record(rig, path, course)
+
+    page = make_report(find(find_run([path])), tmp_path).read_text()
+
+    text = " ".join(" ".join(Reader(page).text).split())
+    for line in (
+        "Before and after: no stretch that counts is as long as a segment of 8 s.",
+        "Rejection against the design: no stretch that counts",
+        "Mirror: range and piston: the loop never followed its star.",
+        "Hysteresis in the commands: the target did not move",
+    ):
+        assert line in text
+    assert not (tmp_path / "right-psd.svg").exists()
+
+
 def test_every_plot_is_beside_it_as_png_and_svg(made):
     folder, page = made
     names = {path.stem for path in folder.glob("*.svg")}
@@ -167,6 +267,10 @@ def test_nights_are_put_side_by_side(findings, rig, tmp_path):
     assert "✓ met" in text
     assert "? not known" in text
     assert (tmp_path / "right-spectra.png").exists()
+    (budget,) = (one.budget for one in findings.loops["right"].rejections)
+    assert f"{budget.measured_px:.4f} ({budget.expected_px:.4f})" in text
+    air = f"{budget.percent['air']} % ({100 * budget.expected_fractions['air']:.0f} %)"
+    assert f"air {air}" in text
     nights = json.loads((tmp_path / "report.json").read_text())["nights"]
     assert [night["verdict"] for night in nights] == ["met", "not known"]
 

@@ -95,6 +95,7 @@ def test_two_loops_are_judged_each_by_itself(rig, tmp_path):
     for section in (document["loops"], document["plant"]["loops"], document["mocks"]["loops"]):
         section["left"] = copy.deepcopy(section["right"])
     document["loops"]["left"]["target_px"] = {"az": 10.0, "el": 30.0}
+    document["loops"]["left"]["siderostat"]["device"]["node_id"] = 2
     both = type(rig).model_validate_json(json.dumps(document))
     path = tmp_path / "both.mcap"
 

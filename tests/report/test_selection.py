@@ -4,13 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_samples import PERIOD_S, ticks_of
 
+from fitctl.error_budget import regular
 from fitctl.messages.modes import Mode
-from fitctl.report.selection import (
-    TARGET_SETTLE_S,
-    regular,
-    searches_for_lost_star,
-    select_frames,
-)
+from fitctl.report.selection import TARGET_SETTLE_S, searches_for_lost_star, select_frames
 from fitctl.simulation.statistics import SETTLE_S
 
 FRAMES = 3000  # a minute

@@ -151,8 +151,9 @@ def test_the_page_has_all_three_loops_and_their_fringes(run_of_three, tmp_path):
     assert read.open == []
     assert len(read.ids) == len(set(read.ids))
     for part in (
-        "Loop metrology: 1 arcsec RMS on each axis",
-        "Loop left: 0.1 px RMS on each axis",
+        "of 1 arcsec RMS",
+        "of 0.1 px RMS",
+        "RMS of the worse axis, 10 s at a time",
         "Error in LOCKED",
         "Fringe visibility that the tilt leaves",
         "Spectrum of the tilt",
@@ -160,7 +161,7 @@ def test_the_page_has_all_three_loops_and_their_fringes(run_of_three, tmp_path):
         "The star comes over the link that loop metrology holds",
     ):
         assert part in text
-    assert page.count("<svg") == 8 + 4 + 8 + 2
+    assert page.count("<svg") == 1 + 8 + 4 + 8 + 2
     figures = json.loads((tmp_path / "report.json").read_text())
     assert figures["fringes"]["visibility_mean"] == findings.fringes.figures.visibility_mean
     assert figures["loops"]["metrology"]["requirement_arcsec"] == 1.0
@@ -168,6 +169,17 @@ def test_the_page_has_all_three_loops_and_their_fringes(run_of_three, tmp_path):
         "rms_arcsec", "low_arcsec", "high_arcsec", "independent"
     }  # fmt: skip
     assert "rms_px" in figures["loops"]["left"]["residual"]["az"]
+
+
+def test_the_error_budget_of_a_star_behind_a_link_is_explained(run_of_three):
+    """The link's siderostat is a part of the loop, and no disturbance."""
+    _, findings = run_of_three
+    ((one,), (other,)) = (findings.loops[name].rejections for name in ("right", "left"))
+
+    for budget in (one.budget, other.budget):
+        assert budget.as_expected
+        assert abs(budget.fractions["unexplained"]) < 0.2
+        assert sum(budget.fractions.values()) == pytest.approx(1.0)
 
 
 def test_a_testbed_that_was_off_makes_a_page_without_fringes(testbed, tmp_path):

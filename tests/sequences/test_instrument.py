@@ -358,8 +358,8 @@ def test_a_key_is_given_once_by_name_or_in_its_order(values):
 
 
 def test_a_figure_that_could_not_be_had_is_not_a_number(monkeypatch, tmp_path):
-    from fitctl.sequences import plain
-    from fitctl.sequences.behaviour import Result
+    from fitctl.sequences.behaviours import plain
+    from fitctl.sequences.behaviours.behaviour import Result
 
     never = plain.PLAIN["wait"]._replace(done=lambda _step, _view: Result({"a_s": math.nan}, ""))
     monkeypatch.setitem(fitctl.sequences.runner.BEHAVIOURS, "wait", never)

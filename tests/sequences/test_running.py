@@ -8,7 +8,8 @@ from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import Acquire, Hold, SequenceControl, Stop
-from fitctl.sequences import pointing, view
+from fitctl.sequences import view
+from fitctl.sequences.behaviours import pointing
 from fitctl.sequences.files import find_sequence, shipped_sequences
 from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import load_sequence
@@ -19,7 +20,10 @@ RIG = load_rig(default_rig_path())
 RIGS = default_rig_path().parent
 SKIES = {
     "stars": load_rig(RIGS / "star-field.toml"),
-    "testbed": load_rig(RIGS / "fit-testbed.toml"),
+    **dict.fromkeys(
+        ("ambient", "feedforward", "overlap", "photodiodes", "testbed"),
+        load_rig(RIGS / "fit-testbed.toml"),
+    ),
 }
 
 

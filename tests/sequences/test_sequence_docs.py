@@ -8,7 +8,7 @@ from documents import between, blocks
 from step_tables import common_keys, step_keys
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.sequences.behaviours import problems
+from fitctl.sequences.behaviours.table import problems
 from fitctl.sequences.files import parse_yaml
 from fitctl.sequences.reading import sequence_from_document
 

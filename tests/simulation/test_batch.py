@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from fitctl.config import StackHysteresis, default_rig_path, load_rig
+from fitctl.logging.records import MetrologyTick
 from fitctl.messages.modes import Mode
 from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.simulation.batch.batch import Batch
-from fitctl.simulation.batch.records import NOT_FOUND
+from fitctl.simulation.batch.records import DONE, NOT_FOUND, REFUSED_COURSE
 from fitctl.simulation.batch.settings import BatchRefusalError
-from fitctl.simulation.simulation import Simulation, simulate
+from fitctl.simulation.simulation import Simulation, simulate, simulate_rig
+from fitctl.simulation.statistics import motion_start_s
 
 pytestmark = pytest.mark.skipif(
     not numba_installed(), reason="numba is not installed (extra `fast`)"
@@ -42,8 +44,9 @@ def both(rig, seed, duration_s):
     return simulation, Batch(rig).run(seed, duration_s, keep=True)
 
 
-def assert_same_run(simulation, run):
-    ticks = [tick for tick in simulation.ticks if tick.number > 0]
+def assert_same_run(simulation, batch_run, loop="right"):
+    run = batch_run.loops[loop]
+    ticks = [tick for tick in simulation.ticks if tick.number > 0 and tick.loop == loop]
     assert len(run.ticks) == len(ticks)
     assert [Mode(mode).name for mode in run.ticks["mode"]] == [tick.mode for tick in ticks]
     seen = np.array([tick.star_visible for tick in ticks])
@@ -52,9 +55,9 @@ def assert_same_run(simulation, run):
         expected = np.array([[getattr(tick, name) for name in theirs] for tick in ticks])
         rows = seen if ours == "star_px" else slice(None)
         assert np.all(np.abs(run.ticks[ours] - expected)[rows] < 1e-9), ours
-    plant = simulation.plants["right"]
+    plant = simulation.plants[loop]
     true_px = plant.history_px(0.0, plant.time_s)[:, 0, 0]
-    assert np.abs(run.true_px - true_px).max() < 1e-9
+    assert np.abs(run.true - true_px).max() < 1e-9
 
 
 @pytest.mark.parametrize("controller", ["eq20", "lqg-ltr", "minimum-variance", "fslq"])
@@ -63,6 +66,25 @@ def test_every_design_makes_the_same_run_from_the_search_to_the_held_star(contro
 
     assert_same_run(simulation, run)
     assert simulation.mode_changes[-1].target == "VERNIER"
+
+
+LINES = (
+    "plant.loops.right.lines=["
+    "{frequency_hz=6.0, rms_px=0.05, direction_deg=20.0, damping=0.01, drift_hz_per_min=0.0}, "
+    "{frequency_hz=48.9, rms_px=0.02, direction_deg=90.0, damping=0.0, drift_hz_per_min=-3.0}]"
+)
+
+
+RATE = "loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}"
+PLANT_RATE, LOOP_RATE = f"plant.{RATE}", RATE
+TIMELINE = (
+    "plant.timeline=["
+    "{at_s=1.505, loops={right={air_path={gain_px=0.9, b1_s2=0.1, b2_s=2.5}}}}, "
+    "{at_s=2.003, pixel_noise_dn=60.0}, "
+    "{at_s=3.0, loops={right={loop_width_fraction=0.3, lines=["
+    "{frequency_hz=8.7, rms_px=0.05, direction_deg=20.0, damping=0.0, drift_hz_per_min=3.0}]}}}, "
+    "{at_s=4.5, pixel_noise_dn=5.0, loops={right={loop_width_fraction=0.0, lines=[]}}}]"
+)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +107,13 @@ def test_every_design_makes_the_same_run_from_the_search_to_the_held_star(contro
             ],
             id="flight rate",
         ),
-        pytest.param(["loops.right.siderostat.travel_sky_arcsec=60.0"], id="end of travel"),
+        pytest.param(
+            [  # the star is at 158 arcsec: seen from 130, and not reached
+                "loops.right.siderostat.travel_sky_arcsec=130.0",
+                "loops.right.acquisition.search_radius_sky_arcsec=130.0",
+            ],
+            id="end of travel",
+        ),
         pytest.param(["loops.right.target_px={az=35.0, el=5.0}"], id="far from the field's middle"),
         pytest.param(
             [
@@ -94,6 +122,48 @@ def test_every_design_makes_the_same_run_from_the_search_to_the_held_star(contro
             ],
             id="now and then most light in one pixel",
         ),
+        pytest.param(["loops.right.sensor=fit"], id="fit"),
+        pytest.param(["camera.electrons_per_dn=1.0"], id="photon noise"),
+        pytest.param(
+            [
+                "loops.right.sensor=fit", "camera.electrons_per_dn=0.5",
+                CONTROLLER.format("minimum-variance"),
+            ],
+            id="fit with photon noise",
+        ),
+        pytest.param([LINES], id="vibration lines"),
+        pytest.param(
+            [
+                "plant.exposure_instants=5", LINES,
+                "loops.right.flux_range={low=0.3, high=1.6}", "loops.right.other_spots=[]",
+            ],
+            id="smeared by motion",
+        ),
+        pytest.param(
+            [PLANT_RATE, LOOP_RATE, "loops.right.siderostat.rotation_deg=25.0"], id="star that moves"
+        ),
+        pytest.param(
+            [
+                PLANT_RATE, "loops.right.siderostat.travel_sky_arcsec=90.0",
+                "loops.right.acquisition.search_radius_sky_arcsec=90.0",
+            ],
+            id="star that leaves",
+        ),
+        pytest.param(
+            ["plant.loops.right.hysteresis.creep_per_decade=0.03", CONTROLLER.format("eq20")],
+            id="creep",
+        ),
+        pytest.param(
+            [
+                "loops.right.siderostat.axis_gains=[[1.1, 0.05], [-0.1, 0.9]]",
+                "loops.right.fsm.axis_gains=[[0.9, 0.1], [0.05, 1.1]]",
+                "loops.right.siderostat.rotation_deg=20.0",
+                "plant.loops.right.fsm_axis_gains=[[0.85, 0.1], [0.0, 1.2]]",
+                LOOP_RATE, PLANT_RATE,
+            ],
+            id="gains of the axes",
+        ),
+        pytest.param([TIMELINE, CONTROLLER.format("minimum-variance")], id="timeline"),
     ],
 )  # fmt: skip
 def test_unusual_rigs_make_the_same_run(overrides):
@@ -115,14 +185,15 @@ def test_a_star_that_is_lost_for_long_makes_the_same_run_round_by_round():
     simulation, run = both(rig_with(*AWAY), 3, 30.0)
 
     assert_same_run(simulation, run)
-    assert set(run.ticks["round"][run.ticks["again"] == 1]) >= {0, 1, 2, 3}
+    ticks = run.loops["right"].ticks
+    assert set(ticks["round"][ticks["again"] == 1]) >= {0, 1, 2, 3}
 
 
 def test_a_lost_star_that_does_not_come_back_in_time_is_simulated():
     run = Batch(rig_with(*AWAY, "loops.right.acquisition.search_again_s=0.5")).run(3, 30.0)
 
     assert run.ended == NOT_FOUND
-    assert run.state["again"] == 1
+    assert run.loops["right"].state["again"] == 1
 
 
 TURNED = ("loops.right.siderostat.rotation_deg=-50.0", "loops.right.fsm.rotation_deg=160.0")
@@ -146,9 +217,9 @@ def test_turned_stages_make_the_same_run(controller):
 )
 def test_the_star_is_held_as_well_by_stages_that_are_turned(rig, turned):
     """The air is the same; encoder counts and hysteresis come in other moments."""
-    straight = Batch(rig).result(5, 60.0)
+    straight = Batch(rig).result(5, 60.0).loops["right"]
 
-    found = Batch(rig_with(*turned)).result(5, 60.0)
+    found = Batch(rig_with(*turned)).result(5, 60.0).loops["right"]
 
     for axis, straight_px in straight.rms_px.items():
         assert found.rms_px[axis] == pytest.approx(straight_px, rel=0.15), axis
@@ -175,7 +246,7 @@ def test_runs_are_the_same_whether_or_not_the_hysteresis_is_known(controller, kn
 def test_a_result_is_the_simulations_result(rig):
     expected = simulate(rig, 5, 25.0)["right"]
 
-    result = Batch(rig).result(5, 25.0)
+    result = Batch(rig).result(5, 25.0).loops["right"]
 
     for name, value in expected._asdict().items():
         if name != "speed_x":
@@ -189,7 +260,7 @@ def test_what_a_batch_does_not_know_is_simulated():
     )
     run = Batch(rig).run(1, 30.0)
 
-    result = Batch(rig).result(1, 30.0)
+    result = Batch(rig).result(1, 30.0).loops["right"]
 
     assert run.ended != 0
     assert math.isnan(result.acquired_s)
@@ -201,16 +272,192 @@ def test_a_rig_with_more_than_fits_is_refused():
         Batch(rig_with("plant.step_s=0.00005"))
 
 
+def test_a_rig_with_more_changes_than_fit_is_refused():
+    changes = ", ".join(f"{{at_s={second}.0, pixel_noise_dn=20.0}}" for second in range(1, 65))
+
+    with pytest.raises(BatchRefusalError, match="timeline has 64 changes; the batch holds 62"):
+        Batch(rig_with(f"plant.timeline=[{changes}]"))
+
+
+def test_a_rig_with_more_lines_than_fit_is_refused():
+    line = "{frequency_hz=6.0, rms_px=0.0, direction_deg=0.0, damping=0.0, drift_hz_per_min=0.0}"
+
+    with pytest.raises(BatchRefusalError, match="the batch holds"):
+        Batch(rig_with(f"plant.loops.right.lines=[{', '.join([line] * 9)}]"))
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
         ["interlocks.fsm_edge.action=flatten"],
         ["interlocks.star_lost.action=hold"],
         ["interlocks.siderostat_rate.high=0.5"],
-        ["interlocks.piezo_limit.stale_s=0.5"],
         ["plant.frame_delay_s=0.07"],  # later than the frame-age row allows
     ],
 )
 def test_a_rig_whose_interlocks_may_act_is_refused(overrides):
     with pytest.raises(BatchRefusalError, match="may act"):
         Batch(rig_with(*overrides))
+
+
+# ---------------------------------------------------------------- several loops
+
+TESTBED = default_rig_path().parent / "fit-testbed.toml"
+BEAM_FIELDS = {
+    "place_m": ("beam_az_m", "beam_el_m"),
+    "motor_rad": FIELDS["motor_rad"],
+    "setpoint_rad": FIELDS["setpoint_rad"],
+}
+
+
+def rig_of_testbed(*overrides):
+    return load_rig(TESTBED, overrides)
+
+
+def both_of_all(rig, seed, duration_s):
+    """One run of the simulation, its collector moving from its start on, and of the batch."""
+    samples = []
+    simulation = Simulation(
+        rig,
+        seed,
+        history_s=duration_s + 1.0,
+        record=lambda record: samples.append(record) if isinstance(record, MetrologyTick) else None,
+    )
+    simulation.acquire()
+    motion_s = motion_start_s(rig)
+    while simulation.clock.now_s() < duration_s:
+        simulation.run(rig.camera.period_s)
+        if simulation.clock.now_s() >= motion_s:
+            simulation.move_collector()
+            motion_s = math.inf
+    return simulation, samples, Batch(rig).run(seed, duration_s, keep=True)
+
+
+def assert_same_loops(simulation, samples, run):
+    for name in simulation.plants:
+        assert_same_run(simulation, run, name)
+    for name, part in simulation.plant.metrology_loops.items():
+        ours, theirs = run.loops[name], [s for s in samples if s.loop == name and s.number > 0]
+        assert [Mode(mode).name for mode in ours.ticks["mode"]] == [s.mode for s in theirs]
+        for field, names in BEAM_FIELDS.items():
+            expected = np.array([[getattr(s, one) for one in names] for s in theirs])
+            rows = ~np.isnan(expected)
+            assert np.all(np.abs(ours.ticks[field] - expected)[rows] < 1e-9), field
+        true_m = part.history_offset_m(0.0, part.time_s)[:, 0]
+        assert np.abs(ours.true - true_m).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        pytest.param(["collector.motion.kind=still"], id="still"),
+        pytest.param(
+            [
+                "collector.motion.kind=sine",
+                "plant.exposure_instants=2",
+                "plant.loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
+                "loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
+            ],
+            id="smeared, and one star moves",
+        ),
+        pytest.param(["collector.motion.kind=drift"], id="drift"),
+        pytest.param(["collector.motion.kind=sine"], id="sine"),
+        pytest.param(["collector.motion.kind=random"], id="random"),
+        pytest.param(
+            ["collector.motion.kind=sine", "loops.left.feedforward.gain=0.0"], id="no feedforward"
+        ),
+        pytest.param(
+            [
+                "collector.motion.kind=drift",
+                "loops.left.feedforward.matrix=[[0.9, 0.2], [-0.1, 1.1]]",
+                "loops.left.siderostat.rotation_deg=20.0",
+                "loops.metrology.siderostat.rotation_deg=-35.0",
+                "loops.left.vernier.controller=minimum-variance",
+            ],
+            id="turned",
+        ),
+        pytest.param(
+            [
+                "collector.motion.kind=still",
+                "plant.loops.metrology.air_path.rms_sky_arcsec=60.0",
+                "loops.metrology.acquisition.search_again_pause_s=0.2",
+            ],
+            id="beam out of reach and back",
+        ),
+    ],
+)
+def test_all_loops_of_the_testbed_make_the_same_run(overrides):
+    rig = rig_of_testbed("collector.motion.start_s=13.0", *overrides)
+
+    simulation, samples, run = both_of_all(rig, 1, 19.0)
+
+    assert run.ended == DONE
+    assert_same_loops(simulation, samples, run)
+
+
+def test_a_course_from_a_file_makes_the_same_run(tmp_path):
+    path = tmp_path / "course.csv"
+    path.write_text("time_s,az_mm,el_mm\n0,0,0\n1,0.5,-0.2\n3,-0.4,0.1\n")
+    rig = rig_of_testbed(
+        "collector.motion.start_s=13.0",
+        "collector.motion.kind=file",
+        f"collector.motion.file={path}",
+    )
+
+    assert_same_loops(*both_of_all(rig, 2, 18.0))
+
+
+NEAR = "plant.loops.{}.star_offset_sky_arcsec_max=50.0"
+
+
+@pytest.mark.parametrize(
+    ("seed", "overrides"),
+    [
+        pytest.param(3, [], id="far from each other"),
+        pytest.param(23, [NEAR], id="both on the frame"),
+        pytest.param(0, [one.replace("right", "{}") for one in AWAY], id="lost and found"),
+    ],
+)
+def test_two_stars_that_arrive_directly_make_the_same_run(seed, overrides):
+    given = [one.format(name) for one in overrides for name in ("right", "left")]
+    rig = load_rig(TESTBED.parent / "two-stars.toml", given)
+
+    simulation, samples, run = both_of_all(rig, seed, 16.0)
+
+    assert_same_loops(simulation, samples, run)
+    # Candidates that were another loop's star, or went away.
+    assert bool(overrides) == any(loop.ticks["rejected"].any() for loop in run.loops.values())
+
+
+@pytest.mark.parametrize("kind", ["still", "sine"])
+def test_a_result_of_all_loops_is_the_simulations(kind):
+    rig = rig_of_testbed(f"collector.motion.kind={kind}", "collector.motion.start_s=25.0")
+    expected = simulate_rig(rig, 4, 30.0)
+
+    result = Batch(rig).result(4, 30.0)
+
+    assert result.visibility == pytest.approx(expected.visibility, rel=1e-9)
+    assert list(result.loops) == list(expected.loops)
+    for name, loop in expected.loops.items():
+        for field, value in loop._asdict().items():
+            if field != "speed_x":
+                ours = getattr(result.loops[name], field)
+                assert ours == pytest.approx(value, rel=1e-9, abs=1e-12), (name, field)
+
+
+def test_a_course_that_the_hexapod_refuses_is_simulated():
+    rig = rig_of_testbed("collector.motion.amplitude_mm=60.0", "collector.motion.kind=sine",
+                       "collector.motion.start_s=2.0", "collector.motion.frequency_hz=0.001")  # fmt: skip
+
+    assert Batch(rig).run(1, 4.0).ended == REFUSED_COURSE
+    assert Batch(rig).result(1, 4.0).loops["right"].frames > 0
+
+
+def test_a_feedforward_that_the_batch_does_not_model_is_refused():
+    with pytest.raises(BatchRefusalError, match="encoders\\+backlash"):
+        Batch(rig_of_testbed("loops.left.feedforward.signal=encoders+backlash"))
+
+
+def test_servos_of_different_rates_are_refused():
+    with pytest.raises(BatchRefusalError, match="rates of its servos differ"):
+        Batch(rig_of_testbed("loops.left.siderostat.servo.rate_hz=1000.0"))

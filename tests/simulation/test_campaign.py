@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from fitctl.cli import main
+from fitctl.config import default_rig_path
 from fitctl.simulation import campaign
 from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.campaign import (
@@ -25,7 +26,7 @@ from fitctl.simulation.campaign import (
     summarize,
 )
 from fitctl.simulation.simulation import simulate
-from fitctl.simulation.statistics import SimulationResult
+from fitctl.simulation.statistics import RigResult, SimulationResult
 
 RUN_S = 20.0
 
@@ -44,11 +45,16 @@ def result(az_px, el_px, vernier_s=8.0):
     )
 
 
+def rig_result(right):
+    return RigResult({"right": right}, math.nan, math.nan)
+
+
 # ---------------------------------------------------------------- what runs say together
 
 
 def test_a_summary_has_means_percentiles_and_the_worst_axis_of_each_run():
-    summary = summarize({seed: {"right": result(0.01 * seed, 0.02)} for seed in (1, 2, 3)})["right"]
+    runs = {seed: rig_result(result(0.01 * seed, 0.02)) for seed in (1, 2, 3)}
+    summary = summarize(runs).loops["right"]
 
     assert (summary.runs, summary.held, summary.judged) == (3, 3, 3)
     assert summary.rms_px["az"].mean == pytest.approx(0.02)
@@ -59,9 +65,12 @@ def test_a_summary_has_means_percentiles_and_the_worst_axis_of_each_run():
 
 
 def test_a_run_that_never_held_its_star_is_the_worst_and_is_counted_apart():
-    runs = {1: {"right": result(0.02, 0.02)}, 2: {"right": result(math.nan, math.nan, math.nan)}}
+    runs = {
+        1: rig_result(result(0.02, 0.02)),
+        2: rig_result(result(math.nan, math.nan, math.nan)),
+    }
 
-    summary = summarize(runs)["right"]
+    summary = summarize(runs).loops["right"]
 
     assert (summary.runs, summary.held, summary.judged) == (2, 1, 1)
     assert summary.worst_seeds[0].seed == 2
@@ -69,7 +78,8 @@ def test_a_run_that_never_held_its_star_is_the_worst_and_is_counted_apart():
 
 
 def test_nothing_held_is_nan_and_no_error():
-    summary = summarize({1: {"right": result(math.nan, math.nan, math.nan)}})["right"]
+    runs = {1: rig_result(result(math.nan, math.nan, math.nan))}
+    summary = summarize(runs).loops["right"]
 
     assert math.isnan(summary.rms_px["az"].mean)
 
@@ -85,8 +95,8 @@ def test_every_seed_of_a_campaign_is_the_run_that_it_is_alone(rig):
     assert list(results) == [4, 5, 6, 7]
     assert progress[-1] == 4
     alone = simulate(rig, 6, RUN_S)["right"]
-    assert results[6]["right"].vernier_s == pytest.approx(alone.vernier_s)
-    assert results[6]["right"].rms_px == pytest.approx(alone.rms_px, rel=1e-9)
+    assert results[6].loops["right"].vernier_s == pytest.approx(alone.vernier_s)
+    assert results[6].loops["right"].rms_px == pytest.approx(alone.rms_px, rel=1e-9)
 
 
 def test_without_the_batch_the_same_runs_are_simulated(rig, monkeypatch):
@@ -101,15 +111,16 @@ def test_without_the_batch_the_same_runs_are_simulated(rig, monkeypatch):
     campaign._runner.cache_clear()
 
     assert reason == "numba is not installed"
-    assert slow[3]["right"].acquired_s == quick[3]["right"].acquired_s
-    assert slow[3]["right"].mode_times == pytest.approx(quick[3]["right"].mode_times)
+    one, other = slow[3].loops["right"], quick[3].loops["right"]
+    assert one.acquired_s == other.acquired_s
+    assert one.mode_times == pytest.approx(other.mode_times)
 
 
 def test_a_worker_that_fails_ends_the_campaign_with_what_was_done(rig, monkeypatch):
     def broken(_json, seeds, _duration):
         if 1 in seeds:
             raise OSError("disk full")
-        return {seed: {"right": result(0.02, 0.02)} for seed in seeds}
+        return {seed: rig_result(result(0.02, 0.02)) for seed in seeds}
 
     monkeypatch.setattr(campaign, "run_seeds", broken)
     with ThreadPoolExecutor(1) as executor, pytest.raises(CampaignError, match="disk full"):
@@ -129,6 +140,22 @@ def test_simulate_runs_prints_one_json_object(capsys):
     assert summary["runs"] == summary["held"] == 3
     assert set(summary["rms_px"]) == {"az", "el", "worst_axis"}
     assert {run["seed"] for run in summary["worst_seeds"]} == {0, 1, 2}
+
+
+def test_runs_of_the_whole_testbed_print_each_loop_and_the_visibility(capsys):
+    testbed = str(default_rig_path().parent / "fit-testbed.toml")
+    with pytest.raises(SystemExit) as ended:
+        main(["simulate", "--rig", testbed, "--runs", "2", "--duration", "70", "--json"])
+
+    output = capsys.readouterr()
+    printed = json.loads(output.out)
+    assert ended.value.code == 0
+    assert printed["batch_refusal"] is None
+    assert list(printed["loops"]) == ["right", "metrology", "left"]
+    beam = printed["loops"]["metrology"]
+    assert beam["runs"] == beam["held"] == 2
+    assert set(beam["rms_arcsec"]) == {"az", "el", "worst_axis"}
+    assert 0.0 < printed["visibility"]["mean"] <= 1.0
 
 
 def test_a_rig_that_the_batch_refuses_is_simulated_slowly_and_says_why_once(capsys):
@@ -218,7 +245,7 @@ def test_a_lost_worker_loses_no_run(rig, tmp_path):
         assert cluster.processes[1].wait(10) == -signal.SIGKILL
     assert list(results) == list(seeds)
     alone = simulate(rig, 63, RUN_S)["right"]
-    assert results[63]["right"].rms_px == pytest.approx(alone.rms_px, rel=1e-9)
+    assert results[63].loops["right"].rms_px == pytest.approx(alone.rms_px, rel=1e-9)
 
 
 def test_no_scheduler_is_said_with_the_next_step(monkeypatch):

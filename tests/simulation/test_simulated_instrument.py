@@ -285,7 +285,9 @@ def test_telemetry_tells_which_file_the_design_at_work_is_from(tmp_path, monkeyp
 
 def test_the_siderostat_stays_within_its_travel(simulate_with):
     simulation = simulate_with(
-        "loops.right.siderostat.travel_sky_arcsec=60.0", star_offset_px=(70.0, 0.0)
+        "loops.right.siderostat.travel_sky_arcsec=60.0",
+        "loops.right.acquisition.search_radius_sky_arcsec=60.0",
+        star_offset_px=(70.0, 0.0),
     )
     simulation.acquire()
     simulation.run(6.0)

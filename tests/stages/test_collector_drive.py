@@ -150,6 +150,16 @@ def test_a_course_begins_where_the_hexapod_is_and_turns_nothing():
     assert np.array(hexapod.sent) == pytest.approx(np.array(expected))
 
 
+def test_its_displacement_is_that_of_the_course_that_runs():
+    clock, _, drive = driven(kind="drift", velocity_mm_s=0.1)
+    assert drive.displacement_mm() == (0.0, 0.0)
+    drive.start()
+    clock.sleep_until(clock.now_s() + 5.0)
+    assert drive.displacement_mm() == pytest.approx((0.5, 0.0))
+    drive.stop()
+    assert drive.displacement_mm() == (0.0, 0.0)
+
+
 def test_a_stopped_course_sends_nothing_more():
     _, hexapod, drive = driven(kind="sine")
     drive.start()

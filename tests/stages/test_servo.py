@@ -366,13 +366,14 @@ class Interruption:
     def __init__(self, code, instruction, action):
         self._code, self._left, self._action = code, instruction, action
         self.happened = False
+        self._tracer = sys.gettrace()  # such as a measurement of coverage
 
     def __enter__(self):
         sys.settrace(self._enter_function)
         return self
 
     def __exit__(self, *_error):
-        sys.settrace(None)
+        sys.settrace(self._tracer)
 
     def _enter_function(self, frame, _event, _argument):
         if frame.f_code is not self._code or self.happened:

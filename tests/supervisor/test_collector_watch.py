@@ -1,5 +1,6 @@
 """The collector under the supervisor: commanded beside the ticks, stopped by STOP, faults as events."""
 
+import threading
 import time
 from types import SimpleNamespace
 
@@ -15,12 +16,14 @@ from fitctl.mocks.c887.server import C887ControllerMock
 from fitctl.simulation.simulation import Simulation
 from fitctl.stages.periodic import PeriodicThread
 from fitctl.supervisor.collector import CollectorWatch
+from fitctl.supervisor.health import hexapod_health
 
 RIG = load_rig(
     default_rig_path().parent / "fit-testbed.toml",
     ["collector.motion.kind=drift", "collector.motion.velocity_mm_s=2.0"],
 )
 PATIENCE_S = 10.0
+RESPONSE_TIMEOUT_S = 0.5
 
 
 @pytest.fixture
@@ -38,7 +41,7 @@ def watched(in_loop, monkeypatch):
 
     mock, ends = in_loop(made())
     clock, events = MonotonicClock(), []
-    settings = device(f"socket://127.0.0.1:{ends.tcp_port}", response_timeout_s=0.5)
+    settings = device(f"socket://127.0.0.1:{ends.tcp_port}", response_timeout_s=RESPONSE_TIMEOUT_S)
     watch = CollectorWatch(
         RIG.collector, C887Hexapod(settings), clock, lambda *event: events.append(event)
     )
@@ -136,18 +139,59 @@ def test_it_is_not_moved_before_it_is_referenced(watched):
     assert watch.is_open, "a refusal does not end the connection"
 
 
-def test_a_stop_returns_at_once_and_leaves_it_where_it_is(watched):
+def test_a_stop_returns_without_waiting_for_the_hexapod(watched):
     watch, mock = watched
     moving(watch, mock)
+    watch.strike("freeze")
     started_s = time.monotonic()
     watch.stop()
-    assert time.monotonic() - started_s < 0.1
+    assert time.monotonic() - started_s < 0.5 * RESPONSE_TIMEOUT_S
+
+
+def test_a_stop_leaves_it_where_it_is(watched):
+    watch, mock = watched
+    moving(watch, mock)
+    watch.stop()
     reported(watch, "was stopped where it is")
     here = y_mm(mock)
     time.sleep(0.2)
     assert y_mm(mock) == here > 0.5
     assert watch.obey(MoveCollector(action="start")) == ""
     until(lambda: y_mm(mock) > here + 0.2, "a new start from there")
+
+
+def test_no_motion_is_begun_while_a_stop_is_under_way(watched, monkeypatch):
+    watch, mock = watched
+    moving(watch, mock)
+    ended, stop = threading.Event(), watch.drive.stop
+
+    def slow_stop():
+        stop()
+        ended.wait(PATIENCE_S)
+
+    monkeypatch.setattr(watch.drive, "stop", slow_stop)
+    watch.stop()
+    until(lambda: not watch.drive.running, "the end of the course")
+    assert "is being stopped" in watch.obey(MoveCollector(action="start"))
+    ended.set()
+    reported(watch, "was stopped where it is")
+    until(lambda: watch.obey(MoveCollector(action="start")) == "", "the next motion")
+    until(lambda: watch.state.motion == "drift", "a drift")
+
+
+def test_a_start_that_a_stop_overtakes_says_that_nothing_moves(watched, monkeypatch):
+    watch, mock = watched
+    opened = watch._hexapod.open
+
+    def slow_open():
+        identity = opened()
+        watch.stop()
+        return identity
+
+    monkeypatch.setattr(watch._hexapod, "open", slow_open)
+    assert watch.obey(MoveCollector(action="reference")) == ""
+    reported(watch, "nothing began to move: a stop came first")
+    assert y_mm(mock) == 0.0
 
 
 def test_a_stop_ends_a_reference_move(watched):
@@ -173,6 +217,7 @@ def test_a_fault_on_the_way_is_an_event_and_the_collector_is_no_longer_moved(wat
     watch.check()
     assert [severity for severity, _, _ in watch.events][-1] == "error"
     assert watch.error
+    assert hexapod_health(watch, 0.0).state == "fault"
     assert watch.is_open == (kind in {"motion_error", "emergency_stop"})
 
 
@@ -189,6 +234,17 @@ def test_the_supervisor_s_stop_stops_the_collector():
     assert not here.moving
     simulation.run(0.5)
     assert simulation.hexapod.pose().pose == here.pose
+    assert not simulation.supervisor.collector.drive.running
+
+
+def test_a_supervisor_that_ends_leaves_no_collector_moving():
+    simulation = Simulation(RIG, seed=1)
+    assert simulation.command(Standby()).accepted
+    simulation.run(0.2)
+    simulation.move_collector()
+    simulation.run(2.0)
+    assert simulation.hexapod.pose().moving
+    simulation.supervisor.close()
     assert not simulation.supervisor.collector.drive.running
 
 

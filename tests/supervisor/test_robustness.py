@@ -5,7 +5,7 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
-from fitctl.controllers.design.bound import bound
+from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.simulation.batch.batch import Batch
 
 pytest.importorskip("numba")
@@ -16,7 +16,7 @@ def truth_over_bound(controller, *truth):
     """Residual, worst axis, mean of some runs of 120 s, over what no controller could go below."""
     rig = load_rig(default_rig_path(), [f"loops.right.vernier.controller={controller}", *truth])
     batch = Batch(rig)
-    rms_px = [max(batch.result(seed, 120.0).rms_px.values()) for seed in SEEDS]
+    rms_px = [max(batch.result(seed, 120.0).loops["right"].rms_px.values()) for seed in SEEDS]
     told = [
         text.replace("plant.loops.right.air_path", "loops.right.vernier.air_path").replace(
             "plant.frame_delay_s", "camera.frame_delay_s"

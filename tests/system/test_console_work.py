@@ -5,7 +5,8 @@ import pytest
 from fitctl.messages.commands import Shutdown, Status
 
 from .conftest import running
-from .test_console import LIMIT_S, PATIENT, terminal
+from .screens import LIMIT_S
+from .test_console import PATIENT, terminal
 
 __all__ = ["terminal"]  # a fixture
 pytestmark = [pytest.mark.terminal, pytest.mark.timeout(900)]
@@ -58,14 +59,14 @@ def run(sequences):
     sequences.press("g")
     sequences.until("y  yes")
     sequences.press("y")
-    sequences.until("▶ short running", 2 * LIMIT_S)
+    sequences.until("▶ short running", limit_s=2 * LIMIT_S)
 
 
 def test_a_sequence_is_run_steered_edited_and_rehearsed_and_its_log_reported_and_replayed(
     sequences, rig
 ):
     run(sequences)
-    sequences.until("step 3/3", 2 * LIMIT_S)
+    sequences.until("step 3/3", limit_s=2 * LIMIT_S)
     sequences.press("p")
     sequences.until("⏸ short paused")
     sequences.press("p")
@@ -82,22 +83,22 @@ def test_a_sequence_is_run_steered_edited_and_rehearsed_and_its_log_reported_and
     sequences.press("Enter")
     sequences.until("well; 3 steps")
     sequences.press("d")
-    rehearsed = sequences.until("s of virtual time", 2 * LIMIT_S)
+    rehearsed = sequences.until("s of virtual time", limit_s=2 * LIMIT_S)
     assert "px RMS; required 5 px" in rehearsed
     assert rig.client.send(Status()).text == "right STANDBY", "a rehearsal moves nothing"
 
     run(sequences)
-    assert "3  wait           1  done" in sequences.until("  done", 2 * LIMIT_S)
+    assert "3  wait           1  done" in sequences.until("  done", limit_s=2 * LIMIT_S)
 
     logs = sequences
     logs.press("5")
     logs.until("recording")
     logs.press("m")
-    logs.until("rec, kept")
+    logs.until("mcap kept")
     rig.client.send(Shutdown())
     assert rig.supervisor.wait(LIMIT_S) == 0
     logs.until("NO DATA")
     logs.press("t")
-    logs.until("report.html", 2 * LIMIT_S)
+    logs.until("report.html", limit_s=2 * LIMIT_S)
     logs.press("y")
-    logs.until("replayed at", 2 * LIMIT_S)
+    logs.until("replayed at", limit_s=2 * LIMIT_S)

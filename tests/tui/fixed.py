@@ -1,14 +1,26 @@
 """A console on recorded telemetry whose clock stands still, with other commands answered by heart."""
 
-import asyncio
+import functools
 import json
 import os
 from pathlib import Path
 
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.theory import loop_theory
+from fitctl.error_budget import LoopTheory, theory_to_plain
 from fitctl.tui.app import ConsoleApp
-from fitctl.tui.widgets.spectrum import Spectrum
+from fitctl.tui.rewind.player import Player
 from tests.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
+
+
+@functools.cache
+def theory_of(controller: str) -> LoopTheory:
+    """What `fitctl design` knows of the shipped rig with a controller."""
+    rig = load_rig(default_rig_path())
+    return loop_theory(rig, "right", design_for(rig, "right", controller))
+
 
 MESSAGES = 420
 LOG_TIME_S = 1796021000.0
@@ -23,6 +35,7 @@ DESIGN = {
     "attenuation_1hz": 6.1,
     "attenuation_2hz": 1.8,
     "residual_px": 0.0131,
+    "theory": theory_to_plain(theory_of("minimum-variance")),
 }
 SEQUENCES = [
     {
@@ -80,6 +93,13 @@ def make_logs(folder: Path) -> Path:
     return folder
 
 
+class PromptPlayer(Player):
+    """Makes each moment at once, on the caller's thread."""
+
+    def seek(self, time_s):
+        self._on_state(time_s, self._make(time_s))
+
+
 class FixedApp(ConsoleApp):
     """A console on recorded telemetry whose clock stands still after the last message."""
 
@@ -97,6 +117,7 @@ class FixedApp(ConsoleApp):
             **options,
         )
         self.silent_s = silent_s
+        self.playback._player.__class__ = PromptPlayer
 
     def start_fake(self, arguments, **options):
         self.jobs.append(FakeJob(arguments, **options))
@@ -107,6 +128,7 @@ class FixedApp(ConsoleApp):
         for message in self.recorded:
             self.fixed_s = message.time_s
             self.state.accept(message, message.time_s)
+            self._recent.add(message, message.time_s)
         self.fixed_s += self.silent_s
         self.draw_all()
 
@@ -114,8 +136,6 @@ class FixedApp(ConsoleApp):
 async def settle(app: ConsoleApp, pilot) -> None:
     """Wait until everything that is drawn in its own time has been drawn."""
     await pilot.pause()
-    while any(spectrum._signal is None for spectrum in app.screen_stack[0].query(Spectrum)):
-        await asyncio.sleep(0.02)
     app.draw_all()  # children are asked for
     app.draw_all()  # and have answered
     await pilot.pause()

@@ -1,19 +1,18 @@
 """Alarms: what is wrong comes up once, says what to do, and goes when it should."""
 
+import re
+
 import msgspec
 import pytest
 
 from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
 from fitctl.tui.alarms import BELL_EVERY_S, AlarmBook
-from fitctl.tui.dialogs import alarms_text
+from fitctl.tui.dialogs import Alarms, alarms_text
+from fitctl.tui.inks import ORANGE, RED
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from tests.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
-
-FAULT = (
-    "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error; "
-    "remove its cause, then recover"
-)
+from tests.tui.wrong import ALARMS, FAULT, stopped_testbed
 
 
 def tripped(name="flux_low", **fields):
@@ -37,9 +36,16 @@ class Watch:
             self.bells += self.book.update(self.state)
         return self.book.in_order
 
-    def row(self, columns=200):
+    def bar(self, columns=200):
         bar = AlarmBar(self.state, self.book)
-        return ["".join(segment.text for segment in line) for line in bar.draw(columns, 3)]
+        return bar, ["".join(segment.text for segment in line) for line in bar.draw(columns, 9)]
+
+    def row(self, columns=200):
+        return self.bar(columns)[1]
+
+    def acknowledge(self):
+        """What the bar shows."""
+        self.book.acknowledge(self.bar()[0].shown)
 
 
 def test_there_is_nothing_when_all_is_well():
@@ -100,7 +106,7 @@ def test_what_was_done_is_said_and_an_error_stays_until_it_is_seen(action, did):
     (alarm,) = watch.hear()
     assert alarm.over_s is not None
     assert "(over " in watch.row()[0]
-    watch.book.acknowledge()
+    watch.acknowledge()
     assert watch.hear() == []
 
 
@@ -120,7 +126,7 @@ def test_a_fault_is_told_once_though_loop_and_device_both_tell_it():
 def test_what_a_device_told_before_the_recovery_is_no_new_alarm():
     watch = Watch(failed())
     watch.hear()
-    watch.book.acknowledge()
+    watch.acknowledge()
     message = watch.supervisor.message()
     loops = [
         msgspec.structs.replace(loop, mode="STANDBY", since_s=message.time_s + 0.05)
@@ -134,7 +140,7 @@ def test_what_a_device_told_before_the_recovery_is_no_new_alarm():
 def test_a_recovery_that_fails_alarms_again_though_its_cause_was_acknowledged():
     watch = Watch(failed())
     watch.hear()
-    watch.book.acknowledge()
+    watch.acknowledge()
     watch.supervisor.last_failure = LoopFailure(
         what="recover", time_s=START_S + 9.0, text=FAULT + "."
     )
@@ -157,7 +163,7 @@ def test_lost_records_alarm_again_when_more_are_lost():
     watch = Watch(FakeSupervisor())
     watch.supervisor.records_lost = 5
     watch.hear()
-    watch.book.acknowledge()
+    watch.acknowledge()
     assert watch.hear()[0].acknowledged
     watch.supervisor.records_lost = 6
     (alarm,) = watch.hear()
@@ -193,7 +199,7 @@ def test_what_was_acknowledged_does_not_ring():
     watch = Watch(FakeSupervisor())
     watch.supervisor.interlocks = [tripped()]
     watch.hear()
-    watch.book.acknowledge()
+    watch.acknowledge()
     watch.hear(round(2.5 * BELL_EVERY_S / 0.05))
     assert watch.bells == 1
 
@@ -207,19 +213,87 @@ def test_the_weightiest_comes_first_and_the_rest_are_counted():
     watch.hear()
     rows = watch.row()
     assert "worst" in rows[0]
-    assert "+2" in rows[-1]
+    assert "+4 more" in rows[-1]
 
 
-@pytest.mark.parametrize("columns", [60, 80, 120, 300])
-def test_the_status_bar_says_what_and_what_to_do_at_every_width(columns):
-    watch = Watch(failed())
+@pytest.mark.parametrize("columns", [40, 60, 80, 120, 300])
+@pytest.mark.parametrize("wrong", ALARMS)
+def test_an_alarm_is_whole_at_every_width(wrong, columns):
+    watch = Watch(ALARMS[wrong]())
     watch.hear()
-    row = watch.row(columns)[0]
-    assert len(row) <= columns
-    assert "✗" in row
-    assert "siderostat right" in row
-    assert "▸ remove" in row
-    assert "k seen" in row
+    bar, rows = watch.bar(columns)
+    first = watch.book.in_order[0]
+    assert max(map(len, rows)) <= columns
+    shown = " ".join(" ".join(rows).split())
+    what = re.sub(r" at \S+:(?= )", ":", first.what, count=1)
+    for words in (what, first.did, first.todo):
+        assert not set(words.split()) - set(shown.split())
+    assert "…" not in shown
+    assert bar.shown == {first.key: first.count}
+
+
+@pytest.mark.parametrize(
+    "wrong", ["drive_fault", "interlock_warns", "device_fault", "faulty_testbed"]
+)
+def test_at_80_columns_the_common_alarms_need_two_rows(wrong):
+    watch = Watch(ALARMS[wrong]())
+    watch.hear()
+    rows = watch.row(80)
+    assert len(rows) == 2
+    assert "▸" in rows[1]
+    assert "▸" not in rows[0]
+
+
+def test_only_what_is_shown_is_acknowledged():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped("shown", action="hold"), tripped("below")]
+    watch.hear()
+    assert "shown" in watch.row()[0]
+    watch.acknowledge()
+    assert {alarm.key: alarm.acknowledged for alarm in watch.hear()} == {
+        "interlock shown: low": True,
+        "interlock below: low": False,
+    }
+    assert "below" in watch.row()[0]
+
+
+def test_an_alarm_that_has_grown_since_it_was_shown_is_not_acknowledged():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.records_lost = 5
+    watch.hear()
+    shown = watch.bar()[0].shown
+    watch.supervisor.records_lost = 6
+    watch.hear()
+    watch.book.acknowledge(shown)
+    assert [alarm.acknowledged for alarm in watch.hear()] == [False]
+
+
+def test_an_alarm_that_came_after_the_list_was_drawn_is_not_acknowledged_by_it():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped("known")]
+    watch.hear()
+    dialog = Alarms(watch.state, watch.book)
+    watch.supervisor.interlocks = [tripped("known"), tripped("new")]
+    watch.hear()
+    dialog._book.acknowledge(dialog._shown)
+    acknowledged = {alarm.key: alarm.acknowledged for alarm in watch.hear()}
+    assert acknowledged == {"interlock known: low": True, "interlock new: low": False}
+
+
+def test_a_stop_says_who_it_was_and_looks_like_no_fault():
+    watch = Watch(stopped_testbed())
+    assert watch.hear() == []
+    bar = AlarmBar(watch.state, watch.book)
+    lines = bar.draw(80, 9)
+    assert "right, metrology, left SAFE: stopped by anna" in text_of(lines[0])
+    assert "recover, or off" in text_of(lines[1])
+    inks = {s.style.color.name for line in lines for s in line if s.style and s.style.color}
+    assert not inks & {RED, ORANGE}
+    assert bar.shown == {}
+
+
+def text_of(line):
+    return "".join(segment.text for segment in line)
 
 
 def test_the_list_has_everything_in_full():

@@ -75,7 +75,7 @@ def test_margins_and_sequences_go_by_the_rig_file_that_was_given():
 
     assert commands(attached(scenario, rig=RIG)) == [
         ["design", "minimum-variance", "--json", "--loop", "right", *RIG],
-        ["sequence", "dry-run", "jog.toml", *RIG],
+        ["sequence", "dry-run", "jog.toml", *RIG, "--present", *KEY],
         ["sequence", "run", "jog.toml", *RIG, *KEY],
     ]
 
@@ -91,7 +91,7 @@ def test_margins_of_a_saved_design_are_those_of_its_file():
         assert "phase margin" in told(panel)
         app.state.loop.state = made_anew
         panel.redraw()
-        assert "being worked out" in told(panel)  # and not the margins of the other
+        assert "computing its margins" in told(panel)  # and not the margins of the other
 
     (made_anew,) = FakeSupervisor().message().loops
     app = attached(scenario, rig=RIG, key=[], controller_file="/rigs/mine.json")

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import pytest
 from textual.screen import Screen
 
+from fitctl.logging.records import Event
 from fitctl.messages.commands import (
     Acquire,
     Hold,
@@ -22,7 +23,7 @@ from fitctl.messages.commands import (
 )
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS
-from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader
+from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader, Running
 from fitctl.tui.jog import JogPad
 from fitctl.tui.state import WINDOWS
 from fitctl.tui.views.operate import OperateView
@@ -32,7 +33,8 @@ from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs
 
 SCREENS = [ConsoleApp.MODES[view.name] for view in VIEWS]
-BOUND = (ConsoleApp, Choice, *SCREENS, Reader, Alarms, Confirm, Ask)
+BOUND = (ConsoleApp, Choice, *SCREENS, Reader, Alarms, Running, Confirm, Ask)
+OF_ITS_OWN_ACCORD = (["sequence", "list"], ["log", "summary"])
 LOG = "fit-mock_20261132T031500Z.mcap"
 STAR = {"hand": "aim", "cursor_px": (24.0, 19.5)}
 CLOSED = {"dialog": ""}
@@ -82,6 +84,20 @@ STANDBY = [
         ],
     ),
 ]
+# Of 21 s of telemetry; the oldest alarm of the fake supervisor is older.
+PAST = [
+    ("comma", "", {"ago_s": 1}),
+    ("full_stop", "less_than_sign", {"ago_s": 9}),
+    ("less_than_sign", "", {"ago_s": 10}),
+    ("greater_than_sign", "less_than_sign comma", {"ago_s": 1}),
+    ("left_curly_bracket", "", {"ago_s": 21}),
+    ("right_curly_bracket", "less_than_sign", {"ago_s": 0}),
+    ("home", "comma", {"ago_s": 21}),
+    ("end", "comma", {"ago_s": 0}),
+    ("left_parenthesis", "comma", {"ago_s": 12}),
+    ("right_parenthesis", "home", {"ago_s": 12}),
+    ("at", "", {"dialog": "Ask"}),
+]
 EVERYWHERE = lines(
     ConsoleApp,
     [
@@ -95,6 +111,7 @@ EVERYWHERE = lines(
         ("e", "", {"dialog": "Reader"}),
         ("l", "", {"loop": "left"}),
         ("ctrl+p", "", {"dialog": "CommandPalette"}),
+        *PAST,
         ("q", "", {"left": True}),
         ("ctrl+c", "v", {"left": True}),
         ("ctrl+q", "v", {"left": True}),
@@ -106,6 +123,7 @@ OPERATE = lines(
         ("t", "", STAR),
         ("i", "", STAR),
         ("j", "", {"hand": "jog"}),
+        ("d", "", {"dialog": "Ask"}),
         ("w", "", {"window_s": 60.0}),
         ("x", "", {"stretch": "sqrt"}),
         ("c", "", {"colours": "viridis"}),
@@ -140,16 +158,20 @@ LISTS = [
         ConsoleApp.MODES["devices"],
         [
             ("enter", "2", {"dialog": "Reader"}),
-            ("n", "2 tab down", {"given": [Reset(loop="right", name="fsm_edge")]}),
+            ("n", "2 tab", {"given": [Reset(loop="right", name="fsm_edge")]}),
         ],
     ),
     *lines(ConsoleApp.MODES["loop"], [("w", "3", {"window_s": 60.0})]),
+    *lines(
+        ConsoleApp.MODES["help"],
+        [("slash", "6", {"finds": True}), ("escape", "6 slash", {"finds": False})],
+    ),
     *lines(
         ConsoleApp.MODES["sequences"],
         [
             ("tab", "4", {"list": "parameters"}),
             ("enter", "4 tab down", {"dialog": "Ask"}),
-            ("d", "4", {"started": ["sequence dry-run acquire.toml"]}),
+            ("d", "4", {"started": ["sequence dry-run acquire.toml --present"]}),
             ("g", "4", {"dialog": "Confirm"}),
             ("p", "4", {"given": [SequenceControl(loop="right", action="pause")]}),
             ("z", "4", {"given": [SequenceControl(loop="right", action="stop")]}),
@@ -174,11 +196,15 @@ DIALOGS = [
     *lines(
         Alarms,
         [
-            *((key, "v", CLOSED) for key in ("escape", "q", "v", "enter")),
+            *((key, "v", CLOSED) for key in ("escape", "q", "v")),
+            ("enter", "v", {"dialog": "", "ago_s": 5}),
+            ("down", "v", {}),
+            ("up", "v", {}),
             ("k", "v", {"unseen": False, "loud": False}),
             ("u", "v", {"loud": False}),
         ],
     ),
+    *lines(Running, [(key, "d enter", CLOSED) for key in ("escape", "q", "enter")]),
     *lines(Ask, [("escape", "4 f", CLOSED)]),
 ]
 # Each part is tried on one console, from the first row to the last.
@@ -219,20 +245,22 @@ class KeyApp(FixedApp):
             "view": view.view_name,
             "dialog": type(self.screen).__name__ if self.screen.is_modal else "",
             "loop": self.state.shown,
+            "finds": bool(view.query("#filter")) and view.query_one("#filter").has_focus,
             "window_s": self.state.window.rms_s,
+            "ago_s": round(self.playback.live.received_s - self.playback.position_s),
             "unseen": self.alarms.unacknowledged,
             "loud": self.alarms.loud,
             "kept": len(list(self.log_folder.glob("*.keep"))),
             "started": [
                 " ".join(job.arguments).replace(f"{self.log_folder}/", "")
                 for job in self.jobs
-                if job.arguments[0] != "design" and job.arguments[:2] != ["sequence", "list"]
+                if job.arguments[0] != "design" and job.arguments[:2] not in OF_ITS_OWN_ACCORD
             ],
         }
         if isinstance(view.focused, Choice):
             seen |= {"list": view.focused.id, "chosen": view.focused.chosen}
         if isinstance(view, OperateView):
-            plane, stage = view.query_one(FocalPlane), view.pad.stage(self.state.mode)
+            plane, stage = view.query_one(FocalPlane), view.pad.stage(self.state.loop)
             seen |= {
                 "hand": view.hand,
                 "stage": stage.name,
@@ -254,6 +282,7 @@ class KeyApp(FixedApp):
             self.action_view("operate")
             await pilot.pause()
         self.view.action_leave()
+        self.playback.now()
         vars(self.view.pad).update(vars(JogPad()))
         self.state.window, self.state.shown = WINDOWS[0], "right"
         for alarm in self.alarms.alarms.values():
@@ -284,6 +313,9 @@ def test_every_key_does_what_its_row_says_and_nothing_else(part, tmp_path):
         wrong = []
         async with app.run_test(size=(80, 24)) as pilot:
             app.feed()
+            app.state.events.appendleft(
+                Event(time_s=app.fixed_s - 7, severity="warning", source="camera", message="late")
+            )
             await pilot.pause()
             for row in rows:
                 changed = await changed_by(pilot, row)

@@ -27,7 +27,7 @@ def test_in_standby_it_is_the_siderostat_and_then_the_mirror():
     pad.next_stage()
     assert pad.press(loop, 0, -1, 0.0) == SetBiasOffset(az_urad=3.0, el_urad=-5.0)
     pad.next_stage()
-    assert pad.stage("STANDBY").name == "siderostat"
+    assert pad.stage(loop).name == "siderostat"
 
 
 @pytest.mark.parametrize("mode", ["COARSE", "VERNIER"])

@@ -26,7 +26,7 @@ def test_a_device_and_a_reading_are_told_in_full():
         assert isinstance(app.screen, Reader)
         assert app.screen._title == "right siderostat"
         await pressed(app, pilot, "escape", "tab", "down", "enter")
-        assert app.screen._title == "fsm_edge"
+        assert app.screen._title == "amplifier_slow"
 
     run(scenario)
 
@@ -36,7 +36,7 @@ def test_an_interlock_is_reset_from_its_row():
         await pressed(app, pilot, "2", "n")  # no reading is chosen yet
         await pressed(app, pilot, "tab", "down", "down", "n")
 
-    assert sent(run(scenario)) == [Reset(loop="right", name="following_error")]
+    assert sent(run(scenario)) == [Reset(loop="right", name="dac_slow")]
 
 
 def test_a_click_chooses_a_row_and_its_list():
@@ -46,7 +46,7 @@ def test_a_click_chooses_a_row_and_its_list():
         await settle(app, pilot)
         readings = app.view.query_one(Readings)
         assert readings.has_focus
-        assert readings.now().name == "following_error"
+        assert readings.now().name == "dac_slow"
 
     run(scenario)
 
@@ -57,7 +57,7 @@ def test_a_click_chooses_a_row_and_its_list():
 def test_a_sequence_is_rehearsed():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "down", "d")
-        assert app.jobs[-1].arguments == ["sequence", "dry-run", "jog.toml"]
+        assert app.jobs[-1].arguments == ["sequence", "dry-run", "jog.toml", "--present"]
         assert not app.jobs[-1].outlives
         assert "last line" in app.view.query_one(Printed).render_line(2).text
 
@@ -87,7 +87,7 @@ def test_a_parameter_is_edited_checked_and_used():
         job = app.jobs[-1]
         assert job.arguments[:2] == ["sequence", "check"]
         assert "jog_px = 0.5" in Path(job.arguments[2]).read_text()
-        assert "jog*" in app.view.query_one(SequenceList).render_line(1).text
+        assert "jog*" in app.view.query_one(SequenceList).render_line(2).text
         await pressed(app, pilot, "d")
         assert app.jobs[-1].arguments[2] == job.arguments[2]
         edited.append(job.arguments[2])

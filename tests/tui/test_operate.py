@@ -1,5 +1,6 @@
 """The Operate screen: target, window and stages by hand, and how the picture looks."""
 
+import msgspec
 import pytest
 
 from fitctl.messages.commands import Jog, Look, SetBiasOffset, SetTarget
@@ -138,5 +139,79 @@ def test_picture_and_window_are_chosen_by_key():
         assert app.state.window.rms_s == 60.0
         await pressed(app, pilot, "c", "c", "c", "x", "x", "w", "w")
         assert (plane.colours, plane.stretch, app.state.window) == before
+
+    run(scenario)
+
+
+async def clicked(app, pilot, shown):
+    """Click what the footer shows."""
+    footer = app.view.query_one(Keys).render_line(0).text
+    await pilot.click("#keys", offset=(footer.index(shown), 0))
+    await settle(app, pilot)
+
+
+def test_arrows_and_steps_in_the_footer_are_buttons():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "j")
+        await clicked(app, pilot, "]")
+        await clicked(app, pilot, "←")
+        await clicked(app, pilot, "[")
+        await clicked(app, pilot, "↑")
+
+    assert sent(run(scenario, "STANDBY")) == [
+        Jog(loop="right", az_sky_arcsec=-10.0, el_sky_arcsec=0.0),
+        Jog(loop="right", az_sky_arcsec=0.0, el_sky_arcsec=2.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("mode", "keys", "there", "missing"),
+    [
+        ("VERNIER", ["j"], ["Jog", "Step", "Leave"], ["Stage", "Zero offset"]),
+        ("STANDBY", ["j"], ["Jog", "Step", "Stage", "Leave"], ["Zero offset"]),
+        ("STANDBY", ["j", "tab"], ["Jog", "Step", "Stage", "Zero offset", "Leave"], []),
+    ],
+)
+def test_a_jog_offers_only_what_it_can_do(mode, keys, there, missing):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, *keys)
+        footer = app.view.query_one(Keys).render_line(0).text
+        assert all(label in footer for label in there)
+        assert not any(label in footer for label in missing)
+
+    run(scenario, mode)
+
+
+def test_zero_moves_nothing_while_another_stage_is_in_the_hand():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "j", "0")
+
+    assert sent(run(scenario, "STANDBY")) == []
+
+
+def test_a_metrology_loop_has_a_siderostat_to_jog_and_no_target():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "j", "tab", "right", "escape", "t")
+        assert app.view.query_one(FocalPlane).cursor_px is None
+
+    supervisor = FakeSupervisor("STANDBY", loops=("metrology",))
+    assert sent(run(scenario, supervisor=supervisor)) == [
+        Jog(loop="metrology", az_sky_arcsec=2.0, el_sky_arcsec=0.0)
+    ]
+
+
+def test_the_last_frame_says_how_old_it_is_once_the_camera_is_closed():
+    async def scenario(app, pilot):
+        message = FakeSupervisor("OFF").message()
+        before = app.state.newest
+        later = msgspec.structs.replace(
+            message, frame=before.frame, time_s=before.time_s + 12.0, sequence=before.sequence + 1
+        )
+        app.fixed_s += 12.0
+        app.state.accept(later, app.clock())
+        await settle(app, pilot)
+        plane = app.view.query_one(FocalPlane)
+        caption = "\n".join(plane.render_line(y).text for y in range(plane.size.height))
+        assert "last frame 12 s ago" in caption
 
     run(scenario)

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import msgspec
@@ -6,7 +7,7 @@ import pytest
 from fitctl.logging.records import Event
 from fitctl.messages.commands import Look, SequenceStatus, SetTarget
 from fitctl.messages.telemetry import TrippedInterlock
-from fitctl.tui.alarms import AlarmBook
+from fitctl.tui.alarms import AlarmBook, counts
 from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.jog import JogPad
 from fitctl.tui.palette import parse_place
@@ -19,20 +20,21 @@ from fitctl.tui.widgets.header import Header
 from fitctl.tui.widgets.health import Devices, Timing
 from fitctl.tui.widgets.keys import Keys
 from fitctl.tui.widgets.loglist import LogList
-from fitctl.tui.widgets.margins import Margins
+from fitctl.tui.widgets.margins import DesignFigures, Margins, design_in_use
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.readings import DeviceList, Readings, in_units
 from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
-from fitctl.tui.widgets.spectrum import Spectrum
+from fitctl.tui.widgets.spectrum import ErrorBudget, Spectrum
 from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces
 from tests.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
 from tests.tui.drawn import plain, shown
+from tests.tui.fixed import DESIGN
 
 
 def header(state):
-    return Header(state, "operate")
+    return Header(state, "operate", updated_book(state))
 
 
 def keys(state):
@@ -74,8 +76,24 @@ def log_list(state):
     return LogList(state, "", Path("no such folder"))
 
 
+def evaluated(state):
+    """What `fitctl design` printed of the design in use."""
+    figures = DesignFigures()
+    if state.loop is not None:
+        figures.accept(design_in_use(state.loop.state), json.dumps(DESIGN), 0)
+    return figures
+
+
 def margins(state):
-    return Margins(state, "", lambda _loop: "")
+    return Margins(state, "", evaluated(state), lambda _loop: "")
+
+
+def spectrum(state):
+    return Spectrum(state, "", evaluated(state))
+
+
+def error_budget(state):
+    return ErrorBudget(state, "", evaluated(state))
 
 
 def printed(state):
@@ -97,7 +115,8 @@ PANELS = (
     Readings,
     Histograms,
     Breakdown,
-    Spectrum,
+    spectrum,
+    error_budget,
     margins,
     sequence_list,
     parameters,
@@ -110,33 +129,34 @@ PANELS = (
 MODES = ["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT"]
 
 
-@pytest.mark.parametrize("panel", PANELS)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("size", [(39, 3), (80, 20), (3, 1), (200, 60)])
-def test_every_panel_draws_in_every_mode_and_size(panel, mode, size):
-    panel(shown(FakeSupervisor(mode))).draw(*size)
+def test_every_panel_draws_in_every_mode_and_size(mode, size):
+    state = shown(FakeSupervisor(mode))
+    for panel in PANELS:
+        panel(state).draw(*size)
 
 
-@pytest.mark.parametrize("panel", PANELS)
-def test_every_panel_draws_before_anything_came(panel):
-    panel(ConsoleState(START_S)).draw(80, 20)
+def test_every_panel_draws_before_anything_came():
+    for panel in PANELS:
+        panel(ConsoleState(START_S)).draw(80, 20)
 
 
-@pytest.mark.parametrize("panel", [header, FocalPlane, Traces, Stages, Devices, Timing, keys])
 @pytest.mark.parametrize("mode", ["ACQUISITION", "VERNIER"])
-def test_nothing_is_wider_than_its_panel_at_80_columns(panel, mode):
-    columns, rows = {
-        header: (80, 3),
-        FocalPlane: (40, 20),
-        Traces: (39, 9),
-        Stages: (39, 4),
-        Devices: (39, 2),
-        Timing: (39, 3),
-        keys: (80, 1),
-    }[panel]
-    lines = plain(panel(shown(FakeSupervisor(mode), 450)).draw(columns, rows))
-    assert len(lines) <= rows
-    assert max(len(line.rstrip()) for line in lines) <= columns
+def test_nothing_is_wider_than_its_panel_at_80_columns(mode):
+    state = shown(FakeSupervisor(mode), 450)
+    for panel, columns, rows in (
+        (header, 80, 3),
+        (FocalPlane, 40, 20),
+        (Traces, 39, 9),
+        (Stages, 39, 4),
+        (Devices, 39, 2),
+        (Timing, 39, 3),
+        (keys, 80, 1),
+    ):
+        lines = plain(panel(state).draw(columns, rows))
+        assert len(lines) <= rows, panel
+        assert max(len(line.rstrip()) for line in lines) <= columns, panel
 
 
 def test_an_ill_device_keeps_a_row_of_its_own_and_comes_first():
@@ -163,6 +183,25 @@ def test_a_fault_is_told_in_full_where_there_is_room():
     assert "no answer in 1 s; check the cable, then Recover" in told
 
 
+def test_a_fault_that_is_longer_uses_the_rows_that_there_are():
+    supervisor = FakeSupervisor()
+    supervisor.faulty = {"right piezo": "no answer in 1 s; " + "check the cable and its plug " * 9}
+    lines = plain(Devices(shown(supervisor)).draw(36, 6))
+    assert "".join(line[0] for line in lines) == "✗  ✓✓✓"
+    assert lines[2].endswith("…")
+
+
+def test_faults_come_before_closed_devices_and_share_the_rows():
+    supervisor = FakeSupervisor()
+    supervisor.faulty = {"right piezo": "no answer in 1 s; " + "x " * 60, "right D/A": "y " * 60}
+    state = shown(supervisor)
+    camera, *others = state.newest.devices
+    devices = [msgspec.structs.replace(camera, state="closed"), *others]
+    state.newest = msgspec.structs.replace(state.newest, devices=devices)
+    lines = plain(Devices(state).draw(36, 8))
+    assert "".join(line[0] for line in lines) == "✗  ✗  ○✓"
+
+
 def test_lost_records_take_the_recorders_line():
     supervisor = FakeSupervisor()
     supervisor.records_lost = 1234
@@ -184,7 +223,7 @@ def test_a_long_name_of_the_commander_gives_way_to_the_state_of_the_link():
         state = shown(supervisor)
         named = msgspec.structs.replace(message, commander="somebody@" + "far-away." * 9)
         state.accept(named, state.now_s)
-        head = " ".join(plain(Header(state, "operate").draw(columns, 3)))
+        head = " ".join(plain(header(state).draw(columns, 3)))
         assert "live" in head
         assert "UTC" in head
 
@@ -192,9 +231,9 @@ def test_a_long_name_of_the_commander_gives_way_to_the_state_of_the_link():
 def test_the_header_says_how_much_a_slow_console_missed():
     supervisor = FakeSupervisor()
     state = shown(supervisor)
-    assert "missed" not in " ".join(plain(Header(state, "operate").draw(80, 3)))
+    assert "missed" not in " ".join(plain(header(state).draw(80, 3)))
     state.accept(supervisor.messages(5)[-1], state.now_s)
-    assert "4 missed!" in " ".join(plain(Header(state, "operate").draw(80, 3)))
+    assert "▲ 4 missed" in " ".join(plain(header(state).draw(80, 3)))
 
 
 @pytest.mark.parametrize("columns", [80, 160])
@@ -240,14 +279,14 @@ def test_at_80_columns_an_alarms_keys_follow_stop_and_the_commands(mode):
     footer = Keys(state, "operate", book)
     line = plain(footer.draw(80, 1))[0]
     commands = [row.label for row in OPERATOR_COMMANDS if row.name in state.usable_commands]
-    wanted = [*commands, "Help", "Acknowledge", "Silence", "Alarms"]
+    wanted = [*commands, "Acknowledge", "Silence", "Alarms", "Help"]
     places = [line.index(word) for word in wanted]
     assert places == sorted(places)
     book.silence()
     line = plain(footer.draw(80, 1))[0]
     assert "Silence" not in line
     assert "Acknowledge" in line
-    book.acknowledge()
+    book.acknowledge(counts(book.in_order))
     line = plain(footer.draw(80, 1))[0]
     assert "Acknowledge" not in line
     assert "Alarms" not in line
@@ -271,7 +310,7 @@ def test_every_key_of_a_screen_is_clicked_as_it_is_pressed(view):
 
 def test_the_header_leads_to_every_screen_by_mouse():
     for columns in (80, 120):
-        lines = Header(shown(FakeSupervisor()), "loop").draw(columns, 3)
+        lines = Header(shown(FakeSupervisor()), "loop", AlarmBook()).draw(columns, 3)
         actions = {s.style.meta.get("@click") for line in lines for s in line if s.style}
         assert {f"app.view('{view.name}')" for view in VIEWS} <= actions
 
@@ -285,9 +324,9 @@ def test_a_reading_out_of_its_range_changes_its_sign():
         )
     ]
     after = plain(Readings(shown(supervisor)).draw(100, 20))
-    row = next(number for number, line in enumerate(after) if "dac_slow" in line)
-    assert before[row].lstrip("▌ ").startswith("✓ dac_slow")
-    assert after[row].lstrip("▌ ").startswith("▲ dac_slow")
+    was, becomes = (next(line for line in lines if "dac_slow" in line) for lines in (before, after))
+    assert was.lstrip("▌ ").startswith("✓ dac_slow")
+    assert becomes.lstrip("▌ ").startswith("▲ dac_slow")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from fitctl.tui.draw.frame import place
 from fitctl.tui.draw.overlays import OVERLAY_INKS, SHAPES, Overlay, cell_marks, paint
 from fitctl.tui.draw.pictures import KITTY_AWAY, SIXEL_INKS, kitty, sixel
 from fitctl.tui.graphics import Graphics, PictureSender, cell_size_px, graphics_of
-from fitctl.tui.look import SKY
+from fitctl.tui.inks import SKY
 from fitctl.tui.widgets import focalplane
 from fitctl.tui.widgets.focalplane import FocalPlane
 from tests.fake_supervisor import FakeSupervisor

@@ -1,16 +1,27 @@
-"""The whole screen as it looks, at the sizes that people use. ``pytest --snapshot-update`` accepts a change."""
+"""The whole screen as it looks, at the sizes that people use. ``pytest --snapshot-update`` accepts a change.
+
+Each console goes through all sizes, which takes a third of the time of a console for each.
+"""
 
 import asyncio
 
 import pytest
 from pytest_textual_snapshot import SVGImageExtension
-from textual.pilot import Pilot
 
 from fitctl.tui.commands import VIEWS
-from tests.fake_supervisor import MODE_NUMBERS, FakeSupervisor
+from tests.fake_supervisor import MODE_NUMBERS, TESTBED, FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs, settle
+from tests.tui.wrong import (
+    ALARMS,
+    drive_fault,
+    fault_and_lost_records,
+    link_lost,
+    stopped_testbed,
+)
 
 SIZES = [(80, 24), (120, 40), (200, 60)]
+SMALL = SIZES[:1]
+OF_NO_MODE = {"sequences", "logs"}  # which look the same in every mode
 
 
 @pytest.fixture
@@ -20,77 +31,97 @@ def logs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def looking(*keys: str):
-    async def run_before(pilot: Pilot) -> None:
-        app = pilot.app
-        assert isinstance(app, FixedApp)
-        app.feed()
-        await pilot.press(*keys)
-        await settle(app, pilot)
+@pytest.fixture
+def changed(snapshot):
+    """Look at a console, on some screens and at some sizes; which pictures differ from those that are kept."""
+    picture = snapshot.use_extension(SVGImageExtension)
 
-    return run_before
+    async def look(app, keys, views, sizes):
+        found = []
+        async with app.run_test(size=sizes[0]) as pilot:
+            app.feed()
+            await pilot.press(*keys)
+            for size in sizes:
+                await pilot.resize_terminal(*size)
+                for view in views or [None]:
+                    if view is not None:
+                        await pilot.press(view.key)
+                    await settle(app, pilot)
+                    name = "-".join([*([view.name] if view else []), "{}x{}".format(*size)])
+                    if app.export_screenshot() != picture(name=name):
+                        found.append(name)
+        return found
+
+    def changed(app, *keys, views=(), sizes=SIZES):
+        return asyncio.run(look(app, keys, views, sizes))
+
+    return changed
 
 
 @pytest.mark.usefixtures("logs")
-@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 @pytest.mark.parametrize("mode", MODE_NUMBERS)
-def test_every_screen_in_every_mode(snapshot, mode, size):
-    picture = snapshot.use_extension(SVGImageExtension)
-
-    async def look() -> list[str]:
-        app = FixedApp(FakeSupervisor(mode))
-        changed = []
-        async with app.run_test(size=size) as pilot:
-            app.feed()
-            for view in VIEWS:
-                await pilot.press(view.key)
-                await settle(app, pilot)
-                if app.export_screenshot() != picture(name=view.name):
-                    changed.append(view.name)
-        return changed
-
-    assert asyncio.run(look()) == []
+def test_every_screen_in_every_mode(changed, mode):
+    views = [view for view in VIEWS if mode == "VERNIER" or view.name not in OF_NO_MODE]
+    assert changed(FixedApp(FakeSupervisor(mode)), views=views) == []
 
 
 @pytest.mark.parametrize(
     "keys", ["e", "v", "o", "t", "j"], ids=["events", "alarms", "off", "target", "jog"]
 )
-def test_dialog(snap_compare, keys):
+def test_dialog(changed, keys):
     app = FixedApp(FakeSupervisor("VERNIER" if keys in "tje" else "STANDBY"))
-    assert snap_compare(app, terminal_size=(80, 24), run_before=looking(*keys))
+    assert changed(app, *keys, sizes=SMALL) == []
 
 
-def safe_with_a_fault() -> FakeSupervisor:
-    supervisor = FakeSupervisor("SAFE")
-    told = "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error"
-    supervisor.trigger, supervisor.reason = "FAULT", f"{told}; remove its cause, then recover"
-    supervisor.faulty = {"right siderostat": supervisor.reason}
-    supervisor.records_lost = 1234
-    return supervisor
+@pytest.mark.parametrize("wrong", ALARMS)
+def test_alarm(changed, wrong):
+    assert changed(FixedApp(ALARMS[wrong]())) == []
 
 
-@pytest.mark.parametrize("size", SIZES[:2])
-def test_safe_with_a_fault_and_lost_records(snap_compare, size):
-    app = FixedApp(safe_with_a_fault())
-    assert snap_compare(app, terminal_size=size, run_before=looking())
+def test_alarms_of_a_fault(changed):
+    assert changed(FixedApp(fault_and_lost_records()), "v", sizes=SMALL) == []
 
 
-def test_alarms_of_a_fault(snap_compare):
-    app = FixedApp(safe_with_a_fault())
-    assert snap_compare(app, terminal_size=(80, 24), run_before=looking("v"))
+@pytest.mark.parametrize("loops", [("right",), TESTBED], ids=["one", "three"])
+def test_stale(changed, loops):
+    assert changed(FixedApp(FakeSupervisor(loops=loops), silent_s=7.2)) == []
 
 
-def test_stale(snap_compare):
+def test_no_data_since_the_start(changed):
     app = FixedApp(FakeSupervisor(), silent_s=7.2)
-    assert snap_compare(app, terminal_size=(80, 24), run_before=looking())
+    app.recorded = []
+    assert changed(app, sizes=SMALL) == []
 
 
-def test_without_colour(snap_compare, monkeypatch):
+@pytest.mark.parametrize("state", ["VERNIER", "fault", "stopped"])
+def test_without_colour(changed, monkeypatch, state):
     monkeypatch.setenv("NO_COLOR", "1")
-    app = FixedApp(FakeSupervisor())
-    assert snap_compare(app, terminal_size=(80, 24), run_before=looking())
+    states = {"VERNIER": FakeSupervisor, "fault": drive_fault, "stopped": stopped_testbed}
+    assert changed(FixedApp(states[state]())) == []
 
 
-def test_two_loops_on_a_wide_and_low_terminal(snap_compare):
+def test_three_loops(changed):
+    views = [view for view in VIEWS if view.name in {"operate", "devices", "loop"}]
+    assert changed(FixedApp(FakeSupervisor(loops=TESTBED)), views=views) == []
+
+
+@pytest.mark.parametrize("chosen", ["right", "metrology"])
+@pytest.mark.parametrize("state", ["OFF", "ACQUISITION", "link_lost", "stopped"])
+def test_three_loops_on_operate(changed, state, chosen):
+    states = {"link_lost": link_lost, "stopped": stopped_testbed}
+    make = states.get(state, lambda: FakeSupervisor(state, loops=TESTBED))
+    keys = ["l"] if chosen == "metrology" else []
+    assert changed(FixedApp(make()), *keys) == []
+
+
+def test_two_loops_on_a_wide_and_low_terminal(changed):
     app = FixedApp(FakeSupervisor(loops=("right", "left")))
-    assert snap_compare(app, terminal_size=(120, 24), run_before=looking("l"))
+    assert changed(app, "l", sizes=[(120, 24)]) == []
+
+
+def test_the_past_while_an_alarm_of_now_rings(changed):
+    supervisor = FakeSupervisor(loops=TESTBED)
+    app = FixedApp(supervisor)
+    supervisor.records_lost = 7
+    app.recorded += supervisor.messages(1)
+    assert changed(app, "less_than_sign") == []

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.logging.records import Event
+from fitctl.logging.records import Event, MetrologyTick, Overlap
 from fitctl.tui.history import KEPT_S, Past
 from fitctl.tui.state import WINDOWS, ConsoleState, error_rms
 from tests.fake_supervisor import MESSAGE_S, START_S, WALL_MINUS_MONOTONIC_S, FakeSupervisor
@@ -29,10 +29,9 @@ def test_ticks_are_kept_for_the_longest_window_and_no_longer():
 
 @pytest.mark.parametrize("count", [1, 5, 4095, 4096, 4097, 9000])
 def test_the_past_is_whole_however_long_it_grows(count):
-    past = Past()
-    ticks = FakeSupervisor().message().ticks
+    past = Past(("time_s", "value"))
     for number in range(count):
-        past.add([msgspec.structs.replace(ticks[0], time_s=number * 0.01)], number * 0.01)
+        past.add([(number * 0.01, 0.0)], number * 0.01)
     times_s = past.since(-1.0, "time_s")[:, 0]
     kept = min(count, round(KEPT_S / 0.01) + 1)
     assert times_s == pytest.approx(np.arange(count - kept, count) * 0.01)
@@ -73,6 +72,59 @@ def test_the_way_of_a_search_is_kept_until_the_next_one_begins():
     again = [msgspec.structs.replace(loop, since_s=START_S + 50) for loop in message.loops]
     state.accept(msgspec.structs.replace(message, loops=again), START_S)
     assert len(state.loop.search_trail_sky_arcsec) <= 3
+
+
+def metrology_tick(time_s, **fields):
+    numbers = {
+        name: 0.0
+        for name, kind in MetrologyTick.__annotations__.items()
+        if kind in {"float", "int"}
+    }
+    texts = {"loop": "metrology", "mode": "LOCKED", "beam_state": "MEASURED", "late": False}
+    return MetrologyTick(**numbers | texts | {"time_s": time_s} | fields)
+
+
+def test_a_metrology_loop_has_a_past_of_its_beam_in_the_cameras_pixels():
+    message = FakeSupervisor(loops=("metrology",)).message()
+    scale = message.loops[0].sky_arcsec_per_px
+    ticks = [
+        metrology_tick(START_S + 0.1, beam_az_arcsec=2 * scale, beam_el_arcsec=-scale),
+        metrology_tick(START_S + 0.2, beam_az_arcsec=math.nan, beam_el_arcsec=math.nan),
+    ]
+    state = ConsoleState(START_S)
+    state.accept(msgspec.structs.replace(message, ticks=[], metrology_ticks=ticks), START_S)
+    assert state.loop.tick is None
+    assert state.loop.beam == ticks[-1]
+    errors = state.loop.errors(10.0)
+    assert errors[0] == pytest.approx([START_S + 0.1, -2.0, 1.0])
+    assert np.isnan(errors[1, 1:]).all()
+
+
+def test_the_visibility_has_a_past_until_another_supervisor_speaks():
+    overlaps = [
+        Overlap(
+            time_s=START_S + 0.02 * number,
+            loop="left",
+            other_loop="right",
+            number=number,
+            tilt_az_arcsec=0.1,
+            tilt_el_arcsec=-0.2,
+            visibility=0.9 + 0.001 * number,
+        )
+        for number in range(3)
+    ]
+    supervisor = FakeSupervisor()
+    state = ConsoleState(START_S)
+    state.accept(msgspec.structs.replace(supervisor.message(), overlaps=overlaps), START_S)
+    state.accept(supervisor.message(), START_S + 0.05)
+    assert state.overlap == overlaps[-1]
+    visibility = state.fringes.since(START_S, "time_s", "visibility")
+    assert visibility == pytest.approx(
+        np.array([[1000.0, 0.9], [1000.02, 0.901], [1000.04, 0.902]])
+    )
+    state.accept(FakeSupervisor(pid=2).message(), START_S + 1)
+    assert state.overlap is None
+    assert len(state.fringes) == 0
 
 
 def test_windows_are_cycled():

@@ -88,7 +88,7 @@ def test_every_key_is_in_the_help():
         for command in OPERATOR_COMMANDS:
             assert command.help in told
 
-    run(scenario, size=(120, 110))
+    run(scenario, size=(120, 150))
 
 
 @pytest.mark.parametrize("size", [(80, 24), (480, 130)])
@@ -99,3 +99,26 @@ def test_the_smallest_and_the_largest_terminal_show_every_screen(size):
             assert "STOP" in app.view.query_one(Keys).render_line(0).text
 
     run(scenario, size=size)
+
+
+def test_the_arrows_of_a_list_in_the_footer_are_buttons():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "2")
+        chosen = app.view.focused.chosen
+        footer = app.view.query_one(Keys).render_line(0).text
+        await pilot.click("#keys", offset=(footer.index("↓"), 0))
+        await settle(app, pilot)
+        assert app.view.focused.chosen == chosen + 1
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("opening", [("o",), ("v",), ("e",), ("ctrl+p",)])
+def test_stop_is_a_bright_button_at_the_top_right_of_every_dialog(opening):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, *opening)
+        assert app.screen.is_modal
+        await pilot.click(offset=(app.size.width - 4, 0))
+        await pilot.pause()
+
+    assert sent(run(scenario, "STANDBY")) == [Stop()]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 from enum import StrEnum
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from fitctl.commands.shared.exits import FAILED
@@ -15,6 +17,7 @@ from fitctl.commands.shared.log_time import time_ns
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
+from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
 app = typer.Typer(
@@ -81,6 +84,68 @@ def _info_document(found: LogInfo, *, kept: bool, recording: bool) -> dict[str, 
         "counts": found.counts,
         "metadata": found.metadata,
     }
+
+
+@app.command()
+def summary(
+    logs: LogsArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="A JSON object a line.")] = False,
+    most_bytes: Annotated[
+        int, typer.Option(min=1, metavar="BYTES", help="Only name larger files.")
+    ] = 1 << 40,
+) -> None:
+    """Print when each log begins, how long it is, and how well its loops held: a line for each, as it is read.
+
+    The verdict is that of fitctl report. Example: fitctl log summary logs/*.mcap
+    """
+    for log in logs:
+        line = _summary(log, most_bytes)
+        if as_json:
+            say(to_json(line))
+        else:
+            start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(line.start_s or 0.0))
+            rms = ", ".join(f"{name} {text}" for name, text in line.rms.items())
+            words = f"{start}, {line.duration_s or 0.0:.0f} s, requirement {line.verdict}: {rms}"
+            say(f"{log}: {line.error or words}")
+
+
+class LogSummary(msgspec.Struct, kw_only=True):
+    """One line of `fitctl log summary`. ``rms`` is text, by loop; times are None where they are not known."""
+
+    path: str
+    bytes: int
+    start_s: float | None = None
+    duration_s: float | None = None
+    verdict: str = "not known"
+    rms: dict[str, str] = {}
+    error: str = ""
+
+
+def _summary(log: Path, most_bytes: int) -> LogSummary:
+    """What is known of a log; of one that is too large or cannot be read, why no more."""
+    # Not at the top: scipy must not delay the other commands.
+    from fitctl.report.findings import find
+    from fitctl.report.run import find_run
+
+    line = LogSummary(path=str(log), bytes=0)
+    try:
+        line.bytes = log.stat().st_size
+        found = log_info(log)
+        if found.counts:
+            line.start_s, line.duration_s = found.start_s, found.duration_s
+        if line.bytes > most_bytes:
+            line.error = "too large to be read here"
+            return line
+        findings = find(find_run([log]))
+    except (LogError, OSError) as error:
+        line.error = str(error)
+        return line
+    line.verdict = findings.word
+    for name, loop in findings.loops.items():
+        worst = max((estimate.rms for estimate in loop.residual.values()), default=math.nan)
+        if math.isfinite(worst):
+            line.rms[name] = f"{worst:.3f} {loop.quantity.unit}"
+    return line
 
 
 @app.command()

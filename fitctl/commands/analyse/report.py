@@ -13,7 +13,7 @@ from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError
 from fitctl.report.compare import make_comparison
-from fitctl.report.findings import Findings, find
+from fitctl.report.findings import Findings, StarFindings, find
 from fitctl.report.make import make_report
 from fitctl.report.page import SIGNS
 from fitctl.report.pdf import PdfError, print_pdf
@@ -95,6 +95,9 @@ def _print_verdict(night: Findings) -> None:
             say(
                 f"  {axis} {number(found.rms, '.4f', f'{unit} RMS')}, 95 % interval {interval(found)}"
             )
+        for under in loop.rejections if isinstance(loop, StarFindings) else ():
+            if under.budget is not None:
+                say(f"  {under.controller}: {under.budget.verdict}; from {under.budget.parts}")
     if night.fringes is not None:
         figures = night.fringes.figures
         say(

@@ -11,20 +11,24 @@ import numpy as np
 import typer
 from numpy.typing import ArrayLike
 
+from fitctl.commands.design.learn import learn
 from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
-from fitctl.controllers.design import coarse, loopshape, lqg_ltr
-from fitctl.controllers.design.basis import Basis, basis
-from fitctl.controllers.design.bound import bound
+from fitctl.controllers.design import coarse, lqg_ltr
+from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
 from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
 from fitctl.controllers.design.eq20 import eq20_zpk
 from fitctl.controllers.design.files import load_design, save_design
+from fitctl.controllers.design.linear_loop import loopshape
+from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.controllers.design.standing import Standing, standing
+from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
+from fitctl.error_budget import theory_to_plain
 from fitctl.model.optics import scales
 
 _RECOVERY_WEIGHTS = (1e-5, 1e-6, 1e-7, 1e-8, 0.5e-9, 1e-11)
@@ -38,10 +42,17 @@ def design(
     what: Annotated[
         str,
         typer.Argument(
-            help="vernier, coarse, bound, compare, or a pair: eq20, lqg-ltr, minimum-variance, fslq, "
-            "or a saved file."
+            help="vernier, coarse, bound, compare, learn, or a pair: eq20, lqg-ltr, minimum-variance, "
+            "fslq, or a saved file."
         ),
     ],
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="LOG...",
+            help="learn: files of one run, or a folder, which means its newest run.",
+        ),
+    ] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",
@@ -58,8 +69,19 @@ def design(
 ) -> None:
     """Design the loop's controllers from the rig file: margins, residual, and the bound for any.
 
-    vernier is LQG/LTR as the paper does it; compare sets all pairs side by side.
+    vernier is LQG/LTR as the paper does it; compare sets all pairs side by side. learn estimates a night
+    (air path, noise, vibrations) from a log and designs the pair for it:
+    fitctl design learn night.mcap --out learnt.json
     """
+    if out is not None and out.suffix != ".json":
+        msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
+        raise ConfigError(msg)
+    if what == "learn":
+        learn(logs or [], rig, overrides, loop, out, as_json=as_json)
+        return
+    if logs:
+        msg = f"design {what}: reads no log, got {logs[0]}; only fitctl design learn LOG does"
+        raise ConfigError(msg)
     settings = rig_of(rig, overrides)
     require_loop("design", settings, loop)
     reports: dict[str, Callable[[Rig, str], Report]] = {
@@ -73,8 +95,8 @@ def design(
         reports[what] = _saved(Path(what))
     if what not in reports:
         msg = (
-            f"design: {what} is nothing to design; there are {', '.join(reports)}, and files (*.json) "
-            "that --out saved"
+            f"design: {what} is nothing to design; there are {', '.join([*reports, 'learn'])}, and files "
+            "(*.json) that --out saved"
         )
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what
@@ -83,9 +105,6 @@ def design(
         raise ConfigError(msg)
     if plot is not None and name != "lqg-ltr":
         msg = f"design {what}: --plot draws Fig. 9: use it with vernier"
-        raise ConfigError(msg)
-    if out is not None and out.suffix != ".json":
-        msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
         raise ConfigError(msg)
     with solving(f"design {what}", loop):
         result, lines = reports[what](settings, loop)
@@ -246,7 +265,7 @@ def _bound(rig: Rig, loop: str) -> Report:
 def _one(name: str) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
         its_basis = basis(rig, loop)
-        return _stands(name, DESIGNS[name](its_basis), its_basis)
+        return _stands(name, DESIGNS[name](its_basis), its_basis, rig, loop)
 
     return report
 
@@ -255,18 +274,20 @@ def _saved(file: Path) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
         its_basis = basis(rig, loop)
         design = load_design(file, its_basis, DESIGNS)
-        return _stands(f"{design.name} of {file}", design, its_basis)
+        its_basis = on_its_mirror(its_basis, design.parameters)
+        return _stands(f"{design.name} of {file}", design, its_basis, rig, loop)
 
     return report
 
 
-def _stands(title: str, design: Design, its_basis: Basis) -> Report:
+def _stands(title: str, design: Design, its_basis: Basis, rig: Rig, loop: str) -> Report:
     found = standing(design, its_basis)
     lines = [
         f"{title}, order {found.order}, sampled at {1 / its_basis.period_s:g} Hz",
         *_standing_lines(found),
     ]
-    return _standing_numbers(found), lines
+    theory = theory_to_plain(loop_theory(rig, loop, design))
+    return _standing_numbers(found) | {"theory": theory}, lines
 
 
 def _compare(rig: Rig, loop: str) -> Report:

@@ -52,7 +52,13 @@ class Source(NamedTuple):
 
 
 def identify(
-    what: Annotated[str, typer.Argument(help="hysteresis, backlash, response, airpath or delay.")],
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="hysteresis, backlash, response, airpath or delay; of a link: feedforward, photodiodes, "
+            "link_delay or ambient."
+        ),
+    ],
     rig: RigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",
@@ -76,10 +82,18 @@ def identify(
     """Measure what a rig truly is, and write it as a fragment that its rig file includes.
 
     Without --log, --simulate or --mock the rig's running supervisor does the experiment: the loop must
-    hold a star in VERNIER. The stages move open loop meanwhile; a stop ends it at once.
+    hold a star in VERNIER. The stages move open loop meanwhile; a stop ends it at once. What is of a link
+    is evaluated from the log of a sequence: give it with --log.
     """
     if what not in EXPERIMENTS:
         msg = f"identify: {what} cannot be identified; there are {', '.join(EXPERIMENTS)}"
+        raise ConfigError(msg)
+    step = EXPERIMENTS[what].step
+    if step and log is None:
+        msg = (
+            f"identify: {what} is evaluated from the log of a sequence with the step {step}; run one with "
+            f"fitctl sequence run, and name its log with --log"
+        )
         raise ConfigError(msg)
     if (log is not None) + simulated + mock > 1:
         msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
@@ -90,7 +104,8 @@ def identify(
     settings = rig_of(rig, overrides)
     if not (log or simulated or mock):
         show_rig(settings.name, str(rig))
-    require_loop("identify", settings, loop)
+    if not step or loop not in settings.loops:
+        require_loop("identify", settings, loop)
     source = Source(log, simulated, mock, seed)
     stem = f"{settings.name}-{loop}-{what}"
     fragment_path = out or Path(f"{stem}.toml")

@@ -24,6 +24,7 @@ from fitctl.config import Rig
 from fitctl.processes import ended_by_signals, interrupt
 from fitctl.simulation.campaign import (
     PERCENTILES,
+    BeamSummary,
     CampaignError,
     LoopSummary,
     Statistics,
@@ -138,7 +139,7 @@ def _simulate_many(
         say(str(error), err=True)
         return FAILED
     wall_s = time.perf_counter() - started
-    summaries = summarize(results)
+    summary = summarize(results)
     speed_x = len(seeds) * duration_s / wall_s
     if as_json:
         head = {
@@ -148,16 +149,36 @@ def _simulate_many(
             "speed_x": speed_x,
             "batch_refusal": refusal,
         }
-        say(to_json(head | {"loops": summaries}))
+        fringes = {} if rig.fringes is None else {"visibility": summary.visibility}
+        say(to_json(head | {"loops": summary.loops} | fringes))
     else:
-        for name, summary in summaries.items():
-            say_lines(_summary_text(name, summary))
+        for name, loop in summary.loops.items():
+            say_lines(_summary_text(name, loop))
+        if rig.fringes is not None:
+            say(_row("visibility", summary.visibility, 4, 1.0))
         say(f"{speed_x:.0f}x real time on {workers} workers, {wall_s:.1f} s in all")
-    return 0 if all(summary.held == summary.runs for summary in summaries.values()) else FAILED
+    return 0 if all(loop.held == loop.runs for loop in summary.loops.values()) else FAILED
 
 
-def _summary_text(name: str, summary: LoopSummary) -> str:
-    head = "".join(f"{f'{p}%':>10}" for p in PERCENTILES)
+def _summary_text(name: str, summary: LoopSummary | BeamSummary) -> str:
+    if isinstance(summary, BeamSummary):
+        return _beam_summary_text(name, summary)
+    return _star_summary_text(name, summary)
+
+
+def _beam_summary_text(name: str, summary: BeamSummary) -> str:
+    rows = [
+        ('true RMS az, "', summary.rms_arcsec["az"], 3, 1.0),
+        ('true RMS el, "', summary.rms_arcsec["el"], 3, 1.0),
+        ('worst axis, "', summary.rms_arcsec["worst_axis"], 3, 1.0),
+        ("beam found, s", summary.acquired_s, 1, 1.0),
+        ("locked, s", summary.locked_s, 1, 1.0),
+    ]
+    worst = {run.seed: f"{run.rms_arcsec:.3f} arcsec" for run in summary.worst_seeds}
+    return _table(name, "beam", summary, rows, worst)
+
+
+def _star_summary_text(name: str, summary: LoopSummary) -> str:
     rows = [
         ("true RMS az, px", summary.rms_px["az"], 4, 1.0),
         ("true RMS el, px", summary.rms_px["el"], 4, 1.0),
@@ -168,15 +189,25 @@ def _summary_text(name: str, summary: LoopSummary) -> str:
         ("star found, s", summary.acquired_s, 1, 1.0),
         ("vernier, s", summary.vernier_s, 1, 1.0),
     ]
+    worst = {run.seed: f"{run.rms_px:.4f} px" for run in summary.worst_seeds}
+    return _table(name, "star", summary, rows, worst)
+
+
+def _table(
+    name: str,
+    held: str,
+    summary: LoopSummary | BeamSummary,
+    rows: Sequence[tuple[str, Statistics, int, float]],
+    worst_seeds: dict[int, str],
+) -> str:
+    head = "".join(f"{f'{p}%':>10}" for p in PERCENTILES)
     worst = ", ".join(
-        f"{run.seed} (not judged)"
-        if math.isnan(run.rms_px)
-        else f"{run.seed} ({run.rms_px:.4f} px)"
-        for run in summary.worst_seeds
+        f"{seed} ({'not judged' if text.startswith('nan') else text})"
+        for seed, text in worst_seeds.items()
     )
     return "\n".join(
         [
-            f"loop {name}: {summary.held} of {summary.runs} runs held their star, "
+            f"loop {name}: {summary.held} of {summary.runs} runs held their {held}, "
             f"{summary.judged} for long enough to be judged",
             f"  {'':18}{'mean':>10}{head}{'worst':>10}",
             *(_row(title, figure, digits, scale) for title, figure, digits, scale in rows),

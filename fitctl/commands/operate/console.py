@@ -9,15 +9,19 @@ from typing import Annotated, Literal
 
 import typer
 
+from fitctl.commands.operate.logged_loops import loops_at_start
 from fitctl.commands.operate.web import serve_console
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address, connect
 from fitctl.commands.shared.terminal import has_terminal
 from fitctl.config import ConfigError
+from fitctl.logging.errors import LogError
 from fitctl.processes import rig_arguments
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.graphics import Graphics, graphics_of
+from fitctl.tui.rewind.logged import LoggedRun
+from fitctl.tui.wire import NoLink
 
 _NICENESS = 5
 _NO_TERMINAL = (
@@ -39,16 +43,24 @@ def console(
             envvar="FITCTL_GRAPHICS", help="How the focal plane is drawn; auto goes by TERM."
         ),
     ] = "auto",
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="FILE", help="Show a log instead of a running instrument."),
+    ] = None,
     web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
     """Attach an operator console to the running supervisor of a rig.
 
-    With --remote, the margins of screen Loop and the sequences need that rig's own file too, with --rig.
+    With --remote, the margins of screen Loop and the sequences need that rig's own file too, with --rig. With
+    --log, no supervisor needs to run, and nothing can be sent.
     """
     # A browser's page runs this command too, with a driver of textual-serve in place of a terminal.
     if not (web or "TEXTUAL_DRIVER" in os.environ or has_terminal()):
         raise ConfigError(_NO_TERMINAL)
+    if log is not None:
+        _show_log(log, remote, graphics, web=web)
+        return
     arguments: list[str] | None = None  # what the shipped file says is not true of a rig elsewhere
     if remote is None:
         found = address("console", rig, overrides)
@@ -72,6 +84,30 @@ def console(
         log_folder=log_folder,
         graphics=graphics_of(Graphics(graphics), os.environ),
     )
+    _run(app)
+
+
+def _show_log(log: Path, remote: Path | None, graphics: str, *, web: bool) -> None:
+    """A console of what was; nothing is attached."""
+    if web or remote is not None:
+        msg = "console: --log shows a file on this machine in this terminal; leave out --web and --remote"
+        raise ConfigError(msg)
+    try:
+        recording = LoggedRun(log, loops_at_start)
+    except LogError as error:
+        raise ConfigError(str(error)) from error
+    app = ConsoleApp(
+        NoLink(),
+        rig_arguments=None,
+        log_folder=log.parent,
+        graphics=graphics_of(Graphics(graphics), os.environ),
+        log=recording,
+        log_name=log.name,
+    )
+    _run(app)
+
+
+def _run(app: ConsoleApp) -> None:
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     # Whatever points the star goes first. What the console starts gives way as well: a sequence, too, only
     # asks the supervisor for what that then does in its own time.

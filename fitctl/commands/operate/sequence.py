@@ -20,6 +20,7 @@ from fitctl.commands.shared.options import (
     SeedOption,
     SetOption,
 )
+from fitctl.commands.shared.present import present_of_rig
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address, client_of, connect, send_and_print, show_rig
@@ -29,10 +30,13 @@ from fitctl.processes import ended_by_signals, interrupt
 from fitctl.sequences.files import find_sequence, shipped_sequences
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from fitctl.logging.records import SequenceAttempt
     from fitctl.messages.commands import SequenceStatus
     from fitctl.sequences.links import Link
     from fitctl.sequences.steps import Sequence
+    from fitctl.simulation.simulation import Simulation
 
 app = typer.Typer(
     help="Run, check and steer sequences of acquisition and experiment steps.",
@@ -118,23 +122,38 @@ def dry_run(
     rig: RigOption = None,
     overrides: StepSetOption = None,
     seed: SeedOption = 0,
+    present: Annotated[
+        bool, typer.Option("--present", help="Begin with the stages and stars of the running rig.")
+    ] = False,
+    remote: RemoteOption = None,
     as_json: JsonOption = False,
     out: OutOption = None,
 ) -> None:
     """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave.
 
-    What it measures of the simulated rig is written only where --out says.
+    What it measures of the simulated rig is written only where --out says. With --present, the simulation
+    begins where the running instrument's stages and stars are now; a star that is not measured is assumed on
+    its target.
     """
     from fitctl.sequences.links import SimulatedLink
 
     settings, sequence = _load(file, rig, overrides)
     settings.mock_parts()
     begun = time.perf_counter()
-    link = SimulatedLink(settings, seed)
+    prepare = _placed(settings, remote) if present else lambda _: None
+    link = SimulatedLink(settings, seed, prepare)
     status = _run(settings, sequence, link, out, as_json=as_json)
     if not as_json:
         say(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")
     raise typer.Exit(status)
+
+
+def _placed(rig: Rig, remote: Path | None) -> Callable[[Simulation], None]:
+    """What puts a simulation where the running instrument's stages and stars are."""
+    from fitctl.simulation.rehearsal import place
+
+    state = present_of_rig(rig, remote, "sequence")
+    return lambda simulation: place(simulation, state)
 
 
 @app.command()
@@ -195,7 +214,11 @@ def _steer(
 def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json: bool) -> int:
     """Run, show progress, print what every attempt gave, write calibrations; returns the exit status."""
     from fitctl.commands.operate.sequence_text import as_json_text, attempts_text, where
-    from fitctl.sequences.calibration import CALIBRATING, require_folder, write_calibration
+    from fitctl.sequences.behaviours.calibration import (
+        CALIBRATING,
+        require_folder,
+        write_calibration,
+    )
     from fitctl.sequences.contact import Contact
     from fitctl.sequences.runner import Runner, run_steps
     from fitctl.sequences.view import SequenceError

@@ -9,7 +9,7 @@ import msgspec
 from fitctl.commands.shared.printing import to_json
 from fitctl.logging.records import SequenceAttempt
 from fitctl.messages.commands import SequenceStatus
-from fitctl.sequences.stars import StarResult, star_results
+from fitctl.sequences.behaviours.stars import StarResult, star_results
 
 
 def where(status: SequenceStatus) -> str:

@@ -10,6 +10,15 @@ from collections.abc import Awaitable, Callable, Sequence
 from fitctl.config import ConfigError
 
 HOST = "127.0.0.1"
+# textual-serve's page takes no key, and so no STOP, before somebody has clicked on it.
+_TAKE_KEYS = """<script>
+const takeKeys = () => document.querySelector(".xterm-helper-textarea")?.focus();
+addEventListener("focus", takeKeys);
+const waiting = setInterval(() => {
+    takeKeys();
+    if (document.activeElement?.classList.contains("xterm-helper-textarea")) clearInterval(waiting);
+}, 100);
+</script>"""
 _Handler = Callable[..., Awaitable]
 
 
@@ -77,6 +86,8 @@ def _guard(web, address: str, key: str) -> _Handler:  # type: ignore[no-untyped-
         given = request.path.split("/")[1]  # of any characters, which strings are not compared with
         if at_home and secrets.compare_digest(given.encode(errors="replace"), key.encode()):
             response = await handler(request)
+            if isinstance(response, web.Response) and response.content_type == "text/html":
+                response.text = (response.text or "").replace("</body>", f"{_TAKE_KEYS}</body>")
             if not response.prepared:
                 response.headers["Content-Security-Policy"] = _nothing_from_elsewhere(host)
                 response.headers["Referrer-Policy"] = "no-referrer"  # the address is the key

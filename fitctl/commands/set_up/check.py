@@ -2,17 +2,71 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import typer
+
 from fitctl.commands.shared.options import RigOption, SetOption
 from fitctl.commands.shared.plant import check_plant
 from fitctl.commands.shared.printing import say
-from fitctl.commands.shared.rig import named_rig, rig_of
-from fitctl.config import default_rig_path
+from fitctl.commands.shared.rig import named_rig
+from fitctl.config import Rig, default_rig_path
+from fitctl.config.origins import Mark, Marks, marks_at
+from fitctl.config.reading import read_parts, rig_from_parts
+from fitctl.config.simulated import mixture
+
+_COLUMN = 72  # of the origins, where the values before them are shorter
+_DEFAULT = "default"
 
 
-def check(rig: RigOption = None, overrides: SetOption = None) -> None:
+def check(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    show: Annotated[
+        bool,
+        typer.Option(
+            "--show", help="Print every value in force and where it comes from, as a rig file."
+        ),
+    ] = False,
+) -> None:
     """Read a rig file and say whether it is well."""
-    rig = named_rig(rig)
-    settings = rig_of(rig, overrides)
+    path = named_rig(rig) or default_rig_path()
+    parts = read_parts(path, overrides or ())
+    settings = rig_from_parts(parts, str(path))
     check_plant(settings)
+    if show:
+        for line in _lines(settings, parts.marks):
+            say(line)
+        return
     loops = ", ".join(settings.loops)
-    say(f"{rig or default_rig_path()}: well; rig {settings.name}, loops {loops}")
+    say(f"{path}: well; rig {settings.name}, loops {loops}")
+    for line in mixture(settings):
+        say(line)
+
+
+def _lines(rig: Rig, marks: Marks) -> Iterator[str]:
+    """A line for each value: a rig file that says the same as all layers together."""
+    for path, value in _values(rig.model_dump(mode="json", exclude_none=True), ()):
+        mark = marks_at(marks, path)
+        origin = str(mark.layer) if isinstance(mark, Mark) else _DEFAULT
+        yield f"{'.'.join(path)} = {_toml(value)}".ljust(_COLUMN) + f" # {origin}"
+
+
+def _values(table: dict[str, Any], place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict) and value:
+            yield from _values(value, (*place, key))
+        else:
+            yield (*place, key), value
+
+
+def _toml(value: Any) -> str:
+    """A value as a rig file has it, on one line."""
+    import tomlkit
+
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return tomlkit.item(value).as_string()

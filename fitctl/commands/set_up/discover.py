@@ -1,8 +1,9 @@
-"""`fitctl discover`: cameras, serial ports and CAN interfaces of this machine."""
+"""`fitctl discover`: cameras and LabJacks in the network, serial ports and CAN interfaces of this machine."""
 
 from __future__ import annotations
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Annotated
 
@@ -14,20 +15,29 @@ from fitctl.commands.shared.options import JsonOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.drivers.gige.discovery import discover as discover_cameras
 from fitctl.drivers.interface import DeviceUnreachable
+from fitctl.drivers.labjack_t7.discovery import discover_labjacks
 
 
 def discover(
     broadcast: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Where cameras are asked to say who they are.")
+        str,
+        typer.Option(metavar="ADDRESS", help="Where cameras and LabJacks are asked who they are."),
     ] = "255.255.255.255",
     wait_s: Annotated[
         float, typer.Option("--wait", min=0.01, max=60.0, help="For their answers, seconds.")
     ] = 1.0,
     as_json: JsonOption = False,
 ) -> None:
-    """List cameras, serial ports and CAN interfaces. Cameras are asked by a broadcast."""
+    """List cameras, LabJacks, serial ports and CAN interfaces.
+
+    Cameras and LabJacks are asked by a broadcast. A C-887 has no documented way to be found.
+    """
+    with ThreadPoolExecutor() as pool:
+        cameras = pool.submit(_cameras, broadcast, wait_s)
+        labjacks = pool.submit(_labjacks, broadcast, wait_s)
     found = {
-        "cameras": _cameras(broadcast, wait_s),
+        "cameras": cameras.result(),
+        "labjacks": labjacks.result(),
         "serial_ports": _serial_ports(),
         "can_interfaces": _can_interfaces(),
     }
@@ -50,6 +60,15 @@ def _cameras(broadcast: str, wait_s: float) -> list[dict[str, str]]:
         {"address": one.address, "mac": one.mac, "name": one.user_name, **asdict(one.identity)}
         for one in cameras
     ]
+
+
+def _labjacks(broadcast: str, wait_s: float) -> list[dict[str, str]]:
+    try:
+        labjacks = discover_labjacks(broadcast, wait_s)
+    except DeviceUnreachable as error:
+        say(f"labjacks: {error}", err=True)
+        return []
+    return [{"address": one.address, **asdict(one.identity)} for one in labjacks]
 
 
 def _serial_ports() -> list[dict[str, str]]:

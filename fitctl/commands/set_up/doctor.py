@@ -22,6 +22,7 @@ from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
 from fitctl.config import Loop, Rig
+from fitctl.config.simulated import mixture, places
 from fitctl.drivers.bal_analog.driver import probe_bal_analog
 from fitctl.drivers.c887.driver import probe_c887
 from fitctl.drivers.cia402.configure import probe_drive
@@ -38,6 +39,8 @@ from fitctl.text import plain
 
 _WIDEST = 118
 _FIRST_REPORT_S = 3.0
+_CAN_DRIVER = "cia402"
+_NOT_STARTED = "simulated, and the mocks are not started: run `fitctl mocks` with this rig"
 PROBES: dict[str, Callable[[Any], Probe]] = {
     "gige": probe_camera,
     "aravis": probe_camera,
@@ -64,6 +67,8 @@ class Finding(NamedTuple):
     round_trip_ms : float or None
     disagreements : list of str
         Empty where all is as the rig file says.
+    note : str
+        What to know of it that is no failure.
     """
 
     device: str
@@ -72,13 +77,15 @@ class Finding(NamedTuple):
     identity: DeviceIdentity | None
     round_trip_ms: float | None
     disagreements: list[str]
+    note: str = ""
 
 
 def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
     """Ask every device of the rig who it is; nothing is set, nothing moves.
 
     While the rig's supervisor runs, print what it reports of its devices instead, and ask none.
-    Exit status 1 if a device is missing or is not as the rig file says.
+    Exit status 1 if a device is missing or is not as the rig file says. Mocks that are not started do
+    not count.
     """
     raise typer.Exit(ask_devices(rig_of(named_rig(rig), overrides), as_json=as_json))
 
@@ -87,24 +94,36 @@ def ask_devices(rig: Rig, *, as_json: bool) -> int:
     """Ask every device of a rig, print what they answer; returns the exit status."""
     logging.disable()  # libraries print on stderr what is in the table
     running = _running_supervisor(rig)
-    if running is None:
-        parts = list(_parts(rig))
-        with ThreadPoolExecutor(len(parts)) as pool:
-            findings = list(pool.map(lambda part: examine(*part), parts))
-    else:
-        findings = reported(rig, running)
+    findings = without_mocks(rig, _examine_all(rig)) if running is None else reported(rig, running)
     asked = "devices" if running is None else "supervisor"
     if as_json:
         documents = [_plain(one) for one in findings]
         say(to_json({"rig": rig.name, "asked": asked, "devices": documents}))
     else:
         _print(rig, findings)
+        for line in mixture(rig):
+            say(line)
         if running is not None:
             say(
                 f"The supervisor of {rig.name} runs (process {running.pid}). This is its report: doctor has"
                 " not asked the devices, which it would disturb. To have them asked, end it first."
             )
     return FAILED if any(finding.disagreements for finding in findings) else 0
+
+
+def _examine_all(rig: Rig) -> list[Finding]:
+    """Ask all devices at once, but drives on one CAN bus one after the other: its adapter serves one."""
+    buses = {name: number for number, drives in enumerate(rig.can_buses) for name in drives}
+    lines: dict[Any, list[tuple[str, str, Any]]] = {}
+    parts = list(_parts(rig))
+    for part in parts:
+        device, driver, _ = part
+        line = buses[device.removesuffix(" siderostat")] if driver == _CAN_DRIVER else device
+        lines.setdefault(line, []).append(part)
+    with ThreadPoolExecutor(len(lines)) as pool:
+        asked = pool.map(lambda line: [examine(*part) for part in line], lines.values())
+        findings = {finding.device: finding for line in asked for finding in line}
+    return [findings[device] for device, _, _ in parts]
 
 
 def examine(device: str, driver: str, settings: Any) -> Finding:
@@ -116,6 +135,19 @@ def examine(device: str, driver: str, settings: Any) -> Finding:
         return Finding(device, driver, found, None, None, [str(error)])
     round_trip_ms = 1e3 * probe.round_trip_s
     return Finding(device, driver, True, probe.identity, round_trip_ms, list(probe.disagreements))
+
+
+def without_mocks(rig: Rig, findings: list[Finding]) -> list[Finding]:
+    """What was found, where no mock answers: then `fitctl mocks` does not run, and no mock has failed."""
+    simulated = {name for name, place in places(rig).items() if place.simulated}
+    if any(finding.found for finding in findings if finding.device in simulated):
+        return findings
+    return [
+        finding._replace(disagreements=[], note=_NOT_STARTED)
+        if finding.device in simulated
+        else finding
+        for finding in findings
+    ]
 
 
 def reported(rig: Rig, running: Telemetry) -> list[Finding]:
@@ -192,7 +224,7 @@ def _print(rig: Rig, findings: list[Finding]) -> None:
             "" if who is None else _cell(filter(None, (who.maker, who.model, who.serial))),
             "" if who is None else plain(who.firmware),
             "" if finding.round_trip_ms is None else f"{finding.round_trip_ms:.2f} ms",
-            _cell(finding.disagreements),
+            _cell([*finding.disagreements, *filter(None, [finding.note])]),
         )
         table.add_row(*map(Text, cells))  # as Text, or what a device says of itself could be markup
     width = min(shutil.get_terminal_size((_WIDEST, 24)).columns, _WIDEST)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from serial.tools import list_ports
@@ -14,34 +14,50 @@ from fitctl.commands.set_up.doctor import ask_devices as run_doctor
 from fitctl.commands.shared.printing import say, say_lines
 from fitctl.commands.shared.welcome import listed
 from fitctl.config import ConfigError, rig_from_document
-from fitctl.config.new_rig import DEVICES, MOCK, Chosen, chosen, forms, new_rig_text
+from fitctl.config.new_rig import (
+    DEVICES,
+    MOCK,
+    ONE_STAR,
+    TESTBED,
+    Asked,
+    Chosen,
+    chosen,
+    forms,
+    new_rig_text,
+)
+from fitctl.config.simulated import mixture_warnings
 
-TITLES = {
-    "camera": "Camera",
-    "siderostat": "Amplifiers of the siderostat",
-    "dac": "D/A converter of the mirror",
-    "mdt693": "MDT693 piezo amplifier",
-}
 _FORM = "KIND:ADDRESS"
+_AMPLIFIERS = "cia402:INTERFACE:CHANNEL, ensemble:PORT, bal_analog:HOST or mock."
+_DACS = "tcp:HOST, rtu:PORT or mock."
+_PIEZOS = "mdt693:LIMIT:PORT or mock; the stacks' limit, 75, 100 or 150 V."
+
+
+def _device(text: str) -> Any:
+    return typer.Option(metavar=_FORM, help=text)
 
 
 def init(
     file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("my-rig.toml"),
     name: Annotated[str | None, typer.Option(help="Of the rig; by default the file's.")] = None,
-    camera: Annotated[
-        str | None, typer.Option(metavar=_FORM, help="gige:ADDRESS, aravis:ADDRESS or mock.")
+    testbed: Annotated[
+        bool,
+        typer.Option("--testbed", help="Two stars, metrology and a collector on a hexapod."),
+    ] = False,
+    camera: Annotated[str | None, _device("gige:ADDRESS, aravis:ADDRESS or mock.")] = None,
+    siderostat: Annotated[str | None, _device(_AMPLIFIERS)] = None,
+    dac: Annotated[str | None, _device(_DACS)] = None,
+    mdt693: Annotated[str | None, _device(_PIEZOS)] = None,
+    metrology_siderostat: Annotated[
+        str | None, _device(f"Testbed: left combiner siderostat; {_AMPLIFIERS}")
     ] = None,
-    siderostat: Annotated[
-        str | None,
-        typer.Option(
-            metavar=_FORM,
-            help="cia402:INTERFACE:CHANNEL, ensemble:PORT, bal_analog:HOST or mock.",
-        ),
+    photodiodes: Annotated[str | None, _device("Testbed: labjack_t7:HOST or mock.")] = None,
+    left_siderostat: Annotated[
+        str | None, _device(f"Testbed: collector siderostat; {_AMPLIFIERS}")
     ] = None,
-    dac: Annotated[
-        str | None, typer.Option(metavar=_FORM, help="tcp:HOST, rtu:PORT or mock.")
-    ] = None,
-    mdt693: Annotated[str | None, typer.Option(metavar=_FORM, help="mdt693:PORT or mock.")] = None,
+    left_dac: Annotated[str | None, _device(f"Testbed: {_DACS}")] = None,
+    left_mdt693: Annotated[str | None, _device(f"Testbed: {_PIEZOS}")] = None,
+    hexapod: Annotated[str | None, _device("Testbed: c887:PORT or mock.")] = None,
     mocks: Annotated[
         bool, typer.Option("--mocks", help="Ask nothing: what is not said is a mock.")
     ] = False,
@@ -51,39 +67,68 @@ def init(
 ) -> None:
     """Write a rig file of your own: asks what hardware is there, or is told by options.
 
-    Nothing is overwritten. At the end the devices are asked who they are, as `fitctl doctor` does; the exit
-    status is 1 if one disagrees.
+    The rig points one star; with --testbed it is the whole testbed. Nothing is overwritten. At the end the
+    devices are asked who they are, as `fitctl doctor` does; the exit status is 1 if one disagrees.
     """
-    options = {"camera": camera, "siderostat": siderostat, "dac": dac, "mdt693": mdt693}
+    options = {
+        "camera": camera,
+        "siderostat": siderostat,
+        "dac": dac,
+        "mdt693": mdt693,
+        "metrology-siderostat": metrology_siderostat,
+        "photodiodes": photodiodes,
+        "left-siderostat": left_siderostat,
+        "left-dac": left_dac,
+        "left-mdt693": left_mdt693,
+        "hexapod": hexapod,
+    }
+    base = TESTBED if testbed else ONE_STAR
     if file.exists():
         msg = f"{file}: is there already, and init overwrites nothing; name another file"
         raise ConfigError(msg)
-    given = {device: text and chosen(device, text) for device, text in options.items()}
+    for device, text in options.items():
+        if text and device not in DEVICES[base]:
+            msg = (
+                f"init: --{device} is a device of the testbed; give --testbed too, or leave it out"
+            )
+            raise ConfigError(msg)
+    given = {
+        device: text and chosen(base, device, text)
+        for device, text in options.items()
+        if device in DEVICES[base]
+    }
     open_questions = [device for device, choice in given.items() if not choice]
     if open_questions and not mocks:
-        _must_be_a_terminal(open_questions)
+        _must_be_a_terminal(base, open_questions)
         say("What hardware is there? Enter takes what stands in brackets.")
         _show_serial_ports()
         name = name or typer.prompt("Name of the rig", default=file.stem)
     devices = {
-        device: choice or (Chosen() if mocks else _ask(device)) for device, choice in given.items()
+        device: choice or (Chosen() if mocks else _ask(base, device))
+        for device, choice in given.items()
     }
-    text = new_rig_text(name or file.stem, devices)
+    text = new_rig_text(base, name or file.stem, devices)
     rig = rig_from_document(tomllib.loads(text), str(file))
     _write(file, text)
     simulated = [device for device, (kind, _) in devices.items() if kind == MOCK]
     say(f"{file}: written; rig {rig.name}, simulated: {', '.join(simulated) or 'nothing'}")
     status = 0
-    if ask_devices and len(simulated) < len(devices):
+    all_mocks = len(simulated) == len(devices)
+    if ask_devices and not all_mocks:
         status = run_doctor(rig, as_json=False)
-    say_lines(_next(file, simulated))
+    else:
+        for line in mixture_warnings(rig):
+            say(line)
+    say_lines(_next(file, simulated, all_mocks=all_mocks))
     raise typer.Exit(status)
 
 
-def _must_be_a_terminal(open_questions: list[str]) -> None:
+def _must_be_a_terminal(base: str, open_questions: list[str]) -> None:
     if sys.stdin.isatty():
         return
-    options = "; ".join(f"--{device} {' or '.join(forms(device))}" for device in open_questions)
+    options = "; ".join(
+        f"--{device} {' or '.join(forms(base, device))}" for device in open_questions
+    )
     msg = (
         "init: needs a terminal to ask questions. Without one, pass --mocks, or name each device: "
         + options
@@ -96,15 +141,25 @@ def _show_serial_ports() -> None:
         say(f"  {port.device}  {port.description}")
 
 
-def _ask(device: str) -> Chosen:
-    kinds = [*DEVICES[device], MOCK]
+def _ask(base: str, device: str) -> Chosen:
+    title, hardware = DEVICES[base][device]
+    kinds = [*hardware, MOCK]
     kind = ""
     while kind not in kinds:
-        kind = typer.prompt(f"{TITLES[device]} ({', '.join(kinds)})", default=MOCK)
+        kind = typer.prompt(f"{title} ({', '.join(kinds)})", default=MOCK)
     if kind == MOCK:
         return Chosen()
-    asked = DEVICES[device][kind].asked
-    return Chosen(kind, tuple(typer.prompt(f"  {a.question}", default=a.example) for a in asked))
+    return Chosen(kind, tuple(map(_answer, hardware[kind].asked)))
+
+
+def _answer(asked: Asked) -> str:
+    """One answer; where only some are possible, none is offered: that choice is the owner's."""
+    if not asked.choices:
+        return str(typer.prompt(f"  {asked.question}", default=asked.example))
+    answer = ""
+    while answer not in asked.choices:
+        answer = typer.prompt(f"  {asked.question}")
+    return answer
 
 
 def _write(path: Path, text: str) -> None:
@@ -116,8 +171,8 @@ def _write(path: Path, text: str) -> None:
         raise ConfigError(msg) from None
 
 
-def _next(path: Path, simulated: list[str]) -> str:
-    if len(simulated) == len(DEVICES):
+def _next(path: Path, simulated: list[str], *, all_mocks: bool) -> str:
+    if all_mocks:
         steps = [(f"fitctl demo --rig {path}", "see it acquire and hold a star")]
     else:
         steps = [

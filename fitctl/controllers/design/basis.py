@@ -2,13 +2,48 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from fitctl.config import AirPathModel, ConfigError, Rig, Vernier
+from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.model.optics import scales
-from fitctl.model.scene import centroid_noise_px
+
+LEAST_GAIN = 0.4
+"""Of a mirror: one that moves less, or more than its inverse, has another fault than its calibration."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A vibration: a damped oscillator under white noise.
+
+    Attributes
+    ----------
+    frequency_hz : float
+        Of the oscillator without damping.
+    damping : float
+        Part of critical damping: its half width at half power is about ``damping * frequency_hz``.
+    rms_px : float
+        Of one axis.
+
+    Raises
+    ------
+    ValueError
+        If a value is not above zero, or the damping is critical.
+    """
+
+    frequency_hz: float
+    damping: float
+    rms_px: float
+
+    def __post_init__(self) -> None:
+        values = dataclasses.astuple(self)
+        if not all(math.isfinite(value) and value > 0 for value in values) or self.damping >= 1:
+            msg = f"line: expected values above 0, and a damping below 1, got {self}"
+            raise ValueError(msg)
 
 
 @dataclass(frozen=True)
@@ -22,7 +57,7 @@ class Basis:
     delay_s : float
         T_fd: mid-exposure to the command made from the frame.
     noise_px : float
-        One standard deviation of one frame's centroid, Eq. 7.
+        One standard deviation of the star's place on one frame, by the loop's sensor.
     air_path : AirPathModel
         The disturbance, as identified.
     coarse_per_s : float
@@ -31,6 +66,13 @@ class Basis:
         phi_max on the focal plane.
     settings : Vernier
         The designs' own parameters.
+    lines : tuple of Line
+        Vibrations beside the air path. A rig file has none; `fitctl design learn` finds them in a log.
+    guard : Line, optional
+        Motion that does not exist. A design that expects it amplifies less there, which gives it its
+        margins (:mod:`fitctl.controllers.design.margins`).
+    mirror_gain : float
+        How far the mirror moves the star, in what the rig file says; `fitctl design learn` measures it.
     """
 
     period_s: float
@@ -40,6 +82,9 @@ class Basis:
     coarse_per_s: float
     mirror_range_px: float
     settings: Vernier
+    lines: tuple[Line, ...] = ()
+    guard: Line | None = None
+    mirror_gain: float = 1.0
 
 
 def basis(rig: Rig, loop_name: str) -> Basis:
@@ -61,7 +106,7 @@ def basis(rig: Rig, loop_name: str) -> Basis:
     return Basis(
         period_s=camera.period_s,
         delay_s=camera.frame_delay_s,
-        noise_px=centroid_noise_px(camera, loop.star_flux_dn, 7),
+        noise_px=sensor_noise_px(camera, loop, loop.star_flux_dn),
         air_path=loop.vernier.air_path,
         coarse_per_s=loop.coarse.gain_rad_per_m * scale.pixel_size_m * scale.motor_px_per_rad,
         mirror_range_px=scale.mirror_px_per_rad * loop.fsm.range_rad,
@@ -71,7 +116,7 @@ def basis(rig: Rig, loop_name: str) -> Basis:
 
 def design_parameters(basis: Basis, *sections: str) -> dict[str, Any]:
     """What a design was made from, plain enough for a file: the loop, and sections of the settings."""
-    return {
+    parameters = {
         "noise_px": basis.noise_px,
         "air_path": basis.air_path.model_dump(),
         "coarse_per_s": basis.coarse_per_s,
@@ -79,6 +124,18 @@ def design_parameters(basis: Basis, *sections: str) -> dict[str, Any]:
             section: getattr(basis.settings, section).model_dump() for section in sections
         },
     }
+    if basis.lines:
+        parameters["lines"] = [dataclasses.asdict(line) for line in basis.lines]
+    if basis.guard is not None:
+        parameters["guard"] = dataclasses.asdict(basis.guard)
+    if basis.mirror_gain != 1.0:
+        parameters["mirror_gain"] = basis.mirror_gain
+    return parameters
+
+
+def on_its_mirror(basis: Basis, parameters: Mapping[str, Any]) -> Basis:
+    """A rig's basis, but with the mirror's gain that a design of these parameters was made for."""
+    return replace(basis, mirror_gain=float(parameters.get("mirror_gain", 1.0)))
 
 
 def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
@@ -90,6 +147,10 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         If these are no :func:`design_parameters`.
     """
     settings = rig_basis.settings
+    mirror_gain = float(parameters.get("mirror_gain", 1.0))
+    if not LEAST_GAIN <= mirror_gain <= 1 / LEAST_GAIN:
+        msg = f"mirror_gain: expected {LEAST_GAIN:g} to {1 / LEAST_GAIN:g}, got {mirror_gain:g}"
+        raise ValueError(msg)
     sections = {
         name: type(getattr(settings, name)).model_validate(values)
         for name, values in parameters["settings"].items()
@@ -101,4 +162,7 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         air_path=AirPathModel.model_validate(parameters["air_path"]),
         coarse_per_s=float(parameters["coarse_per_s"]),
         settings=settings.model_copy(update=sections),
+        lines=tuple(Line(**line) for line in parameters.get("lines", ())),
+        guard=Line(**parameters["guard"]) if "guard" in parameters else None,
+        mirror_gain=mirror_gain,
     )

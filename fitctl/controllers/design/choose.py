@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.config import ConfigError, Rig
-from fitctl.controllers.design.basis import Basis, basis
+from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
 from fitctl.controllers.design.eq20 import design_eq20
 from fitctl.controllers.design.files import load_design
 from fitctl.controllers.design.fslq import design_fslq
+from fitctl.controllers.design.linear_loop.sampled import sampled_loop
 from fitctl.controllers.design.lqg_ltr import design_lqg_ltr
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.controllers.design.sampled import sampled_loop
 from fitctl.controllers.pair import Design
 
 DESIGNS: dict[str, Callable[[Basis], Design]] = {
@@ -48,7 +48,7 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
             "`fitctl design` saved"
         )
         raise ConfigError(msg)
-    if not sampled_loop(design, its_basis).stable:
+    if not sampled_loop(design, on_its_mirror(its_basis, design.parameters)).stable:
         msg = (
             f"controller {chosen}: unstable at {1 / its_basis.period_s:g} Hz with "
             f"{its_basis.delay_s * 1e3:g} ms of delay; choose another, fitctl design compare shows them all"

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.loopshape import Response
+from fitctl.controllers.design.linear_loop.loopshape import Response
 from fitctl.model.backlash import describing_function
 
 Floats = NDArray[np.float64]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.sampled import sampled_loop, timing
+from fitctl.controllers.design.linear_loop.sampled import sampled_loop, timing
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]

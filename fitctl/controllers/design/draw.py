@@ -10,7 +10,7 @@ import numpy as np
 
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.loopshape import Response, coarse_response, delayed
+from fitctl.controllers.design.linear_loop.loopshape import Response, coarse_response, delayed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

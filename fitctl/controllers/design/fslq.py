@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from fitctl.controllers.design.basis import Basis, design_parameters
+from fitctl.controllers.design.linear_loop.disturbance import disturbance
+from fitctl.controllers.design.linear_loop.sampled import hold
 from fitctl.controllers.design.predictor import Gains, predicting_design, star_filter
-from fitctl.controllers.design.sampled import hold
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]
@@ -29,7 +30,7 @@ def design_fslq(basis: Basis) -> Design:
     """
     settings = basis.settings.fslq
     found = star_filter(basis, settings.drift_px_per_sqrt_s)
-    acts = hold(basis.air_path, basis.period_s, basis.delay_s)
+    acts = hold(disturbance(basis), basis.period_s, basis.delay_s)
     crossover_rad_s = 2 * math.pi * settings.crossover_hz
     keep = math.exp(-crossover_rad_s * basis.period_s)
     state = np.diag([keep, 1.0])
@@ -39,10 +40,10 @@ def design_fslq(basis: Basis) -> Design:
     root = np.sqrt(acts.weight)[:, None]
     one = np.ones_like(acts.part)
     by_state, by_control = np.zeros((len(one) + 2, 2)), np.zeros((len(one) + 2, 2))
-    by_star = np.zeros((len(one) + 2, 3))
+    by_star = np.zeros((len(one) + 2, len(found.seen)))
     by_state[:-2] = root * np.column_stack([0 * one, one])
     by_control[:-2] = root * np.column_stack([one, acts.part])
-    by_star[:-2] = root * np.column_stack([acts.air, one])
+    by_star[:-2] = root * np.column_stack([acts.star, one])
     by_state[-2, 0] = settings.control_weight
     by_control[-1, 1] = settings.control_weight / (crossover_rad_s * basis.period_s)
     gain, star_gain = regulator(state, drive, found.transition, by_state, by_control, by_star)

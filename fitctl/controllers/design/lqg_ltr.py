@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from fitctl.config import LqgLtr
 from fitctl.controllers.design.basis import Basis, design_parameters
 from fitctl.controllers.design.eq20 import eq20_zpk, parallel_design
-from fitctl.controllers.design.loopshape import compensator_response
+from fitctl.controllers.design.linear_loop.loopshape import compensator_response
 from fitctl.controllers.pair import Design
 from fitctl.model.air_path import state_space
 

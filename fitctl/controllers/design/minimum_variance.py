@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from fitctl.controllers.design.basis import Basis, design_parameters
+from fitctl.controllers.design.linear_loop.disturbance import disturbance
+from fitctl.controllers.design.linear_loop.sampled import hold
 from fitctl.controllers.design.predictor import Gains, predicting_design, star_filter
-from fitctl.controllers.design.sampled import hold
 from fitctl.controllers.pair import Design
 
 
@@ -22,8 +23,8 @@ def design_minimum_variance(basis: Basis) -> Design:
     holds, s = offload T u.
     """
     settings = basis.settings.minimum_variance
-    acts = hold(basis.air_path, basis.period_s, basis.delay_s)
-    expected = np.append(acts.weight @ acts.air, 1.0)
+    acts = hold(disturbance(basis), basis.period_s, basis.delay_s)
+    expected = np.append(acts.weight @ acts.star, 1.0)
     part = settings.offload_per_s * basis.period_s
     # u + (star + motor + s / 2) = 0 and s = part u.
     outputs = np.array([1.0, part]) / (1.0 + part / 2)

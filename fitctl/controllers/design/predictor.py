@@ -2,7 +2,7 @@
 
 What the camera shows is the star's own motion and what the stages did to it. The stages' part is known,
 at the frame's own time, so it is subtracted, and a steady-state Kalman filter follows the rest: the air
-path and a slow drift. Then a gain for each output makes commands of what is expected.
+path, lines of vibrations, and a slow drift. Then a gain for each output makes commands of what is expected.
 """
 
 from __future__ import annotations
@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_discrete_are
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.sampled import timing
+from fitctl.controllers.design.linear_loop.disturbance import disturbance
+from fitctl.controllers.design.linear_loop.sampled import timing
 from fitctl.controllers.pair import Design
-from fitctl.model.air_path import discretize, state_space
 
 Floats = NDArray[np.float64]
-SEEN = np.array(
-    [1.0, 0.0, 1.0]
-)  # the star's own motion of the states: air path (px, px/s), drift (px)
 
 
 class Filter(NamedTuple):
@@ -29,25 +26,29 @@ class Filter(NamedTuple):
 
     Attributes
     ----------
-    transition : array, shape (3, 3)
-        Of air path and drift, over one period.
-    gain : array, shape (3,)
+    transition : array, shape (n, n)
+        Of air path, lines and drift, over one period.
+    gain : array, shape (n,)
         Of a measurement's innovation on the state at its own time.
+    seen : array, shape (n,)
+        The star's own motion is this of the states.
     """
 
     transition: Floats
     gain: Floats
+    seen: Floats
 
 
 def star_filter(basis: Basis, drift_px_per_sqrt_s: float) -> Filter:
-    """The filter for a loop's air path and noise, with a drift that walks at random."""
-    a, b, _ = state_space(basis.air_path)
-    air, air_noise = discretize(a, b @ b.T, basis.period_s)
-    transition = block_diag(air, 1.0)
-    noise = block_diag(air_noise, drift_px_per_sqrt_s**2 * basis.period_s)
+    """The filter for a loop's air path, lines and noise, with a drift that walks at random."""
+    moving = disturbance(basis)
+    own, own_noise = moving.over(basis.period_s)
+    transition = block_diag(own, 1.0)
+    noise = block_diag(own_noise, drift_px_per_sqrt_s**2 * basis.period_s)
+    seen = np.append(moving.seen, 1.0)
     variance = basis.noise_px**2
-    before = solve_discrete_are(transition.T, SEEN[:, None], noise, np.array([[variance]]))
-    return Filter(transition, before @ SEEN / (SEEN @ before @ SEEN + variance))
+    before = solve_discrete_are(transition.T, seen[:, None], noise, np.array([[variance]]))
+    return Filter(transition, before @ seen / (seen @ before @ seen + variance), seen)
 
 
 class Gains(NamedTuple):
@@ -55,7 +56,7 @@ class Gains(NamedTuple):
 
     Attributes
     ----------
-    star : array, shape (2, 3)
+    star : array, shape (2, n)
         On the star's own motion at mid-exposure, less target.
     motor : array, shape (2,)
         On where the siderostat will be when the command begins.
@@ -76,18 +77,18 @@ def predicting_design(
 ) -> Design:
     """A pair from a filter and a law.
 
-    States: the star's own motion, expected for the next frame (3); the siderostat steps still under way
-    at mid-exposure, newest first; the law's memory.
+    States: the star's own motion, expected for the next frame (air path 2, each line 2, drift 1); the
+    siderostat steps still under way at mid-exposure, newest first; the law's memory.
     """
     frames, walked = timing(basis.period_s, basis.delay_s)
-    own, steps, memory = 3, frames, len(gains.keep)
+    own, steps, memory = len(found.gain), frames, len(gains.keep)
     n = own + steps + memory
     # The star's own motion at mid-exposure, once this frame is known: (states, inputs).
     error, _, mirror, motor, target = range(5)
     frame = np.zeros(5)
     frame[[error, target]], frame[[mirror, motor]] = 1.0, -1.0
     now_state = np.zeros((own, n))
-    now_state[:, :own] = np.eye(own) - np.outer(found.gain, SEEN)
+    now_state[:, :own] = np.eye(own) - np.outer(found.gain, found.seen)
     now_input = np.outer(found.gain, frame)
     # Where the siderostat will be: where it was at the frame, and the steps that it had not yet made.
     motor_state, motor_input = np.zeros(n), np.eye(5)[motor]
@@ -95,7 +96,7 @@ def predicting_design(
     motor_state[own + steps - 1] = 1.0 - walked
     # The target counts as a star's own motion the other way, one that stays.
     less_target = now_input.copy()
-    less_target[2, target] -= 1.0
+    less_target[own - 1, target] -= 1.0
     c = gains.star @ now_state + np.outer(gains.motor, motor_state)
     c[:, own + steps :] += gains.memory
     d = gains.star @ less_target + np.outer(gains.motor, motor_input)
@@ -106,6 +107,9 @@ def predicting_design(
     a[own + steps :, own + steps :] = gains.keep
     a[own + steps :] += gains.drive @ c
     b[own + steps :] = gains.drive @ d
+    # So far in the star's true motion; the mirror's input and output count what the rig file says of it.
+    c[0], d[0] = c[0] / basis.mirror_gain, d[0] / basis.mirror_gain
+    b[:, mirror], d[:, mirror] = b[:, mirror] * basis.mirror_gain, d[:, mirror] * basis.mirror_gain
     return Design(
         name=name,
         period_s=basis.period_s,

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.bound import bound, linear_residual
-from fitctl.controllers.design.loopshape import LoopShape, loop_shape, sampled_response
+from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.loopshape import LoopShape, loop_shape, sampled_response
 from fitctl.controllers.pair import Design
 
 

@@ -8,8 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import NoReturn, TypeVar
 
-import serial
-
 from fitctl.config import C887Device
 from fitctl.drivers.c887 import protocol
 from fitctl.drivers.endpoint import Endpoint
@@ -25,7 +23,7 @@ from fitctl.drivers.interface import (
 T = TypeVar("T")
 DEVICE = "hexapod"
 _POLL_S = 0.02  # how long one read waits; the time limit is counted above it
-_HINTS = {
+_HINTS: dict[int, str] = {
     protocol.GcsError.NOT_REFERENCED_OR_SERVO_OFF: "reference the hexapod, which switches servos on too",
     protocol.GcsError.POSITION_OUT_OF_LIMITS: "choose a pose nearer to zero: what an axis reaches depends on"
     " the others, and VMO? reports whether a pose can be reached",
@@ -65,21 +63,13 @@ class C887Link:
         self.endpoint = Endpoint(DEVICE, device.port)
         self._turn = threading.RLock()
         self._writing = threading.Lock()
-        try:
-            self._port = serial.serial_for_url(
-                device.port,
-                baudrate=device.baud_rate,
-                timeout=_POLL_S,
-                write_timeout=device.response_timeout_s,
-                exclusive=True,
-            )
-        except (OSError, ValueError) as error:
-            raise self.endpoint.error(
-                DeviceUnreachable,
-                "a C-887 controller",
-                str(error),
-                "check its power and cable, and collector.hexapod.port",
-            ) from error
+        self._port = self.endpoint.open_serial(
+            "a C-887 controller",
+            "check its power and cable, and collector.hexapod.port",
+            baud_rate=device.baud_rate,
+            poll_s=_POLL_S,
+            write_timeout_s=device.response_timeout_s,
+        )
 
     def resynchronise(self) -> None:
         """End a line that an earlier client may have left half typed, and forget its error."""
@@ -172,7 +162,7 @@ class C887Link:
 
     def refused(self, name: str, number: int) -> DeviceError:
         """The error for a command that the controller has not done."""
-        hint = _HINTS.get(number, "see the maker's manual for this number")  # type: ignore[call-overload]
+        hint = _HINTS.get(number, "see the maker's manual for this number")
         kind = DeviceFault if number in _FAULTS else DeviceRefused
         return self.endpoint.error(kind, f"{name} to be done", protocol.error_text(number), hint)
 

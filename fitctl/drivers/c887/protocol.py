@@ -60,7 +60,7 @@ class GcsError(IntEnum):
     MOTION_ERROR = 1024
 
 
-_ERROR_TEXTS = {
+_ERROR_TEXTS: dict[int, str] = {
     GcsError.PARAMETER_SYNTAX: "a parameter that it cannot read",
     GcsError.UNKNOWN_COMMAND: "an unknown command",
     GcsError.COMMAND_TOO_LONG: "a command that is too long",
@@ -84,7 +84,7 @@ _ERROR_TEXTS = {
 
 def error_text(number: int) -> str:
     """An error number for people."""
-    known = _ERROR_TEXTS.get(number)  # type: ignore[call-overload]
+    known = _ERROR_TEXTS.get(number)
     return f"error {number}, {known}" if known else f"error {number}"
 
 

@@ -29,6 +29,7 @@ from fitctl.drivers.interface import (
 )
 
 if TYPE_CHECKING:
+    from fitctl.drivers.cia402.bus import BusLink, CanBus
     from fitctl.drivers.cia402.node import Node
 
     _Base = LinkedAmplifiers[Node, Cia402Device]
@@ -38,6 +39,9 @@ else:
 _POLL_S = 0.001
 _STATUS_LIMIT_S = 5 * protocol.STATUS_EVERY_MS / 1e3
 _BEHIND_PERIODS = 10
+_SHARED_BUS = (
+    0.75  # of a period: a silent drive must not cost the others on its bus their next period
+)
 _PAIR = struct.Struct("<ii")
 _STATUS_PAIR = struct.Struct("<HH")
 
@@ -69,9 +73,11 @@ class Cia402Amplifiers(_Base):
     ----------
     siderostat : Siderostat
         Encoder, servo rate and device settings of the rig.
+    bus : CanBus, optional
+        Where the drive shares its bus with others; without it, the drive has a connection of its own.
     """
 
-    def __init__(self, siderostat: Siderostat[Cia402Device]) -> None:
+    def __init__(self, siderostat: Siderostat[Cia402Device], bus: CanBus | None = None) -> None:
         device = siderostat.device
         super().__init__(siderostat, f"{device.interface} {device.channel}, node {device.node_id}")
         self._period_s = 1.0 / siderostat.servo.rate_hz
@@ -82,6 +88,12 @@ class Cia402Amplifiers(_Base):
         self._statuswords = [0, 0]
         self._status_s = 0.0
         self._behind = 0
+        self._bus = bus
+        self._bus_link: BusLink | None = None
+        self._staged = False
+        self._commanded_rad_s: AzEl = (0.0, 0.0)
+        self._sync_s = 0.0
+        self._answers_within_s = self._period_s * (1.0 if bus is None else _SHARED_BUS)
 
     def open(self) -> DeviceIdentity:
         """Connect, check and configure the drive, start the node; nothing moves, no motor has current.
@@ -103,12 +115,16 @@ class Cia402Amplifiers(_Base):
         self.close()
         self._encoders.restart()
         self._behind = 0
-        with self._connected(Node(CanLink(self._device), self._device)) as node:
+        self._staged = False
+        link = self._bus_link = None if self._bus is None else self._bus.connect(self._device)
+        with self._connected(Node(link or CanLink(self._device), self._device)) as node:
             identity = configure(node, self._device, self._position_limit_counts)
             node.handlers |= {
                 protocol.TPDO1_BASE + self._device.node_id: self._on_positions,
                 protocol.TPDO2_BASE + self._device.node_id: self._on_statuswords,
             }
+            if link is not None:
+                link.on_sync = self._on_sync
             node.start()
             for axis in range(2):
                 self._state(axis)
@@ -203,17 +219,15 @@ class Cia402Amplifiers(_Base):
 
         Whatever it raises but ValueError, the velocities have been sent before, if they could be.
         """
-        node, encoders = self._opened(), self._encoders
-        encoders.latched = None
         try:
-            node.drain()
-            self._find_lost()
+            if not self._staged:
+                self.stage(velocity_rad_s)
         finally:
-            # Also when nothing sound comes back, the drive must hear what it shall do, and that we live.
-            node.beat()
-            sync_s = self._send_velocities(*velocity_rad_s)
+            self._staged = False
+            self._synchronize()
+        node, encoders = self._opened(), self._encoders
         late, encoders.latched = encoders.latched, None
-        deadline_s = sync_s + self._period_s
+        deadline_s = self._sync_s + self._answers_within_s
         while encoders.latched is None:
             left_s = deadline_s - time.monotonic()
             if not node.pump(max(0.0, left_s)) or left_s <= 0:
@@ -233,6 +247,25 @@ class Cia402Amplifiers(_Base):
             ),
             fault=self._fault_text(node.error_code),
         )
+
+    def stage(self, velocity_rad_s: AzEl) -> None:
+        """Begin a servo period that :meth:`exchange` ends; on a shared bus, before any drive's SYNC.
+
+        Raises
+        ------
+        DeviceError, ValueError
+            As :meth:`exchange`.
+        """
+        node = self._opened()
+        self._encoders.latched = None
+        try:
+            node.drain()
+            self._find_lost()
+        finally:
+            # Also when nothing sound comes back, the drive must hear what it shall do, and that we live.
+            node.beat()
+            self._command(velocity_rad_s)
+        self._staged = True
 
     def _shut_down(self) -> None:
         # Where nothing answers, or it answers wrongly, the drive's own watch on us stops it.
@@ -275,16 +308,30 @@ class Cia402Amplifiers(_Base):
     def _stand_still(self) -> None:
         for axis in range(2):
             self._write(axis, protocol.TARGET_VELOCITY, "i", 0)
-        self._send_velocities(0.0, 0.0)
+        self._command((0.0, 0.0))
+        self._synchronize()
 
-    def _send_velocities(self, az_rad_s: float, el_rad_s: float) -> float:
-        """Send both velocities and a SYNC; returns the time of the SYNC."""
+    def _command(self, velocity_rad_s: AzEl) -> None:
+        """Send both velocities and a SYNC, or leave the velocities for the bus's next SYNC."""
+        az_rad_s, el_rad_s = velocity_rad_s
         to_wire = protocol.velocity_to_wire
-        velocities = _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
+        rpdo = self._rpdo_id, _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
+        self._commanded_rad_s = velocity_rad_s
+        if self._bus_link is not None:
+            self._bus_link.staged = rpdo
+            return
         sync_s = time.monotonic()
-        self._opened().link.send((self._rpdo_id, velocities), (protocol.SYNC_ID, b""))
-        self._encoders.sync_sent(sync_s, self._driven(az_rad_s, el_rad_s))
-        return sync_s
+        self._opened().link.send(rpdo, (protocol.SYNC_ID, b""))
+        self._on_sync(sync_s)
+
+    def _synchronize(self) -> None:
+        if self._bus_link is not None:
+            self._bus_link.synchronize()
+
+    def _on_sync(self, sync_s: float) -> None:
+        """A SYNC is sent: the drive latches its encoders, and acts on what it was last commanded."""
+        self._sync_s = sync_s
+        self._encoders.sync_sent(sync_s, self._driven(*self._commanded_rad_s))
 
     def _driven(self, az_rad_s: float, el_rad_s: float) -> AzEl | None:
         """Velocities in encoder counts/s; None while an axis may be without current."""

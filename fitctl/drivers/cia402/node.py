@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from fitctl.config import Cia402Device
 from fitctl.drivers.cia402 import protocol
+from fitctl.drivers.cia402.bus import BusLink
 from fitctl.drivers.cia402.link import CanLink
 from fitctl.drivers.cia402.protocol import NmtCommand, NmtState
 from fitctl.drivers.interface import (
@@ -32,8 +33,8 @@ class Node:
 
     Parameters
     ----------
-    link : CanLink
-        The open bus.
+    link : CanLink or BusLink
+        The open bus, or this node's part of it.
     device : Cia402Device
         Node id and time limits.
 
@@ -45,7 +46,7 @@ class Node:
         Of the newest emergency message; 0 once the node reports that the error is gone.
     """
 
-    def __init__(self, link: CanLink, device: Cia402Device) -> None:
+    def __init__(self, link: CanLink | BusLink, device: Cia402Device) -> None:
         self.link = link
         self.endpoint = link.endpoint
         self.error_code = 0

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-import serial
-
 from fitctl.config import EnsembleDevice
 from fitctl.drivers.amplifiers import DEVICE
 from fitctl.drivers.endpoint import Endpoint
@@ -50,21 +48,13 @@ class EnsembleLink:
         self._device = device
         self._endpoint = Endpoint(DEVICE, device.port)
         self.last_words: tuple[str, ...] = ()
-        try:
-            self._port = serial.serial_for_url(
-                device.port,
-                baudrate=device.baud_rate,
-                timeout=_POLL_S,
-                write_timeout=device.response_timeout_s,
-                exclusive=True,
-            )
-        except (OSError, ValueError) as error:
-            raise self._endpoint.error(
-                DeviceUnreachable,
-                "an Ensemble controller",
-                str(error),
-                "check its power and cable, its Ethernet socket's set-up, and siderostat.device.port",
-            ) from error
+        self._port = self._endpoint.open_serial(
+            "an Ensemble controller",
+            "check its power and cable, its Ethernet socket's set-up, and siderostat.device.port",
+            baud_rate=device.baud_rate,
+            poll_s=_POLL_S,
+            write_timeout_s=device.response_timeout_s,
+        )
 
     def probe(self) -> DeviceIdentity:
         """See that a controller answers, whatever it was saying before.

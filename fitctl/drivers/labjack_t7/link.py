@@ -32,6 +32,7 @@ KEYS = "sensor.device"
 _UNIT = 1
 _READ = ReadHoldingRegistersRequest.function_code
 _DIODE_REGISTERS = protocol.AIN_REGISTERS * protocol.DIODES
+_SETTINGS_REGISTERS = sum(register.count for register in protocol.AIN_ALL)
 
 
 class Facts(NamedTuple):
@@ -155,6 +156,19 @@ class T7Link(ModbusLink):
         """
         return self.send(_inputs_request())
 
+    def request_settings(self) -> int:
+        """Ask for the settings of all inputs without waiting; returns the number that the answer will have.
+
+        Raises
+        ------
+        DeviceUnreachable
+        """
+        return self.send(
+            ReadHoldingRegistersRequest(
+                address=protocol.AIN_ALL[0].address, count=_SETTINGS_REGISTERS
+            )
+        )
+
     def decode_inputs(self, answer: Answer) -> list[float]:
         """The voltages in the answer to :meth:`request_inputs`, V; any FLOAT32.
 
@@ -162,12 +176,30 @@ class T7Link(ModbusLink):
         ------
         DeviceRefused, DeviceProtocolError
         """
+        return protocol.decode_inputs(self._registers(answer, _DIODE_REGISTERS))
+
+    def decode_settings(self, answer: Answer) -> dict[Register, float]:
+        """The values in the answer to :meth:`request_settings`, by their registers.
+
+        Raises
+        ------
+        DeviceRefused, DeviceProtocolError
+        """
+        registers = self._registers(answer, _SETTINGS_REGISTERS)
+        first = protocol.AIN_ALL[0].address
+        return {
+            each: protocol.decode(each, registers[each.address - first :][: each.count])
+            for each in protocol.AIN_ALL
+        }
+
+    def _registers(self, answer: Answer, count: int) -> list[int]:
+        """The registers in an answer to a reading that nobody waited for."""
         if answer.unit != _UNIT:
             raise self.nonsense(f"an answer of unit {_UNIT}", f"unit {answer.unit}")
         code = None if answer.pdu[0] == _READ else decode_exception(answer.pdu, _READ)
         if code is not None:
             raise self._refused(_READ, code)
-        return protocol.decode_inputs(self._decode(answer.pdu, _DIODE_REGISTERS))
+        return self._decode(answer.pdu, count)
 
     def silent(self) -> DeviceTimeout:
         """The error for an answer that does not come."""

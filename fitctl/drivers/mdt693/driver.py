@@ -87,21 +87,13 @@ class Mdt693:
         DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
         """
         self.close()
-        try:
-            self._port = serial.serial_for_url(
-                self._piezo.port,
-                baudrate=self._piezo.baud_rate,
-                timeout=_POLL_S,
-                write_timeout=self._piezo.response_timeout_s,
-                exclusive=True,
-            )
-        except (OSError, ValueError) as error:
-            raise self._endpoint.error(
-                DeviceUnreachable,
-                "a serial port",
-                str(error),
-                "check its cable and power, who else has the port open, and piezo.port",
-            ) from error
+        self._port = self._endpoint.open_serial(
+            "a serial port",
+            "check its cable and power, who else has the port open, and piezo.port",
+            baud_rate=self._piezo.baud_rate,
+            poll_s=_POLL_S,
+            write_timeout_s=self._piezo.response_timeout_s,
+        )
         try:
             identity = self._identify()
             self._check_limits()

@@ -25,7 +25,7 @@ from fitctl.mocks.cia402.dictionary import Dictionary, Entry, SdoServer, constan
 from fitctl.mocks.cia402.emergency import Emergencies
 from fitctl.mocks.cia402.objects import axis_objects, identity_objects
 from fitctl.mocks.cia402.pdo import Pdo
-from fitctl.mocks.cia402.slcan import CanFrame, SlcanAdapter
+from fitctl.mocks.cia402.slcan import CanFrame, SharedBus, SlcanAdapter
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults
 from fitctl.mocks.motors import AXES, AXIS_FAULTS, FaultyMotors, Motors
 from fitctl.mocks.timers import Periodic, Watchdog
@@ -87,7 +87,7 @@ class Encoders:
 
 
 class Cia402DriveMock:
-    """A two-axis drive on an SLCAN adapter.
+    """A two-axis drive on an SLCAN adapter, alone or with others.
 
     Parameters
     ----------
@@ -99,6 +99,8 @@ class Cia402DriveMock:
         TCP port on 127.0.0.1; 0 for a free one.
     supported_modes : int
         Object 6502 of both axes; bit n is mode n + 1.
+    adapter : SlcanAdapter, optional
+        Where the drive shares a bus with others; whoever made it starts and stops it.
 
     Attributes
     ----------
@@ -114,13 +116,18 @@ class Cia402DriveMock:
         *,
         port: int,
         supported_modes: int = BOTH_VELOCITY_MODES,
+        adapter: SlcanAdapter | None = None,
     ) -> None:
         self.faults = Faults(FAULTS)
         self._port = port
         self._node_id = siderostat.device.node_id
         self._motors = FaultyMotors(motors, self.faults, siderostat.encoder_counts_per_rev)
         self._encoders = Encoders(self._motors)
-        self._adapter = SlcanAdapter(siderostat.device.bitrate, self.faults, self._receive)
+        self._adapter = (
+            SlcanAdapter(siderostat.device.bitrate, self.faults, self._receive)
+            if adapter is None
+            else SharedBus(adapter, self.faults, self._receive)
+        )
         self.nmt_state = NmtState.STOPPED
         self.axes = tuple(
             Axis(partial(self._motors.set_enabled, number), self._axis_changed)

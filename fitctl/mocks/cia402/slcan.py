@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
-from fitctl.mocks.faults import Faults
+from fitctl.mocks.faults import Faults, Wire
 from fitctl.mocks.tcp import Link, TcpServer
 
 OK = b"\r"
@@ -247,35 +247,96 @@ class SlcanAdapter(TcpServer):
         Of the bus; a client that opens at another one hears nothing.
     faults : Faults
         With `WIRE_FAULTS` among its kinds.
-    received : callable
-        Called with each :class:`CanFrame` that a client puts on the bus.
+    received : callable, optional
+        Called with each :class:`CanFrame` that a client puts on the bus; others by :meth:`attach`.
 
     Attributes
     ----------
     severed : bool
-        The CAN cable between the adapter and the drive is cut.
+        The CAN cable between the adapter and all drives is cut.
     """
 
-    def __init__(self, bitrate: int, faults: Faults, received: Callable[[CanFrame], None]) -> None:
+    def __init__(
+        self, bitrate: int, faults: Faults, received: Callable[[CanFrame], None] | None = None
+    ) -> None:
         super().__init__(faults, lambda: _Client(self))
         self.bitrate = bitrate
         self.severed = False
-        self._received = received
+        self._receivers = [] if received is None else [received]
+
+    def attach(self, received: Callable[[CanFrame], None]) -> None:
+        """Put one more drive on the bus; `received` is called as the constructor's."""
+        self._receivers.append(received)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Put a frame with an 11-bit identifier on the bus, from the drive."""
+        """Put a frame with an 11-bit identifier on the bus, from a drive."""
         if not self.severed:
             self._deliver(CanFrame(can_id, data), None)
 
+    def send_line(self, line: bytes) -> None:
+        """Put a frame's line on the bus, from a drive whose faults may have spoilt it."""
+        try:
+            frame = decode_frame(line.removesuffix(b"\r"))
+        except ValueError:
+            return  # a controller throws a frame with a wrong check sum away
+        self.send(frame.can_id, frame.data)
+
     def from_client(self, sender: _Client, frame: CanFrame) -> None:
-        """Put a client's frame on the bus: the other clients hear it, and so does the drive."""
+        """Put a client's frame on the bus: the other clients hear it, and so do the drives."""
         if len(self.links) > 1:
             self._deliver(frame, sender)
         if not self.severed:
-            self._received(frame)
+            for received in self._receivers:
+                received(frame)
 
     def _deliver(self, frame: CanFrame, sender: _Client | None) -> None:
         line = encode_frame(frame)
         for client in cast(set[_Client], self.links):
             if client is not sender and client.on_bus:
                 client.deliver(frame, line)
+
+
+class SharedBus:
+    """One drive's place on a bus with other drives, which do not hear it; the drive's faults are its own.
+
+    Where an adapter with one drive cuts connections (``disconnect``, ``reboot``, ``freeze``), the drive is
+    silent here and hears nothing: the adapter and the other drives go on.
+
+    Parameters
+    ----------
+    adapter : SlcanAdapter
+    faults : Faults
+        Of the drive.
+    received : callable
+        Called with each frame that the drive hears.
+
+    Attributes
+    ----------
+    severed : bool
+        The drive's own cable is cut.
+    """
+
+    def __init__(
+        self, adapter: SlcanAdapter, faults: Faults, received: Callable[[CanFrame], None]
+    ) -> None:
+        self.severed = False
+        self._wire = Wire(faults, adapter.send_line)
+        self._received = received
+        adapter.attach(self._hear)
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Put a frame on the bus."""
+        if not self.severed:
+            self._wire.send(encode_frame(CanFrame(can_id, data)))
+
+    def _hear(self, frame: CanFrame) -> None:
+        if not (self.severed or self._wire.dead):
+            self._received(frame)
+
+    async def start(self, port: int) -> int:
+        """Be there; the adapter listens by itself at `port`."""
+        return port
+
+    async def stop(self) -> None:
+        """Forget what is still to be sent."""
+        self._wire.close()

@@ -41,8 +41,9 @@ class Acquisition:
     """Exposes, holds each frame for the frame grabber's delay, and gives it to the stream.
 
     Exposure k starts at t0 + k / rate, or, with the trigger on, when triggered. The image is asked
-    for the middle of the exposure once that has passed; the frame leaves `frame_delay_s` after it. A
-    process that was held up sends all that is due when it wakes: frames come late, and none is left out.
+    for the middle of the exposure once that, or the whole exposure, has passed; the frame leaves
+    `frame_delay_s` after the middle. A process that was held up sends all that is due when it wakes:
+    frames come late, and none is left out.
 
     Parameters
     ----------
@@ -53,6 +54,8 @@ class Acquisition:
     frame_delay_s : float
         From mid-exposure until the frame leaves.
     stream : Stream
+    seen_at : float
+        Which part of the exposure must have passed.
 
     Attributes
     ----------
@@ -68,6 +71,8 @@ class Acquisition:
         ticks: Callable[[float], int],
         frame_delay_s: float,
         stream: Stream,
+        *,
+        seen_at: float = 0.5,
     ) -> None:
         self.frames_sent = 0
         self.late_frames = 0
@@ -76,6 +81,7 @@ class Acquisition:
         self._ticks = ticks
         self._delay_s = frame_delay_s
         self._stream = stream
+        self._seen_at = seen_at
         self._running: tuple[AcquisitionSettings, StreamSettings] | None = None
         self._next_start_s = math.inf
         self._busy_until_s = 0.0
@@ -125,7 +131,7 @@ class Acquisition:
             return
         settings, stream = self._running
         now_s = time.monotonic()
-        while self._next_start_s + 0.5 * settings.exposure_s <= now_s:
+        while self._next_start_s + self._seen_at * settings.exposure_s <= now_s:
             self._expose(settings, stream)
         while self._in_flight and self._in_flight[0].due_s <= now_s:
             self._emit(self._in_flight.popleft())
@@ -137,7 +143,8 @@ class Acquisition:
         self._disarm()
         if self._running is None:
             return
-        due_s = min(self._next_start_s + 0.5 * self._running[0].exposure_s, self._stream.due_s)
+        seen_s = self._next_start_s + self._seen_at * self._running[0].exposure_s
+        due_s = min(seen_s, self._stream.due_s)
         if self._in_flight:
             due_s = min(due_s, self._in_flight[0].due_s)
         if math.isfinite(due_s):

@@ -53,6 +53,8 @@ class GigeCameraMock:
         monotonic time.
     port : int
         GVCP port; 0 for any free one.
+    smears : bool
+        The image is of the whole exposure, and asked for once it has ended.
     """
 
     def __init__(
@@ -62,12 +64,14 @@ class GigeCameraMock:
         render: Callable[[float], NDArray[np.uint16]],
         *,
         port: int,
+        smears: bool = False,
     ) -> None:
         self.faults = Faults(FAULTS)
         self._camera = camera
         self._settings = settings
         self._render = render
         self._port = port
+        self._smears = smears
         self._sensor = Sensor(camera, self.faults)
         self._clock = CameraClock(runs=settings.clock)
         self._controller: Address | None = None
@@ -95,7 +99,11 @@ class GigeCameraMock:
         """Listen; returns the GVCP port."""
         stream = Stream(self.faults, resends=self._settings.resends)
         acquisition = Acquisition(
-            self._expose, self._clock.ticks, self._camera.frame_delay_s, stream
+            self._expose,
+            self._clock.ticks,
+            self._camera.frame_delay_s,
+            stream,
+            seen_at=1.0 if self._smears else 0.5,
         )
         self._started = stream, acquisition, self._registers(stream, acquisition)
         try:

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, AirPath, LinkAir, Rig
-from fitctl.model.compiled import compilable, compiled, numba_installed, record
+from fitctl.config import ARCSEC_PER_RAD, AirPath, LinkAir, MetrologyPlant, Rig
+from fitctl.model.compiled import compilable, compiled, numba_installed
 from fitctl.model.metrology.collector import CollectorPart
 from fitctl.model.metrology.photodiodes import diode_volts
 from fitctl.model.optics import motor_sky_rad_per_rad, rotation, turned
-from fitctl.model.plant_constants import air_constants
+from fitctl.model.plant_constants import AirConstants, air_constants
+from fitctl.model.plant_step import step_motor
 from fitctl.model.randomness import disc_place, run_randomness
 from fitctl.model.timeline import Air, Part, Timeline
 
@@ -32,6 +33,18 @@ _ROW = np.dtype(
     ]
 )
 
+BEAM_CONSTANTS = np.dtype(
+    [
+        ("step_s", "f8"),
+        ("amplifier_decay", "f8"),
+        ("amplifier_lag_s", "f8"),
+        ("backlash_half_rad", "f8"),
+        ("motor_sky_rad_per_rad", "f8"),
+        ("turn", "f8", (2, 2)),
+    ]
+)
+"""What of :class:`BeamConstants` compiled code needs."""
+
 
 class BeamConstants(NamedTuple):
     """Numbers of one step."""
@@ -42,6 +55,38 @@ class BeamConstants(NamedTuple):
     backlash_half_rad: float
     motor_sky_rad_per_rad: float
     turn: Floats
+    air: AirConstants
+
+    @property
+    def packed(self) -> NDArray[np.void]:
+        """All of it but the air, for compiled code; shape (1,)."""
+        made = np.zeros(1, BEAM_CONSTANTS)
+        for name in BEAM_CONSTANTS.names or ():
+            made[name] = getattr(self, name)
+        return made
+
+
+def beam_constants(rig: Rig, loop_name: str) -> BeamConstants:
+    """Numbers of one step of a rig's metrology loop."""
+    truth, _ = rig.mock_parts()
+    plant = truth.metrology_loops[loop_name]
+    siderostat = rig.metrology_loops[loop_name].siderostat
+    lag_s = 1 / (2 * np.pi * plant.amplifier_bandwidth_hz)
+    motor_sky = motor_sky_rad_per_rad(siderostat)
+    return BeamConstants(
+        step_s=truth.step_s,
+        amplifier_decay=float(np.exp(-truth.step_s / lag_s)),
+        amplifier_lag_s=lag_s,
+        backlash_half_rad=plant.backlash_sky_arcsec / ARCSEC_PER_RAD / motor_sky / 2,
+        motor_sky_rad_per_rad=motor_sky,
+        turn=rotation(siderostat.rotation_deg),
+        air=air_constants(_filter(plant.air_path), truth.step_s),
+    )
+
+
+def misalignment_rad(plant: MetrologyPlant, random: np.random.Generator) -> Floats:
+    """Where the beam goes with the motors at zero, uniform over the disc of the rig's largest, shape (2,)."""
+    return disc_place(plant.beam_offset_sky_arcsec_max / ARCSEC_PER_RAD, random)
 
 
 class BeamState:
@@ -74,8 +119,7 @@ class BeamState:
 def turn_beam(constants: Any, state: Any, misaligned_rad: Floats, beam_rad: Floats) -> None:
     """Advance the siderostats of all runs, a step for each row of `beam_rad`, shape (rows, runs, 2).
 
-    `misaligned_rad`, shape (runs, 2), is where the beam goes with the motors at zero. Amplifier and backlash
-    are those of :func:`fitctl.model.plant_step.step_run`.
+    `misaligned_rad`, shape (runs, 2), is where the beam goes with the motors at zero.
     """
     c = constants[0]
     decay, half = c.amplifier_decay, c.backlash_half_rad
@@ -88,9 +132,7 @@ def turn_beam(constants: Any, state: Any, misaligned_rad: Floats, beam_rad: Floa
             motor, lead = s.motor_rad[axis], s.motor_rad_s[axis] - command
             beam = s.beam_motor_rad[axis]
             for row in range(beam_rad.shape[0]):
-                motor += moved + lead * catch_up_s
-                lead *= decay
-                beam = max(motor - half, min(motor + half, beam))
+                motor, lead, beam = step_motor(motor, lead, beam, moved, catch_up_s, decay, half)
                 beam_rad[row, run, axis] = c.motor_sky_rad_per_rad * beam
             s.motor_rad[axis], s.motor_rad_s[axis] = motor, command + lead
             s.beam_motor_rad[axis] = beam
@@ -136,33 +178,23 @@ class MetrologyPart(Part):
         super().__init__(timeline)
         truth, _ = rig.mock_parts()
         plant = truth.metrology_loops[loop_name]
-        siderostat = rig.metrology_loops[loop_name].siderostat
         runs, streams = len(seeds), [run_randomness(seed, 1) for seed in seeds]
         self.seeds = tuple(seeds)
         self.sensor = plant.sensor
         self.noise_keys = [stream.pixels for stream in streams]
-        farthest_rad = plant.beam_offset_sky_arcsec_max / ARCSEC_PER_RAD
-        self.misaligned_rad = np.array([disc_place(farthest_rad, s.place) for s in streams])
-        lag_s = 1 / (2 * np.pi * plant.amplifier_bandwidth_hz)
-        motor_sky = motor_sky_rad_per_rad(siderostat)
-        self.constants = BeamConstants(
-            step_s=timeline.step_s,
-            amplifier_decay=float(np.exp(-timeline.step_s / lag_s)),
-            amplifier_lag_s=lag_s,
-            backlash_half_rad=plant.backlash_sky_arcsec / ARCSEC_PER_RAD / motor_sky / 2,
-            motor_sky_rad_per_rad=motor_sky,
-            turn=rotation(siderostat.rotation_deg),
-        )
+        self.misaligned_rad = np.array([misalignment_rad(plant, s.place) for s in streams])
+        self.constants = beam_constants(rig, loop_name)
         self.state = BeamState(runs)
         self._air_rad = np.empty((timeline.block_steps, runs, 1, 2))
-        air = air_constants(_filter(plant.air_path), timeline.step_s)
-        self._air = Air(air, [stream.air for stream in streams], self._air_rad)
+        self._air = Air(
+            [(0, self.constants.air)], [stream.air for stream in streams], self._air_rad
+        )
         self._collector = collector
         self.beam_rad = np.empty((timeline.block_steps, runs, 2))
         self._offsets_m = np.empty((timeline.kept, runs, 2))
         self._turn_beam = compiled(turn_beam)
         self._rows: Any = self.state.rows
-        self._constant_rows: Any = record(self.constants._asdict())[None]
+        self._constant_rows: Any = self.constants.packed
         if not numba_installed():
             names = _ROW.names or ()
             self._rows = [SimpleNamespace(**{n: row[n] for n in names}) for row in self.state.rows]

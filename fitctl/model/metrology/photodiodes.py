@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fitctl.config import BeamSensor
+from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
+
+
+@compilable()
+def light_v(sensor: Any, along_m: Any, squared_m2: Any) -> Any:
+    """Volts that the light of the laser's nominal power gives a diode, or an array of diodes.
+
+    Parameters
+    ----------
+    sensor : has diode_offset_m, on_axis_v and beam_radius_m
+    along_m : float or array
+        How far the beam's centre is from the array's towards the diode.
+    squared_m2 : float or array
+        The square of its whole distance from the array's.
+    """
+    # |p - r|^2 - d^2 of a diode at r, so that a beam on the centre gives on_axis_v.
+    beyond_m2 = squared_m2 - 2.0 * sensor.diode_offset_m * along_m
+    return sensor.on_axis_v * np.exp(-2.0 * beyond_m2 / sensor.beam_radius_m**2)
 
 
 def diode_volts(sensor: BeamSensor, offset_m: ArrayLike, laser: ArrayLike = 1.0) -> Floats:
@@ -24,7 +44,5 @@ def diode_volts(sensor: BeamSensor, offset_m: ArrayLike, laser: ArrayLike = 1.0)
     offset_m = np.asarray(offset_m, dtype=float)
     along_m = np.stack([offset_m, -offset_m], axis=-1).reshape(*offset_m.shape[:-1], 4)
     squared_m2 = np.sum(offset_m**2, axis=-1)[..., None]
-    # |p - r|^2 - d^2 of a diode at r, so that a beam on the centre gives on_axis_v.
-    beyond_m2 = squared_m2 - 2.0 * sensor.diode_offset_m * along_m
-    light_v = sensor.on_axis_v * np.exp(-2.0 * beyond_m2 / sensor.beam_radius_m**2)
-    return np.asarray(light_v * np.asarray(laser)[..., None] + np.asarray(sensor.ambient_v))
+    lit_v = light_v(sensor, along_m, squared_m2) * np.asarray(laser)[..., None]
+    return np.asarray(lit_v + np.asarray(sensor.ambient_v))

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 
-from fitctl.config import QUANTITIES, Rig
-from fitctl.model.optics import scales
+from fitctl.config import ARCSEC_PER_RAD, QUANTITIES, Rig
+from fitctl.loop.quantities import metrology_places, stellar_places
+from fitctl.model.optics import motor_sky_rad_per_rad
 
 
 def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
-    """Interlocks that do more than warn, and that a simulated run without them might have tripped."""
-    loop, camera, scale = (
-        rig.stellar_loops[loop_name],
-        rig.camera,
-        scales(rig, rig.stellar_loops[loop_name]),
-    )
-    travel_rad = scale.travel_rad(loop.siderostat)
-    rate_rad_s = loop.siderostat.velocity_limit_rad_s
-    count_rad = loop.siderostat.encoder_count_rad
+    """Interlocks of a loop that do more than warn, and that a simulated run without them might have tripped."""
+    siderostat, camera = rig.loops[loop_name].siderostat, rig.camera
+    travel_rad = siderostat.travel_sky_arcsec / ARCSEC_PER_RAD / motor_sky_rad_per_rad(siderostat)
+    rate_rad_s = siderostat.velocity_limit_rad_s
+    count_rad = siderostat.encoder_count_rad
+    truth, _ = rig.mock_parts()
+    if loop_name in rig.metrology_loops:
+        places = metrology_places(rig, loop_name)
+        polled_s = truth.metrology_loops[loop_name].link_round_trip_s
+    else:
+        places = stellar_places(rig, loop_name)
+        polled_s = rig.stellar_loops[loop_name].fsm.piezo.poll_s
     late_s = rig.true_camera.frame_delay_s - camera.frame_delay_s
     # How far each gets while nothing fails; its set-points are limited, and it counts in steps.
     reached = {
@@ -26,6 +30,7 @@ def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
         "frame_late_s": (late_s - 1e-9, late_s + 1e-9),
         "frame_interval_periods": (0.999, 1.001),
         "dac_unwritten_s": (0.0, 2 * camera.period_s),
+        "diode_sample_age_s": (0.0, polled_s + 3 * camera.period_s),
         **dict.fromkeys(
             (
                 "amplifier_fault", "amplifier_round_trip_periods", "dac_round_trip_s",
@@ -34,7 +39,7 @@ def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
             (0.0, 0.0),
         ),
     }  # fmt: skip
-    oldest_s = max(camera.frame_delay_s, loop.fsm.piezo.poll_s) + 2 * camera.period_s
+    oldest_s = max(camera.frame_delay_s, polled_s) + 2 * camera.period_s
     frames_s = camera.frame_delay_s + 2 * camera.period_s
     acting = []
     for name, row in rig.interlocks.items():
@@ -46,6 +51,7 @@ def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
             and (row.high is None or row.high >= high)
             and (row.stale_s is None or row.stale_s >= age_s)
         )
-        if row.action != "warn" and not in_range:
+        measured = QUANTITIES[row.quantity].part in places
+        if measured and row.action != "warn" and not in_range:
             acting.append(name)
     return acting

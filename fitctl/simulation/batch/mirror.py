@@ -109,7 +109,7 @@ def write_stacks(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
     for stack in range(3):
         output_v = np.rint(r.stack_v[stack] / s.dac_step_v) * s.dac_step_v
         plant.stack_v[stack] = min(output_v, s.dac_most_v)
-    move_plant_stacks(s, w, c, plant)
+    move_plant_stacks(s, r, w, c, plant)
     mirror_written(s, r, w)
     entry = r.writes & _HISTORY
     w.written_s[entry] = r.now_s

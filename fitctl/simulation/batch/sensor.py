@@ -9,11 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
-from fitctl.controllers.centroid import EDGE_PX, LARGEST_PEAK, MAX_CANDIDATES, window_centre
+from fitctl.controllers.attribution import FOLLOWED_PX, MOST_STRANGERS, PROVEN_PX, is_within
+from fitctl.controllers.centroid import (
+    EDGE_PX,
+    LARGEST_PEAK,
+    MAX_CANDIDATES,
+    REACH_DIAMETERS,
+    window_centre,
+)
+from fitctl.controllers.spot_fit import NODES, STEPS_PER_PX, node
 from fitctl.model.compiled import compilable
-from fitctl.model.light import REACH_SIGMAS
+from fitctl.model.light import REACH_SIGMAS, light_fractions
 from fitctl.model.scene import render
-from fitctl.simulation.batch.laws import ACQUISITION, has_arrived
+from fitctl.simulation.batch.laws import ACQUISITION, COARSE, VERNIER, has_arrived
 from fitctl.simulation.batch.mirror import mirror_px
 from fitctl.simulation.batch.records import SIDE_PX
 from fitctl.simulation.batch.siderostat import motor_px
@@ -25,7 +33,7 @@ SENSED, WHOLE_FRAME = 1_000_001, 1_000_002  # above the number of any spot
 @compilable()
 def stages_px(s: Any, r: Any) -> tuple[float, float]:
     """``StarEstimator.stages_px`` at the exposure."""
-    az_px, el_px = motor_px(s, r.motor_rad[0], r.motor_rad[1])
+    az_px, el_px = motor_px(s, r.beam_rad[0], r.beam_rad[1])
     mirror_az_px, mirror_el_px = mirror_px(s, r.exposed_mirror_rad[0], r.exposed_mirror_rad[1])
     return az_px + mirror_az_px, el_px + mirror_el_px
 
@@ -54,46 +62,152 @@ def centroid(
         el_moment += row_dn * (row - HALF_WINDOW_PX)
     if flux <= 0 or peak > LARGEST_PEAK * flux:
         return math.nan, math.nan, math.nan
-    return window_az + az_moment / flux, window_el + el_moment / flux, flux
+    az_px, el_px = az_moment / flux, el_moment / flux
+    if s.fits:
+        az_px, el_px = fitted(s, window_dn, az_px, el_px)
+    return window_az + az_px, window_el + el_px, flux
+
+
+@compilable(inline=True)
+def fitted(s: Any, window_dn: Floats, az_px: float, el_px: float) -> tuple[float, float]:
+    """``SpotFit.place`` on pixels that are all good; a batch has no others."""
+    for _ in range(2):
+        row, column = node(el_px), node(az_px)
+        light = az_moment = el_moment = 0.0
+        for pixel in range(SIDE_PX * SIDE_PX):
+            dn = window_dn[pixel // SIDE_PX, pixel % SIDE_PX] - s.bias_dn
+            light += s.fit_weights[row, column, 0, pixel] * dn
+            az_moment += s.fit_weights[row, column, 1, pixel] * dn
+            el_moment += s.fit_weights[row, column, 2, pixel] * dn
+        if light <= 0:
+            return math.nan, math.nan
+        az_px = (column - NODES) / STEPS_PER_PX + az_moment / light
+        el_px = (row - NODES) / STEPS_PER_PX + el_moment / light
+    return az_px, el_px
 
 
 @compilable()
-def in_flux_range(s: Any, flux_dn: float) -> bool:
+def is_followed(r: Any) -> bool:
+    """``StellarLoop.spots`` are not empty."""
+    return bool(r.mode in (COARSE, VERNIER))
+
+
+@compilable()
+def looks_again(r: Any) -> bool:
+    """``StellarLoop.candidate_spots`` are not empty."""
+    return bool(r.mode == ACQUISITION and r.has_candidate and not r.waits)
+
+
+@compilable()
+def is_own_star(ss: Any, rr: Any, i: int, az_px: float, el_px: float, flux_dn: float) -> bool:
     """``StarSensor._accepted``."""
-    return s.sensor.flux_low_dn <= flux_dn <= s.sensor.flux_high_dn
-
-
-@compilable()
-def accept(r: Any, az_px: float, el_px: float) -> None:
-    """The star is on the frame."""
-    r.star_visible = 1
-    r.star_px[0], r.star_px[1] = az_px, el_px
-
-
-@compilable()
-def measure(s: Any, r: Any, w: Any, window_az: int, window_el: int) -> bool:
-    """``StarSensor.measure``; False where the whole frame must decide (``StarSensor.follow``)."""
-    first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
-    render(
-        w.window_dn, first_row, first_column, s.width_px, w.spots_px, s.flux_dn, s.sigma_px, s.spots,
-        s.bias_dn, s.noise_dn, s.full_dn, r.pixel_key, r.frames, s.quantiles, s.light,
-        w.down, w.across,
-    )  # fmt: skip
-    az_px, el_px, flux = centroid(s, w.window_dn, first_row, first_column, window_az, window_el)
-    if not in_flux_range(s, flux):
+    s = ss.stars[i]
+    if not s.sensor.flux_low_dn <= flux_dn <= s.sensor.flux_high_dn:
         return False
-    if abs(az_px - window_az) > EDGE_PX or abs(el_px - window_el) > EDGE_PX:
-        return False
-    accept(r, az_px, el_px)
+    for j in range(len(ss.stars)):
+        other = rr.stars[j]
+        if j != i and is_followed(other):
+            away_px = max(abs(az_px - other.star_px[0]), abs(el_px - other.star_px[1]))
+            if away_px <= HALF_WINDOW_PX:
+                return False
     return True
 
 
 @compilable()
-def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
-    """``StarSensor.find`` over a whole frame."""
+def subtract_others(ss: Any, rr: Any, w: Any, i: int, window_az: int, window_el: int) -> None:
+    """Take the light of other loops' spots from the window, as ``StarSensor._centroid`` does."""
+    first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
+    for j in range(len(ss.stars)):
+        s, r = ss.stars[j], rr.stars[j]
+        if j == i or not (is_followed(r) or looks_again(r)):
+            continue
+        star_az_px, star_el_px = r.star_px[0], r.star_px[1]
+        if looks_again(r):
+            stages_az_px, stages_el_px = stages_px(s, r)
+            star_az_px += stages_az_px - r.seen_stages_px[0]
+            star_el_px += stages_el_px - r.seen_stages_px[1]
+        for spot in range(s.followed_spots):
+            az_px = star_az_px + s.followed_offset_px[spot, 0]
+            el_px = star_el_px + s.followed_offset_px[spot, 1]
+            away_px = max(abs(az_px - window_az), abs(el_px - window_el))
+            if away_px >= SIDE_PX / 2 + REACH_DIAMETERS * 4 * s.followed_sigma_px:
+                continue
+            left, right = light_fractions(
+                first_column, az_px, s.followed_sigma_px, s.light, w.across
+            )
+            top, bottom = light_fractions(first_row, el_px, s.followed_sigma_px, s.light, w.down)
+            flux_dn = s.followed_part[spot] * r.flux_dn * r.star_visible
+            for row in range(top, bottom):
+                for column in range(left, right):
+                    w.window_dn[row, column] -= flux_dn * w.down[row] * w.across[column]
+
+
+@compilable()
+def accept(r: Any, az_px: float, el_px: float, flux_dn: float) -> None:
+    """The star is on the frame."""
+    r.star_visible = 1
+    r.star_px[0], r.star_px[1] = az_px, el_px
+    r.flux_dn = flux_dn
+
+
+@compilable()
+def measure(ss: Any, rr: Any, ww: Any, i: int, window_az: int, window_el: int) -> bool:
+    """``StarSensor.measure``; False where the whole frame must decide (``StarSensor.follow``)."""
+    s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
+    first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
     render(
-        frame_dn, 0, 0, s.width_px, w.spots_px, s.flux_dn, s.sigma_px, s.spots,
-        s.bias_dn, s.noise_dn, s.full_dn, r.pixel_key, r.frames, s.quantiles, s.light,
+        w.window_dn, first_row, first_column, s.width_px, w.spots_px, ss.flux_dn, ss.sigma_px,
+        ss.instants * ss.spots, s.bias_dn, r.noise_dn, s.photon_dn, s.full_dn, r.pixel_key, r.frames,
+        s.quantiles, s.light, w.down, w.across,
+    )  # fmt: skip
+    subtract_others(ss, rr, w, i, window_az, window_el)
+    az_px, el_px, flux = centroid(s, w.window_dn, first_row, first_column, window_az, window_el)
+    if not is_own_star(ss, rr, i, az_px, el_px, flux):
+        return False
+    if not (abs(az_px - window_az) <= EDGE_PX and abs(el_px - window_el) <= EDGE_PX):
+        return False
+    accept(r, az_px, el_px, flux)
+    return True
+
+
+@compilable()
+def centroid_on(
+    ss: Any, rr: Any, ww: Any, i: int, frame_dn: Floats, window_az: int, window_el: int
+) -> Any:
+    """:func:`centroid` about a window of a whole frame, without other loops' light."""
+    w = ww.stars[i]
+    first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
+    for row in range(SIDE_PX):
+        for column in range(SIDE_PX):
+            w.window_dn[row, column] = frame_dn[first_row + row, first_column + column]
+    subtract_others(ss, rr, w, i, window_az, window_el)
+    return centroid(ss.stars[i], w.window_dn, first_row, first_column, window_az, window_el)
+
+
+@compilable()
+def may_be_own(r: Any, az_px: float, el_px: float, near_az_px: float, near_el_px: float) -> bool:
+    """What ``Attribution.choose`` does not leave out."""
+    if r.mode != ACQUISITION:
+        return is_within(az_px, el_px, near_az_px, near_el_px, FOLLOWED_PX)
+    if r.has_candidate:
+        return is_within(az_px, el_px, near_az_px, near_el_px, PROVEN_PX)
+    for stranger in range(min(r.strangers, MOST_STRANGERS)):
+        place_px = r.strangers_px[stranger]
+        if is_within(az_px, el_px, place_px[0], place_px[1], HALF_WINDOW_PX):
+            return False
+    return True
+
+
+@compilable()
+def find(ss: Any, rr: Any, ww: Any, i: int, frame_dn: Floats, search_dn: Floats) -> None:
+    """``StarSensor.find`` over a whole frame, or ``Attribution.choose`` where the frame is shared."""
+    s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
+    stages_az_px, stages_el_px = stages_px(s, r)
+    near_az_px, near_el_px = r.star_origin_px[0] + stages_az_px, r.star_origin_px[1] + stages_el_px
+    nearest_px = math.inf
+    render(
+        frame_dn, 0, 0, s.width_px, w.spots_px, ss.flux_dn, ss.sigma_px, ss.instants * ss.spots,
+        s.bias_dn, r.noise_dn, s.photon_dn, s.full_dn, r.pixel_key, r.frames, s.quantiles, s.light,
         search_dn[:, 0], search_dn[0],
     )  # fmt: skip
     search_dn[:] = frame_dn
@@ -105,67 +219,88 @@ def find(s: Any, r: Any, w: Any, frame_dn: Floats, search_dn: Floats) -> None:
             window_centre(az, s.sensor.largest_az_px),
             window_centre(el, s.sensor.largest_el_px),
         )
-        az_px, el_px, flux = centroid(s, frame_dn, 0, 0, window_az, window_el)
+        az_px, el_px, flux = centroid_on(ss, rr, ww, i, frame_dn, window_az, window_el)
         if flux > 0:
             window_az = window_centre(az_px, s.sensor.largest_az_px)
             window_el = window_centre(el_px, s.sensor.largest_el_px)
-            az_px, el_px, flux = centroid(s, frame_dn, 0, 0, window_az, window_el)
+            az_px, el_px, flux = centroid_on(ss, rr, ww, i, frame_dn, window_az, window_el)
         centred = abs(az_px - window_az) <= 1.0 and abs(el_px - window_el) <= 1.0
-        if in_flux_range(s, flux) and centred:
-            accept(r, az_px, el_px)
-            return
+        if centred and is_own_star(ss, rr, i, az_px, el_px, flux):
+            if not s.shared:
+                accept(r, az_px, el_px, flux)
+                return
+            away_px = math.hypot(az_px - near_az_px, el_px - near_el_px)
+            if away_px < nearest_px and may_be_own(r, az_px, el_px, near_az_px, near_el_px):
+                accept(r, az_px, el_px, flux)
+                nearest_px = away_px
         top, left = max(0, el - HALF_WINDOW_PX), max(0, az - HALF_WINDOW_PX)
         search_dn[top : el + HALF_WINDOW_PX + 1, left : az + HALF_WINDOW_PX + 1] = 0.0
 
 
 @compilable()
-def spots_over(s: Any, r: Any, w: Any, left: int, top: int, width: int, height: int) -> int:
-    """Spots of an exposure with light on some pixels: how many; NaN for the others.
+def spots_over(
+    ss: Any, rr: Any, ww: Any, spots_px: Floats, left: int, top: int, width: int, height: int
+) -> int:
+    """Spots of an exposure with light on some pixels: how many; NaN for the others. Of all loops.
 
-    Where a further spot, whose own air has not been drawn so far, might matter: minus its number.
+    A spot is there once for each instant of the exposure. Where a further spot, whose own air has not been
+    drawn so far, might matter: minus its number.
     """
-    lit, block = 0, s.block_steps
-    row = r.exposed_step - 1
-    for spot in range(s.spots):
-        az_px = r.exposed_px[0] + s.spot_offset_px[spot, 0]
-        el_px = r.exposed_px[1] + s.spot_offset_px[spot, 1]
-        reach_px = REACH_SIGMAS * s.sigma_px[spot] + 1.0 + (s.own_reach_px if spot > 0 else 0.0)
-        if not (
-            left - reach_px < az_px < left + width - 1 + reach_px
-            and top - reach_px < el_px < top + height - 1 + reach_px
-        ):
-            w.spots_px[spot, 0] = w.spots_px[spot, 1] = math.nan
-            continue
-        if spot > 0:
-            if r.own_blocks[spot] <= row // block:
-                return -spot
-            az_px += w.own_px[spot, row % block, 0] * s.air_relative
-            el_px += w.own_px[spot, row % block, 1] * s.air_relative
-        w.spots_px[spot, 0], w.spots_px[spot, 1] = az_px, el_px
-        lit += 1
+    lit = 0
+    for i in range(len(ss.stars)):
+        s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
+        for seen in range(ss.instants * s.spots):
+            instant, spot = divmod(seen, s.spots)
+            number, row = s.first_spot + spot, r.exposed_step[instant] - 1
+            entry = instant * ss.spots + number
+            az_px = r.exposed_px[instant, 0] + s.spot_offset_px[spot, 0]
+            el_px = r.exposed_px[instant, 1] + s.spot_offset_px[spot, 1]
+            reach_px = (
+                REACH_SIGMAS * ss.sigma_px[number] + 1.0 + (s.own_reach_px if spot > 0 else 0.0)
+            )
+            if not (
+                left - reach_px < az_px < left + width - 1 + reach_px
+                and top - reach_px < el_px < top + height - 1 + reach_px
+            ):
+                spots_px[entry, 0] = spots_px[entry, 1] = math.nan
+                continue
+            if spot > 0:
+                if r.own_blocks[spot] <= row // s.block_steps:
+                    return -number
+                az_px += w.own_px[spot, row % s.ring_steps, 0] * s.air_relative
+                el_px += w.own_px[spot, row % s.ring_steps, 1] * s.air_relative
+            spots_px[entry, 0], spots_px[entry, 1] = az_px, el_px
+            lit += 1
     return lit
 
 
 @compilable()
-def sense(s: Any, r: Any, w: Any) -> int:
+def follows(r: Any) -> bool:
+    """The star is expected where it was."""
+    return bool(r.mode != ACQUISITION and r.lost == 0)
+
+
+@compilable()
+def sense(ss: Any, rr: Any, ww: Any, i: int) -> int:
     """``StellarLoop._find`` as far as a window shows: SENSED, or WHOLE_FRAME if :func:`find` must look.
 
     Negative: the number of a spot that might matter, and needs more air first.
     """
+    s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
     r.star_visible = 0
-    if r.mode == ACQUISITION and not has_arrived(s, r):
+    if r.mode == ACQUISITION and (r.waits or not has_arrived(s, r)):
         return SENSED
-    if r.mode != ACQUISITION and r.lost == 0:
+    if follows(r):
         az_px, el_px = stages_px(s, r)
         az = window_centre(r.star_origin_px[0] + az_px, s.sensor.largest_az_px)
         el = window_centre(r.star_origin_px[1] + el_px, s.sensor.largest_el_px)
         left, top = az - HALF_WINDOW_PX, el - HALF_WINDOW_PX
-        lit = spots_over(s, r, w, left, top, SIDE_PX, SIDE_PX)
+        lit = spots_over(ss, rr, ww, w.spots_px, left, top, SIDE_PX, SIDE_PX)
         if lit < 0:
             return lit
-        if measure(s, r, w, az, el):
+        if measure(ss, rr, ww, i, az, el):
             return SENSED
-    lit = spots_over(s, r, w, 0, 0, s.width_px, s.height_px)
+    lit = spots_over(ss, rr, ww, w.spots_px, 0, 0, s.width_px, s.height_px)
     if lit > 0 or (lit == 0 and not s.noise_is_dark):
         return WHOLE_FRAME
     # Nothing but noise is there, and that alone finds no star.

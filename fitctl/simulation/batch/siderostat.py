@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fitctl.controllers.position_servo import axis_velocity_rad_s, start_move
 from fitctl.model.compiled import compilable
-from fitctl.model.optics import turned, turned_back
-from fitctl.simulation.batch.plant import advance_to
+from fitctl.model.optics import turned
 from fitctl.simulation.batch.records import MOST_HISTORY
 
+Floats = NDArray[np.float64]
 _HISTORY = MOST_HISTORY - 1  # a power of two less one
 
 
@@ -25,7 +26,7 @@ def motor_px(s: Any, az_rad: float, el_rad: float) -> tuple[float, float]:
 @compilable(inline=True)
 def motor_rad(s: Any, az_px: float, el_px: float) -> tuple[float, float]:
     """``Scales.motor_rad``."""
-    az, el = turned_back(s.scale.siderostat_turn, az_px, el_px)
+    az, el = turned(s.scale.siderostat_back, az_px, el_px)
     return az / s.scale.motor_px_per_rad, el / s.scale.motor_px_per_rad
 
 
@@ -50,15 +51,14 @@ def read_encoders(s: Any, r: Any, w: Any, plant: Any) -> None:
 
 
 @compilable(inline=True)
-def servo_period(s: Any, r: Any, w: Any, c: Any, plant: Any) -> bool:
-    """``SiderostatServo.period``; False where the motors do not follow."""
+def servo_period(s: Any, r: Any, w: Any, plant: Any) -> bool:
+    """``SiderostatServo.period``, the plant being there; False where the motors do not follow."""
     if r.setpoint_is_new:
         start_move(s.servo, r.axes[0], r.setpoint_rad[0])
         start_move(s.servo, r.axes[1], r.setpoint_rad[1])
         r.setpoint_is_new = 0
     az_rad_s = axis_velocity_rad_s(s.servo, r.axes[0], r.position_rad[0])
     el_rad_s = axis_velocity_rad_s(s.servo, r.axes[1], r.position_rad[1])
-    advance_to(s, r, w, c, plant)
     plant.velocity_rad_s[0], plant.velocity_rad_s[1] = az_rad_s, el_rad_s
     read_encoders(s, r, w, plant)
     following_error_rad = max(
@@ -71,8 +71,8 @@ def servo_period(s: Any, r: Any, w: Any, c: Any, plant: Any) -> bool:
 
 
 @compilable()
-def position_at(s: Any, r: Any, w: Any, time_s: float) -> None:
-    """``SiderostatServo.position_at``."""
+def position_at(s: Any, r: Any, w: Any, time_s: float, at_rad: Floats) -> None:
+    """``SiderostatServo.position_at``, into `at_rad`."""
     oldest = max(0, r.readings - s.readings)
     for reading in range(r.readings - 1, oldest, -1):
         after, before = reading & _HISTORY, (reading - 1) & _HISTORY
@@ -81,7 +81,7 @@ def position_at(s: Any, r: Any, w: Any, time_s: float) -> None:
             part = min(1.0, (time_s - t0) / (t1 - t0)) if t1 > t0 else 1.0
             for axis in range(2):
                 start_rad = w.read_rad[before, axis]
-                r.motor_rad[axis] = start_rad + part * (w.read_rad[after, axis] - start_rad)
+                at_rad[axis] = start_rad + part * (w.read_rad[after, axis] - start_rad)
             return
     for axis in range(2):
-        r.motor_rad[axis] = w.read_rad[oldest & _HISTORY, axis]
+        at_rad[axis] = w.read_rad[oldest & _HISTORY, axis]

@@ -53,6 +53,12 @@ def layered(layers: Sequence[tuple[Dots, str]]) -> list[Line]:
     return lines
 
 
+def meeting(one: Dots, other: Dots) -> Dots:
+    """The dots of two canvases in those characters in which both have some."""
+    both = (cells(one) != _BLANK) & (cells(other) != _BLANK)
+    return (one | other) & both.repeat(4, axis=0).repeat(2, axis=1)
+
+
 def scatter(dots: Dots, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
     """Set dots at places from 0 to 1, shape (n,) each, y upwards; what lies outside is left out."""
     height, width = dots.shape

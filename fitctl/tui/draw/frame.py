@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from rich.segment import Segment
 
 from fitctl.tui.draw.colours import LEVELS
-from fitctl.tui.look import WHITE, Line, style
+from fitctl.tui.inks import WHITE
+from fitctl.tui.look import Line, style
 
 Floats = NDArray[np.float64]
 PlaceT = TypeVar("PlaceT", float, Floats)  # one place, or many at once

@@ -11,26 +11,32 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.logging.records import Tick
+from fitctl.text import plain
 from fitctl.tui.draw.frame import Mark, Marks, Placing, box_marks, reticle_marks
-from fitctl.tui.look import DIM, FAINT, GREEN, PINK, SKY, WHITE, YELLOW
+from fitctl.tui.inks import DIM, FAINT, GREEN, PINK, SKY, WHITE, YELLOW
 
 Polyline = NDArray[np.float64]
 
 WINDOW_PX = 2 * HALF_WINDOW_PX + 1
 """Side of the centroid's window; a tick names its central pixel."""
 OTHER_SPOT = "◦"
+_LIGHT_PX = 4.0  # from a spot's middle to where its light ends
 OVERLAY_INKS = (WHITE, SKY, GREEN, PINK, YELLOW, DIM, FAINT)
 """Every colour that an overlay may have."""
 _CIRCLE = np.linspace(0, 2 * math.pi, 33)
 
 
 class Overlay(NamedTuple):
-    """One thing that is marked: a name of `SHAPES`, its place, its colour."""
+    """One thing that is marked: a name of `SHAPES`, its place, its colour, and a name beside it if it has one.
+
+    The name is in characters alone: a picture of pixels has the caption.
+    """
 
     shape: str
     az_px: float
     el_px: float
     colour: str
+    label: str = ""
 
 
 def tick_overlays(tick: Tick, target: str = SKY, window: str = GREEN) -> list[Overlay]:
@@ -55,26 +61,46 @@ def _target_marks(overlay: Overlay, placing: Placing) -> Marks:
 
 def _window_marks(overlay: Overlay, placing: Placing) -> Marks:
     low_az, low_el = overlay.az_px - WINDOW_PX / 2, overlay.el_px - WINDOW_PX / 2
-    return box_marks(
+    left, top = (
         math.floor(placing.column(low_az)) - 1,
         math.floor(placing.row(low_el + WINDOW_PX)) - 1,
-        math.ceil(placing.column(low_az + WINDOW_PX)),
-        math.ceil(placing.row(low_el)),
-        overlay.colour,
     )
+    right = math.ceil(placing.column(low_az + WINDOW_PX))
+    return box_marks(left, top, right, math.ceil(placing.row(low_el)), overlay.colour)
+
+
+def _centroid_marks(overlay: Overlay, placing: Placing) -> Marks:
+    """Four arms of braille dots that point at the centroid: a cell is two dots wide and four dots high."""
+    column, row = _cell(overlay, placing)
+    x, y = math.floor(column), math.floor(row)
+    across = Mark("⠉⠒⠤⣀"[int(4 * (row - y))], overlay.colour)
+    down = Mark("⡇⢸"[int(2 * (column - x))], overlay.colour)
+    arms = {(x + sign * place, y): across for sign in (-1, 1) for place in (1, 2)}
+    return arms | {(x, y + sign): down for sign in (-1, 1)}
+
+
+def _spot_marks(overlay: Overlay, placing: Placing) -> Marks:
+    """A ring, and its name below the spot's light; above it at the lower edge."""
+    column, row = (math.floor(place) for place in _cell(overlay, placing))
+    light_rows = max(2, math.ceil(_LIGHT_PX * placing.zoom / placing.shrink / 2))
+    below = row + light_rows < placing.top + placing.rows
+    named = row + (light_rows if below else -light_rows)
+    begin = column - len(overlay.label) // 2
+    name = name_marks(overlay.label, begin, named, overlay.colour, placing)
+    return name | {(column, row): Mark(OTHER_SPOT, overlay.colour)}
+
+
+def name_marks(name: str, column: int, row: int, colour: str, placing: Placing) -> Marks:
+    """A name from a column on, or from as far to the left of it as keeps the name whole on the frame."""
+    signs = plain(name)
+    begin = max(placing.left, min(column, placing.left + placing.columns - len(signs)))
+    return {(begin + place, row): Mark(sign, colour) for place, sign in enumerate(signs)}
 
 
 def _cursor_marks(overlay: Overlay, placing: Placing) -> Marks:
     marks = reticle_marks(*_cell(overlay, placing), (1, 1), overlay.colour)
-    return marks | _character("╳")(overlay, placing)
-
-
-def _character(character: str) -> Callable[[Overlay, Placing], Marks]:
-    def marks(overlay: Overlay, placing: Placing) -> Marks:
-        column, row = _cell(overlay, placing)
-        return {(math.floor(column), math.floor(row)): Mark(character, overlay.colour)}
-
-    return marks
+    column, row = _cell(overlay, placing)
+    return marks | {(math.floor(column), math.floor(row)): Mark("╳", overlay.colour)}
 
 
 def _cell(overlay: Overlay, placing: Placing) -> tuple[float, float]:
@@ -102,10 +128,8 @@ class Shape(NamedTuple):
 SHAPES = {
     "target": Shape(_target_marks, _rays(WINDOW_PX / 2 + 1, WINDOW_PX / 2 + 3, _STRAIGHT)),
     "window": Shape(_window_marks, [_BOX]),
-    "centroid": Shape(_character("+"), _rays(-0.8, 0.8, _STRAIGHT[::2])),
-    "spot": Shape(
-        _character(OTHER_SPOT), [2.5 * np.column_stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])]
-    ),
+    "centroid": Shape(_centroid_marks, _rays(-0.8, 0.8, _STRAIGHT[::2])),
+    "spot": Shape(_spot_marks, [2.5 * np.column_stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])]),
     "cursor": Shape(_cursor_marks, _rays(0.0, 1.5, _SLANTING) + _rays(1.5, 3.5, _STRAIGHT)),
 }
 

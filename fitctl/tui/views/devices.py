@@ -12,14 +12,13 @@ from textual.binding import BindingType
 from fitctl.messages.commands import Reset
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Reader
-from fitctl.tui.look import DIM, INK
+from fitctl.tui.inks import DIM, INK
 from fitctl.tui.views.view import View
-from fitctl.tui.widgets.readings import DeviceList, Readings, device_lines, reading_lines
-from fitctl.tui.widgets.stages import Stages
+from fitctl.tui.widgets.readings import Detail, DeviceList, Readings, device_lines, reading_lines
 
 
 class DevicesView(View):
-    """Devices above, readings below, the stages beside them where there is room."""
+    """Devices above, readings below; where there is room, all about the chosen row under them."""
 
     view_name = "devices"
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -27,18 +26,19 @@ class DevicesView(View):
     ]
 
     def parts(self) -> ComposeResult:
-        """Two lists and the stages."""
-        yield DeviceList(self.state, "Devices")
-        yield Readings(self.state, "Readings")
-        yield Stages(self.state, "Stages")
+        """Two lists, and the chosen row."""
+        devices = DeviceList(self.state, "Devices")
+        readings = Readings(self.state, "Readings, nearest to a limit first")
+        yield devices
+        yield readings
+        yield Detail(self.state, "Chosen", devices, readings)
 
     def action_more(self) -> None:
         """All about the chosen row."""
         devices, readings = self.query_one(DeviceList), self.query_one(Readings)
         loop, row = self.state.loop, readings.now()
-        known = devices.devices()
-        if devices.has_focus and known:
-            device = known[min(devices.chosen, len(known) - 1)]
+        device = devices.now()
+        if devices.has_focus and device is not None:
             self.app.push_screen(Reader(device.device, _table(device_lines(devices, device))))
         elif readings.has_focus and loop is not None and row is not None:
             self.app.push_screen(Reader(row.name, _table(reading_lines(loop, row))))

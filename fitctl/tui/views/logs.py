@@ -11,7 +11,7 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.folder import keep
 from fitctl.tui.commands import keys_of
 from fitctl.tui.views.view import View
-from fitctl.tui.widgets.loglist import LogList
+from fitctl.tui.widgets.loglist import LogList, Summaries
 from fitctl.tui.widgets.printed import Printed
 
 TOOLS = {
@@ -20,7 +20,10 @@ TOOLS = {
     "report": ["report"],
     "replay": ["replay"],
 }
-HINT = "Choose a log. enter says what it holds, f verifies it, m keeps it, t reports on it, y replays it."
+HINT = (
+    "Choose a log. enter shows what it holds, f verifies it, m keeps it, t reports on it, y replays it. "
+    "To see every screen as it was, run from a shell: fitctl console --log FILE"
+)
 
 
 class LogsView(View):
@@ -29,10 +32,23 @@ class LogsView(View):
     view_name = "logs"
     BINDINGS: ClassVar[list[BindingType]] = [key.binding() for key in keys_of("logs") if key.action]
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._summaries = Summaries()
+
     def parts(self) -> ComposeResult:
         """Two panels."""
-        yield LogList(self.state, "Logs", self.console.log_folder)
+        yield LogList(self.state, "Logs", self.console.log_folder, self._summaries.of)
         yield Printed(self.state, "Printed", HINT)
+
+    def before_drawing(self) -> None:
+        """Have the logs read that are not known yet."""
+        for logs in self.query(LogList):  # there is none before the screen is composed
+            self._summaries.ask(self.console.start_job, logs.logs, logs.current)
+
+    def on_unmount(self) -> None:
+        """Leave no child behind."""
+        self._summaries.end()
 
     def action_tool(self, name: str) -> None:
         """Run a fitctl command on the chosen log."""

@@ -1,4 +1,4 @@
-"""Loop: how the tick spends its time, what is left of the error by frequency, and how the design stands."""
+"""Loop: where the error comes from, its spectrum, how the tick spends its time, and the design's margins."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from fitctl.messages.telemetry import LoopState
 from fitctl.tui.commands import keys_of
 from fitctl.tui.jobs import Job
 from fitctl.tui.views.view import View
-from fitctl.tui.widgets.margins import DesignInUse, Margins, design_in_use
-from fitctl.tui.widgets.spectrum import Spectrum
+from fitctl.tui.widgets.margins import DesignFigures, DesignInUse, Margins, design_in_use
+from fitctl.tui.widgets.spectrum import ErrorBudget, Spectrum
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 
 NEEDS_RIG = (
@@ -23,7 +23,7 @@ FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known h
 
 
 class LoopScreen(View):
-    """Spectrum and histograms above, breakdown and margins below."""
+    """The error budget above; below it spectrum and histograms, breakdown and margins."""
 
     view_name = "loop"
     BINDINGS: ClassVar[list[BindingType]] = [key.binding() for key in keys_of("loop")]
@@ -32,19 +32,21 @@ class LoopScreen(View):
         super().__init__()
         self._job: Job | None = None
         self._asked = DesignInUse("", "")
+        self._evaluated = DesignFigures()
 
     def parts(self) -> ComposeResult:
-        """Four panels."""
-        yield Spectrum(self.state, "Spectrum of the pointing error")
+        """Five panels."""
+        yield ErrorBudget(self.state, "Where the error comes from", self._evaluated)
+        yield Spectrum(self.state, "Spectrum of the pointing error", self._evaluated)
         yield Histograms(self.state, "Timing")
         yield Breakdown(self.state, "The tick")
-        yield Margins(self.state, "Design", self._why_unknown)
+        yield Margins(self.state, "Design", self._evaluated, self._why_unknown)
 
     def before_drawing(self) -> None:
         """Have `fitctl design` evaluate the design in use, once for each design."""
         loop, job = self.state.loop, self._job
         if job is not None and job.status is not None:
-            self.query_one(Margins).show_result(self._asked, job.text(), job.status)
+            self._evaluated.accept(self._asked, job.text(), job.status)
             job.end()
             self._job = None
         rig_arguments = self.console.rig_arguments

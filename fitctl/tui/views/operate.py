@@ -10,7 +10,8 @@ from textual.containers import Container
 
 from fitctl.messages.commands import Look, SetBiasOffset, SetTarget
 from fitctl.tui.commands import Key, keys_of
-from fitctl.tui.jog import JogPad
+from fitctl.tui.jog import MODES_WITH_STAR, JogPad
+from fitctl.tui.state import LoopView
 from fitctl.tui.views.view import View
 from fitctl.tui.widgets.events import Events
 from fitctl.tui.widgets.focalplane import FocalPlane
@@ -20,20 +21,24 @@ from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.traces import Traces
 
 AIM_STEP_PX = 0.5
-MODES_WITH_STAR = {"COARSE", "VERNIER"}
 _AIM_KEYS = [
-    Key("", "↑↓←→", "Move", "", ""),
+    Key("", "↑↓←→", "Move", "screen.nudge", ""),
     Key("enter", "enter", "Set target", "screen.set_target", ""),
     Key("i", "i", "Look here", "screen.look", ""),
     Key("escape", "esc", "Leave", "screen.leave", ""),
 ]
 _JOG_KEYS = [
-    Key("", "↑↓←→", "Jog", "", ""),
-    Key("", "[ ]", "Step", "screen.step(1)", ""),
-    Key("tab", "tab", "Stage", "screen.next_stage", ""),
-    Key("0", "0", "Zero offset", "screen.zero", ""),
-    Key("escape", "esc", "Leave", "screen.leave", ""),
+    Key("", "↑↓←→", "Jog", "screen.nudge", ""),
+    Key("", "[ ]", "Step", "screen.step", ""),
 ]
+_STAGE_KEY = Key("tab", "tab", "Stage", "screen.next_stage", "")
+_ZERO_KEY = Key("0", "0", "Zero offset", "screen.zero", "")
+_LEAVE_KEY = Key("escape", "esc", "Leave", "screen.leave", "")
+
+
+def has_target(loop: LoopView | None) -> bool:
+    """Whether the loop follows a star, so that its target and window can be moved."""
+    return loop is not None and loop.state.kind == "stellar" and loop.state.mode in MODES_WITH_STAR
 
 
 class OperateView(View):
@@ -76,14 +81,25 @@ class OperateView(View):
 
     def keys_now(self) -> list[Key]:
         """What the arrow keys are for."""
-        return {"": [], "aim": _AIM_KEYS, "jog": _JOG_KEYS}[self.hand]
+        if self.hand != "jog":
+            return _AIM_KEYS if self.hand == "aim" else []
+        stages = self.pad.stages(self.state.loop)
+        stage = self.pad.stage(self.state.loop)
+        keys = [*_JOG_KEYS, _STAGE_KEY] if len(stages) > 1 else [*_JOG_KEYS]
+        is_mirror = stage is not None and stage.name == "mirror"
+        return [*keys, _ZERO_KEY, _LEAVE_KEY] if is_mirror else [*keys, _LEAVE_KEY]
 
     def before_drawing(self) -> None:
         """A mode in which nothing can be moved ends it."""
-        mode = self.state.mode
-        idle = {"aim": mode not in MODES_WITH_STAR, "jog": self.pad.stage(mode) is None}
+        loop = self.state.loop
+        idle = {"aim": not has_target(loop), "jog": self.pad.stage(loop) is None}
         if idle.get(self.hand):
             self._set_hand("")
+
+    def to_rehearse(self) -> str:
+        """The target at the cursor, if there is one."""
+        cursor = self._plane.cursor_px
+        return super().to_rehearse() if cursor is None else f"target {cursor[0]:g} {cursor[1]:g}"
 
     @property
     def _plane(self) -> FocalPlane:
@@ -118,7 +134,7 @@ class OperateView(View):
         self._aim_at(event.az_px, event.el_px)
 
     def _aim_at(self, az_px: float, el_px: float) -> None:
-        if self.state.mode not in MODES_WITH_STAR:
+        if not has_target(self.state.loop):
             self.notify("target and window are moved while a star is held", timeout=3)
             return
         frame = self.state.newest.frame if self.state.newest else None
@@ -141,7 +157,7 @@ class OperateView(View):
         """Let the arrow keys move a stage, or no more."""
         if self.hand == "jog":
             self._set_hand("")
-        elif self.pad.stage(self.state.mode) is None:
+        elif self.pad.stage(self.state.loop) is None:
             self.notify(
                 "stages are moved by hand in STANDBY, targets while a star is held", timeout=4
             )
@@ -160,7 +176,7 @@ class OperateView(View):
 
     def action_step(self, by: int) -> None:
         """A finer or a coarser step."""
-        stage = self.pad.stage(self.state.mode)
+        stage = self.pad.stage(self.state.loop)
         if self.hand == "jog" and stage is not None:
             self.pad.change_step(stage, by)
             self.console.draw_all()
@@ -173,7 +189,8 @@ class OperateView(View):
 
     def action_zero(self) -> None:
         """The mirror back to its bias."""
-        if self.hand == "jog" and self.state.mode == "STANDBY":
+        stage = self.pad.stage(self.state.loop)
+        if self.hand == "jog" and stage is not None and stage.name == "mirror":
             self.pad.begin_anew()
             self.console.send(SetBiasOffset(az_urad=0.0, el_urad=0.0))
 

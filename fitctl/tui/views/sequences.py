@@ -18,7 +18,7 @@ from fitctl.tui.dialogs import Ask
 from fitctl.tui.jobs import Job
 from fitctl.tui.views.view import View
 from fitctl.tui.widgets.printed import Printed
-from fitctl.tui.widgets.sequencing import Parameters, Progress, SequenceList
+from fitctl.tui.widgets.sequencing import Estimates, Parameters, Progress, SequenceList
 
 HINT = (
     "Choose a sequence. tab and enter change its parameters, d rehearses all of it on the virtual clock, "
@@ -46,13 +46,14 @@ class SequencesView(View):
         super().__init__()
         self._folder = tempfile.TemporaryDirectory(prefix="fitctl-console-")
         self._list: Job | None = None
+        self._estimates = Estimates()
 
     def parts(self) -> ComposeResult:
         """Two lists, and two panels below them."""
-        sequences = SequenceList(self.state, "Sequences")
+        sequences = SequenceList(self.state, "Sequences", self._estimates.of)
         yield sequences
         yield Parameters(self.state, "Parameters", sequences)
-        yield Progress(self.state, "On the instrument")
+        yield Progress(self.state, "On the instrument", sequences)
         hint = NEEDS_RIG if self.console.rig_arguments is None else HINT
         yield Printed(self.state, "Printed", hint)
 
@@ -65,10 +66,12 @@ class SequencesView(View):
         """What was asked for is not waited for."""
         if self._list is not None:
             self._list.end()
+        self._estimates.end()
         self._folder.cleanup()
 
     def before_drawing(self) -> None:
         """Show the list of sequences once it has come."""
+        self._estimate()
         job = self._list
         if job is None or job.status is None:
             return
@@ -82,6 +85,15 @@ class SequencesView(View):
         else:
             self.notify(job.text(), severity="error", timeout=8, markup=False)
             job.end()
+
+    def _estimate(self) -> None:
+        """Have the sequence under way run dry, or else the chosen one."""
+        rig_arguments = self.console.rig_arguments
+        for progress in self.query(Progress):  # there is none before the screen is composed
+            document = progress.document() or self.query_one(SequenceList).document
+            if document is not None and rig_arguments is not None:
+                file = [self._file(document), *rig_arguments]
+                self._estimates.ask(self.console.start_job, document, file, self.console.clock())
 
     def _add(self, documents: list[dict[str, Any]]) -> None:
         sequences = self.query_one(SequenceList)
@@ -115,14 +127,18 @@ class SequencesView(View):
         self.app.push_screen(Ask(document["name"], prompt, str(parameter.value)), accept)
 
     def action_dry_run(self) -> None:
-        """Rehearse the chosen sequence on the virtual clock."""
+        """Rehearse the chosen sequence on the virtual clock, from where the stages are now."""
         if self._chosen():
-            self._start("dry-run")
+            from_now = [] if self.state.stale or not self.state.live else ["--present"]
+            self._start("dry-run", *from_now, *(self.console.remote_arguments if from_now else ()))
 
     def action_go(self) -> None:
         """Run the chosen sequence on the instrument, once the operator has said yes."""
         document = self._chosen()
         if document is None:
+            return
+        if not self.state.live:
+            self.notify("Go: the console shows the past; press end first", timeout=4)
             return
         steps = ", ".join(step["step"] for step in document["steps"])
         question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
@@ -163,10 +179,9 @@ class SequencesView(View):
             self.notify("no sequence is chosen yet", timeout=3)
         return document
 
-    def _file(self) -> str:
-        """The chosen sequence's own file, or, once it was edited, one of ours."""
+    def _file(self, document: dict[str, Any]) -> str:
+        """A sequence's own file, or, once it was edited, one of ours."""
         sequences = self.query_one(SequenceList)
-        document = sequences.document or {}
         if document["file"] not in sequences.edited:
             return document["file"]
         path = Path(self._folder.name) / f"{document['name']}.toml"
@@ -176,8 +191,9 @@ class SequencesView(View):
     def _start(self, word: str, *more: str, outlives: bool = False) -> None:
         """Do something with the chosen sequence; never with the file of another rig."""
         rig_arguments = self.console.rig_arguments
-        if rig_arguments is not None:
-            arguments = ["sequence", word, self._file(), *rig_arguments, *more]
+        document = self.query_one(SequenceList).document
+        if rig_arguments is not None and document is not None:
+            arguments = ["sequence", word, self._file(document), *rig_arguments, *more]
             self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
 
 

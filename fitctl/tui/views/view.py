@@ -12,13 +12,15 @@ from textual.screen import Screen
 
 from fitctl.tui.commands import Key
 from fitctl.tui.console import Console
+from fitctl.tui.rewind.bar import RewindBar
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.header import WIDE_FROM_COLUMNS, Header
-from fitctl.tui.widgets.keys import Keys
+from fitctl.tui.widgets.keys import Keys, StopKey
 from fitctl.tui.widgets.panel import Panel
 
 TALL_FROM_ROWS = 36
+OF_TELEMETRY = {"operate", "devices", "loop"}  # screens whose body is old when the data are
 
 
 class View(Screen[None]):
@@ -44,11 +46,13 @@ class View(Screen[None]):
 
     def compose(self) -> ComposeResult:
         """From top to bottom."""
-        yield Header(self.state, self.view_name)
+        yield Header(self.state, self.view_name, self.console.alarms)
         yield AlarmBar(self.state, self.console.alarms)
         with Container(id="body"):
             yield from self.parts()
+        yield RewindBar(self.state, self.console.playback)
         yield Keys(self.state, self.view_name, self.console.alarms, self.keys_now)
+        yield StopKey()
 
     @abstractmethod
     def parts(self) -> ComposeResult:
@@ -57,6 +61,15 @@ class View(Screen[None]):
     def keys_now(self) -> list[Key]:
         """Keys that go before the screen's own, at this moment."""
         return []
+
+    def to_rehearse(self) -> str:
+        """The command that is most likely wanted next."""
+        tick = self.state.loop.tick if self.state.loop else None
+        if self.state.mode in {"COARSE", "VERNIER"} and tick is not None:
+            return f"target {tick.target_az_px:g} {tick.target_el_px:g}"
+        return {"SAFE": "recover", "STANDBY": "jog 10 0", "OFF": "standby"}.get(
+            self.state.mode, "hold"
+        )
 
     def on_mount(self) -> None:
         """Choose the layout that fits."""
@@ -79,9 +92,13 @@ class View(Screen[None]):
     def draw(self, beat: int | None) -> None:
         """Draw the panels whose turn it is; all without a beat."""
         self.set_class(self.state.stale, "stale")
+        self.set_class(not self.state.live, "past")
+        self.set_class(len(self.state.loops) > 1, "several")
         self.before_drawing()
+        old = self.state.stale and self.view_name in OF_TELEMETRY
         panels = [widget for widget in self.query() if isinstance(widget, Panel)]
         for panel in panels:
+            panel.is_old = old and panel.parent is not self
             if panel.display and (beat is None or beat % panel.every == 0):
                 panel.redraw()
 

@@ -9,7 +9,8 @@ from textual.binding import Binding, BindingType
 from textual.events import Click, MouseScrollDown, MouseScrollUp
 from textual.message import Message
 
-from fitctl.tui.look import SKY, Line, text
+from fitctl.tui.inks import SKY
+from fitctl.tui.look import Line, text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
@@ -22,7 +23,7 @@ class Choice(Panel, can_focus=True):
     Attributes
     ----------
     chosen : int
-        Number of the row.
+        Number of the row. Where rows have names, the choice follows its row to another place in the list.
     """
 
     every: ClassVar[int] = 5
@@ -42,6 +43,17 @@ class Choice(Panel, can_focus=True):
         self._top = 0
         self._heads = 0
         self._count = 0
+        self._names: list[str] = []  # as they were drawn last
+
+    def names(self) -> list[str]:
+        """The names of the rows, where rows change places; empty where they do not."""
+        return []
+
+    def _follow(self) -> None:
+        """Keep the choice on its row."""
+        before, self._names = self._names, self.names()
+        if self.chosen < len(before) and before[self.chosen] in self._names:
+            self.chosen = self._names.index(before[self.chosen])
 
     def head(self, columns: int) -> list[Line]:
         """Lines that stay above the rows."""
@@ -53,6 +65,7 @@ class Choice(Panel, can_focus=True):
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """The head, and as many rows as there is room for about the chosen one."""
+        self._follow()
         heads = self.head(columns - 1)[: max(0, rows - 1)]
         lines = self.rows(columns - 1)
         room = max(1, rows - len(heads))

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from textual.events import Click
 from textual.message import Message
+from textual.strip import Strip
 
-from fitctl.logging.records import FrameRecord, Tick
+from fitctl.logging.records import FrameRecord, MetrologyTick, Tick
 from fitctl.tui.draw.colours import ANCHORS, LEVELS, colour_map
 from fitctl.tui.draw.frame import (
     STRETCHES,
-    Mark,
     Marks,
     Placing,
     frame_lines,
@@ -23,31 +24,22 @@ from fitctl.tui.draw.frame import (
 from fitctl.tui.draw.overlays import (
     OTHER_SPOT,
     OVERLAY_INKS,
+    WINDOW_PX,
     Overlay,
     cell_marks,
+    name_marks,
     paint,
     tick_overlays,
 )
 from fitctl.tui.graphics import PictureSender, cell_size_px
-from fitctl.tui.look import (
-    DIM,
-    FAINT,
-    GREEN,
-    INK,
-    ORANGE,
-    PINK,
-    WHITE,
-    YELLOW,
-    Line,
-    number,
-    pad,
-    text,
-    width,
-)
+from fitctl.tui.inks import DIM, FAINT, GREEN, INK, PINK, WHITE, YELLOW
+from fitctl.tui.look import Line, faded, number, pad, text, width
+from fitctl.tui.loops.band import age
 from fitctl.tui.state import ConsoleState, LoopView
 from fitctl.tui.widgets.panel import Panel
 
 PICTURE_BEATS = 3
+OLD_FROM_S = 1.0  # a frame that is older is no picture of what is
 TERMINAL = 2  # the file descriptor that Textual writes to
 
 
@@ -97,10 +89,16 @@ class FocalPlane(Panel):
             self._placing = None
             note = [[text("no frame yet".center(columns), DIM)]]
             return [[] for _ in range((rows - 1) // 2)] + note
+        old_s = self.state.newest.time_s - frame.time_s if self.state.newest else 0.0
         image = np.frombuffer(frame.data, dtype="<u2").reshape(frame.height_px, frame.width_px)
-        placing = self._placing = place(frame.width_px, frame.height_px, columns, rows)
-        caption = self._caption(frame, tick, columns - placing.left)
+        # Rather than half the size, a frame loses its lowest row below the caption.
+        whole = rows + (2 * rows < frame.height_px <= 2 * (rows + 1))
+        placing = self._placing = place(frame.width_px, frame.height_px, columns, whole)
         below = placing.top + placing.rows
+        left = 0 if below < rows else placing.left
+        caption = self._caption(frame, tick, columns - left)
+        if old_s > OLD_FROM_S:
+            caption = [text(f"○ last frame {age(old_s)} ago", INK, bold=True)]
         pictures, cell_px = self._pictures, self._picture_cell_px()
         if pictures is not None and cell_px is not None:
             self._beats += 1
@@ -108,17 +106,19 @@ class FocalPlane(Panel):
                 seen_rows = min(placing.rows, rows - 1 - placing.top)
                 self._send(pictures, cell_px, image, placing, seen_rows)
             lines: list[Line] = [[] for _ in range(rows)]
-            lines[min(below, rows - 1)] = [text(" " * placing.left), *caption]
+            lines[min(below, rows - 1)] = [text(" " * left), *caption]
             return lines
         if pictures is not None:
             pictures.clear()
         levels = levels_on_screen(image, placing, self.stretch)
-        marks = cell_marks(self._overlays(), placing)
-        if below >= rows:
-            marks |= _written_over(caption, placing.left, rows - 1)
-        lines = frame_lines(levels, placing, marks, columns, rows, colour_map(self.colours))
-        if below < rows:
-            lines[below] = pad([text(" " * placing.left), *caption], columns)
+        marks = cell_marks(self._overlays(), placing) | self._names(placing)
+        colours = colour_map(self.colours)
+        lines = frame_lines(levels, placing, marks, columns, whole, colours)[:rows]
+        row = min(below, rows - 1)
+        under = Strip(lines[row]).crop(left + width(caption)) if below >= rows else Strip([])
+        if old_s > OLD_FROM_S:
+            lines = list(map(faded, lines))
+        lines[row] = pad([text(" " * left), *caption, *under], columns)
         return lines
 
     def _picture_cell_px(self) -> tuple[int, int] | None:
@@ -126,6 +126,13 @@ class FocalPlane(Panel):
 
         That is while something lies over the panel, or what it shows is old, which would have to be faded.
         """
+        newest = self.state.newest
+        if (
+            newest is None
+            or newest.frame is None
+            or newest.time_s - newest.frame.time_s > OLD_FROM_S
+        ):
+            return None
         if self._pictures is None or self.state.stale or not self.screen.is_active:
             return None
         return None if self.screen.query("Toast") else cell_size_px(TERMINAL)
@@ -177,25 +184,45 @@ class FocalPlane(Panel):
 
     def _overlays(self) -> list[Overlay]:
         """The shown loop's on top of those of others, whose stars the same camera sees."""
-        found: list[Overlay] = []
-        for name, loop in self.state.loops.items():
-            if name != self.state.shown and loop.tick is not None:
-                found += spot_overlays(loop, DIM)
-                found += tick_overlays(loop.tick, target=FAINT, window=DIM)
         shown = self.state.loop
+        others = [loop for loop in self.state.loops.values() if loop is not shown]
+        own = [] if shown is None else spot_overlays(shown)
+        named = {spot.label for spot in own}  # of several loops' spots with one name, one has it
+        spots = [spot for loop in others for spot in spot_overlays(loop, DIM)]
+        spots = [spot._replace(label="") if spot.label in named else spot for spot in spots]
+        ticks = [loop.tick for loop in others if loop.tick is not None]
+        found = [each for tick in ticks for each in tick_overlays(tick, FAINT, DIM)]
         if shown is not None and shown.tick is not None:
-            found += spot_overlays(shown)
             found += tick_overlays(shown.tick)
+        found += [*spots, *own]  # on top of the windows, which would hide their names
         if self.cursor_px is not None:
             found.append(Overlay("cursor", *self.cursor_px, YELLOW))
         return found
+
+    def _names(self, placing: Placing) -> Marks:
+        """The name of its loop at the upper left corner of each window, where there are several loops."""
+        if len(self.state.loops) < 2:
+            return {}
+        marks: Marks = {}
+        for name, loop in self.state.loops.items():
+            tick = loop.tick
+            if tick is None or not tick.star_visible:
+                continue
+            row = math.floor(placing.row(tick.window_el_px + WINDOW_PX / 2)) - 1
+            column = math.floor(placing.column(tick.window_az_px - WINDOW_PX / 2))
+            colour = GREEN if name == self.state.shown else INK
+            marks |= name_marks(name, column, row, colour, placing)
+        return marks
 
     def _caption(self, frame: FrameRecord, tick: Tick | None, columns: int) -> Line:
         if self.cursor_px is not None:
             az_px, el_px = self.cursor_px
             return [text(f"╳ {az_px:.1f} {el_px:.1f} px: target, or look here?", YELLOW, bold=True)]
+        beam = self.state.loop.beam if self.state.loop else None
+        if beam is not None:
+            return _beam_caption(beam, columns)
         if tick is None or not tick.star_visible:
-            return [text("○ no star", ORANGE, bold=True), text(f"  frame {frame.number}", DIM)]
+            return [text("○ no star", INK, bold=True), text(f"  frame {frame.number}", DIM)]
         position = f"{number(tick.star_az_px, '5.2f')} {number(tick.star_el_px, '5.2f')} px"
         flux = f"{number(tick.star_flux_dn, ',.0f')} DN".replace(",", " ")
         star = [text("+", WHITE, bold=True), text(" star ", GREEN, bold=True), text(position, INK)]
@@ -213,7 +240,11 @@ def spot_overlays(loop: LoopView, colour: str = PINK) -> list[Overlay]:
         return []
     return [
         Overlay(
-            "spot", tick.star_az_px + spot.az_offset_px, tick.star_el_px + spot.el_offset_px, colour
+            "spot",
+            tick.star_az_px + spot.az_offset_px,
+            tick.star_el_px + spot.el_offset_px,
+            colour,
+            spot.name,
         )
         for spot in loop.state.other_spots
     ]
@@ -223,15 +254,12 @@ def _next(names: list[str], name: str) -> str:
     return names[(names.index(name) + 1) % len(names)]
 
 
-def _written_over(line: Line, left: int, row: int) -> Marks:
-    colour = {
-        segment: (segment.style.color.name if segment.style and segment.style.color else INK)
-        for segment in line
-    }
-    marks: Marks = {}
-    column = left
-    for segment in line:
-        for character in segment.text:
-            marks[column, row] = Mark(character, colour[segment])
-            column += 1
-    return marks
+def _beam_caption(beam: MetrologyTick, columns: int) -> Line:
+    """Where a metrology loop's beam is on its photodiodes, which no camera sees."""
+    state = beam.beam_state.lower()
+    if not math.isfinite(beam.beam_az_arcsec):
+        return [text(f"○ beam {state}", INK, bold=True)]
+    place = f"{number(beam.beam_az_arcsec, '+.2f')} {number(beam.beam_el_arcsec, '+.2f')}″"
+    line = [text("◉ beam ", GREEN, bold=True), text(place, INK)]
+    in_full = [*line, text(f" {state}", DIM)]
+    return in_full if width(in_full) <= columns else line

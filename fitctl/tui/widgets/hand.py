@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from fitctl.tui.inks import DIM, INK, PAPER, WHITE, YELLOW
 from fitctl.tui.jog import JogPad
-from fitctl.tui.look import DIM, INK, PAPER, WHITE, YELLOW, Line, number, text
+from fitctl.tui.look import Line, number, text
 from fitctl.tui.state import ConsoleState, LoopView
 from fitctl.tui.widgets.panel import Panel
 
@@ -22,7 +23,7 @@ class Hand(Panel):
     def draw(self, columns: int, rows: int) -> list[Line]:
         """Stage and step, where it is, the steps to choose from."""
         loop = self.state.loop
-        stage = self._pad.stage(self.state.mode)
+        stage = self._pad.stage(self.state.loop)
         if loop is None or stage is None:
             return []
         step = self._pad.step(stage)
@@ -42,11 +43,12 @@ class Hand(Panel):
 
 
 def _place(loop: LoopView, stage: str) -> str:
-    tick = loop.tick
+    tick, beam = loop.tick, loop.beam
+    siderostat = beam or tick
+    if stage == "siderostat" and siderostat is not None:
+        az, el = siderostat.siderostat_az_sky_arcsec, siderostat.siderostat_el_sky_arcsec
+        return f"az {number(az, '+.1f')}″ el {number(el, '+.1f')}″"
     if stage == "mirror" or tick is None:
         az, el = loop.state.bias_offset_urad
         return f"offset az {number(az, '+.1f')} el {number(el, '+.1f')} µrad"
-    if stage == "siderostat":
-        az, el = tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec
-        return f"az {number(az, '+.1f')}″ el {number(el, '+.1f')}″"
     return f"az {number(tick.target_az_px, '.2f')} el {number(tick.target_el_px, '.2f')} px"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import textwrap
 from pathlib import PurePath
 from typing import ClassVar
@@ -10,24 +12,15 @@ import msgspec
 
 from fitctl.logging.records import DeviceHealth, LoopTiming
 from fitctl.messages.telemetry import Telemetry
-from fitctl.tui.look import (
-    DEVICES,
-    DIM,
-    GREEN,
-    INK,
-    ORANGE,
-    PAPER,
-    RED,
-    Line,
-    shorten,
-    spread,
-    text,
-    width,
-)
+from fitctl.tui.inks import DIM, GREEN, INK, ORANGE, PAPER, RED
+from fitctl.tui.look import DEVICES, Line, number, shorten, spread, text, width
 from fitctl.tui.widgets.panel import Panel
 
 TABLE_FROM_ROWS = 7
 DETAIL_INDENT = 4
+DETAIL_FROM_COLUMNS = 8  # less says nothing
+STATES = ("fault", "closed", "ok")  # in the order in which devices are shown
+_PLACE = re.compile(r"^[^:;]* at \S+: ")  # which device and where, of which the row has the name
 
 
 class Devices(Panel):
@@ -40,26 +33,29 @@ class Devices(Panel):
     every: ClassVar[int] = 5
 
     def draw(self, columns: int, rows: int) -> list[Line]:
-        """Ill devices first when not all have a row of their own."""
+        """Ill devices before healthy ones."""
         devices = self.state.newest.devices if self.state.newest else []
         if len(self.state.loops) == 1:
             devices = [_without_loop(device, self.state.shown) for device in devices]
+        devices = sorted(devices, key=lambda device: STATES.index(device.state))
+        others = tuple(f"{name} " for name in self.state.loops if name != self.state.shown)
+        if len(devices) > rows:  # then those of other loops only while they are ill
+            devices = [
+                _without_loop(device, self.state.shown) if device.state == "ok" else device
+                for device in devices
+                if device.state != "ok" or not device.device.startswith(others)
+            ]
         if len(devices) <= rows:
             names = max((len(device.device) for device in devices), default=0)
-            spare = rows - len(devices)
+            spare, faults = rows - len(devices), sum(d.state == "fault" for d in devices)
             lines: list[Line] = []
-            for device in devices:
-                own = _device(device, names, columns, 1 + spare)
+            for number, device in enumerate(devices):
+                own = _device(device, names, columns, 1 + spare // max(1, faults - number))
                 spare -= len(own) - 1
                 lines += own
             return lines
         ill = [device for device in devices if device.state != "ok"]
-        others = tuple(f"{name} " for name in self.state.loops if name != self.state.shown)
-        well = [
-            _without_loop(device, self.state.shown)
-            for device in devices
-            if device.state == "ok" and not device.device.startswith(others)
-        ]
+        well = [device for device in devices if device.state == "ok"]
         lines = [_device(device, len(device.device), columns, 1)[0] for device in ill]
         return lines + _packed(well, columns)
 
@@ -78,12 +74,16 @@ def _device(device: DeviceHealth, name_columns: int, columns: int, rows: int) ->
     ill = device.state != "ok"
     if ill:
         line.append(text(f" {device.state}", look.colour, bold=True))
-    detail = device.detail or device.identity or device.endpoint
-    pieces = textwrap.wrap(detail, max(10, columns - DETAIL_INDENT)) if ill and rows > 1 else []
-    if 0 < len(pieces) < rows:
+    detail = _PLACE.sub("", device.detail) or device.identity or device.endpoint
+    if device.state == "fault" and detail and rows > 1:
+        pieces = textwrap.wrap(
+            detail, max(10, columns - DETAIL_INDENT), max_lines=rows - 1, placeholder="…"
+        )
         return [line, *([text(" " * DETAIL_INDENT + piece, DIM)] for piece in pieces)]
     room = columns - width(line) - 1
-    return [[*line, text(" " + shorten(detail, room), DIM)] if room > 3 else line]
+    return [
+        [*line, text(" " + shorten(detail, room), DIM)] if room >= DETAIL_FROM_COLUMNS else line
+    ]
 
 
 def _packed(devices: list[DeviceHealth], columns: int) -> list[Line]:
@@ -142,7 +142,8 @@ def _dense(timing: LoopTiming, unsent: int, scheduling: str, columns: int) -> li
     )
     times: Line = []
     for name, median_s, worst_s in pairs:
-        times += [text(f"{name} ", DIM), text(f"{_short_ms(median_s)}/{_short_ms(worst_s)} ", INK)]
+        pair = [text(f"{name} ", DIM), text(f"{_short_ms(median_s)}/{_short_ms(worst_s)} ", INK)]
+        times += pair if width(times) + width(pair) + 2 <= columns else []
     counts = _counts(timing, unsent)
     room = columns - width(counts) - 1
     return [
@@ -187,11 +188,13 @@ def _counts(timing: LoopTiming, unsent: int) -> Line:
 
 def _ms(seconds: float) -> str:
     milliseconds = 1e3 * seconds
-    return f"{milliseconds:.2f}" if milliseconds < 10 else f"{milliseconds:.1f}"
+    return number(milliseconds, ".2f" if milliseconds < 10 else ".1f")
 
 
 def _short_ms(seconds: float) -> str:
     milliseconds = 1e3 * seconds
+    if math.isnan(milliseconds):
+        return "–"
     if milliseconds < 0.995:
         return f"{milliseconds:.2f}".removeprefix("0")
     return f"{milliseconds:.1f}" if milliseconds < 9.95 else f"{milliseconds:.0f}"

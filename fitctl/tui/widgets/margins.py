@@ -9,14 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+from fitctl.error_budget import LoopTheory, theory_from_plain
 from fitctl.messages.telemetry import LoopState
-from fitctl.tui.look import DIM, INK, ORANGE, RED, Line, mark, number, shorten, text
-from fitctl.tui.state import ConsoleState, error_rms
+from fitctl.tui.inks import DIM, INK, ORANGE, RED
+from fitctl.tui.look import Line, mark, number, shorten, text
+from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
 LEAST_PHASE_DEG = 30.0
 LEAST_GAIN_DB = 6.0
 MOST_SENSITIVITY = 2.0
+_NAME_COLUMNS = 14
 
 
 class DesignInUse(NamedTuple):
@@ -31,41 +34,71 @@ def design_in_use(loop: LoopState) -> DesignInUse:
     return DesignInUse(loop.name, loop.controller_file or loop.controller)
 
 
+class DesignFigures:
+    """What `fitctl design` printed of the design in use, for all panels of the Loop screen.
+
+    Attributes
+    ----------
+    of : DesignInUse
+        The design; without a name before anything was printed.
+    figures : dict or None
+    theory : LoopTheory or None
+        For the error budget.
+    problem : str
+        Why there are no figures.
+    """
+
+    def __init__(self) -> None:
+        self.of = DesignInUse("", "")
+        self.figures: dict[str, Any] | None = None
+        self.theory: LoopTheory | None = None
+        self.problem = ""
+
+    def accept(self, design: DesignInUse, output: str, status: int) -> None:
+        """Keep what the command printed of a design."""
+        self.of, self.figures, self.theory, self.problem = design, None, None, ""
+        if status != 0:
+            self.problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
+            return
+        self.figures = json.loads(output.strip().splitlines()[-1])
+        theory = self.figures.pop("theory", None)
+        self.theory = None if theory is None else theory_from_plain(theory)
+
+    def theory_of(self, loop: LoopState) -> LoopTheory | None:
+        """The theory of a loop as it works now; None in other modes than VERNIER and where it is not known."""
+        at_work = loop.mode == "VERNIER" and self.of == design_in_use(loop)
+        return self.theory if at_work else None
+
+
 class Margins(Panel):
-    """The figures that `fitctl design` prints of the design in use; :meth:`show_result` passes them in.
+    """The figures of the design in use.
 
     The limits beside the margins are the usual ones of textbooks (30 deg, 6 dB, 2).
 
     Parameters
     ----------
+    evaluated : DesignFigures
     why_unknown : callable
-        Says why the margins of a loop's design cannot be known here; nothing if they can.
+        Returns why the margins of a loop's design cannot be known here; nothing if they can.
     """
 
     every: ClassVar[int] = 5
 
     def __init__(
-        self, state: ConsoleState, title: str, why_unknown: Callable[[LoopState], str]
+        self,
+        state: ConsoleState,
+        title: str,
+        evaluated: DesignFigures,
+        why_unknown: Callable[[LoopState], str],
     ) -> None:
         super().__init__(state, title)
+        self._evaluated = evaluated
         self._why_unknown = why_unknown
-        self._evaluated = DesignInUse("", "")
-        self._figures: dict[str, Any] | None = None
-        self._problem = ""
-
-    def show_result(self, design: DesignInUse, output: str, status: int) -> None:
-        """Show what the command printed of a design."""
-        self._evaluated = design
-        self._figures, self._problem = None, ""
-        if status == 0:
-            self._figures = json.loads(output.strip().splitlines()[-1])
-        else:
-            self._problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
 
     def draw(self, columns: int, rows: int) -> list[Line]:
         """A row a figure."""
-        loop, newest = self.state.loop, self.state.newest
-        if loop is None or newest is None:
+        loop = self.state.loop
+        if loop is None:
             return []
         file = Path(loop.state.controller_file).name
         head = [text("design ", DIM), text(loop.state.controller, INK, bold=True)]
@@ -76,36 +109,33 @@ class Margins(Panel):
                 *lines,
                 *([text(line, DIM)] for line in textwrap.wrap(unknown, max(10, columns))),
             ]
-        if self._evaluated != design_in_use(loop.state):
-            return [*lines, [text("its margins are being worked out", DIM)]]
-        figures = self._figures
+        if self._evaluated.of != design_in_use(loop.state):
+            return [*lines, [text("computing its margins", DIM)]]
+        figures = self._evaluated.figures
         if figures is None:
-            return [*lines, [text(shorten(f"✗ {self._problem}", columns), RED)]]
+            return [*lines, [text(shorten(f"✗ {self._evaluated.problem}", columns), RED)]]
         if not figures["stable"]:
             return [*lines, [text("✗ unstable by the rig file's values", RED, bold=True)]]
-        since_s = newest.time_s - self.state.window.rms_s
-        rms = error_rms(loop.errors(self.state.window.rms_s), max(since_s, loop.state.since_s))
-        measured_px = max(rms.az_px, rms.el_px) if not math.isnan(rms.az_px) else math.nan
-        attenuation = "  ".join(
-            f"{figures[f'attenuation_{hz:g}hz']:.1f}× at {hz:g} Hz"
-            for hz in (0.1, 0.5, 1.0, 2.0)
-            if figures.get(f"attenuation_{hz:g}hz") is not None
-        )
+        attenuation = ""
+        for hz in (0.1, 0.5, 1.0, 2.0):
+            value = figures.get(f"attenuation_{hz:g}hz")
+            longer = attenuation if value is None else f"{attenuation}  {value:.1f}× at {hz:g} Hz"
+            if len(longer) - 2 <= columns - _NAME_COLUMNS:
+                attenuation = longer
         return [
             *lines,
             _figure("crossover", figures["crossover_hz"], "Hz"),
             _within("phase margin", figures["phase_margin_deg"], "°", least=LEAST_PHASE_DEG),
             _within("gain margin", figures["gain_margin_db"], "dB", least=LEAST_GAIN_DB),
             _within("sensitivity", figures["peak_sensitivity"], "at most", most=MOST_SENSITIVITY),
-            [text(f"{'attenuates':<14}", DIM), text(shorten(attenuation, columns - 14), INK)],
-            _figure("should leave", figures["residual_px"], "px, by linear theory", ".4f"),
-            _figure("measured", measured_px, "px, the worse axis", ".4f"),
+            [text("attenuates".ljust(_NAME_COLUMNS), DIM), text(attenuation.strip(), INK)],
+            _figure("should leave", figures["residual_px"], "px, true star", ".4f"),
         ][:rows]
 
 
 def _figure(name: str, value: float, unit: str, form: str = ".2f") -> Line:
     return [
-        text(f"{name:<14}", DIM),
+        text(name.ljust(_NAME_COLUMNS), DIM),
         text(f"{number(value, form):>8}", INK, bold=True),
         text(f" {unit}", DIM),
     ]

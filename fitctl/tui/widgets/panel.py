@@ -9,7 +9,8 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
-from fitctl.tui.look import INK, PAPER, Line, style
+from fitctl.tui.inks import INK, PAPER, RED
+from fitctl.tui.look import Line, faded, style, text
 from fitctl.tui.state import ConsoleState
 
 GROUND = style(INK, PAPER)  # the stylesheet's, which takes long to ask for at every line
@@ -29,6 +30,8 @@ class Panel(Widget, can_focus=False):
     ----------
     every : int
         It is drawn at each of so many beats of the console (:data:`fitctl.tui.app.BEAT_S`).
+    is_old : bool
+        What it shows is of the past: it is drawn in greys.
     """
 
     every: ClassVar[int] = 2
@@ -37,6 +40,7 @@ class Panel(Widget, can_focus=False):
         super().__init__(id=type(self).__name__.lower())
         self.state = state
         self.border_title = title
+        self.is_old = False
         self._strips: list[Strip] = []
 
     @abstractmethod
@@ -49,11 +53,21 @@ class Panel(Widget, can_focus=False):
         if not columns or not rows:
             return
         old = self._strips
-        self._strips = [Strip(line) for line in self.draw(columns, rows)[:rows]]
+        lines = self._lines(columns, rows)[:rows]
+        self._strips = [Strip(faded(line) if self.is_old else line) for line in lines]
         changed = [y for y, strip in enumerate(self._strips) if y >= len(old) or strip != old[y]]
         changed.extend(range(len(self._strips), len(old)))
         if changed:
             self.refresh(*(Region(0, y, columns, 1) for y in changed))
+
+    def _lines(self, columns: int, rows: int) -> list[Line]:
+        """What is drawn; of a log, whose values may be anything, also why nothing can be."""
+        try:
+            return self.draw(columns, rows)
+        except Exception as error:
+            if self.state.live:
+                raise
+            return [[text(f"✗ cannot be drawn: {type(error).__name__}: {error}", RED)]]
 
     def on_resize(self) -> None:
         """Fill the new size."""

@@ -6,8 +6,9 @@ import textwrap
 from collections.abc import Callable
 from typing import ClassVar
 
+from fitctl.tui.inks import DIM, GREEN, INK, RED, SKY
 from fitctl.tui.jobs import Job
-from fitctl.tui.look import DIM, GREEN, INK, RED, SKY, Line, shorten, text
+from fitctl.tui.look import Line, shorten, text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 

@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Iterator
+from typing import ClassVar
 
+import numpy as np
 from rich.segment import Segment
 
 from fitctl.config import QUANTITIES
 from fitctl.logging.records import DeviceHealth
 from fitctl.messages.telemetry import TrippedInterlock, Watched
+from fitctl.tui.draw import braille
+from fitctl.tui.inks import DIM, GREEN, INK, ORANGE, RED, SKY
 from fitctl.tui.look import (
     DEVICES,
-    DIM,
-    GREEN,
-    INK,
-    ORANGE,
-    RED,
-    SKY,
     Line,
     bar,
+    duration,
+    in_columns,
     number,
     shorten,
+    spread,
     text,
     wall,
     width,
 )
-from fitctl.tui.state import LoopView
+from fitctl.tui.state import ConsoleState, LoopView
 from fitctl.tui.widgets.choice import Choice
+from fitctl.tui.widgets.events import event_lines
+from fitctl.tui.widgets.panel import Panel
 
 NAME_COLUMNS = 21
 # What a device's link is measured by: a quantity, its unit as people write it, and what it is in it.
@@ -36,6 +41,8 @@ LINKS = {
     "D/A": ("dac_round_trip_s", "round trip", 1e3, "ms"),
 }
 UNITS = {"s": "s", "bytes": "GB", "rad": "rad", "v": "V", "fraction": "%", "periods": "periods"}
+ILL_FIRST = ("fault", "closed", "ok")
+USED_STEPS = 20  # a reading moves in its list when it has used a twentieth more of its limit
 FACTORS = {"bytes": 1e-9, "fraction": 100.0}
 
 
@@ -56,17 +63,29 @@ class DeviceList(Choice):
 
     def rows(self, columns: int) -> list[Line]:
         """All devices of the rig."""
-        return [self._row(device, columns) for device in self.devices()]
+        devices = self.devices()
+        names = max((len(device.device) for device in devices), default=0) + 1
+        return [self._row(device, names, columns) for device in devices]
+
+    def names(self) -> list[str]:
+        """Of the devices."""
+        return [device.device for device in self.devices()]
 
     def devices(self) -> list[DeviceHealth]:
-        """As telemetry has them."""
-        return self.state.newest.devices if self.state.newest else []
+        """Ill ones first, otherwise as telemetry has them."""
+        devices = self.state.newest.devices if self.state.newest else []
+        return sorted(devices, key=lambda device: ILL_FIRST.index(device.state))
 
-    def _row(self, device: DeviceHealth, columns: int) -> Line:
+    def now(self) -> DeviceHealth | None:
+        """The chosen device."""
+        known = self.devices()
+        return known[min(self.chosen, len(known) - 1)] if known else None
+
+    def _row(self, device: DeviceHealth, name_columns: int, columns: int) -> Line:
         look = DEVICES[device.state]
         line = [
             text(f"{look.symbol} ", look.colour, bold=True),
-            text(device.device.ljust(17), INK, bold=True),
+            text(device.device.ljust(name_columns), INK, bold=True),
             text(f"{device.state:<7}", look.colour),
             text(f"{self.link_of(device):<29}", INK),
         ]
@@ -95,8 +114,18 @@ class Readings(Choice):
     """Every row of the table of interlocks: what is measured, within what, and how far that is."""
 
     def watched(self) -> list[Watched]:
-        """Of the loop on the screen."""
-        return self.state.loop.state.watched if self.state.loop else []
+        """Of the loop on the screen: tripped ones first, then those nearest to their limits."""
+        loop = self.state.loop
+        if loop is None:
+            return []
+        tripped = {trip.name for trip in loop.state.interlocks}
+        return sorted(
+            loop.state.watched, key=lambda row: (row.name not in tripped, *_distance(row))
+        )
+
+    def names(self) -> list[str]:
+        """Of the interlocks."""
+        return [row.name for row in self.watched()]
 
     def head(self, columns: int) -> list[Line]:
         """Names of the columns."""
@@ -110,12 +139,95 @@ class Readings(Choice):
         if loop is None:
             return []
         tripped = {trip.name for trip in loop.state.interlocks}
-        return [_reading(row, columns, tripped=row.name in tripped) for row in loop.state.watched]
+        return [_reading(row, columns, tripped=row.name in tripped) for row in self.watched()]
 
     def now(self) -> Watched | None:
         """The chosen row."""
         rows = self.watched()
         return rows[self.chosen] if self.chosen < len(rows) else None
+
+
+class Detail(Panel):
+    """All about the chosen row of the list that has the focus, and its course.
+
+    Of a reading, its values beside its limits; of a device, the events that name it.
+    """
+
+    every: ClassVar[int] = 5
+
+    def __init__(
+        self, state: ConsoleState, title: str, devices: DeviceList, readings: Readings
+    ) -> None:
+        super().__init__(state, title)
+        self._devices = devices
+        self._readings = readings
+
+    def draw(self, columns: int, rows: int) -> list[Line]:
+        """Words at the left, the course at the right."""
+        loop, row, device = self.state.loop, self._readings.now(), self._devices.now()
+        if self._readings.has_focus and loop is not None and row is not None:
+            self.border_title = row.name
+            words = reading_lines(loop, row)
+            course = self._course(loop, row, columns // 2, rows)
+        elif device is not None:
+            self.border_title = device.device
+            words = device_lines(self._devices, device)
+            course = self._events_of(device, columns // 2, rows)
+        else:
+            return []
+        left = columns - columns // 2 - 2
+        lines = [
+            [text(f"{name if first else '':<11}", DIM), text(piece, INK)]
+            for name, content in words
+            for first, piece in _wrapped(content, left - 12)
+        ]
+        return in_columns(lines[:rows], left + 2, course)
+
+    def _course(self, loop: LoopView, row: Watched, columns: int, rows: int) -> list[Line]:
+        """The values that were kept, with dotted lines at the limits, and their scale."""
+        kept = np.array(loop.readings.get(row.name, ()), dtype=float).reshape(-1, 2)
+        values = kept[np.isfinite(kept[:, 1])]
+        if len(values) < 2 or rows < 4:
+            return [[text("no course yet", DIM)]]
+        limits = [limit for limit in (row.low, row.high) if limit is not None]
+        least = min([*limits, float(values[:, 1].min())])
+        most = max([*limits, float(values[:, 1].max())])
+        middle, half = (most + least) / 2, max(0.55 * (most - least), 1e-12)
+        now_s, span_s = float(values[-1, 0]), max(float(np.ptp(values[:, 0])), 1.0)
+        trace, guides = braille.empty(rows - 2, columns), braille.empty(rows - 2, columns)
+        braille.envelope(
+            trace, values[:, 0], values[:, 1] - middle, now_s=now_s, span_s=span_s, limit=half
+        )
+        for limit in limits:
+            braille.guide(guides, limit - middle, half, 3)
+        scale = f"{in_units(row.quantity, least)} to {in_units(row.quantity, most)}"
+        return [
+            [text(f"limits dotted; {scale}", DIM)],
+            *braille.layered([(guides, ORANGE), (trace, SKY)]),
+            spread(
+                [text(f"−{duration(span_s)}", DIM)],
+                [text(wall(self.state.wall_s(now_s)), DIM)],
+                columns,
+            ),
+        ]
+
+    def _events_of(self, device: DeviceHealth, columns: int, rows: int) -> list[Line]:
+        """What was reported of a device, newest first."""
+        words = device.device.split()
+        lines: list[Line] = []
+        for event in self.state.events:
+            said = f"{event.source} {event.message}"
+            if all(word in said for word in words):
+                lines += event_lines(event, self.state.wall_s(event.time_s), columns)
+            if len(lines) >= rows:
+                break
+        return lines or [[text("no event names it", DIM)]]
+
+
+def _wrapped(content: str, columns: int) -> Iterator[tuple[bool, str]]:
+    """Pieces of a text, and whether each is the first."""
+    for number_, piece in enumerate(textwrap.wrap(content, max(10, columns)) or [""]):
+        yield number_ == 0, piece
 
 
 def _reading(row: Watched, columns: int, *, tripped: bool) -> Line:
@@ -145,11 +257,28 @@ def _allowed(row: Watched) -> str:
     return f"≤ {high}" if high else f"≥ {low}" if low else "only not stale"
 
 
+def limit_used(row: Watched) -> float:
+    """How much of what is allowed is used, 1.0 at the limit; not-a-number without a value or a limit."""
+    value, low, high = row.value, row.low, row.high
+    used = []
+    if high is not None and high > 0:
+        used.append(abs(value) / high if low is None or low < 0 else value / high)
+    if low is not None and low > 0:
+        used.append(low / value if value > 0 else math.inf)
+    return max(used, default=math.nan)
+
+
+def _distance(row: Watched) -> tuple[bool, int, str]:
+    """The order of a list: what is judged first, then by how much is used, in steps that rarely change."""
+    used = limit_used(row)
+    steps = -math.floor(USED_STEPS * min(used, 10.0)) if not math.isnan(used) else 0
+    return not row.judged, steps, row.name
+
+
 def _gauge(row: Watched, columns: int, colour: str) -> list[Segment]:
-    """How much of what is allowed is used, where there is an upper limit."""
-    if row.high is None or row.high <= 0 or math.isnan(row.value):
-        return []
-    return bar(abs(row.value) / row.high, min(columns, 30), colour)
+    """How much of what is allowed is used."""
+    used = limit_used(row)
+    return bar(used, min(columns, 30), colour) if math.isfinite(used) else []
 
 
 def device_lines(devices: DeviceList, device: DeviceHealth) -> list[tuple[str, str]]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from fitctl.messages.telemetry import LoopLimits
 from fitctl.tui.draw import braille
-from fitctl.tui.look import DIM, FAINT, GREEN, INK, SKY, YELLOW, Line, in_columns, number, text
+from fitctl.tui.inks import DIM, FAINT, GREEN, INK, SKY, YELLOW
+from fitctl.tui.look import Line, in_columns, number, text
 from fitctl.tui.state import LoopView
 
 NOTES_COLUMNS = 24
@@ -18,12 +19,12 @@ _ANGLES = np.linspace(0, 2 * math.pi, 400)
 
 def search_lines(loop: LoopView, field_px: int, columns: int, rows: int) -> list[Line]:
     """A map with the search's numbers beside it; `field_px` is the camera's width."""
-    state, tick = loop.state, loop.tick
+    state, tick = loop.state, loop.beam or loop.tick
     if tick is None or state.limits is None or state.search_centre_sky_arcsec is None:
         return [[text("searching", YELLOW)]]
     centre = np.array(state.search_centre_sky_arcsec)
     here = np.array([tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec])
-    field_arcsec = field_px * state.sky_arcsec_per_px
+    field_arcsec = 0.0 if loop.beam else field_px * state.sky_arcsec_per_px
     limits = state.limits
     if state.search_again is not None:
         radius = state.search_again.radius_sky_arcsec
@@ -72,15 +73,25 @@ def _map(
 
 
 def _notes(loop: LoopView, limits: LoopLimits, here: np.ndarray, field_arcsec: float) -> list[Line]:
-    tick = loop.tick
-    progress = tick.search_progress if tick else math.nan
+    tick, beam = loop.tick, loop.beam
+    searching = beam or tick
+    progress = searching.search_progress if searching else math.nan
     found = tick is not None and tick.star_visible
+    if beam is not None:
+        found = math.isfinite(beam.beam_az_arcsec)
+    what = "star" if beam is None else "beam"
+    field = [[text("▯ ", GREEN), text(f"field, {field_arcsec:.0f}″", DIM)]] if field_arcsec else []
     return [
         [text("searched ", DIM), text(f"{number(100 * progress, '.0f')} %", INK, bold=True)],
         [text("at ", DIM), text(f"{number(here[0], '+.0f')}″ {number(here[1], '+.0f')}″", INK)],
-        [text("● a star is seen" if found else "○ no star yet", GREEN if found else YELLOW)],
+        [
+            text(
+                f"● a {what} is seen" if found else f"○ no {what} yet",
+                GREEN if found else YELLOW,
+            )
+        ],
         [],
         [text("─ ", YELLOW), text("way so far", DIM)],
-        [text("▯ ", GREEN), text(f"field, {field_arcsec:.0f}″", DIM)],
+        *field,
         [text("· ", SKY), text(f"radius {limits.search_radius_sky_arcsec:g}″", DIM)],
     ]

@@ -8,26 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from textual.strip import Strip
 
-from fitctl.logging.records import Tick
+from fitctl.logging.records import MetrologyTick, Tick
 from fitctl.tui.draw import braille
-from fitctl.tui.look import (
-    DIM,
-    FAINT,
-    GREEN,
-    INK,
-    ORANGE,
-    PAPER,
-    RED,
-    SKY,
-    YELLOW,
-    Line,
-    bar,
-    in_columns,
-    number,
-    pad,
-    text,
-    width,
-)
+from fitctl.tui.inks import DIM, FAINT, GREEN, INK, ORANGE, PAPER, RED, SKY, YELLOW
+from fitctl.tui.look import Line, bar, faded, in_columns, number, pad, text, width
 from fitctl.tui.state import LoopView
 from fitctl.tui.widgets.panel import Panel
 
@@ -36,14 +20,26 @@ NUMBER_COLUMNS = 28
 NAME_COLUMNS = 6
 STACKS_LIMIT_FROM_COLUMNS = 38
 TRAIL_S = 10.0
+OLD_FROM_S = 1.0
 
 
 class Stages(Panel):
-    """The diamond at the left, numbers at the right."""
+    """The diamond at the left, numbers at the right; of a metrology loop photodiodes and siderostat."""
 
     def draw(self, columns: int, rows: int) -> list[Line]:
-        """As many rows of numbers as there is room for, the weightiest first."""
+        """As many rows of numbers as there is room for, the weightiest first; in greys while nothing ticks."""
+        loop, newest = self.state.loop, self.state.newest
+        record = (loop.beam or loop.tick) if loop else None
+        lines = self._numbers(columns, rows)
+        is_old = newest and record and newest.time_s - record.time_s > OLD_FROM_S
+        return list(map(faded, lines)) if is_old else lines
+
+    def _numbers(self, columns: int, rows: int) -> list[Line]:
         loop = self.state.loop
+        if loop is not None and loop.beam is not None:
+            self.border_title = "Photodiodes and siderostat"
+            return _of_beam(loop, loop.beam, columns)[:rows]
+        self.border_title = "Mirror and siderostat"
         tick = loop.tick if loop else None
         if loop is None or tick is None:
             return []
@@ -55,6 +51,28 @@ class Stages(Panel):
         numbers = _numbers(loop, tick, columns - left, rows)[:rows]
         numbers += [[] for _ in range(rows - len(numbers))]
         return in_columns([*([] for _ in range(above)), *picture], left, numbers)
+
+
+def _of_beam(loop: LoopView, beam: MetrologyTick, columns: int) -> list[Line]:
+    """Where the beam is, the light on each photodiode, and the siderostat, the weightiest first."""
+    diodes_v = (
+        ("az + −", beam.diode_az_plus_v, beam.diode_az_minus_v),
+        ("el + −", beam.diode_el_plus_v, beam.diode_el_minus_v),
+    )
+    return [
+        _row("beam", _pair(beam.beam_az_arcsec, beam.beam_el_arcsec, "+.2f"), "″"),
+        _siderostat(loop, beam, columns),
+        _to_go(beam),
+        *(_row(name, _pair(plus_v, minus_v, ".2f"), "V") for name, plus_v, minus_v in diodes_v),
+        _row("rate", _pair(beam.rate_az_arcsec_s, beam.rate_el_arcsec_s, "+.1f"), "″/s"),
+    ]
+
+
+def _to_go(tick: Tick | MetrologyTick) -> Line:
+    """How far the siderostat is from its set-point."""
+    az_rad = tick.siderostat_setpoint_az_rad - tick.siderostat_az_rad
+    el_rad = tick.siderostat_setpoint_el_rad - tick.siderostat_el_rad
+    return _row("to go", _pair(1e3 * az_rad, 1e3 * el_rad, "+.1f"), "mrad")
 
 
 def working_point(tick: Tick) -> tuple[float, float]:
@@ -94,11 +112,7 @@ def _numbers(loop: LoopView, tick: Tick, columns: int, rows: int) -> list[Line]:
     stacks_v = (tick.stack1_v, tick.stack2_v, tick.stack3_v)
     stacks = _row("D/A", " ".join(number(v, ".2f") for v in stacks_v), "V")
     siderostat = _siderostat(loop, tick, columns)
-    behind_rad = (
-        tick.siderostat_setpoint_az_rad - tick.siderostat_az_rad,
-        tick.siderostat_setpoint_el_rad - tick.siderostat_el_rad,
-    )
-    behind = _row("to go", _pair(1e3 * behind_rad[0], 1e3 * behind_rad[1], "+.1f"), "mrad")
+    behind = _to_go(tick)
     if rows <= 4:
         last = _search_bar(tick, columns) if tick.mode == "ACQUISITION" else behind
         return [mirror, stacks, siderostat, last]
@@ -123,7 +137,7 @@ def _pair(az: float, el: float, form: str) -> str:
     return f"{number(az, form):>8} {number(el, form):>8}"
 
 
-def _siderostat(loop: LoopView, tick: Tick, columns: int) -> Line:
+def _siderostat(loop: LoopView, tick: Tick | MetrologyTick, columns: int) -> Line:
     """On the sky, beside how far it may go, in the widest form that has room."""
     az_arcsec, el_arcsec = tick.siderostat_az_sky_arcsec, tick.siderostat_el_sky_arcsec
     wide = _pair(az_arcsec, el_arcsec, "+.1f").rjust(17)

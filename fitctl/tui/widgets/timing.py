@@ -7,21 +7,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.tui.look import (
-    DIM,
-    FAINT,
-    GREEN,
-    INK,
-    ORANGE,
-    PINK,
-    SKY,
-    YELLOW,
-    Line,
-    bar,
-    number,
-    spread,
-    text,
-)
+from fitctl.tui.inks import DIM, FAINT, GREEN, INK, PINK, SKY, VIOLET, YELLOW
+from fitctl.tui.look import Line, bar, number, spread, text, width
 from fitctl.tui.widgets.panel import Panel
 
 LONG_FROM_COLUMNS = 56
@@ -45,7 +32,7 @@ class Histograms(Panel):
         lines: list[Line] = []
         for name, values_s, colour in (
             ("compute", past[:, 0], SKY),
-            ("frame age", past[:, 1], ORANGE),
+            ("frame age", past[:, 1], VIOLET),
         ):
             lines += histogram(name, 1e3 * values_s[np.isfinite(values_s)], colour, columns, height)
         return lines
@@ -110,9 +97,9 @@ class Breakdown(Panel):
                 text("".join(f"{number(value, '.2f'):>8}" for value in (middle, late, worst)), INK),
                 text("  "),
             ]
-            share = 0.0 if name == "frame" else 1e-3 * middle / longest_s
             room = columns - 60
-            if room >= 6 and name != "frame":
-                line += [*bar(share, room, colour), text("  ")]
-            lines.append([*line, text(meaning, DIM)])
+            if room >= 6 and name != "frame" and longest_s > 0:
+                line += [*bar(1e-3 * middle / longest_s, room, colour), text("  ")]
+            whole = [*line, text(meaning, DIM)]
+            lines.append(whole if width(whole) <= columns else line)
         return lines[:rows]

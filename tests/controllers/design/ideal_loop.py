@@ -4,7 +4,7 @@ from collections import deque
 
 import numpy as np
 
-from fitctl.controllers.design.sampled import timing
+from fitctl.controllers.design.linear_loop.sampled import timing
 from fitctl.controllers.pair import Measurement, Pair
 from fitctl.model.optics import scales
 

@@ -12,7 +12,7 @@ from fitctl.controllers.design.coarse import (
     siderostat_response,
 )
 from fitctl.controllers.design.eq20 import eq20_zpk
-from fitctl.controllers.design.loopshape import compensator_response
+from fitctl.controllers.design.linear_loop.loopshape import compensator_response
 
 HALF_WIDTH_PX = 0.185
 

@@ -4,7 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from fitctl.controllers.design.loopshape import compensator_response
+from fitctl.controllers.design.linear_loop.loopshape import compensator_response
 from fitctl.controllers.design.lqg_ltr import (
     COMPARED_RAD_S,
     design_lqg_ltr,

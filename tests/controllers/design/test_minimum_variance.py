@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from ideal_loop import run_pair
 
-from fitctl.controllers.design.bound import bound, linear_residual
 from fitctl.controllers.design.choose import DESIGNS
+from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 
 NO_LIMIT_RAD = 1e6
 

@@ -5,7 +5,7 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
-from fitctl.controllers.design.bound import bound
+from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.simulation.simulation import simulate
 
 WORSE_STAGES = (

@@ -64,6 +64,7 @@ def driver(script):
             f"{DEVICE}.port={script.port}",
             "loops.right.siderostat.servo.rate_hz=100.0",
             "loops.right.siderostat.servo.gain_per_s=40.0",
+            "loops.right.siderostat.servo.following_error_limit_rad=2.0",
         ],
     )
     driver = BalAnalogAmplifiers(rig.loops["right"].siderostat)
@@ -222,6 +223,15 @@ def test_a_late_answer_is_taken_when_it_comes_and_dated_by_its_own_request(drive
     asked_s = time.monotonic()
     reading = driver.exchange(STILL)
     assert started_s < reading.time_s < asked_s + 0.5 * (time.monotonic() - started_s)
+
+
+def test_an_exchange_waits_for_answers_until_its_period_ends(driver, monkeypatch):
+    driver.open()
+    deadlines_s = []
+    monkeypatch.setattr(driver._link, "receive", deadlines_s.append)
+    before_s = time.monotonic()
+    driver.exchange(STILL)
+    assert before_s + 0.01 <= deadlines_s[0] <= time.monotonic() + 0.01
 
 
 def test_an_answer_that_is_lost_costs_one_reading(driver, script):

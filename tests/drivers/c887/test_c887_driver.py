@@ -285,6 +285,13 @@ def test_silence_ends_within_the_time_limit(scripted):
     assert time.monotonic() - started_s < 1.0
 
 
+def test_a_move_that_is_not_confirmed_is_named(scripted):
+    driver, _ = scripted({"ERR?": ["0", ""]})
+    driver.open()
+    with pytest.raises(DeviceTimeout, match=r"MOV X .* within 0\.2 s"):
+        driver.move_to(Pose(), 8.0)
+
+
 @pytest.mark.parametrize("answer", ["X=word", "X=1 \nY=1", "X=1\nX=1", "Y=M-850", "\x01"])
 def test_an_answer_that_is_none_ends_the_connection(scripted, answer):
     driver, _ = scripted({"VLS?": answer})

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import struct
 import tracemalloc
 import zipfile
 from pathlib import Path
 
 import pytest
+from gige_served import camera_settings
 
 from fitctl.drivers.gige import protocol as p
 from fitctl.drivers.gige.features import Features, unpacked
@@ -136,3 +138,73 @@ def test_a_description_that_declares_a_document_type_is_refused(declaration: str
 
 def test_a_description_may_have_a_byte_order_mark_and_zeros_after_it() -> None:
     assert unpacked(b"\xef\xbb\xbf<x/>\0\0\0", "test") == "<x/>"
+
+
+AUTOMATIC = ("ExposureAuto", "GainAuto", "AcquisitionFrameRateAuto", "GevGVSPExtendedIDMode")
+SWITCHES = {  # and how each is to be
+    "AcquisitionFrameRateEnable": True,
+    "AcquisitionFrameRateEnabled": True,
+    "ChunkModeActive": False,
+}
+ADDRESSES = {name: 0xB000 + 4 * at for at, name in enumerate((*AUTOMATIC, *SWITCHES))}
+
+
+def richer_description() -> str:
+    """The mock's, with every feature that could change a picture by itself."""
+    nodes = [
+        f'<Enumeration Name="{name}"><EnumEntry Name="Off"><Value>0</Value></EnumEntry>'
+        f'<EnumEntry Name="Continuous"><Value>2</Value></EnumEntry><pValue>{name}Reg</pValue></Enumeration>'
+        for name in AUTOMATIC
+    ]
+    nodes += [
+        f'<Boolean Name="{name}"><pValue>{name}Reg</pValue><OnValue>1</OnValue><OffValue>0</OffValue></Boolean>'
+        for name in SWITCHES
+    ]
+    nodes += [
+        f'<IntReg Name="{name}Reg"><Address>{address}</Address><Length>4</Length><AccessMode>RW</AccessMode>'
+        "<pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>"
+        for name, address in ADDRESSES.items()
+    ]
+    return DESCRIPTION.replace("</RegisterDescription>", "".join(nodes) + "</RegisterDescription>")
+
+
+class Registers(Memory):
+    """A camera's memory that keeps what is written to it."""
+
+    def __init__(self, description: str, words: dict[int, int]) -> None:
+        content = description.encode()
+        super().__init__(f"Local:camera.xml;{XML_ADDRESS:X};{len(content):X}", content)
+        self.words = words
+
+    def read_register(self, address: int) -> int:
+        return self.words.get(address, 0)
+
+    def write_register(self, address: int, value: int) -> None:
+        self.words[address] = value
+
+    def read_memory(self, address: int, length: int) -> bytes:
+        if address == XML_ADDRESS:
+            return super().read_memory(address, length)
+        return p.encode_words(*(self.read_register(address + at) for at in range(0, length, 4)))
+
+    def write_memory(self, address: int, data: bytes) -> None:
+        for at in range(0, len(data), 4):
+            self.write_register(address + at, int.from_bytes(data[at : at + 4], "big"))
+
+
+def test_nothing_of_a_camera_stays_automatic() -> None:
+    settings = camera_settings()
+    pixels = settings.width_px * settings.height_px
+    # The largest width and height, the bytes of a picture, and an exposure.
+    words = {0xA028: 640, 0xA02C: 480, 0xA014: 2 * pixels}
+    words |= dict(
+        zip((0xA030, 0xA034), struct.unpack(">II", struct.pack(">d", 1000.0)), strict=True)
+    )
+    words |= dict.fromkeys(ADDRESSES.values(), 2)
+    words |= {ADDRESSES[name]: not wanted for name, wanted in SWITCHES.items()}
+    camera = Registers(richer_description(), words)
+    Features(camera).configure(settings)
+    assert {name: camera.words[ADDRESSES[name]] for name in AUTOMATIC} == dict.fromkeys(
+        AUTOMATIC, 0
+    )
+    assert {name: camera.words[ADDRESSES[name]] for name in SWITCHES} == SWITCHES

@@ -137,3 +137,20 @@ def test_memory_from_another_address_is_passed_over(scripts: list[Script]) -> No
     channel = ControlChannel("127.0.0.1", scripts[-1].port, timeout_s=0.6)
     assert channel.read_memory(0x1000, 4) == p.encode_words(2)
     channel.close()
+
+
+def test_what_expects_no_answer_asks_for_none(scripts: list[Script]) -> None:
+    script = Script([], [])
+    scripts.append(script)
+    channel = ControlChannel("127.0.0.1", script.port, timeout_s=0.1)
+    try:
+        channel.request_resend(p.Resend(0, 7, 2, 5))
+        channel.release_unheard()
+        script.close()
+    finally:
+        channel.close()
+    resend, release = script.commands
+    assert (resend.command, resend.flags) == (p.Command.PACKETRESEND, 0)
+    assert resend.payload == p.encode_resend(p.Resend(0, 7, 2, 5))
+    assert (release.command, release.flags) == (p.Command.WRITEREG, 0)
+    assert release.payload == p.encode_words(p.Register.CONTROL_PRIVILEGE, 0)

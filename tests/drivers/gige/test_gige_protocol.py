@@ -22,6 +22,10 @@ def test_reading_the_control_privilege_on_the_wire() -> None:
     assert p.decode_answer(answer) == p.AnswerPacket(0, 0x81, 7, b"\0\0\0\2")
 
 
+def test_a_discovery_on_the_wire() -> None:
+    assert p.encode_command(p.Command.DISCOVERY, 1) == bytes.fromhex("42 01 0002 0000 0001")
+
+
 def test_a_refusal_on_the_wire() -> None:
     refusal = p.encode_answer(p.Command.WRITEREG + 1, 9, status=p.Status.ACCESS_DENIED)
     assert refusal == bytes.fromhex("8006 0083 0000 0009")

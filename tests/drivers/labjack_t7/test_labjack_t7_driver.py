@@ -115,7 +115,7 @@ def script():
 
 @pytest.fixture
 def driver(script):
-    driver = LabJackT7(device_at(script.port))
+    driver = LabJackT7(device_at(script.port), check_every_s=math.inf)
     yield driver
     driver.close()
 
@@ -491,6 +491,68 @@ def test_pymodbus_own_server_is_a_station_too(in_loop):
     in_loop(server.shutdown())
 
 
+# ---------------------------------------------------------------- its settings, while it samples
+
+READ_SAMPLE, READ_SETTINGS = "03 00 00 00 08", "03 ab 7c 00 06"
+
+
+def test_settings_are_read_beside_a_sample_now_and_then(script):
+    with contextlib.closing(LabJackT7(device_at(script.port), check_every_s=0.1)) as driver:
+        driver.open()
+        opened = len(script.requests)
+        for _ in range(25):
+            driver.send_request()
+            assert sampled(driver).volts == (5.0, 4.0, 3.0, 2.0)
+            time.sleep(0.02)
+    asked = script.requests[opened:]
+    assert asked.count(READ_SAMPLE) == 25
+    assert 3 <= asked.count(READ_SETTINGS) <= 25
+    assert asked[0] == READ_SAMPLE
+
+
+@pytest.mark.parametrize(
+    ("address", "words", "got"),
+    [
+        (43900, float32(1.0), "43900 to read 10, as it was set, got 1"),
+        (
+            43900,
+            float32(-9999.0),
+            "43900 to read 10, as it was set, got other values of some inputs",
+        ),
+        (43900, float32(math.nan), "got nan"),
+        (43902, [1], "43902 to read 199, as it was set, got 1"),
+        (43903, [8], "43903 to read 4, as it was set, got 8"),
+        (43904, float32(100.0), "43904 to read 0, as it was set, got 100"),
+    ],
+)
+def test_a_setting_that_another_client_changes_is_a_mismatch_until_it_is_opened_again(
+    script, address, words, got
+):
+    with contextlib.closing(LabJackT7(device_at(script.port), check_every_s=0.0)) as driver:
+        driver.open()
+        driver.send_request()
+        sampled(driver)
+        script.put(address, words)
+        with pytest.raises(DeviceMismatch, match="another client") as error:
+            ask_every_20_ms(driver)
+        assert got in str(error.value)
+        driver.open()
+        ask_every_20_ms(driver)
+
+
+def test_settings_that_are_not_answered_hold_up_no_sample(script):
+    def respond(message):
+        return b"" if message.pdu.hex(" ") == READ_SETTINGS else script.answer(message)
+
+    with contextlib.closing(LabJackT7(device_at(script.port), check_every_s=0.0)) as driver:
+        driver.open()
+        script.respond = respond
+        for _ in range(20):
+            driver.send_request()
+            assert sampled(driver).volts == (5.0, 4.0, 3.0, 2.0)
+            time.sleep(0.02)
+
+
 # ---------------------------------------------------------------- with the mock
 
 
@@ -587,6 +649,21 @@ def test_a_turned_bit_is_an_error_a_lost_sample_or_a_voltage_within_the_range(be
         with contextlib.suppress(DeviceError):
             assert all(abs(value) <= 11.5 for value in sampled(driver).volts)
     driver.close()
+
+
+def test_a_range_that_another_client_changes_is_noticed_and_opening_writes_it_again(
+    bench, opened, wrong
+):
+    opened.send_request()
+    sampled(opened)
+    wrong("range_changed")
+    since_s = time.monotonic()
+    with pytest.raises(DeviceMismatch, match="43900 to read 10"):
+        ask_every_20_ms(opened)
+    assert time.monotonic() - since_s < 0.1 + 3 * AT_ONCE_S
+    opened.open()
+    opened.send_request()
+    assert sampled(opened).volts == pytest.approx(bench.volts, abs=1e-3)
 
 
 def test_a_probe_says_who_it_is_and_writes_nothing(script):

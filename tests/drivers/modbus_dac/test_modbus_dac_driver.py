@@ -274,7 +274,7 @@ def test_over_rtu_an_answer_that_comes_again_during_the_next_request_is_no_answe
 
 def test_a_turned_bit_is_an_error_or_harmless_and_never_another_voltage(station, wrong):
     volts = np.array([1.0, 2.0, 3.0])
-    hurried = station.model_copy(update={"response_timeout_s": 0.05})
+    hurried = station.model_copy(update={"response_timeout_s": 0.25})
     driver = ModbusDac(hurried)
     seen = set()
     for _ in range(8):
@@ -360,8 +360,8 @@ def test_over_rtu_the_wrong_unit_or_baud_rate_is_silence(mock, changes, says):
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
-        (["transport='rtu'"], "serial_port must name a port"),
-        (["transport='rtu'", "serial_port='/dev/ttyUSB0'", "device_id=0"], "device_id must be"),
+        (["transport='rtu'"], "serial_port must be a serial port"),
+        (["transport='rtu'", "serial_port='/dev/ttyUSB0'", "device_id=0"], "device_id: must be"),
         (["serial_format='7E1'"], "serial_format"),
         (["first_register=65534"], "first_register"),
     ],

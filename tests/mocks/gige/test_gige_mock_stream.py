@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 
+import numpy as np
 import pytest
 from gige_asked import (
     ME,
@@ -17,7 +18,9 @@ from gige_asked import (
     write,
     write_double,
 )
+from numpy.typing import NDArray
 
+from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.gige import protocol as p
 from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.gige.memory import TICKS_PER_S, Feature
@@ -137,6 +140,32 @@ def test_frames_that_a_delay_leaves_no_time_for_are_left_out() -> None:
                 await asyncio.sleep(0.01)
 
     scenario(check)
+
+
+def test_a_picture_that_motion_smears_is_asked_for_when_its_exposure_has_ended() -> None:
+    asked: list[float] = []
+
+    def picture(middle_s: float) -> NDArray[np.uint16]:
+        asked.append(time.monotonic() - middle_s)
+        return np.zeros((40, 40), np.uint16)
+
+    async def check() -> None:
+        rig = load_rig(default_rig_path())
+        _, mocks = rig.mock_parts()
+        mock = GigeCameraMock(rig.camera, mocks.camera, picture, port=0, smears=True)
+        await mock.start()
+        try:
+            async with streaming(mock) as client:
+                write_double(mock, Feature.FRAME_RATE_HZ, 10.0)
+                write_double(mock, Feature.EXPOSURE_TIME_US, 80_000.0)
+                write(mock, Feature.ACQUISITION_START, 1)
+                await received(client)
+        finally:
+            await mock.stop()
+
+    asyncio.run(check())
+
+    assert asked[0] > 0.04 - 0.002  # an event loop may wake a little early
 
 
 def test_with_the_trigger_on_each_trigger_is_one_frame() -> None:

@@ -1,0 +1,72 @@
+"""`fitctl design learn`: from a log to the night that it shows, and to a pair for that night."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fitctl.commands.shared.printing import say_lines, to_json
+from fitctl.commands.shared.rig import require_loop, rig_of
+from fitctl.config import ConfigError
+from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.choose import solving
+from fitctl.controllers.design.files import save_design
+from fitctl.controllers.design.theory import loop_theory
+from fitctl.figures.attenuation import mirror_at_exposure_rad
+from fitctl.identify.record import axis_pair
+from fitctl.learn.advice import Advice, advise
+from fitctl.learn.opened import rebuild
+from fitctl.report.gather import gather
+from fitctl.report.rejection import last_design
+from fitctl.report.run import Run, find_run
+from fitctl.report.selection import select_frames
+
+
+def learn(
+    logs: list[Path],
+    rig: Path | None,
+    overrides: list[str] | None,
+    loop: str,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Print a night's estimates and what designs leave of it; write the learnt design to `out`.
+
+    Raises
+    ------
+    ConfigError
+        If the log shows too little of the loop, or no design has the margins.
+    LogError
+        If the log cannot be read.
+    """
+    if not logs:
+        msg = "design learn: expected a log; name one: fitctl design learn night.mcap"
+        raise ConfigError(msg)
+    run = find_run(logs, rig_of(rig, overrides) if rig or overrides else None)
+    require_loop("design learn", run.rig, loop)
+    with solving("design learn", loop):
+        found = _advice(run, loop)
+    if out is not None:
+        save_design(found.design, out)
+    say_lines(to_json(found.numbers()) if as_json else "\n".join(found.lines_of_text()))
+    if out is not None and not as_json:
+        say_lines(f"written: {out} (name it in loops.{loop}.vernier.controller)")
+
+
+def _advice(run: Run, loop_name: str) -> Advice:
+    rig, gathered = run.rig, gather(run)
+    loop, ticks = rig.stellar_loops[loop_name], gathered.ticks[loop_name]
+    present = last_design(gathered, loop_name)
+    pieces = select_frames(ticks, rig.camera.period_s, loop.requirement_px).pieces
+    series = rebuild(
+        loop_theory(rig, loop_name, present),
+        ticks,
+        pieces,
+        mirror_at_exposure_rad(loop.fsm, ticks),
+    )
+    rows = np.concatenate([np.empty(0, np.intp), *pieces])
+    error_px = axis_pair(ticks, "error_{}_px")[rows]
+    az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(rows) else (0.0, 0.0)
+    return advise(series, (az_px, el_px), basis(rig, loop_name), present)

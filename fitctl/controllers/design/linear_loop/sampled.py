@@ -1,0 +1,139 @@
+"""One axis of the loop from frame to frame, linear and exact: what a design meets.
+
+A frame exposed at k T leads to a command at k T + delay; the mirror holds it for one period T, and the
+siderostat walks there in a straight line (its 45 Hz servo is left out: it lags a walk of at most a few
+hundredths of a pixel per second). The delay may be any fraction of a period.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm
+
+from fitctl.controllers.design.basis import Basis
+from fitctl.controllers.design.linear_loop.disturbance import Disturbance
+from fitctl.controllers.pair import Design
+
+Floats = NDArray[np.float64]
+_NODES = 8  # of Gauss-Legendre: exact to rounding for anything smooth over one period
+_ROUNDING = 1e-9
+
+
+class Timing(NamedTuple):
+    """How a delay falls into frames.
+
+    Attributes
+    ----------
+    frames : int
+        At mid-exposure of frame k the mirror holds what came of frame k - frames: 2 on FIT.
+    walked : float
+        And the siderostat has walked this part of what came of the same frame: 0.25 on FIT.
+    """
+
+    frames: int
+    walked: float
+
+
+def timing(period_s: float, delay_s: float) -> Timing:
+    """How `delay_s` falls into frames."""
+    frames = max(1, math.ceil(delay_s / period_s - _ROUNDING))
+    return Timing(frames, frames - delay_s / period_s)
+
+
+class SampledLoop(NamedTuple):
+    """A design on its stages, opened at the camera: x+ = a x + b error.
+
+    Attributes
+    ----------
+    a, b : arrays, shapes (n, n), (n,)
+    star : array, shape (n,)
+        The star's motion by both stages at mid-exposure is ``star @ x``.
+    command, command_error : arrays, shapes (2, n), (2,)
+        The pair's outputs are ``command @ x + command_error * error``.
+    motor_held : array, shape (n,)
+        Where the siderostat is when that command begins.
+    """
+
+    a: Floats
+    b: Floats
+    star: Floats
+    command: Floats
+    command_error: Floats
+    motor_held: Floats
+
+    @property
+    def stable(self) -> bool:
+        """Closed at the camera, every course of it dies away."""
+        closed = self.a + np.outer(self.b, self.star)
+        return bool(np.abs(np.linalg.eigvals(closed)).max() < 1.0)
+
+
+def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
+    """A design, which may have been made for another delay, on the stages of a loop."""
+    frames, walked = timing(basis.period_s, basis.delay_s)
+    # The stages' memory: mirror commands 1 to `frames` frames old, siderostat positions 0 to `frames`.
+    size = 2 * frames + 1
+    newest_motor = frames
+    advance = np.zeros((size, size))
+    advance[1:frames, : frames - 1] = np.eye(frames - 1)
+    advance[newest_motor, newest_motor] = 1.0
+    advance[newest_motor + 1 :, newest_motor:-1] = np.eye(frames)
+    drive = np.zeros((size, 2))
+    drive[0, 0] = drive[newest_motor, 1] = 1.0
+    mirror, motor = np.zeros(size), np.zeros(size)
+    mirror[frames - 1] = 1.0
+    motor[-1], motor[-2] = 1.0 - walked, walked
+    # Within the design: its inputs are the error, and what the stages had done (see `Design`).
+    from_stages = np.zeros((5, size))
+    from_stages[2], from_stages[3] = mirror, motor
+    command = np.hstack([design.d @ from_stages, design.c])
+    command_error = design.d[:, 0]
+    n = len(design.a)
+    a = block_diag(advance, design.a)
+    a[:size] += drive @ command
+    a[size:, :size] = design.b @ from_stages
+    return SampledLoop(
+        a=a,
+        b=np.concatenate([drive @ command_error, design.b[:, 0]]),
+        star=np.concatenate([basis.mirror_gain * mirror + motor, np.zeros(n)]),
+        command=command,
+        command_error=command_error,
+        motor_held=np.eye(size + n)[newest_motor],
+    )
+
+
+class Hold(NamedTuple):
+    """The time for which a command acts, as nodes of a quadrature.
+
+    Attributes
+    ----------
+    part, weight : arrays, shape (nodes,)
+        Place within the hold, from 0 to 1, and weight, of sum 1.
+    star : array, shape (nodes, n)
+        The star's own motion there is this of the disturbance's state at mid-exposure,
+    new_px2 : array, shape (nodes,)
+        and besides something new of this variance.
+    """
+
+    part: Floats
+    weight: Floats
+    star: Floats
+    new_px2: Floats
+
+
+def hold(moving: Disturbance, period_s: float, delay_s: float) -> Hold:
+    """The time from `delay_s` after mid-exposure to one period later."""
+    a, seen = moving.a, moving.seen
+    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    part = (node + 1) / 2
+    times_s = delay_s + part * period_s
+    return Hold(
+        part=part,
+        weight=weight / 2,
+        star=np.array([seen @ expm(a * time_s) for time_s in times_s]),
+        new_px2=np.array([seen @ moving.over(time_s)[1] @ seen for time_s in times_s]),
+    )

@@ -1,0 +1,91 @@
+"""What the rig file and a design say of a loop's error, for its error budget."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.controllers.design.basis import Basis, basis, basis_of, on_its_mirror
+from fitctl.controllers.design.choose import DESIGNS
+from fitctl.controllers.design.linear_loop.loopshape import sampled_response
+from fitctl.controllers.feedforward import link_matrix
+from fitctl.controllers.pair import Design
+from fitctl.error_budget import LoopTheory
+from fitctl.model.optics import motor_sky_rad_per_rad, scales, star_rate_px_s
+
+_LOWEST_HZ = 0.005
+_POINTS = 300
+_QUICKER = 20
+"""So many times the frame rate stands for a loop without hold."""
+
+
+def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
+    """Sensitivity, disturbance and scales of a rig's loop with a design.
+
+    Raises
+    ------
+    ConfigError
+        If the rig file knows of no disturbance.
+    """
+    loop = rig.stellar_loops[loop_name]
+    its_basis = on_its_mirror(basis(rig, loop_name), design.parameters)
+    scale = scales(rig, loop)
+    frequency_hz = np.geomspace(_LOWEST_HZ, 0.5 / its_basis.period_s, _POINTS)
+    omega_rad_s = 2 * math.pi * frequency_hz
+    quick = _without_delay_and_hold(its_basis)
+    quick_design = DESIGNS[design.name](
+        dataclasses.replace(basis_of(design.parameters, quick), noise_px=quick.noise_px)
+    )
+    air = its_basis.air_path
+    motor_px_per_rad = scale.motor_px(np.eye(2)).T
+    link_px_per_rad, link_backlash_rad = np.zeros((2, 2)), math.nan
+    if loop.link is not None:
+        link = rig.loops[loop.link].siderostat
+        matrix = np.eye(2) if loop.feedforward is None else loop.feedforward.matrix
+        link_px_per_rad = motor_px_per_rad @ link_matrix(
+            1.0, matrix, motor_sky_rad_per_rad(link), motor_sky_rad_per_rad(loop.siderostat)
+        )
+        link_backlash_rad = _half_width_rad(
+            link.backlash_sky_arcsec, motor_sky_rad_per_rad(link) * ARCSEC_PER_RAD
+        )
+    return LoopTheory(
+        frequency_hz=frequency_hz,
+        sensitivity=1 / (1 + sampled_response(design, its_basis)(omega_rad_s)),
+        undelayed=1 / np.abs(1 + sampled_response(quick_design, quick)(omega_rad_s)),
+        # Eq. 8 and 9 with white noise of unit intensity, on both sides of zero.
+        air_px2_per_hz=2
+        * air.gain_px**2
+        / np.abs(1 - air.b1_s2 * omega_rad_s**2 + 1j * air.b2_s * omega_rad_s) ** 2,
+        noise_px=its_basis.noise_px,
+        flux_dn=loop.star_flux_dn,
+        period_s=its_basis.period_s,
+        mirror_px_per_rad=scale.mirror_px(np.eye(2)).T,
+        motor_px_per_rad=motor_px_per_rad,
+        hysteresis_known=loop.fsm.hysteresis is not None,
+        backlash_rad=_half_width_rad(
+            loop.siderostat.backlash_sky_arcsec, scale.motor_sky_arcsec_per_rad
+        ),
+        link_px_per_rad=link_px_per_rad,
+        star_rate_px_s=star_rate_px_s(loop.star_rate_sky_arcsec_s, scale),
+        link_backlash_rad=link_backlash_rad,
+    )
+
+
+def _without_delay_and_hold(its_basis: Basis) -> Basis:
+    """The same star under a camera many times as fast, whose frames are used at once.
+
+    A frame has less light then, and a centroid more noise, so that the noise in a second is the same.
+    """
+    return dataclasses.replace(
+        its_basis,
+        period_s=its_basis.period_s / _QUICKER,
+        delay_s=0.0,
+        noise_px=its_basis.noise_px * math.sqrt(_QUICKER),
+    )
+
+
+def _half_width_rad(backlash_sky_arcsec: float | None, sky_arcsec_per_rad: float) -> float:
+    return math.nan if backlash_sky_arcsec is None else backlash_sky_arcsec / 2 / sky_arcsec_per_rad

@@ -1,0 +1,340 @@
+"""What to do about a night: the design for it, beside the one in use and beside the bound."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ConfigError
+from fitctl.controllers.design.basis import LEAST_GAIN, Basis, Line
+from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.loopshape import sampled_response
+from fitctl.controllers.design.margins import (
+    Margins,
+    Required,
+    design_with_margins,
+    frequencies_hz,
+    margins,
+)
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
+from fitctl.controllers.pair import Design
+from fitctl.learn.intervals import Interval
+from fitctl.learn.night import LearntLine, Night, estimate
+from fitctl.learn.opened import LEAST_S, Series, periodograms
+from fitctl.learn.spectrum import (
+    air_of,
+    air_px2_per_hz,
+    framed_line_px2_per_hz,
+    white_px2_per_hz,
+)
+
+Floats = NDArray[np.float64]
+WORTH_IT = 0.98
+"""A design that leaves more than this part of what the present one leaves is not worth the change."""
+TOLERATED_GAIN = 0.15
+"""A mirror's gain so far from 1 is left to the margins."""
+_AXES = ("az", "el")
+
+
+class LineAdvice(NamedTuple):
+    """What a design makes of one line.
+
+    Attributes
+    ----------
+    found : LearntLine
+    counteracted : bool
+        The learnt design knows it.
+    present_px, learnt_px : float
+        Residual of both designs if the line is one of its aliases.
+    """
+
+    found: LearntLine
+    counteracted: bool
+    present_px: float
+    learnt_px: float
+
+
+class Standing(NamedTuple):
+    """What one design leaves of the night, linear, and its margins in it.
+
+    Attributes
+    ----------
+    name : str
+    residual_px : float
+        True RMS in continuous time, each axis with the stronger of both axes' lines.
+    camera_px : float
+        RMS of the error on frames, noise included.
+    margins : Margins
+    """
+
+    name: str
+    residual_px: float
+    camera_px: float
+    margins: Margins
+
+
+class Advice(NamedTuple):
+    """A night, and what designs make of it.
+
+    Attributes
+    ----------
+    night : Night
+    measured_px : tuple of float
+        RMS of the error on frames, az and el.
+    present, learnt : Standing
+    bound_px : float
+    lines : tuple of LineAdvice
+    design : Design
+        The learnt one.
+    """
+
+    night: Night
+    measured_px: tuple[float, float]
+    present: Standing
+    learnt: Standing
+    bound_px: float
+    lines: tuple[LineAdvice, ...]
+    design: Design
+
+    @property
+    def worth_it(self) -> bool:
+        """The model fits, and the learnt design leaves clearly less."""
+        return self.night.test.fits and (
+            self.learnt.residual_px <= WORTH_IT * self.present.residual_px
+        )
+
+    def lines_of_text(self) -> list[str]:
+        """For an operator."""
+        night = self.night
+        text = [
+            f"{night.duration_s:.0f} s of frames in VERNIER",
+            f"air path     k/b1 {night.strength} px/s², b2/b1 {night.fast_pole} 1/s",
+            f"             gain {night.gain_px} px, b1 {night.b1_s2} s², b2 {night.b2_s} s",
+            f"noise        {night.noise_px} px a frame",
+            f"mirror gain  {night.mirror_gain} of the rig file's{self._gain_text()}",
+            f"overshoot    {night.overshoot} of the mirror's last step, at mid-exposure",
+            *(_line_text(line) for line in self.lines),
+            *([] if self.lines else ["lines        none"]),
+            f"test of fit  {night.test.text}",
+            f"measured     {' '.join(f'{a} {px:.4f}' for a, px in zip(_AXES, self.measured_px, strict=True))}"
+            " px RMS on frames, noise included",
+            f"{'':13}true px    on frames  of bound  peak  gain m.  phase m.",
+            _standing_text("present", self.present, self.bound_px),
+            _standing_text("learnt", self.learnt, self.bound_px),
+            f"bound        {self.bound_px:.4f}",
+        ]
+        if not night.test.fits:
+            text.append("The model does not explain this night: do not use the learnt design.")
+        elif self.learnt.residual_px > self.present.residual_px:
+            peak = self.present.margins.peak_sensitivity
+            text.append(
+                f"The present design leaves less, with a peak sensitivity of {peak:.2f}; the learnt one keeps "
+                "its margins."
+            )
+        elif not self.worth_it:
+            text.append("Keep the present design: the learnt one would leave hardly less.")
+        else:
+            gained = 1 - self.learnt.residual_px / self.present.residual_px
+            text.append(f"The learnt design would leave {gained:.0%} less.")
+        return text
+
+    def _gain_text(self) -> str:
+        if self.night.mirror_gain.covers(1.0):
+            return ""
+        return "; measure the stacks with fitctl identify hysteresis"
+
+    def numbers(self) -> dict[str, Any]:
+        """The same for a program."""
+        night = self.night
+        return {
+            "duration_s": night.duration_s,
+            "air_path": {
+                name: getattr(night, name)._asdict()
+                for name in ("gain_px", "b1_s2", "b2_s", "strength", "fast_pole")
+            },
+            "noise_px": night.noise_px._asdict(),
+            "mirror_gain": night.mirror_gain._asdict(),
+            "overshoot": night.overshoot._asdict(),
+            "lines": [_line_numbers(line) for line in self.lines],
+            "test": night.test._asdict() | {"fits": night.test.fits},
+            "measured_px": dict(zip(_AXES, self.measured_px, strict=True)),
+            "present": _standing_numbers(self.present),
+            "learnt": _standing_numbers(self.learnt),
+            "bound_px": self.bound_px,
+            "worth_it": self.worth_it,
+        }
+
+
+def advise(
+    series: list[Series],
+    measured_px: tuple[float, float],
+    rig_basis: Basis,
+    present: Design,
+    required: Required | None = None,
+) -> Advice:
+    """Estimate a night and design for it.
+
+    Parameters
+    ----------
+    series : list of Series
+        The loop, opened: :func:`fitctl.learn.opened.rebuild`.
+    measured_px : tuple of float
+        RMS of the error on the same frames, az and el.
+    rig_basis : Basis
+        What the rig file has of the loop: the estimate begins there.
+    present : Design
+        In use.
+    required : Required, optional
+        Margins of the learnt design.
+
+    Raises
+    ------
+    ConfigError
+        If there is too little of it, or no design has the margins.
+    """
+    opened = periodograms(series, rig_basis.period_s)
+    if opened is None:
+        longest_s = max((len(one.disturbance_px) for one in series), default=0) * rig_basis.period_s
+        msg = (
+            f"learn: the longest piece in VERNIER is {longest_s:.0f} s; expected at least {LEAST_S:.0f} s, "
+            "better two minutes, of a star held on its target; give a longer log"
+        )
+        raise ConfigError(msg)
+    night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
+    truth = dataclasses.replace(
+        rig_basis,
+        noise_px=night.noise_px.value,
+        air_path=night.air_path,
+        lines=tuple(line.for_design for line in night.lines),
+        mirror_gain=_gain_for_design(night),
+    )
+    wanted = tuple(line for line in truth.lines if _worth_counteracting(line, truth))
+    design = design_with_margins(dataclasses.replace(truth, lines=wanted), required)
+    return Advice(
+        night=night,
+        measured_px=measured_px,
+        present=_standing(present, truth),
+        learnt=_standing(design, truth),
+        bound_px=bound(truth).residual_px,
+        lines=tuple(
+            LineAdvice(
+                found, line in wanted, *(_if_alias(one, truth, line) for one in (present, design))
+            )
+            for found, line in zip(night.lines, truth.lines, strict=True)
+        ),
+        design=design,
+    )
+
+
+def _gain_for_design(night: Night) -> float:
+    """Of the mirror: the rig file's, unless the night says otherwise beyond what the margins cover.
+
+    Within them the estimate is not worth its risk: a strong line above half the frame rate has other tails
+    than the slow line that it looks like, and the gain makes up for them by up to 14 %.
+
+    Raises
+    ------
+    ConfigError
+        If the mirror moves so little or so much that something is wrong with it.
+    """
+    found = night.mirror_gain
+    if found.low < 1 + TOLERATED_GAIN and found.high > 1 - TOLERATED_GAIN:
+        return 1.0
+    if not LEAST_GAIN <= found.value <= 1 / LEAST_GAIN:
+        msg = (
+            f"learn: the mirror moves by {found} of what the rig file says; expected {LEAST_GAIN:g} to "
+            f"{1 / LEAST_GAIN:g}; look at its amplifiers, then measure it with fitctl identify hysteresis"
+        )
+        raise ConfigError(msg)
+    return found.value
+
+
+def _standing(design: Design, truth: Basis) -> Standing:
+    return Standing(
+        design.name,
+        linear_residual(design, truth),
+        _camera_px(design, truth),
+        margins(design, truth),
+    )
+
+
+def _camera_px(design: Design, truth: Basis) -> float:
+    """RMS of the error on frames that a design leaves, noise included."""
+    hz, period_s = frequencies_hz(truth), truth.period_s
+    density = air_px2_per_hz(air_of(truth.air_path), hz, period_s)
+    density = density + white_px2_per_hz(truth.noise_px, period_s)
+    for line in truth.lines:
+        width_hz = np.full(len(hz), line.damping * line.frequency_hz)
+        density = density + line.rms_px**2 * framed_line_px2_per_hz(
+            line.frequency_hz, width_hz, hz, period_s
+        )
+    sensitivity = 1 / np.abs(1 + sampled_response(design, truth)(2 * math.pi * hz))
+    return math.sqrt(float(np.trapezoid(sensitivity**2 * density, hz)))
+
+
+def _without(line: Line, truth: Basis) -> Basis:
+    return dataclasses.replace(truth, lines=tuple(one for one in truth.lines if one != line))
+
+
+def _worth_counteracting(line: Line, truth: Basis) -> bool:
+    """Whether a line is better counteracted, while nobody knows if it is one of its aliases.
+
+    On frames an alias looks the same, but what the mirror does about it only adds to it. Both are weighed
+    alike: what is gained if the line is what it looks like, and what is lost if it is not.
+    """
+    knows, does_not = design_minimum_variance(truth), design_minimum_variance(_without(line, truth))
+    gained = linear_residual(does_not, truth) ** 2 - linear_residual(knows, truth) ** 2
+    lost = _if_alias(knows, truth, line) ** 2 - _if_alias(does_not, truth, line) ** 2
+    return gained > max(lost, 0.0)
+
+
+def _if_alias(design: Design, truth: Basis, line: Line) -> float:
+    """Residual if a line is truly one of its aliases: it stays, and the mirror's answer to it comes on top."""
+    omega_rad_s = np.array([2 * math.pi * line.frequency_hz])
+    loop = sampled_response(design, truth)(omega_rad_s)[0]
+    answer = abs(loop / (1 + loop))
+    others_px = linear_residual(design, _without(line, truth))
+    return math.sqrt(others_px**2 + line.rms_px**2 * (1 + answer**2))
+
+
+def _line_text(line: LineAdvice) -> str:
+    found = line.found
+    sizes = ", ".join(f"{axis} {rms}" for axis, rms in zip(_AXES, found.rms_px, strict=True))
+    fast = " or ".join(f"{hz:.1f}" for hz in found.aliases_hz)
+    done = "" if line.counteracted else "; left alone"
+    return (
+        f"line         {found.frequency_hz} Hz, half width {found.half_width_hz} Hz{done}\n"
+        f"             RMS {sizes} px\n"
+        f"             if it is at {fast} Hz instead: present {line.present_px:.4f}, "
+        f"learnt {line.learnt_px:.4f} px"
+    )
+
+
+def _standing_text(title: str, stands: Standing, bound_px: float) -> str:
+    kept = stands.margins
+    return (
+        f"{title:<13}{stands.residual_px:.4f}     {stands.camera_px:.4f}     "
+        f"{stands.residual_px / bound_px:.3f}     {kept.peak_sensitivity:.2f}  "
+        f"{kept.gain_margin_db:4.1f} dB   {kept.phase_margin_deg:3.0f} deg  {stands.name}"
+    )
+
+
+def _standing_numbers(stands: Standing) -> dict[str, Any]:
+    return stands._asdict() | {"margins": stands.margins._asdict()}
+
+
+def _line_numbers(line: LineAdvice) -> dict[str, Any]:
+    found = line.found
+    sizes: dict[str, Interval] = dict(zip(_AXES, found.rms_px, strict=True))
+    return {
+        "frequency_hz": found.frequency_hz._asdict(),
+        "half_width_hz": found.half_width_hz._asdict(),
+        "rms_px": {axis: size._asdict() for axis, size in sizes.items()},
+        "aliases_hz": list(found.aliases_hz),
+        "counteracted": line.counteracted,
+        "residual_if_alias_px": {"present": line.present_px, "learnt": line.learnt_px},
+    }

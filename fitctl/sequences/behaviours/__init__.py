@@ -1,0 +1,1 @@
+"""How each kind of step works: what it checks, commands, watches and ends."""

@@ -1,0 +1,54 @@
+"""`fitctl log summary` prints a line for each log as it is read, also of one that cannot be read."""
+
+import json
+
+import pytest
+from report_samples import record
+
+from fitctl.cli import main
+from fitctl.config import default_rig_path, load_rig
+
+
+@pytest.fixture
+def log(tmp_path):
+    def held(simulation):
+        simulation.acquire()
+        simulation.run(60.0)
+
+    path = tmp_path / "held.mcap"
+    record(load_rig(default_rig_path()), path, held)
+    return path
+
+
+def printed(capsys, *arguments):
+    with pytest.raises(SystemExit) as end:
+        main(["log", "summary", *map(str, arguments)])
+    return end.value.code, capsys.readouterr().out.splitlines()
+
+
+def test_start_duration_rms_and_verdict_are_printed(log, tmp_path, capsys):
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(log.read_bytes()[:200])
+    status, lines = printed(capsys, "--json", log, torn, tmp_path / "none.mcap")
+    held, cut, none = map(json.loads, lines)
+    assert status == 0
+    assert held["verdict"] == "met"
+    assert held["duration_s"] == pytest.approx(60.0, abs=1.0)
+    rms, unit = held["rms"]["right"].split()
+    assert 0.005 < float(rms) < 0.1
+    assert unit == "px"
+    assert cut["verdict"] == "not known"
+    assert "none.mcap" in none["error"]
+
+
+def test_a_log_that_is_too_large_is_only_named(log, capsys):
+    _, (line,) = printed(capsys, "--json", "--most-bytes", "1000", log)
+    known = json.loads(line)
+    assert known["error"] == "too large to be read here"
+    assert known["duration_s"] > 50
+    assert known["rms"] == {}
+
+
+def test_a_line_for_people_has_them_too(log, capsys):
+    _, (line,) = printed(capsys, log)
+    assert "requirement met: right 0.0" in line

@@ -1,0 +1,71 @@
+"""`fitctl rehearse` shows what a command would do to a running supervisor, and gives it no command."""
+
+import json
+
+import pytest
+from served import Served
+
+from fitctl.cli import main
+from fitctl.config import default_rig_path
+from fitctl.messages.commands import Acquire, Standby
+from fitctl.messages.modes import Mode
+
+
+@pytest.fixture
+def served(tmp_path):
+    supervisor = Served(tmp_path)
+    supervisor.start()
+    yield supervisor
+    supervisor.close()
+
+
+@pytest.fixture
+def fitctl(served, capsys):
+    def run(*arguments):
+        at = ["--rig", str(default_rig_path()), "--set", f"service.folder={served.folder}"]
+        with pytest.raises(SystemExit) as end:
+            main([*arguments, *at])
+        printed = capsys.readouterr()
+        return end.value.code, printed.out, printed.err
+
+    return run
+
+
+def in_vernier(served):
+    for command in (Standby(), Acquire()):
+        assert served.client.send(command).accepted
+    served.follow(lambda _: served.simulation.supervisor.loops["right"].mode is Mode.VERNIER)
+
+
+def test_where_the_stages_end_is_printed_and_nothing_is_sent(served, fitctl):
+    in_vernier(served)
+    status, out, _ = fitctl("rehearse", "target", "22", "21")
+    assert status == 0
+    assert "nothing was sent" in out
+    assert "siderostat  " in out
+    assert "of its range" in out
+    assert "✓ no interlock would trip" in out
+    assert served.commands("SetTarget") == []
+
+
+def test_a_refusal_is_foreseen(served, fitctl):
+    in_vernier(served)
+    status, out, _ = fitctl("rehearse", "recover", "--json")
+    assert status == 1
+    result = json.loads(out)
+    assert not result["accepted"]
+    assert "recover" in result["refused"]
+    assert served.commands("Recover") == []
+
+
+def test_a_mistake_is_named_before_anything_is_simulated(fitctl):
+    status, _, err = fitctl("rehearse", "target", "22")
+    assert status == 2
+    assert "target needs AZ_PX EL_PX" in err or "needs" in err
+
+
+def test_a_sequence_begins_where_the_stages_are(served, fitctl):
+    in_vernier(served)
+    status, out, _ = fitctl("sequence", "dry-run", "acquire", "--present")
+    assert status == 0
+    assert "done" in out

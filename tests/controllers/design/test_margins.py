@@ -1,0 +1,109 @@
+"""Designs for nights with lines, and the margins that a learnt design keeps."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.controllers.design.basis import Line, basis, basis_of
+from fitctl.controllers.design.choose import DESIGNS
+from fitctl.controllers.design.files import load_design, save_design
+from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.disturbance import disturbance, line_px2_per_hz
+from fitctl.controllers.design.linear_loop.loopshape import loop_shape, sampled_response
+from fitctl.controllers.design.margins import Required, design_with_margins, margins
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
+
+SIX_HZ = Line(frequency_hz=6.0, damping=0.005, rms_px=0.05)
+
+
+@pytest.fixture(scope="module")
+def six_hz(fit):
+    return dataclasses.replace(fit, lines=(SIX_HZ,))
+
+
+@pytest.fixture(scope="module")
+def with_the_fit():
+    settings = ["loops.right.sensor=fit", "loops.right.spot_diameter_px=3.0"]
+    return basis(load_rig(default_rig_path(), settings), "right")
+
+
+@given(frequency_hz=st.floats(0.5, 60.0), damping=st.floats(1e-3, 0.5), rms_px=st.floats(1e-3, 1.0))
+@settings(max_examples=20, deadline=None)
+def test_a_line_has_its_rms_in_time_and_in_its_spectrum(fit, frequency_hz, damping, rms_px):
+    line = Line(frequency_hz, damping, rms_px)
+    moving = disturbance(dataclasses.replace(fit, lines=(line,)))
+    away_hz = frequency_hz * damping * np.tan(np.linspace(-1.5, 1.5, 20_001))
+    at_hz = frequency_hz + away_hz[away_hz > -frequency_hz]
+
+    assert moving.covariance[2, 2] == pytest.approx(rms_px**2, rel=1e-6)
+    density = rms_px**2 * line_px2_per_hz(frequency_hz, damping * frequency_hz, at_hz)
+    assert np.trapezoid(density, at_hz) == pytest.approx(rms_px**2, rel=0.1)
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.1, 1.0), (6.0, 1.0, 1.0), (6.0, 0.1, math.nan)])
+def test_a_line_that_cannot_be_is_refused(values):
+    with pytest.raises(ValueError, match="expected values above 0"):
+        Line(*values)
+
+
+def test_a_design_that_knows_a_line_leaves_what_the_bound_allows(fit, six_hz):
+    least_px = bound(six_hz).residual_px
+    knows, does_not = design_minimum_variance(six_hz), design_minimum_variance(fit)
+
+    assert linear_residual(knows, six_hz) < 1.01 * least_px
+    assert linear_residual(does_not, six_hz) > 3 * least_px
+
+
+def test_margins_agree_with_those_of_python_control(six_hz):
+    design = design_minimum_variance(six_hz)
+    found = margins(design, six_hz)
+    shape = loop_shape(sampled_response(design, six_hz), 0.5 / six_hz.period_s, stable=True)
+
+    assert found.peak_sensitivity == pytest.approx(shape.peak_sensitivity, rel=0.02)
+    assert found.gain_margin_db == pytest.approx(shape.gain_margin_db, abs=0.2)
+    assert found.phase_margin_deg == pytest.approx(shape.phase_margin_deg, abs=1.0)
+
+
+def test_a_design_that_has_its_margins_stays_as_it_is(fit):
+    design, plain = design_with_margins(fit), design_minimum_variance(fit)
+
+    assert "guard" not in design.parameters
+    assert np.array_equal(design.a, plain.a)
+
+
+def test_a_design_keeps_its_margins_at_little_cost(with_the_fit):
+    its_basis, required = with_the_fit, Required()
+    plain = design_minimum_variance(its_basis)
+    design = design_with_margins(its_basis, required)
+    found = margins(design, its_basis, required)
+
+    assert margins(plain, its_basis, required).peak_sensitivity > required.peak_sensitivity
+    assert found.stable
+    assert found.peak_sensitivity <= 1.001 * required.peak_sensitivity
+    assert found.gain_margin_db >= 0.999 * required.gain_margin_db
+    assert found.phase_margin_deg >= 0.999 * required.phase_margin_deg
+    assert linear_residual(design, its_basis) < 1.13 * bound(its_basis).residual_px
+
+
+def test_margins_that_no_design_can_have_are_an_error(fit, monkeypatch):
+    monkeypatch.setattr("fitctl.controllers.design.margins._TRIES", 10)
+
+    with pytest.raises(ConfigError, match=r"no minimum-variance pair .* measure the delay"):
+        design_with_margins(fit, Required(peak_sensitivity=1.01))
+
+
+def test_a_design_with_lines_and_guard_is_made_again_from_its_file(six_hz, fit, tmp_path):
+    design = design_with_margins(six_hz)
+    save_design(design, tmp_path / "six.json")
+
+    again = load_design(tmp_path / "six.json", fit, DESIGNS)
+    made_for = basis_of(again.parameters, fit)
+
+    assert np.array_equal(again.a, design.a)
+    assert made_for.lines == (SIX_HZ,)
+    assert made_for.guard is not None

@@ -1,0 +1,248 @@
+"""Nights that are known exactly, estimated from what their loop recorded."""
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.linear_loop import course_px, held
+from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.controllers.design.basis import Line, basis
+from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.margins import Required, margins
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
+from fitctl.learn.advice import advise
+from fitctl.learn.fit_test import fit_test
+from fitctl.learn.night import estimate
+from fitctl.learn.opened import Series, periodograms
+from fitctl.learn.spectrum import Air, air_of, framed_line_px2_per_hz
+from fitctl.learn.whittle import Guess, LineGuess, _Problem, likeliest
+
+TWO_MINUTES_S = 120.0
+THREE_HZ = Line(frequency_hz=3.1, damping=0.005, rms_px=0.05)
+SIX_HZ = Line(frequency_hz=6.0, damping=0.005, rms_px=0.05)
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return basis(load_rig(default_rig_path()), "right")
+
+
+@pytest.fixture(scope="module")
+def fixed(paper):
+    """The design for the paper's night."""
+    return design_minimum_variance(paper)
+
+
+@pytest.fixture(scope="module")
+def shaken(paper):
+    return dataclasses.replace(paper, lines=(THREE_HZ,))
+
+
+@pytest.fixture(scope="module")
+def shaken_opened(shaken, fixed):
+    _, series = held(shaken, fixed, TWO_MINUTES_S, seed=3)
+    return periodograms([series], shaken.period_s)
+
+
+def opened(truth, design, seed=2, **options):
+    _, series = held(truth, design, TWO_MINUTES_S, seed, **options)
+    return periodograms([series], truth.period_s)
+
+
+# ---------------------------------------------------------------- opening the loop
+
+
+def test_the_opened_loop_has_the_power_of_its_disturbance(paper):
+    star_px = course_px(paper, 3000, seed=1)
+    fast_px = np.diff(star_px, axis=0)  # no slow motion, which the first frequencies leave out
+    found = periodograms([Series(fast_px, 0 * fast_px)], paper.period_s)
+    power_px2 = found.disturbance.sum(axis=0) * 2 * found.resolution_hz[0]
+
+    assert power_px2 == pytest.approx(np.mean(fast_px**2, axis=0), rel=0.2)
+
+
+@pytest.mark.parametrize(("gain", "overshoot"), [(0.7, 0.0), (1.0, 0.0), (1.3, 0.1), (1.0, -0.2)])
+def test_the_same_periodograms_serve_every_mirror(paper, fixed, gain, overshoot):
+    _, series = held(paper, fixed, 120.0, seed=1)
+    step_px = np.diff(series.mirror_px, axis=0, prepend=series.mirror_px[:1])
+    moved_px = (gain - 1) * series.mirror_px + overshoot * step_px
+    turned = Series(series.disturbance_px - moved_px, series.mirror_px)
+    as_if = periodograms([turned], paper.period_s).disturbance
+    found = periodograms([series], paper.period_s).with_mirror(gain, overshoot)
+
+    assert np.median(np.abs(found / as_if - 1)) < 0.01  # but for the windows' ends
+
+
+def test_pieces_that_are_too_short_are_left_out(paper):
+    short, long = (Series(np.ones((n, 2)), np.ones((n, 2))) for n in (400, 1500))
+
+    assert periodograms([short], paper.period_s) is None
+    assert periodograms([short, long], paper.period_s).duration_s == 30.0
+
+
+def test_a_long_piece_is_cut_into_segments(paper):
+    white = np.random.default_rng(0).standard_normal((15_000, 2))
+    found = periodograms([Series(white, white)], paper.period_s)
+
+    assert set(found.segments) == {2.0}
+    assert found.disturbance.mean() == pytest.approx(2 * paper.period_s, rel=0.05)
+
+
+# ---------------------------------------------------------------- the likelihood
+
+
+def test_the_likelihoods_slope_is_its_own(shaken, shaken_opened):
+    rms = np.array([0.03, 0.05])
+    begin = Guess(Air(1.2, 4.0, 3.0), 0.012, 0.9, 0.03, (LineGuess(3.2, 0.02, rms),))
+    problem = _Problem(shaken_opened, begin)
+    at = problem.begin + 0.05
+    _, slope = problem.cost(at)
+    for index, step in enumerate(1e-5 * np.eye(len(at))):
+        by_difference = (problem.cost(at + step)[0] - problem.cost(at - step)[0]) / 2e-5
+        assert slope[index] == pytest.approx(by_difference, rel=1e-3, abs=1e-2)
+
+
+def test_a_fast_line_has_its_place_among_slow_frequencies(paper):
+    at_hz = np.linspace(0.5, 24.5, 4801)
+    width_hz = np.full(len(at_hz), 0.05)
+    density = framed_line_px2_per_hz(48.9, width_hz, at_hz, paper.period_s)
+
+    assert at_hz[density.argmax()] == pytest.approx(1.1, abs=0.01)
+    assert np.trapezoid(density, at_hz) == pytest.approx(1.0, rel=0.1)
+
+
+# ---------------------------------------------------------------- nights
+
+
+def test_the_papers_night_is_estimated_within_its_intervals(paper, fixed):
+    night = estimate(opened(paper, fixed), paper.air_path, paper.noise_px)
+    air = air_of(paper.air_path)
+
+    assert night.lines == ()
+    assert night.test.fits
+    assert night.strength.covers(air.strength)
+    assert night.fast_pole.covers(air.damping)
+    assert night.b1_s2.covers(paper.air_path.b1_s2)
+    assert night.noise_px.covers(paper.noise_px)
+    assert night.mirror_gain.covers(1.0)
+    assert night.overshoot.covers(0.0)
+    assert night.mirror_gain.high / night.mirror_gain.low < 1.15  # no dither, and yet within 7 %
+
+
+def test_a_line_is_not_taken_for_air(shaken, shaken_opened, paper):
+    night = estimate(shaken_opened, paper.air_path, paper.noise_px)
+    (line,) = night.lines
+
+    assert night.strength.covers(air_of(paper.air_path).strength)
+    assert line.frequency_hz.covers(THREE_HZ.frequency_hz)
+    assert all(rms.covers(THREE_HZ.rms_px) for rms in line.rms_px)
+    assert line.half_width_hz.covers(THREE_HZ.damping * THREE_HZ.frequency_hz)
+    assert night.test.fits
+
+
+def test_a_model_that_lacks_a_line_does_not_fit(shaken_opened, paper):
+    without = likeliest(shaken_opened, Guess(air_of(paper.air_path), paper.noise_px))
+    test = fit_test(shaken_opened, without.density, without.guess.gain, without.guess.overshoot)
+
+    assert without.guess.air.strength > 1.5 * air_of(paper.air_path).strength  # what a line does
+    assert not test.fits
+    assert "does not fit" in test.text
+
+
+def test_a_mirror_that_moves_less_than_believed_is_noticed(paper, fixed):
+    night = estimate(opened(paper, fixed, mirror_gain=0.82), paper.air_path, paper.noise_px)
+
+    assert night.mirror_gain.covers(0.82)
+    assert not night.mirror_gain.covers(1.0)
+    assert night.strength.covers(air_of(paper.air_path).strength)
+
+
+def test_air_of_another_shape_does_not_fit(paper, fixed):
+    random = np.random.default_rng(0)
+    pink = np.fft.irfft(
+        np.fft.rfft(random.standard_normal((6000, 2)), axis=0)
+        / np.maximum(np.fft.rfftfreq(6000, paper.period_s), 0.01)[:, None] ** 0.7,
+        axis=0,
+    )
+    _, series = held(paper, fixed, TWO_MINUTES_S, 0, star_px=0.2 * pink / pink.std())
+    night = estimate(periodograms([series], paper.period_s), paper.air_path, paper.noise_px)
+
+    assert not night.test.fits
+
+
+# ---------------------------------------------------------------- advice
+
+
+@pytest.fixture(scope="module")
+def six_hz(paper, fixed):
+    truth = dataclasses.replace(paper, lines=(SIX_HZ,))
+    error_px, series = held(truth, fixed, TWO_MINUTES_S, seed=5)
+    rms_px = tuple(np.sqrt(np.mean(error_px**2, axis=0)).tolist())
+    return truth, advise([series], rms_px, paper, fixed)
+
+
+def test_the_learnt_design_comes_near_the_bound_of_the_true_night(six_hz, fixed):
+    truth, advice = six_hz
+    least_px = bound(truth).residual_px
+
+    assert linear_residual(advice.design, truth) < 1.15 * least_px  # the goal for this night
+    assert linear_residual(fixed, truth) > 3 * least_px
+    assert advice.bound_px == pytest.approx(least_px, rel=0.15)
+    assert advice.worth_it
+
+
+def test_the_learnt_design_keeps_its_margins_on_the_true_night(six_hz):
+    truth, advice = six_hz
+
+    assert margins(advice.design, truth).excess(Required()) < 1.02
+
+
+def test_what_the_present_design_leaves_is_what_was_measured(six_hz):
+    _, advice = six_hz
+
+    assert advice.present.camera_px == pytest.approx(np.mean(advice.measured_px), rel=0.15)
+
+
+def test_a_line_is_marked_with_the_faster_lines_that_look_like_it(six_hz):
+    _, advice = six_hz
+    (line,) = advice.lines
+
+    assert line.found.aliases_hz == pytest.approx((44.0, 56.0), abs=0.02)
+    assert line.counteracted
+    # If it is one of these, it stays, and the mirror's answer is added to it.
+    assert line.learnt_px > math.hypot(SIX_HZ.rms_px, SIX_HZ.rms_px) * 0.8
+    assert "if it is at 44.0 or 56.0 Hz instead" in "\n".join(advice.lines_of_text())
+
+
+def test_advice_is_the_same_for_people_and_for_programs(six_hz):
+    _, advice = six_hz
+    numbers = msgspec.json.decode(msgspec.json.encode(advice.numbers()))
+    text = "\n".join(advice.lines_of_text())
+
+    for value in (numbers["bound_px"], numbers["learnt"]["residual_px"]):
+        assert f"{value:.4f}" in text
+    assert numbers["lines"][0]["frequency_hz"]["value"] == pytest.approx(6.0, abs=0.05)
+    assert numbers["worth_it"]
+
+
+def test_too_short_a_hold_is_an_error(paper, fixed):
+    _, series = held(paper, fixed, 10.0, seed=0)
+
+    with pytest.raises(
+        ConfigError, match="longest piece in VERNIER is 10 s; expected at least 20 s"
+    ):
+        advise([series], (0.01, 0.01), paper, fixed)
+
+
+def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed):
+    truth = dataclasses.replace(paper, mirror_gain=0.6)
+    _, series = held(paper, fixed, TWO_MINUTES_S, 5, mirror_gain=0.6)
+    advice = advise([series], (0.0, 0.0), paper, fixed)
+    least_px = bound(truth).residual_px
+
+    assert linear_residual(advice.design, truth) < 1.02 * least_px
+    assert linear_residual(fixed, truth) > 1.1 * least_px
+    assert margins(advice.design, truth).excess(Required()) < 1.02

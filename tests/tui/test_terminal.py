@@ -1,0 +1,98 @@
+"""The console on a terminal, while its process is stopped and continued."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+CONSOLE = """
+import sys
+from pathlib import Path
+from fitctl.messages.client import Client
+from fitctl.tui.app import ConsoleApp
+
+ConsoleApp(Client(Path(sys.argv[1]))).run()
+"""
+LIMIT_S = 30.0
+TO_ALTERNATE_SCREEN = b"\x1b[?1049h"
+
+
+class OnTerminal:
+    """A console without a supervisor, on a pseudo-terminal whose other end is read."""
+
+    def __init__(self, folder):
+        self._terminal, self.inside = pty.openpty()
+        termios.tcsetwinsize(self.inside, (40, 140))
+        self.modes_before = termios.tcgetattr(self.inside)
+        self.shown = b""
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", CONSOLE, str(folder)],
+            stdin=self.inside,
+            stdout=self.inside,
+            stderr=self.inside,
+            start_new_session=True,
+            env=os.environ | {"TERM": "xterm-256color", "OPENBLAS_NUM_THREADS": "1"},
+        )
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        while True:
+            self.shown += os.read(self._terminal, 65536)
+
+    def press(self, key):
+        os.write(self._terminal, key)
+
+    def threads(self):
+        """How many its process has."""
+        return len(list(Path(f"/proc/{self.process.pid}/task").iterdir()))
+
+    def stop_and_continue(self):
+        before = len(self.shown)
+        self.process.send_signal(signal.SIGSTOP)
+        os.waitpid(self.process.pid, os.WUNTRACED)
+        self.process.send_signal(signal.SIGCONT)
+        until(
+            lambda: b"Operate" in self.shown[before:].partition(TO_ALTERNATE_SCREEN)[2],
+            "drawn anew",
+        )
+
+
+def until(holds, what):
+    """Wait until something holds."""
+    end_s = time.monotonic() + LIMIT_S
+    while not holds():
+        assert time.monotonic() < end_s, f"not within {LIMIT_S:g} s: {what}"
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def console(tmp_path):
+    """On its terminal, with its first screen drawn."""
+    console = OnTerminal(tmp_path / "nobody")
+    try:
+        until(lambda: b"Operate" in console.shown, "the first screen")
+        yield console
+    finally:
+        console.process.kill()
+        console.process.wait()
+
+
+def test_a_console_that_is_stopped_and_continued_has_as_many_threads_as_before(console):
+    until(lambda: console.threads() == 6, "its own threads, and none of a command")
+    for _ in range(3):
+        console.stop_and_continue()
+    until(lambda: console.threads() == 6, f"6 threads; there are {console.threads()}")
+
+
+def test_a_console_that_was_stopped_and_continued_ends_and_leaves_the_terminal_as_it_was(console):
+    console.stop_and_continue()
+    console.press(b"q")
+    assert console.process.wait(LIMIT_S) == 0
+    assert termios.tcgetattr(console.inside) == console.modes_before
