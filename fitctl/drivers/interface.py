@@ -327,8 +327,8 @@ class HexapodReading(NamedTuple):
         Host's monotonic time at which the pose was read: midway between question and answer.
     pose : Pose
         Measured; of no meaning while the hexapod is not referenced.
-    moving, referenced : bool
-        Some axis moves; all axes know where they are.
+    moving, referenced, servos_on : bool
+        Some axis moves; all axes know where they are; the servos of all axes are on.
     error : str
         Empty, or the error that the controller had latched, which reading it has cleared.
     """
@@ -337,6 +337,7 @@ class HexapodReading(NamedTuple):
     pose: Pose
     moving: bool
     referenced: bool
+    servos_on: bool
     error: str
 
 

@@ -255,7 +255,8 @@ class SimulatedHexapod:
         """Where it is."""
         now_s = self._clock.now_s()
         pose = Pose(*self._trajectory.pose_at(now_s).tolist())
-        return HexapodReading(now_s, pose, now_s < self._trajectory.ends_s, self._referenced, "")
+        moving = now_s < self._trajectory.ends_s
+        return HexapodReading(now_s, pose, moving, self._referenced, servos_on=True, error="")
 
     def stop(self) -> None:
         """Brake where it is."""

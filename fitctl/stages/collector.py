@@ -88,13 +88,15 @@ class CollectorDrive:
         ConfigError
             The motion's file cannot be read. Nothing has moved.
         DeviceRefused
-            The hexapod is not referenced, or moves, or the course goes farther or faster than
+            The hexapod is not referenced, or a servo is off, or it moves, or the course goes farther or faster than
             `collector.hexapod` allows. Nothing has moved.
         DeviceUnreachable, DeviceTimeout, DeviceProtocolError
         """
         reading = self._hexapod.pose()
         if not reading.referenced:
             raise self._refused("a referenced hexapod", "one that is not", "reference it first")
+        if not reading.servos_on:
+            raise self._refused("all servos on", "one that is off", "reference it first")
         if reading.moving:
             raise self._refused("a hexapod at rest", "one that moves", "stop it first")
         motion = motion or self._rig_motion

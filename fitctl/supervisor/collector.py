@@ -146,29 +146,33 @@ class CollectorWatch:
         self._hexapod.close()
 
     def _work(self, motion: CollectorMotion | None, stops: int) -> None:
-        """Begin a motion, or without one reference the hexapod."""
+        """Begin a motion, or without one reference the hexapod; whoever hears of its end can begin the next."""
         try:
-            if not self.is_open:
-                self.identity = self._hexapod.open()
-                self.is_open = True
-            if stops != self._stops:
-                self._report("warning", HEXAPOD, _STOPPED_FIRST)
-                return
-            if motion is None:
-                self._hexapod.reference()
-                self._report("info", HEXAPOD, "referenced: all axes are at zero")
-            else:
-                self.drive.start(motion)
-                if stops != self._stops:  # a stop has the last word
-                    self.drive.stop()
-                    self._report("warning", HEXAPOD, _STOPPED_FIRST)
-                    return
-                self._report("info", HEXAPOD, f"the collector begins to move: {motion.kind}")
-            self.error = ""
+            try:
+                severity, message = self._begin(motion, stops)
+            finally:
+                self._busy = False
         except (DeviceError, ConfigError) as error:
             self._failed(error)
-        finally:
-            self._busy = False
+        else:
+            self._report(severity, HEXAPOD, message)
+
+    def _begin(self, motion: CollectorMotion | None, stops: int) -> tuple[Severity, str]:
+        if not self.is_open:
+            self.identity = self._hexapod.open()
+            self.is_open = True
+        if stops != self._stops:
+            return "warning", _STOPPED_FIRST
+        if motion is None:
+            self._hexapod.reference()
+            self.error = ""
+            return "info", "referenced: all axes are at zero"
+        self.drive.start(motion)
+        if stops != self._stops:  # a stop has the last word
+            self.drive.stop()
+            return "warning", _STOPPED_FIRST
+        self.error = ""
+        return "info", f"the collector begins to move: {motion.kind}"
 
     def _stop_at_once(self) -> None:
         try:

@@ -117,7 +117,9 @@ class Hexapod:
 
     def pose(self):
         where = self.sent[-1] if self.sent and not self.stuck else Pose(y_mm=3.0, u_deg=0.5)
-        well = HexapodReading(self.clock.now_s(), where, moving=False, referenced=True, error="")
+        well = HexapodReading(
+            self.clock.now_s(), where, moving=False, referenced=True, servos_on=True, error=""
+        )
         return well._replace(**self.reading)
 
     def move_to(self, pose, velocity_mm_s):
@@ -212,7 +214,11 @@ def test_a_course_beyond_travel_or_velocity_is_refused_before_anything_moves(cha
 
 @pytest.mark.parametrize(
     ("reading", "why"),
-    [({"referenced": False}, "reference it first"), ({"moving": True}, "stop it first")],
+    [
+        ({"referenced": False}, "a referenced hexapod.*reference it first"),
+        ({"servos_on": False}, "all servos on.*reference it first"),
+        ({"moving": True}, "stop it first"),
+    ],
 )
 def test_a_hexapod_that_is_not_ready_is_not_moved(reading, why):
     _, hexapod, drive = driven(kind="sine")

@@ -36,8 +36,8 @@ def watched(in_loop, monkeypatch):
         mock = C887ControllerMock(MOCK.model_copy(update={"referenced": False, "reference_s": 1.0}))
         return mock, await mock.start()
 
-    async def struck(fault):
-        mock.faults.set(fault)
+    async def struck(kind):
+        mock.faults.set(Fault(device="hexapod", kind=kind)) if kind else mock.faults.clear()
 
     mock, ends = in_loop(made())
     clock, events = MonotonicClock(), []
@@ -46,7 +46,7 @@ def watched(in_loop, monkeypatch):
         RIG.collector, C887Hexapod(settings), clock, lambda *event: events.append(event)
     )
     watch.events = events
-    watch.strike = lambda kind: in_loop(struck(Fault(device="hexapod", kind=kind)))
+    watch.strike = lambda kind: in_loop(struck(kind))
     thread = PeriodicThread(watch.drive, clock)
     thread.start()
     yield watch, mock
@@ -85,6 +85,24 @@ def test_it_is_connected_when_it_is_first_needed_and_moves_only_on_command(watch
     assert watch.identity.model == "C-887 with M-850.H11"
     assert watch.detail.startswith("drift at +")
     assert watch.obey(MoveCollector(action="start")) == "the collector moves; stop it first"
+
+
+def test_servos_that_are_off_are_reported_before_anything_is_said_to_move(watched):
+    watch, mock = watched
+    moving(watch, mock)
+    watch.strike("servo_off")
+    until(lambda: not watch.drive.running, "the end of the course")
+    watch.strike("")
+    del watch.events[:]
+
+    assert watch.obey(MoveCollector(action="start")) == ""
+    until(lambda: watch.events, "how the start ends")
+    [(severity, _, message)] = watch.events
+    assert severity == "error"
+    assert "expected all servos on" in message
+    assert "reference it first" in message
+
+    moving(watch, mock)
 
 
 def test_a_motion_of_the_command_s_own_replaces_the_rig_s_once(watched):

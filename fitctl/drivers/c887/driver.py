@@ -88,7 +88,7 @@ class C887Hexapod:
         DeviceUnreachable, DeviceProtocolError
         """
         link = self._opened()
-        if not all(link.ask(f"SVO? {_ALL}", _six_flags)):
+        if not self._are_servos_on(link):
             link.command(protocol.line("SVO", *(f"{axis} 1" for axis in AXES)))
         link.command(protocol.line("FRF", *AXES))
         limit_s = self._device.reference_timeout_s
@@ -146,12 +146,14 @@ class C887Hexapod:
             pose = link.ask(protocol.GET_POSITION, _six_numbers)
             read_s = time.monotonic()
             referenced = self._is_referenced(link)
+            servos_on = self._are_servos_on(link)
             number = link.ask("ERR?", protocol.parse_error)
         return HexapodReading(
             time_s=(requested_s + read_s) / 2,
             pose=Pose(*pose),
             moving=moving != 0,
             referenced=referenced,
+            servos_on=servos_on,
             error=protocol.error_text(number) if number else "",
         )
 
@@ -198,7 +200,7 @@ class C887Hexapod:
         found = []
         if not self._is_referenced(link):
             found.append("the hexapod is not referenced: clear its way, then reference it")
-        if not all(link.ask(f"SVO? {_ALL}", _six_flags)):
+        if not self._are_servos_on(link):
             found.append("a servo is off: reference the hexapod, which switches it on")
         return tuple(found)
 
@@ -268,6 +270,9 @@ class C887Hexapod:
 
     def _is_referenced(self, link: C887Link) -> bool:
         return all(link.ask(f"FRF? {_ALL}", _six_flags))
+
+    def _are_servos_on(self, link: C887Link) -> bool:
+        return all(link.ask(f"SVO? {_ALL}", _six_flags))
 
     def _opened(self) -> C887Link:
         if self._link is None:

@@ -182,10 +182,10 @@ def test_a_reading_on_the_wire(scripted):
     del script.heard[:]
     before_s = time.monotonic()
     reading = driver.pose()
-    assert script.heard == ["\x05", "\x03", f"FRF? {SIX}", "ERR?"]
+    assert script.heard == ["\x05", "\x03", f"FRF? {SIX}", f"SVO? {SIX}", "ERR?"]
     assert reading.pose == Pose(x_mm=1.5, w_deg=-2.0)
     assert before_s <= reading.time_s <= time.monotonic()
-    assert (reading.moving, reading.referenced) == (True, True)
+    assert (reading.moving, reading.referenced, reading.servos_on) == (True, True, True)
     assert reading.error == "error 7, the pose is out of reach"
 
 
