@@ -88,8 +88,8 @@ class CollectorDrive:
         ConfigError
             The motion's file cannot be read. Nothing has moved.
         DeviceRefused
-            The hexapod is not referenced, or a servo is off, or it moves, or the course goes farther or faster than
-            `collector.hexapod` allows. Nothing has moved.
+            The hexapod is not referenced, or a servo is off, or it moves, or the course goes farther or
+            faster than `collector.hexapod` allows. Nothing has moved.
         DeviceUnreachable, DeviceTimeout, DeviceProtocolError
         """
         reading = self._hexapod.pose()
