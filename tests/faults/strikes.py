@@ -219,12 +219,15 @@ def moving(rig, entry):
 
 
 def move_collector(rig):
-    """Start the collector's motion, referenced first where the hexapod asks for that."""
+    """Start the collector's motion unless it goes on, referenced first where the hexapod asks for that."""
     end_s = time.monotonic() + COLLECTOR_S
     while True:
         since_s = time.monotonic()
         assert since_s < end_s, f"the collector does not move within {COLLECTOR_S:g} s"
-        if not rig.client.send(MoveCollector(action="start")).accepted:
+        reply = rig.client.send(MoveCollector(action="start"))
+        if "the collector moves" in reply.text:
+            return
+        if not reply.accepted:
             rig.receive(0.1)
             continue
         answer = hexapod_event(rig, since_s)
