@@ -41,7 +41,7 @@ demo: $(READY)  ## Run the whole instrument on mock devices
 BESIDE := $(MAKE) --no-print-directory --jobs 2 --output-sync=target
 
 test: lint contract  ## Lint, import contract, types, all tests but those with a target of their own
-	@echo "Types and tests, about five minutes ..."
+	@echo "Types and tests, less than five minutes ..."
 	@$(BESIDE) types test-parts
 
 lint: $(READY)
@@ -68,6 +68,9 @@ test-parts: $(READY)
 # Nothing may run beside it: it judges real time.
 test-instrument: $(READY)  ## The whole instrument in real time, as processes on real wires
 	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system $(ARGS)
+
+test-long: $(READY)  ## Batches, campaigns, whole nights, the commands of the documents (three minutes)
+	$(BIN)/pytest -m long --numprocesses 3 --dist loadfile $(ARGS)
 
 test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)

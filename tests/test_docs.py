@@ -243,6 +243,7 @@ def expanded(words, folder):
         yield from (str(path.relative_to(folder)) for path in named) if named else (word,)
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)  # a batch compiles its kernels first
 @pytest.mark.parametrize("document", to_run())
 def test_commands_run_in_their_order_and_print_what_the_document_shows(
@@ -324,6 +325,7 @@ def test_every_command_is_documented_and_has_help(name, capsys):
     assert "Usage:" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("block", blocks("python"), ids=str)
 def test_python_blocks_run_on_a_log(block, checkout):
     done = subprocess.run(

@@ -77,6 +77,7 @@ def test_the_intervals_hold_the_truth():
     assert np.all(covered_by_intervals(range(6)) >= 5)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_95_percent_intervals_hold_the_truth_as_often_as_they_say():
     covered = covered_by_intervals(range(60))

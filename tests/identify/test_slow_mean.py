@@ -25,6 +25,7 @@ def air_motion(random, rms):
     return np.array(moved) * rms / air_path.rms_px(AIR)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("slow_px", "white_px"), [(0.05, 0.1), (0.0, 0.1), (0.1, 0.01)])
 def test_the_interval_holds_the_truth_as_often_as_it_says(slow_px, white_px):
     random = np.random.default_rng(1)

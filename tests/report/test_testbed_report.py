@@ -17,6 +17,8 @@ from fitctl.report.make import make_report
 from fitctl.report.run import find_run
 from fitctl.report.selection import select_samples
 
+pytestmark = pytest.mark.long
+
 PERIOD_S = 0.02
 
 

@@ -27,6 +27,7 @@ SKIES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", shipped_sequences(), ids=lambda path: path.stem)
 def test_every_shipped_sequence_runs_to_its_end(path):
     rig = SKIES.get(path.stem, RIG)

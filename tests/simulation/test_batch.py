@@ -16,9 +16,10 @@ from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation, simulate, simulate_rig
 from fitctl.simulation.statistics import motion_start_s
 
-pytestmark = pytest.mark.skipif(
-    not numba_installed(), reason="numba is not installed (extra `fast`)"
-)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)"),
+]
 
 CONTROLLER = "loops.right.vernier.controller={}"
 FIELDS = {

@@ -28,6 +28,8 @@ from fitctl.simulation.campaign import (
 from fitctl.simulation.simulation import simulate
 from fitctl.simulation.statistics import RigResult, SimulationResult
 
+pytestmark = pytest.mark.long
+
 RUN_S = 20.0
 
 

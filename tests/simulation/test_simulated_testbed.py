@@ -14,6 +14,8 @@ from fitctl.drivers.interface import DeviceRefused, Pose
 from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.simulation.simulation import Simulation, simulate_rig
 
+pytestmark = pytest.mark.long
+
 TESTBED = default_rig_path().parent / "fit-testbed.toml"
 EARLY = ["collector.motion.kind=sine", "collector.motion.start_s=25.0"]
 

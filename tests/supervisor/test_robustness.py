@@ -8,6 +8,8 @@ from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.simulation.batch.batch import Batch
 
+pytestmark = pytest.mark.long
+
 pytest.importorskip("numba")
 SEEDS = range(6)
 

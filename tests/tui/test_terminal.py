@@ -20,6 +20,22 @@ from fitctl.tui.app import ConsoleApp
 
 ConsoleApp(Client(Path(sys.argv[1]))).run()
 """
+CONTINUED_WHILE_IT_WRITES = """
+import queue
+import signal
+
+put, left = queue.Queue._put, [1]
+
+
+def put_and_continue(self, item):  # the queue's lock is held here
+    put(self, item)
+    if left and isinstance(item, str) and "Operate" in item:
+        left.clear()
+        signal.raise_signal(signal.SIGCONT)
+
+
+queue.Queue._put = put_and_continue
+"""
 LIMIT_S = 30.0
 TO_ALTERNATE_SCREEN = b"\x1b[?1049h"
 
@@ -27,13 +43,13 @@ TO_ALTERNATE_SCREEN = b"\x1b[?1049h"
 class OnTerminal:
     """A console without a supervisor, on a pseudo-terminal whose other end is read."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, program=CONSOLE):
         self._terminal, self.inside = pty.openpty()
         termios.tcsetwinsize(self.inside, (40, 140))
         self.modes_before = termios.tcgetattr(self.inside)
         self.shown = b""
         self.process = subprocess.Popen(
-            [sys.executable, "-c", CONSOLE, str(folder)],
+            [sys.executable, "-c", program, str(folder)],
             stdin=self.inside,
             stdout=self.inside,
             stderr=self.inside,
@@ -96,3 +112,15 @@ def test_a_console_that_was_stopped_and_continued_ends_and_leaves_the_terminal_a
     console.press(b"q")
     assert console.process.wait(LIMIT_S) == 0
     assert termios.tcgetattr(console.inside) == console.modes_before
+
+
+def test_a_console_that_is_continued_while_it_writes_goes_on(tmp_path):
+    console = OnTerminal(tmp_path / "nobody", CONTINUED_WHILE_IT_WRITES + CONSOLE)
+    try:
+        until(lambda: console.shown.count(TO_ALTERNATE_SCREEN) == 2, "its terminal set up anew")
+        until(lambda: b"Operate" in console.shown.rpartition(TO_ALTERNATE_SCREEN)[2], "drawn anew")
+        console.press(b"q")
+        assert console.process.wait(LIMIT_S) == 0
+    finally:
+        console.process.kill()
+        console.process.wait()

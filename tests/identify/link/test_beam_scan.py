@@ -95,6 +95,7 @@ def results():
     return [beam.analyse(RIG, "metrology", scan(seed), beam.PhotodiodesResult) for seed in SEEDS]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "truth"),
     [("beam_radius_mm", 26.2), ("on_axis_v", 4.6)],

@@ -94,6 +94,7 @@ def scan(seed, swing_arcsec=60.0, rig=RIG):
     return columns | {f"stack{n + 1}_v": volts[:, n] for n in range(3)}
 
 
+@pytest.mark.long
 def test_the_interval_of_each_element_holds_the_truth_as_often_as_it_says():
     found = [feedforward.analyse(KNOWN, "left", scan(seed, rig=KNOWN)) for seed in range(40)]
     inside = [np.abs(one.matrix - TRUTH) < 1.96 * one.matrix_sd for one in found]

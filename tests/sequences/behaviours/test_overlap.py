@@ -12,6 +12,8 @@ from fitctl.sequences.reading import STEPS, make_step
 from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import SequenceError
 
+pytestmark = pytest.mark.long
+
 RIGS = default_rig_path().parent
 RIG = load_rig(RIGS / "two-stars.toml")
 QUIET = (

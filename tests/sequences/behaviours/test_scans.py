@@ -21,6 +21,8 @@ from fitctl.sequences.behaviours.table import problems
 from fitctl.sequences.reading import STEPS, make_step
 from fitctl.sequences.steps import BeamScan
 
+pytestmark = pytest.mark.long
+
 RIGS = default_rig_path().parent
 RIG = load_rig(RIGS / "fit-testbed.toml")
 NEAR = (
