@@ -23,6 +23,8 @@ from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import half_widths_v, stack_gains
 from fitctl.simulation.simulation import Simulation
 
+pytestmark = pytest.mark.long
+
 NEARBY_PX = np.array([5.0, -3.0])
 SKIPPED_S = 15.0
 HELD_S = 60.0

@@ -22,7 +22,8 @@ from typing import Any, NoReturn
 import coverage
 import pytest
 
-PLUGINS = ("-p", "no:cacheprovider", "-p", __name__)
+MARKED = "not slow and not peer and not fault and not terminal and not dist"  # the tests marked long count
+PLUGINS = ("-p", "no:cacheprovider", "-p", __name__, "-m", MARKED)
 
 
 def run_forked(folder: Path, arguments: list[str]) -> NoReturn:

@@ -12,6 +12,8 @@ from fitctl.model.light import centroid_noise_px
 from fitctl.model.optics import scales, stack_volts
 from fitctl.model.plant import Plant
 
+pytestmark = pytest.mark.long
+
 HOLD_S = 0.0073  # as the supervisor's injector: no common measure with the frames
 STARTED_S = 5000.0
 # The plant shows a voltage from the grid step after it on, which is half a step late on average.

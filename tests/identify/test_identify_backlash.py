@@ -10,6 +10,8 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.model.drives import experiment_s
 from fitctl.model.optics import scales
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="session")
 def record(rig):

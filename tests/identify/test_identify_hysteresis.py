@@ -14,6 +14,8 @@ from fitctl.model.drives import STACKS, channel_values, experiment_s
 from fitctl.model.hysteresis import half_widths_v, hysteresis_output, stack_gains, swept_stroke
 from fitctl.model.plant import Plant
 
+pytestmark = pytest.mark.long
+
 FULL_V = 10.0
 
 

@@ -11,6 +11,8 @@ from fitctl.mocks.detector import DetectorBench
 from fitctl.model import hysteresis, structure
 from fitctl.model.detector import DETECTOR_RANGE_V, SAMPLE_RATE_HZ
 
+pytestmark = pytest.mark.long
+
 AZ, EL = 0, 1
 
 

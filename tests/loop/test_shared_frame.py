@@ -9,6 +9,8 @@ from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
+pytestmark = pytest.mark.long
+
 RIG = default_rig_path().with_name("two-stars.toml")
 TARGET_PX = {"right": (28.0, 20.0), "left": (12.0, 20.0)}
 NEAR = (3.0, -2.0)  # px: both stars are on the frame from the start

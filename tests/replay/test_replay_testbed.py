@@ -14,6 +14,8 @@ from fitctl.logging.records import Event, MetrologyTick, ModeChange, Overlap, Ti
 from fitctl.messages.commands import Acquire, Off, Recover, SetController, Standby, Stop
 from fitctl.messages.modes import Mode
 
+pytestmark = pytest.mark.long
+
 RIG = default_rig_path().with_name("fit-testbed.toml")
 SOON_TOO = SOON.replace("right", "left")
 LOOPS = {"metrology", "left", "right"}

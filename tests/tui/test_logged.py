@@ -229,6 +229,7 @@ def wild(change):
     return checked
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_hostile_log_stays_harmless(tmp_path, seed):
     loops = TESTBED if seed == 2 else ("right", "left")

@@ -8,6 +8,8 @@ from fitctl.sequences.behaviours.table import loops_of, problems
 from fitctl.sequences.instrument import Instrument
 from fitctl.sequences.reading import STEPS, make_step
 
+pytestmark = pytest.mark.long
+
 RIG = load_rig(default_rig_path().parent / "fit-testbed.toml")
 REFERENCE = {"step": "collector", "action": "reference"}
 SINE = {
