@@ -239,12 +239,18 @@ def test_a_fault_on_the_way_is_an_event_and_the_collector_is_no_longer_moved(wat
     assert watch.is_open == (kind in {"motion_error", "emergency_stop"})
 
 
-def test_the_supervisor_s_stop_stops_the_collector():
+def drifting():
+    """A simulation whose collector has moved for two seconds."""
     simulation = Simulation(RIG, seed=1)
     assert simulation.command(Standby()).accepted
     simulation.run(0.2)
     simulation.move_collector()
     simulation.run(2.0)
+    return simulation
+
+
+def test_the_supervisor_s_stop_stops_the_collector():
+    simulation = drifting()
     assert simulation.hexapod.pose().pose.y_mm > 1.0
     assert simulation.command(Stop()).accepted
     simulation.run(0.5)
@@ -256,11 +262,7 @@ def test_the_supervisor_s_stop_stops_the_collector():
 
 
 def test_a_supervisor_that_ends_leaves_no_collector_moving():
-    simulation = Simulation(RIG, seed=1)
-    assert simulation.command(Standby()).accepted
-    simulation.run(0.2)
-    simulation.move_collector()
-    simulation.run(2.0)
+    simulation = drifting()
     assert simulation.hexapod.pose().moving
     simulation.supervisor.close()
     assert not simulation.supervisor.collector.drive.running
