@@ -11,6 +11,7 @@ FUZZ_S ?= 120
 SEED ?= 1
 COUNT ?= 200
 SOAK_S ?= 3600
+HOURS ?= 1
 FAULT_RESULTS ?= .fault-results.json
 # Two instruments side by side: one takes less than half a core.
 FAULTS := tests/faults --numprocesses 2 --dist loadgroup
@@ -19,7 +20,7 @@ FAULTS := tests/faults --numprocesses 2 --dist loadgroup
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults test-faults-part test-faults-testbed reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-learn bench-loop bench-sim bench-testbed soak fuzz docs dist dist-test lock clean
+.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults test-faults-part test-faults-testbed reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-learn bench-loop bench-sim bench-testbed swarm soak fuzz docs dist dist-test lock clean
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -109,6 +110,9 @@ fuzz: $(READY)  ## Coverage-guided fuzzing of every parser, FUZZ_S seconds each 
 mutants: $(READY)  ## Mutation testing: COUNT changes to the code drawn by SEED, and which of them the tests find
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/mutants.lock
 	$(BIN)/python -m benchmarks.mutants --seed $(SEED) --count $(COUNT) $(ARGS)
+
+swarm: $(READY)  ## HOURS hours on virtual time from SEED: everything that fails, at once, and what must hold
+	nice -n 19 $(BIN)/python -m benchmarks.swarm --hours $(HOURS) $(if $(filter-out file,$(origin SEED)),--seed $(SEED)) $(ARGS)
 
 soak: $(READY)  ## SOAK_S seconds on mocks with random faults: what grows, is late, is lost
 	$(BIN)/python -m benchmarks.soak --duration $(SOAK_S) $(ARGS)

@@ -1,0 +1,143 @@
+"""Swarm: short nights on virtual time in which devices fail and operators meddle, each from one seed.
+
+Prints one JSON object: simulated hours, happenings by kind, pairs of kinds that met within a second, what was
+violated. Exit status 1 if anything was. ``--replay SEED`` repeats one run and prints what happened in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from itertools import count
+
+import msgspec
+
+from benchmarks.swarm.plan import Plan, plan_of
+from benchmarks.swarm.run import Result, run_plan
+from benchmarks.swarm.shrink import shrunk
+from fitctl.logging.records import AnyRecord, Event
+
+_RUNS_A_SEED = 1_000_000
+_MET_S = 1.0
+_SHOWN = 10
+
+
+def run_seed(seed: int) -> tuple[Plan, Result]:
+    """One run; for a process of its own."""
+    plan = plan_of(seed)
+    return plan, run_plan(plan)
+
+
+def met(plan: Plan) -> Iterator[tuple[str, str]]:
+    """Pairs of kinds of happenings that came within a second of each other."""
+    happenings = plan.happenings
+    for number, one in enumerate(happenings):
+        for other in happenings[number + 1 :]:
+            if other.at_s - one.at_s > _MET_S:
+                break
+            first, second = sorted((one.kind, other.kind))
+            yield first, second
+
+
+def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
+    """Run until so many hours are simulated, or a thing was violated in ten runs."""
+    started_s, simulated_s, runs = time.monotonic(), 0.0, 0
+    kinds: Counter[str] = Counter()
+    modes: Counter[str] = Counter()
+    pairs: Counter[tuple[str, str]] = Counter()
+    found: list[dict[str, object]] = []
+    seeds = (seed * _RUNS_A_SEED + number for number in count())
+    with ProcessPoolExecutor(jobs) as pool:
+        running: set[Future[tuple[Plan, Result]]] = set()
+        while simulated_s < 3600 * hours and len(found) < _SHOWN:
+            while len(running) < 2 * jobs:
+                running.add(pool.submit(run_seed, next(seeds)))
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                plan, result = future.result()
+                runs += 1
+                simulated_s += result.lasted_s
+                kinds.update(happening.kind for happening in plan.happenings)
+                modes.update(result.modes)
+                pairs.update(met(plan))
+                if result.violations:
+                    found.append(_finding(plan, result))
+            _progress(simulated_s / 3600, hours, len(found), started_s)
+        pool.shutdown(cancel_futures=True)
+    took_s = time.monotonic() - started_s
+    return {
+        "seed": seed,
+        "runs": runs,
+        "simulated_hours": round(simulated_s / 3600, 3),
+        "real_time_factor_per_core": round(simulated_s / took_s / jobs, 1),
+        "happenings": dict(kinds.most_common()),
+        "modes_entered": dict(modes.most_common()),
+        "kinds_that_met_within_1_s": len(pairs),
+        "pairs_that_met_within_1_s": {" + ".join(pair): n for pair, n in pairs.most_common()},
+        "violations": found,
+    }
+
+
+def _finding(plan: Plan, result: Result) -> dict[str, object]:
+    return {
+        "seed": plan.seed,
+        "replay": f"python -m benchmarks.swarm --replay {plan.seed}",
+        "violated": [violation._asdict() for violation in result.violations],
+    }
+
+
+def _progress(done_h: float, hours: float, found: int, started_s: float) -> None:
+    part = min(1.0, done_h / hours)
+    bar = ("#" * round(30 * part)).ljust(30)
+    line = f"[{bar}] {done_h:8.2f} of {hours:g} h, {found} violated, {time.monotonic() - started_s:.0f} s"
+    if sys.stderr.isatty():
+        print(f"\r{line}", end="" if part < 1 else "\n", file=sys.stderr, flush=True)
+    elif part >= 1 or found:
+        print(line, file=sys.stderr, flush=True)
+
+
+def replay(plan: Plan) -> int:
+    """Repeat one run, and print its happenings and events in their order."""
+    happenings = list(plan.happenings)
+
+    def show(record: AnyRecord) -> None:
+        while happenings and happenings[0].at_s <= record.time_s:
+            happening = happenings.pop(0)
+            print(f"{happening.at_s:10.4f}  > {msgspec.json.encode(happening).decode()}")
+        if isinstance(record, Event):
+            print(f"{record.time_s:10.4f}  {record.severity:8}{record.source}: {record.message}")
+
+    result = run_plan(plan, show)
+    print(f"records {result.digest}, {result.lasted_s:g} s")
+    for violation in result.violations:
+        print(f"VIOLATED at {violation.at_s:.4f} s: {violation.invariant}: {violation.detail}")
+    return 1 if result.violations else 0
+
+
+def main() -> int:
+    """Run, and print the result."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=float, default=1.0, help="to simulate")
+    parser.add_argument("--seed", type=int, help="by default drawn, and printed")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--replay", type=int, metavar="SEED", help="one run, with what happened")
+    parser.add_argument("--shrink", action="store_true", help="first leave out what need not be")
+    options = parser.parse_args()
+    if options.replay is not None:
+        plan = plan_of(options.replay)
+        return replay(shrunk(plan) if options.shrink else plan)
+    seed = options.seed if options.seed is not None else int.from_bytes(os.urandom(2))
+    print(f"seed {seed}", file=sys.stderr)
+    found = swarm(seed, options.hours, options.jobs)
+    print(json.dumps(found, indent=1))
+    return 1 if found["violations"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""A driver's line to its device: every exchange takes time, and may fail as the driver would fail."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from random import Random
+from typing import TypeVar
+
+from benchmarks.swarm.threads import VirtualTime
+from fitctl.drivers.interface import (
+    DeviceProtocolError,
+    DeviceRefused,
+    DeviceTimeout,
+    DeviceUnreachable,
+)
+
+Result = TypeVar("Result")
+
+FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
+"""Of a line, while they last: answers come late; requests are lost; answers are lost; the device refuses;
+answers make no sense; nothing is connected."""
+
+
+class Line:
+    """One driver's connection.
+
+    Parameters
+    ----------
+    device, endpoint : str
+        For errors.
+    time : VirtualTime
+    random : Random
+    usual_s : float
+        What an exchange usually takes.
+    timeout_s : float
+        The driver's own time limit.
+
+    Attributes
+    ----------
+    faults : dict of str to float
+        Those in force, of `FAULTS`; of "slow", how much slower.
+    connected : bool
+        The driver has opened it, and it has not broken since.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        endpoint: str,
+        time: VirtualTime,
+        random: Random,
+        usual_s: float,
+        timeout_s: float,
+    ) -> None:
+        self.device = device
+        self.endpoint = endpoint
+        self.faults: dict[str, float] = {}
+        self.connected = False
+        self.timeout_s = timeout_s
+        self._time = time
+        self._random = random
+        self._usual_s = usual_s
+
+    def open(self) -> None:
+        """Connect.
+
+        Raises
+        ------
+        DeviceUnreachable
+        """
+        if "unplugged" in self.faults:
+            self._time.sleep(self._usual_s)
+            raise self._unreachable("nothing")
+        self.connected = True
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.connected = False
+
+    def delay_s(self) -> float:
+        """What the next exchange takes."""
+        delay_s = self._usual_s * (0.7 + 0.6 * self._random.random())
+        return delay_s * self.faults["slow"] if "slow" in self.faults else delay_s
+
+    def ask(self, act: Callable[[], Result]) -> Result:
+        """Have the device do something, and wait for its answer.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout, DeviceRefused, DeviceProtocolError
+        """
+        if not self.connected:
+            raise DeviceUnreachable(
+                self.device, self.endpoint, "an open connection", "none", "open it again"
+            )
+        if self.faults:
+            return self._ask_badly(act)
+        delay_s = self.delay_s()
+        self._time.sleep(delay_s / 2)
+        result = act()
+        self._time.sleep(delay_s / 2)
+        if not self.connected:  # closed, or reset, meanwhile
+            raise self._unreachable("a broken connection")
+        return result
+
+    def _ask_badly(self, act: Callable[[], Result]) -> Result:
+        began_s = self._time.now_s()
+        if "unplugged" in self.faults:
+            self.connected = False
+            self._time.sleep(self._usual_s)
+            raise self._unreachable("a broken connection")
+        delay_s = self.delay_s()
+        self._time.sleep(min(delay_s / 2, self.timeout_s))
+        if "deaf" in self.faults or delay_s / 2 > self.timeout_s:
+            self._time.sleep_until(began_s + self.timeout_s)
+            raise self.timeout()
+        if "refuses" in self.faults:
+            self._time.sleep(min(delay_s / 2, self.timeout_s))
+            raise DeviceRefused(self.device, self.endpoint, "to obey", "a refusal", "ask it why")
+        result = act()
+        if "mute" in self.faults or delay_s > self.timeout_s:
+            self._time.sleep_until(began_s + self.timeout_s)
+            raise self.timeout()
+        self._time.sleep(delay_s / 2)
+        if "garbled" in self.faults:
+            raise self.garbled()
+        if not self.connected:
+            raise self._unreachable("a broken connection")
+        return result
+
+    def timeout(self) -> DeviceTimeout:
+        """The error of an answer that did not come."""
+        return DeviceTimeout(
+            self.device, self.endpoint, f"an answer within {self.timeout_s:g} s", "none", "check it"
+        )
+
+    def garbled(self) -> DeviceProtocolError:
+        """The error of an answer that makes no sense; the link is given up."""
+        self.connected = False
+        return DeviceProtocolError(
+            self.device, self.endpoint, "an answer", "nonsense", "check the line"
+        )
+
+    def broken(self) -> DeviceUnreachable:
+        """The error of a link that broke."""
+        self.connected = False
+        return self._unreachable("a broken connection")
+
+    def _unreachable(self, got: str) -> DeviceUnreachable:
+        return DeviceUnreachable(self.device, self.endpoint, "an answer", got, "check its cable")
+
+
+def drawn_slowness(random: Random) -> float:
+    """How much slower: from somewhat to a thousand times."""
+    return math.pow(10.0, 3.0 * random.random())

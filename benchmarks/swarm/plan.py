@@ -1,0 +1,157 @@
+"""What happens in one run: drawn from a seed before it begins, so that a part of it can be left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from random import Random
+
+import msgspec
+
+from benchmarks.swarm.lines import FAULTS, drawn_slowness
+from fitctl.messages.commands import (
+    Acquire,
+    AnyCommand,
+    Hold,
+    Jog,
+    Off,
+    Recover,
+    SetBiasOffset,
+    SetTarget,
+    Standby,
+    Status,
+    Stop,
+    TakeOver,
+)
+
+RIGS: dict[str, list[str]] = {
+    "fit-mock.toml": ["camera", "right siderostat", "right D/A", "right piezo"],
+}
+"""Files of ``rigs/``, each with its devices."""
+DURATION_S = 120.0
+OPERATORS = ("ada", "ben", "cleo")
+_BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True, tag="order"):
+    """An operator gives a command; without one, whatever leads the first loop on towards its star."""
+
+    at_s: float
+    who: str
+    command: AnyCommand | None = None
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "onwards" if self.command is None else type(self.command).__name__
+
+
+class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
+    """A fault of one device begins, and ends after a while; a reset has no duration."""
+
+    at_s: float
+    device: str
+    fault: str
+    lasts_s: float = 0.0
+    size: float = 0.0
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return f"{self.device.rpartition(' ')[2]} {self.fault}"
+
+
+Happening = Order | Strike
+
+
+class Plan(msgspec.Struct, frozen=True, kw_only=True):
+    """One run.
+
+    Attributes
+    ----------
+    seed : int
+        Of everything that is not a happening: the plant's noise, each delay.
+    rig : str
+        A file of ``rigs/``.
+    settings : list of str
+        ``key.path=value`` texts that replace values of the file.
+    duration_s : float
+        Until everything is healed.
+    happenings : list
+        In the order of their times.
+    """
+
+    seed: int
+    rig: str
+    settings: list[str]
+    duration_s: float
+    happenings: list[Happening]
+
+
+_COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
+    "onwards": lambda _: None,
+    "stop": lambda _: Stop(),
+    "off": lambda _: Off(),
+    "recover": lambda _: Recover(),
+    "standby": lambda _: Standby(),
+    "acquire": lambda _: Acquire(),
+    "hold": lambda _: Hold(),
+    "status": lambda _: Status(),
+    "take-over": lambda _: TakeOver(),
+    "target": lambda random: SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30)),
+    "jog": lambda random: Jog(
+        az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
+    ),
+    "bias-offset": lambda random: SetBiasOffset(
+        az_urad=random.uniform(-400, 400), el_urad=random.uniform(-400, 400)
+    ),
+}
+"""By their words; without a command, the one that leads on."""
+
+
+def plan_of(seed: int) -> Plan:
+    """The plan of a seed."""
+    random = Random(seed)  # noqa: S311 - a repeatable draw
+    rig = random.choice(list(RIGS))
+    return drawn_plan(random, seed, rig)
+
+
+def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
+    """A plan for a rig.
+
+    Each run has some kinds of faults and commands, and others not at all, at a pace of its own: what everything
+    together would drown is found where most of it is left out.
+    """
+    devices, duration_s = RIGS[rig], DURATION_S
+    faults = random.sample(("reset", *FAULTS), random.randint(1, 1 + len(FAULTS)))
+    struck = random.sample(devices, random.randint(1, len(devices)))
+    words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
+    every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
+    attend_s = 10 ** random.uniform(0.0, 1.3)
+    happenings: list[Happening] = []
+    at_s = 0.1
+    while at_s < duration_s:  # somebody wants the star, and tries again and again
+        happenings.append(Order(at_s=at_s, who=OPERATORS[0]))
+        at_s += random.expovariate(1 / attend_s)
+    at_s = 0.2
+    while True:
+        burst = random.random() < _BURST
+        at_s += random.expovariate(1 / (_BURST_S if burst else every_s))
+        if at_s >= duration_s:
+            break
+        if random.random() < fault_part:
+            happenings.append(_strike(random, at_s, random.choice(struck), random.choice(faults)))
+        else:
+            command = _COMMANDS[random.choice(words)](random)
+            happenings.append(Order(at_s=at_s, who=random.choice(OPERATORS), command=command))
+    happenings.sort(key=lambda happening: happening.at_s)
+    return Plan(seed=seed, rig=rig, settings=[], duration_s=duration_s, happenings=happenings)
+
+
+def _strike(random: Random, at_s: float, device: str, fault: str) -> Strike:
+    return Strike(
+        at_s=at_s,
+        device=device,
+        fault=fault,
+        lasts_s=0.0 if fault == "reset" else 10 ** random.uniform(-2.0, 1.0),
+        size=drawn_slowness(random) if fault == "slow" else 0.0,
+    )

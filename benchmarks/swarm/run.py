@@ -1,0 +1,262 @@
+"""One run: a rig, a plan, what happened, and what must not have."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import msgspec
+
+from benchmarks.swarm.devices import SwarmAmplifiers, SwarmCamera, SwarmDac, SwarmPiezo
+from benchmarks.swarm.invariants import Invariants, Violation
+from benchmarks.swarm.lines import Line
+from benchmarks.swarm.plan import Happening, Order, Plan, Strike
+from benchmarks.swarm.threads import VirtualExecutor, VirtualTime, installed
+from fitctl.config import Rig, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.drivers.interface import Devices, LoopDevices
+from fitctl.logging.records import AnyRecord, ModeChange
+from fitctl.messages.commands import Acquire, AnyCommand, Recover, Reply, Standby, Stop, TakeOver
+from fitctl.messages.modes import HOLDING, Mode
+from fitctl.model.plant import Plant
+from fitctl.service.admission import Admission, Sender
+from fitctl.simulation.devices import SimulatedMirror
+from fitctl.stages.periodic import PeriodicThread
+from fitctl.supervisor.supervisor import Supervisor
+
+RIGS = Path(__file__).parents[2] / "rigs"
+HEAL_S = 60.0  # within which a loop must hold its star again
+_HISTORY_S = 1.0
+_ANSWER_S = 5.0
+_LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
+    Mode.OFF: Standby,
+    Mode.SAFE: Recover,
+    Mode.STANDBY: Acquire,
+}
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of a run.
+
+    Attributes
+    ----------
+    digest : str
+        Of all records: the same for the same plan.
+    lasted_s : float
+        Of virtual time.
+    modes : dict of str to int
+        How often each mode was entered.
+    """
+
+    digest: str
+    lasted_s: float
+    modes: dict[str, int]
+    violations: list[Violation]
+
+
+class Instrument:
+    """The supervisor and its threads on virtual time, with devices that fail.
+
+    Parameters
+    ----------
+    rig : Rig
+    plan : Plan
+    time : VirtualTime
+        Whose threads are installed.
+    on_record : callable, optional
+        Takes every record.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        plan: Plan,
+        time: VirtualTime,
+        on_record: Callable[[AnyRecord], None] = lambda _: None,
+    ) -> None:
+        self.rig = rig
+        self.time = time
+        self.plant = Plant(rig, [plan.seed], history_s=_HISTORY_S)
+        self.plant.advance(self.plant.step_s)
+        self.lines: dict[str, Line] = {}
+        self.resets: dict[str, Callable[[], None]] = {}
+        self.modes: dict[str, int] = {}
+        self._plan = plan
+        self._on_record = on_record
+        self._digest = hashlib.blake2b(digest_size=16)
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._unanswered: dict[int, tuple[float, str]] = {}
+        self._posted = 0
+        self.amplifiers: dict[str, SwarmAmplifiers] = {}
+        self.invariants = Invariants(rig, time, self.amplifiers)
+        self.camera = SwarmCamera(rig, time, self.plant, self._random("camera"))
+        self._add("camera", self.camera)
+        loops = {name: self._loop_devices(name) for name in rig.loops}
+        self.devices = Devices(self.camera, loops)
+        self.start()
+
+    def _random(self, name: str) -> Random:
+        return Random(f"{self._plan.seed} {name}")  # noqa: S311 - a repeatable draw
+
+    def _add(self, name: str, device: Any) -> None:
+        self.lines[name] = device.line
+        self.resets[name] = device.reset
+
+    def _loop_devices(self, name: str) -> LoopDevices:
+        part = self.plant.stellar_loops[name]
+        random = self._random(name)
+        self.amplifiers[name] = amplifiers = SwarmAmplifiers(
+            part, self.time, self.rig, name, random, self.invariants.velocity
+        )
+        mirror = SimulatedMirror(part, self.time, self.rig, name)  # type: ignore[arg-type]
+        dac = SwarmDac(mirror, part, self.time, self.rig, name, random, self.invariants.volts)
+        piezo = SwarmPiezo(mirror, self.time, self.rig, name, random)
+        for what, device in (("siderostat", amplifiers), ("D/A", dac), ("piezo", piezo)):
+            self._add(f"{name} {what}", device)
+        return LoopDevices(amplifiers, dac=dac, piezo=piezo)
+
+    # ------------------------------------------------------------ the supervisor's process
+
+    def start(self) -> None:
+        """Start a supervisor."""
+        executor = VirtualExecutor(self.time, "devices")
+        self.supervisor = Supervisor(
+            self.rig,
+            self.devices,
+            self.time,
+            executor,
+            self._record,
+            design_for,
+            design_executor=VirtualExecutor(self.time, "design"),
+            record_frames=False,
+        )
+        self.admission = Admission(self.rig.service.lease_s)
+        self.invariants.watch(self.supervisor)
+        for work in self.supervisor.periodic:
+            PeriodicThread(work, self.time).start()
+        self.time.spawn(self._main, "main")
+
+    def _main(self) -> None:
+        supervisor, tick = self.supervisor, self.invariants.tick
+        while not supervisor.shutdown_wanted:
+            supervisor.step()
+            tick()
+        supervisor.close()
+
+    def _record(self, record: AnyRecord) -> None:
+        self._digest.update(self._encode(record))
+        if isinstance(record, ModeChange):
+            self.modes[record.target] = self.modes.get(record.target, 0) + 1
+        self._on_record(record)
+
+    # ------------------------------------------------------------ operators
+
+    def give(self, who: str, command: AnyCommand) -> None:
+        """An operator gives a command, by the service's rules."""
+        now_s = self.time.now_s()
+        sender = Sender(who, "swarm", "commander", is_local=True)
+        if self.admission.refusal(sender, command, now_s):
+            return
+        if type(command).__name__ in {"Status", "RecentEvents", "TakeOver"}:
+            return  # answered by the service itself
+        self._posted += 1
+        number = self._posted
+        self._unanswered[number] = now_s, type(command).__name__
+        self.supervisor.post(command, partial(self._answered, number), who, "swarm")
+
+    def _answered(self, number: int, _reply: Reply) -> None:
+        if self._unanswered.pop(number, None) is None:
+            self.invariants.violated("a command is answered once", f"{number} is answered twice")
+
+    def lead_on(self, who: str) -> None:
+        """Give the command that leads every loop on towards its star."""
+        for name, loop in self.supervisor.loops.items():
+            make = _LEADS_ON.get(loop.mode)
+            if make is not None:
+                self.give(who, make(loop=name))
+
+    def answers_due(self) -> None:
+        """No command waits longer for its answer than a step may take."""
+        now_s = self.time.now_s()
+        for since_s, name in self._unanswered.values():
+            if now_s - since_s > _ANSWER_S:
+                self.invariants.violated(
+                    "a command is answered once", f"{name} of {since_s:.3f} s never was"
+                )
+
+    # ------------------------------------------------------------ what happens
+
+    def happen(self, happening: Happening) -> None:
+        """Let something happen."""
+        match happening:
+            case Order(command=None):
+                self.lead_on(happening.who)
+            case Order(command=command) if command is not None:
+                self.give(happening.who, command)
+            case Strike(fault="reset"):
+                self.resets[happening.device]()
+            case Strike():
+                faults = self.lines[happening.device].faults
+                faults[happening.fault] = happening.size
+                self.time.call_at(
+                    self.time.now_s() + happening.lasts_s,
+                    partial(faults.pop, happening.fault, None),  # type: ignore[arg-type]
+                )
+
+    def heal(self) -> None:
+        """End every fault."""
+        for line in self.lines.values():
+            line.faults.clear()
+
+    @property
+    def digest(self) -> str:
+        """Of all records until now."""
+        return self._digest.hexdigest()
+
+
+def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None) -> Result:
+    """Run a plan, then heal everything, and require the stars to be held."""
+    rig = load_rig(RIGS / plan.rig, plan.settings)
+    time = VirtualTime()
+    with installed(time):
+        instrument = Instrument(rig, plan, time, on_record)
+        for happening in plan.happenings:
+            time.call_at(happening.at_s, partial(instrument.happen, happening))
+        end_s = 0.0
+        while end_s < plan.duration_s:
+            end_s += 1.0
+            time.run_until(end_s)
+            instrument.answers_due()
+        _recover(instrument)
+        time.end()
+    violations = instrument.invariants.violations
+    violations += [
+        Violation("no exception escapes", 0.0, f"{name}: {error!r}") for name, error in time.escaped
+    ]
+    return Result(
+        digest=instrument.digest,
+        lasted_s=time.now_s(),
+        modes=instrument.modes,
+        violations=violations,
+    )
+
+
+def _recover(instrument: Instrument) -> None:
+    """Nothing fails any more: `recover` and `acquire` must hold every star within `HEAL_S`."""
+    time, loops = instrument.time, instrument.supervisor.loops
+    instrument.heal()
+    time.run_until(time.now_s() + 1.0)
+    instrument.give("ada", TakeOver())
+    instrument.give("ada", Stop())
+    end_s = time.now_s() + HEAL_S
+    while time.now_s() < end_s:
+        time.run_until(time.now_s() + 1.0)
+        if all(loop.mode in HOLDING for loop in loops.values()):
+            return
+        instrument.lead_on("ada")
+    modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
+    instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)

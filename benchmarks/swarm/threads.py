@@ -1,0 +1,336 @@
+"""Threads on virtual time: one runs at a time, until it waits, and the earliest deadline decides which is next.
+
+The supervisor's own threads, locks, events and futures run on these in place of the interpreter's, unchanged:
+:func:`installed` puts these in the modules that use them. Each thread is a greenlet, so that a wait costs a
+microsecond, and the order of everything depends on nothing but the deadlines.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest.mock import patch
+
+from greenlet import GreenletExit, getcurrent, greenlet
+
+_WITH_THREADS = (
+    "fitctl.supervisor.collector",
+    "fitctl.stages.collector",
+    "fitctl.stages.injector",
+    "fitctl.stages.periodic",
+)
+
+
+class _Due:
+    """What is to happen at a time: a thread goes on, or a function is called, which must not wait."""
+
+    __slots__ = ("fired", "run")
+
+    def __init__(self, run: Any) -> None:
+        self.run = run
+        self.fired = False
+
+
+class VirtualTime:
+    """The clock, and the threads that wait by it.
+
+    Attributes
+    ----------
+    escaped : list of (str, Exception)
+        What ended a thread, and its name.
+    """
+
+    def __init__(self) -> None:
+        self.escaped: list[tuple[str, Exception]] = []
+        self._now_s = 0.0
+        self._due: list[tuple[float, int, _Due]] = []
+        self._number = 0
+        self._hub = getcurrent()
+        self._threads: list[greenlet] = []
+        self._killed: set[greenlet] = set()
+        self._over = False
+
+    # ------------------------------------------------------------ the clock
+
+    def now_s(self) -> float:
+        """The virtual time."""
+        return self._now_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Wait; the others go on meanwhile."""
+        if self._over:
+            raise GreenletExit
+        due = self._due
+        if not due or due[0][0] > deadline_s:  # nothing else happens before
+            if deadline_s > self._now_s:  # noqa: PLR1730 - as in fitctl.clock: max takes thrice as long
+                self._now_s = deadline_s
+            return
+        self._push(max(deadline_s, self._now_s), getcurrent())
+        self._switch()
+
+    def sleep(self, duration_s: float) -> None:
+        """Wait for a while."""
+        self.sleep_until(self._now_s + duration_s)
+
+    def call_at(self, time_s: float, function: Callable[[], None]) -> None:
+        """Call a function, which must not wait, at a time."""
+        self._push(max(time_s, self._now_s), function)
+
+    def run_until(self, time_s: float) -> None:
+        """Let all threads go on until a time; for whoever made this."""
+        mine = self._push(time_s, self._hub)
+        while not mine.fired:  # a thread that ends comes back here too
+            self._switch()
+
+    def end(self) -> None:
+        """End all threads where they are."""
+        self._over = True
+        for thread in self._threads:
+            if not thread.dead:
+                thread.throw(GreenletExit)
+
+    # ------------------------------------------------------------ threads
+
+    def spawn(self, run: Callable[[], None], name: str) -> greenlet:
+        """Start a thread, at this time but not before this one waits."""
+
+        def guarded() -> None:
+            try:
+                run()
+            except Exception as error:
+                self.escaped.append((name, error))
+
+        thread = greenlet(guarded, self._hub)
+        self._threads.append(thread)
+        self._push(self._now_s, thread)
+        return thread
+
+    def kill(self, thread: greenlet) -> None:
+        """Let a thread never go on, as the threads of a killed process."""
+        self._killed.add(thread)
+
+    def park(self, timeout_s: float | None = None) -> None:
+        """Wait to be woken, no longer than a time limit."""
+        if self._over:
+            raise GreenletExit
+        mine = None
+        if timeout_s is not None:
+            mine = self._push(self._now_s + timeout_s, getcurrent())
+        self._switch()
+        if mine is not None and not mine.fired:
+            mine.run = None
+
+    def wake(self, thread: greenlet) -> None:
+        """Let a parked thread go on."""
+        self._push(self._now_s, thread)
+
+    def _push(self, time_s: float, run: Any) -> _Due:
+        due = _Due(run)
+        self._number += 1
+        heapq.heappush(self._due, (time_s, self._number, due))
+        return due
+
+    def _switch(self) -> None:
+        """Go on with what is due next, until this thread is."""
+        me = getcurrent()
+        while True:
+            time_s, _, due = heapq.heappop(self._due)
+            run = due.run
+            if run is None or run in self._killed:
+                continue
+            due.fired = True
+            if time_s > self._now_s:  # noqa: PLR1730
+                self._now_s = time_s
+            if run is me:
+                return
+            if isinstance(run, greenlet):
+                if run.dead:
+                    continue
+                run.switch()
+                if self._over:
+                    raise GreenletExit
+                return
+            run()
+
+
+class _Waiters:
+    """Threads that wait for one thing, in their order."""
+
+    def __init__(self, time: VirtualTime) -> None:
+        self.time = time
+        self._waiting: deque[greenlet] = deque()
+
+    def wait(self, timeout_s: float | None) -> None:
+        me = getcurrent()
+        self._waiting.append(me)
+        try:
+            self.time.park(timeout_s)
+        finally:
+            if me in self._waiting:
+                self._waiting.remove(me)
+
+    def wake(self, most: int = 1_000_000) -> None:
+        while self._waiting and most > 0:
+            self.time.wake(self._waiting.popleft())
+            most -= 1
+
+
+class VirtualEvent:
+    """As `threading.Event`."""
+
+    def __init__(self, time: VirtualTime) -> None:
+        self._is_set = False
+        self._waiters = _Waiters(time)
+
+    def is_set(self) -> bool:
+        """Whether it is set."""
+        return self._is_set
+
+    def set(self) -> None:
+        """Set it, and wake whoever waits."""
+        self._is_set = True
+        self._waiters.wake()
+
+    def clear(self) -> None:
+        """Clear it."""
+        self._is_set = False
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is set, no longer than `timeout`."""
+        if not self._is_set:
+            self._waiters.wait(timeout)
+        return self._is_set
+
+
+class VirtualLock:
+    """As `threading.Lock`, as a context manager."""
+
+    def __init__(self, time: VirtualTime) -> None:
+        self._held = False
+        self._waiters = _Waiters(time)
+
+    def __enter__(self) -> None:
+        while self._held:
+            self._waiters.wait(None)
+        self._held = True
+
+    def __exit__(self, *_: object) -> None:
+        self._held = False
+        self._waiters.wake(1)
+
+
+class VirtualThread:
+    """As `threading.Thread`."""
+
+    def __init__(self, time: VirtualTime, target: Callable[[], None], name: str) -> None:
+        self._time = time
+        self._target = target
+        self._name = name
+        self._started = False
+        self._ended = VirtualEvent(time)
+
+    def start(self) -> None:
+        """Start it."""
+        self._started = True
+        self._time.spawn(self._run, self._name)
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait for its end."""
+        self._ended.wait(timeout)
+
+    def is_alive(self) -> bool:
+        """It was started, and has not ended."""
+        return self._started and not self._ended.is_set()
+
+    def _run(self) -> None:
+        try:
+            self._target()
+        finally:
+            self._ended.set()
+
+
+class VirtualThreading:
+    """As the module `threading`, as far as the supervisor uses it."""
+
+    def __init__(self, time: VirtualTime) -> None:
+        self._time = time
+
+    def Thread(  # noqa: N802
+        self, *, target: Callable[[], None], name: str, daemon: bool = True
+    ) -> VirtualThread:
+        """A thread."""
+        return VirtualThread(self._time, target, name)
+
+    def Event(self) -> VirtualEvent:  # noqa: N802
+        """An event."""
+        return VirtualEvent(self._time)
+
+    def Lock(self) -> VirtualLock:  # noqa: N802
+        """A lock."""
+        return VirtualLock(self._time)
+
+
+def future_on(time: VirtualTime) -> type[Future]:
+    """As `concurrent.futures.Future`, waited for on virtual time."""
+
+    class VirtualFuture(Future):
+        def result(self, timeout: float | None = None) -> Any:
+            self._wait(timeout)
+            return super().result(0)
+
+        def exception(self, timeout: float | None = None) -> BaseException | None:
+            self._wait(timeout)
+            return super().exception(0)
+
+        def _wait(self, timeout: float | None) -> None:
+            if not self.done():
+                waiters = _Waiters(time)
+                self.add_done_callback(lambda _: waiters.wake())
+                waiters.wait(timeout)
+
+    return VirtualFuture
+
+
+class VirtualExecutor(Executor):
+    """As a `ThreadPoolExecutor` of one thread."""
+
+    def __init__(self, time: VirtualTime, name: str) -> None:
+        self._time = time
+        self._future = future_on(time)
+        self._work: deque[tuple[Future, Callable[[], Any]]] = deque()
+        self._some = VirtualEvent(time)
+        self.thread = time.spawn(self._run, name)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
+        """Have `fn` called by the thread, after what was submitted before."""
+        future = self._future()
+        self._work.append((future, lambda: fn(*args, **kwargs)))
+        self._some.set()
+        return future
+
+    def _run(self) -> None:
+        while True:
+            self._some.wait()
+            self._some.clear()
+            while self._work:
+                future, work = self._work.popleft()
+                try:
+                    future.set_result(work())
+                except Exception as error:
+                    future.set_exception(error)
+
+
+@contextmanager
+def installed(time: VirtualTime) -> Iterator[None]:
+    """The supervisor's threads are virtual meanwhile."""
+    with ExitStack() as stack:
+        threading = VirtualThreading(time)
+        for module in _WITH_THREADS:
+            stack.enter_context(patch(f"{module}.threading", threading))
+        stack.enter_context(patch("fitctl.stages.servo.Future", future_on(time)))
+        stack.enter_context(patch("fitctl.stages.periodic.become_realtime", lambda **_: None))
+        yield

@@ -1,0 +1,146 @@
+"""The supervisor under everything at once, on virtual time: a few fixed seeds of `make swarm`."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.swarm.plan import Order, Strike, plan_of
+from benchmarks.swarm.run import run_plan
+from benchmarks.swarm.threads import (
+    VirtualEvent,
+    VirtualExecutor,
+    VirtualLock,
+    VirtualThreading,
+    VirtualTime,
+)
+from fitctl.messages.commands import Stop
+
+DIGEST = """
+from benchmarks.swarm.plan import plan_of
+from benchmarks.swarm.run import run_plan
+print(run_plan(plan_of(7)).digest)
+"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_violated_whatever_fails(seed):
+    assert run_plan(plan_of(seed)).violations == []
+
+
+def test_the_same_seed_gives_the_same_records_in_any_process():
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", DIGEST],
+            env=os.environ | {"PYTHONHASHSEED": hash_seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for hash_seed in ("1", "2")
+    }
+
+    assert len(digests) == 1
+    assert digests != {run_plan(plan_of(8)).digest + "\n"}
+
+
+def test_a_plan_has_commands_and_faults_in_their_order():
+    plan = plan_of(5)
+
+    times_s = [happening.at_s for happening in plan.happenings]
+    assert times_s == sorted(times_s)
+    assert {type(happening) for happening in plan.happenings} == {Order, Strike}
+
+
+@pytest.fixture
+def time():
+    time = VirtualTime()
+    yield time
+    time.end()
+
+
+def test_threads_go_on_in_the_order_of_their_deadlines(time):
+    seen = []
+
+    def thread(name, *deadlines_s):
+        for deadline_s in deadlines_s:
+            time.sleep_until(deadline_s)
+            seen.append((name, time.now_s()))
+
+    time.spawn(lambda: thread("a", 1.0, 4.0), "a")
+    time.spawn(lambda: thread("b", 2.0, 3.0), "b")
+    time.run_until(10.0)
+
+    assert seen == [("a", 1.0), ("b", 2.0), ("b", 3.0), ("a", 4.0)]
+    assert time.now_s() == 10.0
+
+
+def test_a_wait_ends_when_its_event_is_set_or_its_time_is_over(time):
+    event, seen = VirtualEvent(time), []
+
+    def wait(timeout_s):
+        seen.append((event.wait(timeout_s), time.now_s()))
+
+    time.spawn(lambda: wait(1.0), "short")
+    time.spawn(lambda: wait(None), "long")
+    time.call_at(2.0, event.set)
+    time.run_until(3.0)
+
+    assert seen == [(False, 1.0), (True, 2.0)]
+
+
+def test_a_lock_has_one_holder_at_a_time(time):
+    lock, seen = VirtualLock(time), []
+
+    def hold(name):
+        with lock:
+            time.sleep(1.0)
+            seen.append((name, time.now_s()))
+
+    for name in "abc":
+        time.spawn(lambda name=name: hold(name), name)
+    time.run_until(10.0)
+
+    assert seen == [("a", 1.0), ("b", 2.0), ("c", 3.0)]
+
+
+def test_an_executor_does_one_thing_after_the_other(time):
+    executor, seen = VirtualExecutor(time, "devices"), []
+
+    def fail():
+        raise OSError("gone")
+
+    def ask():
+        futures = [executor.submit(time.sleep, 1.0), executor.submit(fail)]
+        with pytest.raises(TimeoutError):
+            futures[0].result(timeout=0.5)
+        seen.append((futures[0].result(), str(futures[1].exception()), time.now_s()))
+
+    time.spawn(ask, "asks")
+    time.run_until(5.0)
+
+    assert seen == [(None, "gone", 1.0)]
+
+
+def test_an_exception_that_ends_a_thread_is_kept(time):
+    thread = VirtualThreading(time).Thread(target=lambda: 1 // 0, name="divides")
+    thread.start()
+    time.run_until(1.0)
+
+    assert not thread.is_alive()
+    assert [(name, type(error)) for name, error in time.escaped] == [("divides", ZeroDivisionError)]
+
+
+def test_a_stop_is_obeyed_while_a_device_does_not_answer():
+    plan = plan_of(0)
+    happenings = [
+        Order(at_s=0.1, who="ada"),
+        Strike(at_s=1.0, device="right D/A", fault="deaf", lasts_s=5.0),
+        Order(at_s=1.01, who="ada", command=Stop()),
+    ]
+    plan = type(plan)(seed=1, rig=plan.rig, settings=[], duration_s=10.0, happenings=happenings)
+    result = run_plan(plan)
+
+    assert result.violations == []
+    assert result.modes["SAFE"] >= 1
