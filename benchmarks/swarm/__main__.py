@@ -14,10 +14,11 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from itertools import count
+from itertools import count, repeat
 
 import msgspec
 
+from benchmarks.swarm.past import DEFECTS, put_back
 from benchmarks.swarm.plan import Plan, plan_of
 from benchmarks.swarm.run import Result, run_plan
 from benchmarks.swarm.shrink import shrunk
@@ -28,10 +29,11 @@ _MET_S = 1.0
 _SHOWN = 10
 
 
-def run_seed(seed: int) -> tuple[Plan, Result]:
-    """One run; for a process of its own."""
+def run_seed(seed: int, defect: str = "") -> tuple[Plan, Result]:
+    """One run, with a defect of the past put back; for a process of its own."""
     plan = plan_of(seed)
-    return plan, run_plan(plan)
+    with put_back(defect):
+        return plan, run_plan(plan)
 
 
 def met(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -47,7 +49,7 @@ def met(plan: Plan) -> Iterator[tuple[str, str]]:
 
 def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
     """Run until so many hours are simulated, or a thing was violated in ten runs."""
-    started_s, simulated_s, runs = time.monotonic(), 0.0, 0
+    started_s, simulated_s, cpu_s, runs = time.monotonic(), 0.0, 0.0, 0
     kinds: Counter[str] = Counter()
     modes: Counter[str] = Counter()
     pairs: Counter[tuple[str, str]] = Counter()
@@ -63,6 +65,7 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
                 plan, result = future.result()
                 runs += 1
                 simulated_s += result.lasted_s
+                cpu_s += result.cpu_s
                 kinds.update(happening.kind for happening in plan.happenings)
                 modes.update(result.modes)
                 pairs.update(met(plan))
@@ -75,13 +78,34 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
         "seed": seed,
         "runs": runs,
         "simulated_hours": round(simulated_s / 3600, 3),
-        "real_time_factor_per_core": round(simulated_s / took_s / jobs, 1),
+        "took_s": round(took_s, 1),
+        "real_time_factor_per_core": round(simulated_s / cpu_s, 1),
         "happenings": dict(kinds.most_common()),
         "modes_entered": dict(modes.most_common()),
         "kinds_that_met_within_1_s": len(pairs),
         "pairs_that_met_within_1_s": {" + ".join(pair): n for pair, n in pairs.most_common()},
         "violations": found,
     }
+
+
+def find(defect: str, seed: int, hours: float, jobs: int) -> dict[str, object]:
+    """How many hours it takes until a defect of the past is found, no more than so many."""
+    simulated_s, runs = 0.0, 0
+    with ProcessPoolExecutor(jobs) as pool:
+        while simulated_s < 3600 * hours:
+            first = seed * _RUNS_A_SEED + runs
+            for plan, result in pool.map(run_seed, range(first, first + 2 * jobs), repeat(defect)):
+                runs += 1
+                simulated_s += result.lasted_s
+                if result.violations:
+                    return {
+                        "hours": round(simulated_s / 3600, 3),
+                        "runs": runs,
+                        "seed": plan.seed,
+                        "violated": result.violations[0].invariant,
+                        "detail": result.violations[0].detail,
+                    }
+    return {"hours": None, "not_in_hours": round(simulated_s / 3600, 3), "runs": runs}
 
 
 def _finding(plan: Plan, result: Result) -> dict[str, object]:
@@ -120,6 +144,16 @@ def replay(plan: Plan) -> int:
     return 1 if result.violations else 0
 
 
+def past(names: list[str], seed: int, hours: float, jobs: int) -> int:
+    """Put defects back one after the other, and print how soon each is found."""
+    found = {}
+    for name in names:
+        found[name] = {"was": DEFECTS[name].what} | find(name, seed, hours, jobs)
+        print(f"{name}: {json.dumps(found[name])}", file=sys.stderr, flush=True)
+    print(json.dumps(found, indent=1))
+    return 1 if any(one["hours"] is None for one in found.values()) else 0
+
+
 def main() -> int:
     """Run, and print the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -128,7 +162,16 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--replay", type=int, metavar="SEED", help="one run, with what happened")
     parser.add_argument("--shrink", action="store_true", help="first leave out what need not be")
+    parser.add_argument(
+        "--past",
+        nargs="*",
+        metavar="NAME",
+        help="put defects of the past back, by default each, and show how soon they are found: "
+        + ", ".join(DEFECTS),
+    )
     options = parser.parse_args()
+    if options.past is not None:
+        return past(options.past or list(DEFECTS), options.seed or 1, options.hours, options.jobs)
     if options.replay is not None:
         plan = plan_of(options.replay)
         return replay(shrunk(plan) if options.shrink else plan)

@@ -232,7 +232,7 @@ class SwarmDac:
         rig: Rig,
         loop_name: str,
         random: Random,
-        written: Callable[[str, Floats], None],
+        written: Callable[[str, Floats, Floats], None],
     ) -> None:
         dac = rig.stellar_loops[loop_name].fsm.dac
         _, mocks = rig.mock_parts()
@@ -259,7 +259,7 @@ class SwarmDac:
         self.confirm()
         if not self.line.connected or "unplugged" in self.line.faults:
             raise self.line.broken()
-        self._written(self.name, volts)
+        self._written(self.name, volts, self._mirror.read_v())
         self._unconfirmed = volts.copy(), self._time.now_s()
 
     def confirm(self) -> None:
@@ -356,6 +356,15 @@ class SwarmCamera(SimulatedCamera):
         self._time = time
         self._streams = False
         self._lost = 0
+        self._clear_dn = self._scene._flux_dn
+
+    def dim(self, part: float) -> None:
+        """The spots have so much of their light."""
+        self._scene._flux_dn = self._clear_dn * part
+
+    def undim(self) -> None:
+        """The spots have all of their light."""
+        self._scene._flux_dn = self._clear_dn
 
     def open(self) -> DeviceIdentity:
         """Take control."""

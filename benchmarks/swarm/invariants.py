@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -13,7 +14,9 @@ from benchmarks.swarm.devices import SwarmAmplifiers
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.drivers.interface import AzEl
-from fitctl.messages.modes import Mode
+from fitctl.logging.records import AnyRecord, Event, ModeChange, PiezoReading
+from fitctl.messages.commands import AnyCommand, Recover, Reply, Standby, Stop
+from fitctl.messages.modes import Mode, Trigger
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
@@ -24,6 +27,8 @@ _SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
 _MOST_STEP_S = 2.0
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
+_MOST_ALIKE, _ALIKE_S = 20, 10.0
+_MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
 
 
 class Violation(NamedTuple):
@@ -52,17 +57,29 @@ class Invariants:
         self._amplifiers = amplifiers
         self._supervisor: Supervisor | None = None
         self._resting_since_s = dict.fromkeys(rig.loops, 0.0)
-        self._last_v: dict[str, tuple[Floats, bool]] = {}
+        self._slowly: dict[str, bool] = {}
         self._powerless_since_s: dict[str, float] = {}
         self._unneeded_since_s: dict[str, float] = {}
         self._busy_since_s = math.inf
         self._stepped_s = 0.0
+        self.nothing_fails = False
+        self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
+        self._power_up_s: dict[str, float] = {}
+        self._stop_answered_s: dict[str, float] = {}
+        self._texts: dict[tuple[str, str], deque[float]] = {}
+        self._piezo_read_s: dict[str, float] = {}
 
-    def watch(self, supervisor: Supervisor) -> None:
-        """Watch this one from now on."""
+    def watch(self, supervisor: Supervisor | None) -> None:
+        """Watch this one from now on; without one, what needs none."""
         self._supervisor = supervisor
-        self._last_v.clear()
+        self._stopped_s.clear()
+        self._power_up_s.clear()
+        self._stop_answered_s.clear()
+        self._texts.clear()
+        self._piezo_read_s = dict.fromkeys(self._rig.loops, math.inf)
+        self._slowly.clear()
         self._powerless_since_s.clear()
+        self._unneeded_since_s.clear()
         self._busy_since_s = math.inf
         self._stepped_s = self._clock.now_s()
 
@@ -71,6 +88,62 @@ class Invariants:
         known = any(one.invariant == invariant for one in self.violations)
         if not known and len(self.violations) < _MOST_VIOLATIONS:
             self.violations.append(Violation(invariant, self._clock.now_s(), detail))
+
+    def stalled(self, duration_s: float) -> None:
+        """The machine stands still for so long from now on, and nothing can be expected of it."""
+        self._stepped_s = self._clock.now_s() + duration_s
+        for name in self._stopped_s:
+            self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
+
+    # ------------------------------------------------------------ commands and records
+
+    def posted(self, command: AnyCommand) -> None:
+        """A command is on its way to the supervisor."""
+        if isinstance(command, Stop):
+            for name in self._named(command):
+                self._stopped_s[name] = self._clock.now_s()
+
+    def answered(self, command: AnyCommand, reply: Reply) -> None:
+        """A command was obeyed or refused."""
+        if not reply.accepted:
+            return
+        now_s = self._clock.now_s()
+        for name in self._named(command):
+            if isinstance(command, Stop):
+                self._stop_answered_s[name] = now_s
+            elif isinstance(command, Standby | Recover):
+                self._power_up_s[name] = now_s
+
+    def _named(self, command: AnyCommand) -> list[str]:
+        return [name for name in self._rig.loops if command.loop in {"", name}]
+
+    def record(self, record: AnyRecord) -> None:
+        """The supervisor makes a record."""
+        match record:
+            case ModeChange():
+                self._mode_changed(record)
+            case Event():
+                self._reported(record)
+            case PiezoReading():
+                self._piezo_read_s[record.loop] = record.time_s
+
+    def _mode_changed(self, change: ModeChange) -> None:
+        name = change.loop
+        if change.target == Mode.STANDBY.name and change.source in {"OFF", "SAFE"}:
+            self._stopped_s.pop(name, None)
+            stop_s = self._stop_answered_s.get(name, -math.inf)
+            if self._power_up_s.get(name, math.inf) < stop_s:
+                self.violated("a stop has the last word", f"{name}: powered up after it")
+        if change.trigger == Trigger.FAULT.name and self.nothing_fails:
+            self.violated("without a fault nothing fails", f"{name}: {change.reason}")
+
+    def _reported(self, event: Event) -> None:
+        times_s = self._texts.setdefault((event.source, event.message), deque(maxlen=_MOST_ALIKE))
+        times_s.append(event.time_s)
+        if len(times_s) == _MOST_ALIKE and event.time_s - times_s[0] < _ALIKE_S:
+            self.violated("a cause is reported once", f"{event.source}: {event.message}")
+        if "star's place is forgotten" in event.message:
+            self.violated("encoders that count on keep the star's place", event.message)
 
     # ------------------------------------------------------------ what is sent
 
@@ -84,6 +157,12 @@ class Invariants:
         if supervisor is None or fastest_rad_s == 0.0:
             return
         loop = supervisor.loops[name]
+        since_stop_s = self._clock.now_s() - self._stopped_s.get(name, math.inf)
+        if since_stop_s > 3 / siderostat.servo.rate_hz:
+            self.violated(
+                "a stop is obeyed at once",
+                f"{name}: {velocity_rad_s} rad/s {since_stop_s:.3f} s after it",
+            )
         if loop.mode in _AT_REST:
             at_rest_s = self._clock.now_s() - loop.mode_since_s
             if at_rest_s > 3 / siderostat.servo.rate_hz:
@@ -92,27 +171,23 @@ class Invariants:
                     f"{name}: {velocity_rad_s} rad/s after {at_rest_s:.3f} s in {loop.mode.name}",
                 )
 
-    def volts(self, name: str, volts: Floats) -> None:
-        """Voltages are sent to a loop's mirror."""
+    def volts(self, name: str, volts: Floats, before_v: Floats) -> None:
+        """Voltages are sent to a loop's mirror, whose D/A has others until they arrive."""
         fsm = self._rig.stellar_loops[name].fsm
         if not (np.all(volts >= 0.0) and np.all(volts <= fsm.dac.full_scale_v)):
             self.violated("voltages within their limits", f"{name}: {volts} V")
         if self._supervisor is None:
             return
+        # The first write in a mode was decided in the one before.
         slowly = self._supervisor.loops[name].mode in _SLOWLY
-        before_v, was_slow = self._last_v.get(name, (volts, False))
-        self._last_v[name] = (volts.copy(), slowly)
+        was_slow, self._slowly[name] = self._slowly.get(name, False), slowly
         step_v = float(np.abs(volts - before_v).max())
-        most_v = fsm.slew_v_per_s * self._rig.camera.period_s * _SLACK
+        most_v = fsm.slew_v_per_s * self._rig.camera.period_s * _SLACK + fsm.dac.step_v
         if slowly and was_slow and step_v > most_v:
             self.violated(
                 "the mirror rests no faster than its slew",
-                f"{name}: {step_v:.2f} V in one write, at most {most_v:.2f} V",
+                f"{name}: {step_v:.3f} V in one write, at most {most_v:.3f} V",
             )
-
-    def opened(self, name: str) -> None:
-        """A loop's D/A was opened anew: the mirror starts from what is found there."""
-        self._last_v.pop(name, None)
 
     # ------------------------------------------------------------ once a tick
 
@@ -129,6 +204,11 @@ class Invariants:
         self._busy_since_s = min(self._busy_since_s, now_s) if jobs.busy else math.inf
         if now_s - self._busy_since_s > _MOST_BUSY_S:
             self.violated("opening and closing end", f"busy for {_MOST_BUSY_S:g} s")
+        for name, piezo in supervisor.piezos.items():
+            if not piezo.is_open or jobs.busy:
+                self._piezo_read_s[name] = now_s
+            elif now_s - self._piezo_read_s[name] > _MOST_UNREAD_S and piezo.error == "":
+                self.violated("an open piezo amplifier is read", f"{name}: not for a long time")
         for name, loop in supervisor.loops.items():
             self._power(name, loop.mode, busy=jobs.busy, now_s=now_s)
 

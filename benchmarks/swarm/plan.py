@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from random import Random
 
 import msgspec
@@ -16,7 +17,9 @@ from fitctl.messages.commands import (
     Off,
     Recover,
     SetBiasOffset,
+    SetController,
     SetTarget,
+    Shutdown,
     Standby,
     Status,
     Stop,
@@ -29,6 +32,7 @@ RIGS: dict[str, list[str]] = {
 """Files of ``rigs/``, each with its devices."""
 DURATION_S = 120.0
 OPERATORS = ("ada", "ben", "cleo")
+_WITHOUT_FAULTS = 0.15  # so many runs have none of a device
 _BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
 
 
@@ -60,7 +64,44 @@ class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
         return f"{self.device.rpartition(' ')[2]} {self.fault}"
 
 
-Happening = Order | Strike
+class Stall(msgspec.Struct, frozen=True, kw_only=True, tag="stall"):
+    """The machine stands still."""
+
+    at_s: float
+    lasts_s: float
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "stall"
+
+
+class Kill(msgspec.Struct, frozen=True, kw_only=True, tag="kill"):
+    """The supervisor's process is killed, and a new one started after a while."""
+
+    at_s: float
+    back_after_s: float
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "kill"
+
+
+class Cloud(msgspec.Struct, frozen=True, kw_only=True, tag="cloud"):
+    """All stars have another part of their light for a while."""
+
+    at_s: float
+    lasts_s: float
+    part: float
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "cloud"
+
+
+Happening = Order | Strike | Stall | Kill | Cloud
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,6 +142,8 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "jog": lambda random: Jog(
         az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
     ),
+    "controller": lambda random: SetController(name=random.choice(("eq20", "minimum-variance"))),
+    "shutdown": lambda random: Shutdown() if random.random() < 0.2 else None,
     "bias-offset": lambda random: SetBiasOffset(
         az_urad=random.uniform(-400, 400), el_urad=random.uniform(-400, 400)
     ),
@@ -125,6 +168,12 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     faults = random.sample(("reset", *FAULTS), random.randint(1, 1 + len(FAULTS)))
     struck = random.sample(devices, random.randint(1, len(devices)))
     words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
+    strikes: list[Callable[[Random, float], Happening]] = []
+    for make, part in ((_stall, 0.4), (_kill, 0.3), (_cloud, 0.3)):
+        strikes += [make] * (random.random() < part)
+    fault_free = random.random() < _WITHOUT_FAULTS
+    if not fault_free:
+        strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
     attend_s = 10 ** random.uniform(0.0, 1.3)
     happenings: list[Happening] = []
@@ -138,8 +187,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         at_s += random.expovariate(1 / (_BURST_S if burst else every_s))
         if at_s >= duration_s:
             break
-        if random.random() < fault_part:
-            happenings.append(_strike(random, at_s, random.choice(struck), random.choice(faults)))
+        if strikes and random.random() < fault_part:
+            happenings.append(random.choice(strikes)(random, at_s))
         else:
             command = _COMMANDS[random.choice(words)](random)
             happenings.append(Order(at_s=at_s, who=random.choice(OPERATORS), command=command))
@@ -147,7 +196,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     return Plan(seed=seed, rig=rig, settings=[], duration_s=duration_s, happenings=happenings)
 
 
-def _strike(random: Random, at_s: float, device: str, fault: str) -> Strike:
+def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> Happening:
+    device, fault = random.choice(devices), random.choice(faults)
     return Strike(
         at_s=at_s,
         device=device,
@@ -155,3 +205,15 @@ def _strike(random: Random, at_s: float, device: str, fault: str) -> Strike:
         lasts_s=0.0 if fault == "reset" else 10 ** random.uniform(-2.0, 1.0),
         size=drawn_slowness(random) if fault == "slow" else 0.0,
     )
+
+
+def _stall(random: Random, at_s: float) -> Happening:
+    return Stall(at_s=at_s, lasts_s=10 ** random.uniform(-2.5, 0.3))
+
+
+def _kill(random: Random, at_s: float) -> Happening:
+    return Kill(at_s=at_s, back_after_s=10 ** random.uniform(-1.0, 0.7))
+
+
+def _cloud(random: Random, at_s: float) -> Happening:
+    return Cloud(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.2), part=random.random() ** 2)

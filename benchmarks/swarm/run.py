@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from random import Random
+from time import process_time
 from typing import Any
 
 import msgspec
@@ -14,12 +16,14 @@ import msgspec
 from benchmarks.swarm.devices import SwarmAmplifiers, SwarmCamera, SwarmDac, SwarmPiezo
 from benchmarks.swarm.invariants import Invariants, Violation
 from benchmarks.swarm.lines import Line
-from benchmarks.swarm.plan import Happening, Order, Plan, Strike
+from benchmarks.swarm.plan import Cloud, Happening, Kill, Order, Plan, Stall, Strike
 from benchmarks.swarm.threads import VirtualExecutor, VirtualTime, installed
 from fitctl.config import Rig, load_rig
 from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import AnyRecord, ModeChange
+from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import Acquire, AnyCommand, Recover, Reply, Standby, Stop, TakeOver
 from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.plant import Plant
@@ -30,13 +34,23 @@ from fitctl.supervisor.supervisor import Supervisor
 
 RIGS = Path(__file__).parents[2] / "rigs"
 HEAL_S = 60.0  # within which a loop must hold its star again
-_HISTORY_S = 1.0
+_HISTORY_S = 5.0  # a frame may come so late
 _ANSWER_S = 5.0
+_WIND_DOWN_S = 1.0  # as fitctl.daemon.run
+_START_S = 2.0
+_MOST_DESIGN_S = 20.0
+_BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
     Mode.OFF: Standby,
     Mode.SAFE: Recover,
     Mode.STANDBY: Acquire,
 }
+
+
+@functools.cache
+def _design_once(rig_file: str, name: str, controller: str) -> Design:
+    """Designs are the same for every seed."""
+    return design_for(load_rig(RIGS / rig_file), name, controller)
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,6 +70,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     lasted_s: float
     modes: dict[str, int]
     violations: list[Violation]
+    cpu_s: float
 
 
 class Instrument:
@@ -86,6 +101,8 @@ class Instrument:
         self.resets: dict[str, Callable[[], None]] = {}
         self.modes: dict[str, int] = {}
         self._plan = plan
+        self._design_random = self._random("design")
+        self._designs_take_time = False
         self._on_record = on_record
         self._digest = hashlib.blake2b(digest_size=16)
         self._encode = msgspec.msgpack.Encoder().encode
@@ -93,6 +110,8 @@ class Instrument:
         self._posted = 0
         self.amplifiers: dict[str, SwarmAmplifiers] = {}
         self.invariants = Invariants(rig, time, self.amplifiers)
+        if not any(isinstance(one, Strike | Stall) for one in plan.happenings):
+            self.invariants.nothing_fails = True
         self.camera = SwarmCamera(rig, time, self.plant, self._random("camera"))
         self._add("camera", self.camera)
         loops = {name: self._loop_devices(name) for name in rig.loops}
@@ -123,32 +142,63 @@ class Instrument:
 
     def start(self) -> None:
         """Start a supervisor."""
-        executor = VirtualExecutor(self.time, "devices")
+        self.time.new_process()
+        self._unanswered.clear()
         self.supervisor = Supervisor(
             self.rig,
             self.devices,
             self.time,
-            executor,
+            VirtualExecutor(self.time, "devices"),
             self._record,
-            design_for,
+            self._design,
             design_executor=VirtualExecutor(self.time, "design"),
             record_frames=False,
         )
+        self._designs_take_time = True
         self.admission = Admission(self.rig.service.lease_s)
         self.invariants.watch(self.supervisor)
-        for work in self.supervisor.periodic:
-            PeriodicThread(work, self.time).start()
+        self.running = True
+        self._threads = [PeriodicThread(work, self.time) for work in self.supervisor.periodic]
+        for thread in self._threads:
+            thread.start()
         self.time.spawn(self._main, "main")
 
+    def kill(self, back_after_s: float) -> None:
+        """The supervisor's process is gone, and a new one comes."""
+        if self.running:
+            self.time.kill_process()
+            self._end(back_after_s)
+
+    def _end(self, back_after_s: float) -> None:
+        self.running = self._designs_take_time = False
+        self._unanswered.clear()
+        self.invariants.watch(None)
+        self.time.call_at(self.time.now_s() + back_after_s, self.start)
+
     def _main(self) -> None:
+        """As :func:`fitctl.daemon.run.run_supervisor` does it."""
         supervisor, tick = self.supervisor, self.invariants.tick
         while not supervisor.shutdown_wanted:
             supervisor.step()
             tick()
+        supervisor.stop("shutting down")
+        end_s = self.time.now_s() + _WIND_DOWN_S
+        while self.time.now_s() < end_s and not supervisor.at_rest():
+            supervisor.step()
         supervisor.close()
+        for thread in self._threads:
+            thread.stop()
+        self.time.kill_process()
+        self._end(_START_S)
+
+    def _design(self, _rig: Rig, name: str, controller: str) -> Design:
+        if self._designs_take_time:  # those of the start come before time goes on
+            self.time.sleep(self._design_random.uniform(0.5, _MOST_DESIGN_S))
+        return _design_once(self._plan.rig, name, controller)
 
     def _record(self, record: AnyRecord) -> None:
         self._digest.update(self._encode(record))
+        self.invariants.record(record)
         if isinstance(record, ModeChange):
             self.modes[record.target] = self.modes.get(record.target, 0) + 1
         self._on_record(record)
@@ -157,6 +207,8 @@ class Instrument:
 
     def give(self, who: str, command: AnyCommand) -> None:
         """An operator gives a command, by the service's rules."""
+        if not self.running:
+            return
         now_s = self.time.now_s()
         sender = Sender(who, "swarm", "commander", is_local=True)
         if self.admission.refusal(sender, command, now_s):
@@ -166,15 +218,18 @@ class Instrument:
         self._posted += 1
         number = self._posted
         self._unanswered[number] = now_s, type(command).__name__
-        self.supervisor.post(command, partial(self._answered, number), who, "swarm")
+        self.invariants.posted(command)
+        answered = partial(self._answered, number, command)
+        self.supervisor.post(command, answered, who, "swarm")
 
-    def _answered(self, number: int, _reply: Reply) -> None:
+    def _answered(self, number: int, command: AnyCommand, reply: Reply) -> None:
         if self._unanswered.pop(number, None) is None:
             self.invariants.violated("a command is answered once", f"{number} is answered twice")
+        self.invariants.answered(command, reply)
 
     def lead_on(self, who: str) -> None:
         """Give the command that leads every loop on towards its star."""
-        for name, loop in self.supervisor.loops.items():
+        for name, loop in self.supervisor.loops.items() if self.running else ():
             make = _LEADS_ON.get(loop.mode)
             if make is not None:
                 self.give(who, make(loop=name))
@@ -197,6 +252,14 @@ class Instrument:
                 self.lead_on(happening.who)
             case Order(command=command) if command is not None:
                 self.give(happening.who, command)
+            case Stall():
+                self.time.stall(happening.lasts_s)
+                self.invariants.stalled(happening.lasts_s)
+            case Kill():
+                self.kill(happening.back_after_s)
+            case Cloud():
+                self.camera.dim(happening.part)
+                self.time.call_at(self.time.now_s() + happening.lasts_s, self.camera.undim)
             case Strike(fault="reset"):
                 self.resets[happening.device]()
             case Strike():
@@ -209,6 +272,7 @@ class Instrument:
 
     def heal(self) -> None:
         """End every fault."""
+        self.camera.undim()
         for line in self.lines.values():
             line.faults.clear()
 
@@ -220,6 +284,7 @@ class Instrument:
 
 def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None) -> Result:
     """Run a plan, then heal everything, and require the stars to be held."""
+    began_s = process_time()
     rig = load_rig(RIGS / plan.rig, plan.settings)
     time = VirtualTime()
     with installed(time):
@@ -242,21 +307,33 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
         lasted_s=time.now_s(),
         modes=instrument.modes,
         violations=violations,
+        cpu_s=process_time() - began_s,
     )
 
 
 def _recover(instrument: Instrument) -> None:
     """Nothing fails any more: `recover` and `acquire` must hold every star within `HEAL_S`."""
-    time, loops = instrument.time, instrument.supervisor.loops
+    time = instrument.time
     instrument.heal()
-    time.run_until(time.now_s() + 1.0)
+    time.run_until(time.now_s() + _BACK_S)
     instrument.give("ada", TakeOver())
     instrument.give("ada", Stop())
     end_s = time.now_s() + HEAL_S
     while time.now_s() < end_s:
         time.run_until(time.now_s() + 1.0)
+        instrument.answers_due()
+        loops = instrument.supervisor.loops
         if all(loop.mode in HOLDING for loop in loops.values()):
-            return
+            break
         instrument.lead_on("ada")
-    modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
-    instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)
+    else:
+        modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
+        instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)
+    now_s = time.now_s()
+    for loop in instrument.supervisor.loops.values():
+        for outcome in instrument.supervisor.outcomes.add_to(loop.state(now_s)).outcomes:
+            longest_s = next(row.wait_s for row in COMMANDS if row.word == outcome.command)
+            if outcome.state == "under way" and now_s - outcome.began_s > longest_s:
+                instrument.invariants.violated(
+                    "what takes time ends", f"{outcome.command} of {outcome.began_s:.2f} s"
+                )

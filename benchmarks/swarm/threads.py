@@ -52,6 +52,8 @@ class VirtualTime:
         self._hub = getcurrent()
         self._threads: list[greenlet] = []
         self._killed: set[greenlet] = set()
+        self._process: list[greenlet] = []
+        self._stalled_until_s = 0.0
         self._over = False
 
     # ------------------------------------------------------------ the clock
@@ -106,12 +108,21 @@ class VirtualTime:
 
         thread = greenlet(guarded, self._hub)
         self._threads.append(thread)
+        self._process.append(thread)
         self._push(self._now_s, thread)
         return thread
 
-    def kill(self, thread: greenlet) -> None:
-        """Let a thread never go on, as the threads of a killed process."""
-        self._killed.add(thread)
+    def new_process(self) -> None:
+        """What is spawned from now on belongs to a new process."""
+        self._process = []
+
+    def kill_process(self) -> None:
+        """No thread of the process ever goes on."""
+        self._killed.update(self._process)
+
+    def stall(self, duration_s: float) -> None:
+        """No thread goes on for a while, as on a machine that stands still; what is no thread does."""
+        self._stalled_until_s = max(self._stalled_until_s, self._now_s + duration_s)
 
     def park(self, timeout_s: float | None = None) -> None:
         """Wait to be woken, no longer than a time limit."""
@@ -141,6 +152,14 @@ class VirtualTime:
             time_s, _, due = heapq.heappop(self._due)
             run = due.run
             if run is None or run in self._killed:
+                continue
+            if (
+                time_s < self._stalled_until_s
+                and isinstance(run, greenlet)
+                and run is not self._hub
+            ):
+                self._number += 1
+                heapq.heappush(self._due, (self._stalled_until_s, self._number, due))
                 continue
             due.fired = True
             if time_s > self._now_s:  # noqa: PLR1730

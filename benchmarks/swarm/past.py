@@ -1,0 +1,230 @@
+"""Defects that fitctl once had, put back one at a time: what the swarm must find, and how soon it does.
+
+Each is a patch of today's code that acts as the code did before its commit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+from fitctl.drivers.interface import AzEl, Frame
+from fitctl.loop.loop import Loop
+from fitctl.loop.stellar import StellarLoop
+from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.modes import Mode, Trigger
+from fitctl.stages.mirror import MirrorStage
+from fitctl.stages.servo import SiderostatServo
+from fitctl.supervisor.camera_watch import CameraWatch
+from fitctl.supervisor.device_jobs import DeviceJobs
+from fitctl.supervisor.piezo import PiezoWatch
+from fitctl.supervisor.supervisor import Posted, Supervisor
+
+
+class Defect(NamedTuple):
+    """One defect.
+
+    Attributes
+    ----------
+    commit : str
+        That mended it.
+    what : str
+    patches : sequence of (type, str, Any)
+        Class, attribute, and what it was.
+    """
+
+    commit: str
+    what: str
+    patches: Sequence[tuple[type, str, Any]]
+
+
+def _post_waits(
+    self: Supervisor,
+    command: AnyCommand,
+    reply: Callable[[Reply], None],
+    sender: str = "",
+    address: str = "",
+) -> None:
+    self._commands.append(Posted(command, reply, sender, address))
+
+
+def _ask_while_dac_ready(self: PiezoWatch) -> None:
+    if self._loop.mirror.ready:
+        _ASK(self)
+
+
+def _oldest_frame(self: CameraWatch) -> Frame | None:
+    self.older.clear()
+    if not self.ready:
+        self._clock.sleep_until(self._clock.now_s() + self._period_s)
+        return None
+    try:
+        frame = self._camera.next_frame(2 * self._period_s)
+    except Exception as error:
+        self.ready = False
+        self._failed(error)  # type: ignore[arg-type]
+        return None
+    if frame is not None:
+        self._last_frame_s = self._clock.now_s()
+    return frame
+
+
+def _steer_by_any_reading(self: SiderostatServo, *arguments: Any) -> None:
+    _SERVO_INIT(self, *arguments)
+    self._blind_s = math.inf
+
+
+def _find_position_as_a_jump(self: SiderostatServo) -> None:
+    _FIND_POSITION(self)
+    self.encoders_jumped = self.encoders_jumped or self.turned_on_rad > 0.0
+
+
+def _open_unread(self: SiderostatServo) -> Any:
+    self._stopped = True
+    self.fault = None
+    self.opened = self.enabled = False
+    identity = self._amplifiers.open()
+    self._amplifiers.reset_fault()
+    self._amplifiers.enable()
+    self.opened = self.enabled = True
+    self._timely_s = self._clock.now_s()
+    return identity
+
+
+def _one_slot(self: Loop, source: str, reason: str) -> None:
+    if not self.fire(Trigger.FAULT, reason) and reason not in self._last_failures.values():
+        self._report_event("error", reason)
+    self._last_failures.clear()
+    self._last_failures[source] = reason
+
+
+def _go_on_as_before(self: SiderostatServo, _position_rad: AzEl) -> None:
+    self._blind = False
+
+
+def _designs_with_devices(self: Supervisor, *arguments: Any, **options: Any) -> None:
+    options["design_executor"] = None
+    _SUPERVISOR_INIT(self, *arguments, **options)
+
+
+def _goes_on_in_a_fault(self: SiderostatServo, now_s: float) -> AzEl:
+    return self._velocity_rad_s(now_s)
+
+
+def _fail_and_go_on(self: SiderostatServo, error: Exception) -> None:
+    stopped = self._stopped
+    _FAIL(self, error)
+    self._stopped = stopped
+
+
+def _safe_and_go_on(self: Loop, source: Mode, motor_rad: Any) -> None:
+    if self.mode is not Mode.SAFE:
+        _ENTER(self, source, motor_rad)
+
+
+_ASK = PiezoWatch.ask
+_SERVO_INIT = SiderostatServo.__init__
+_FIND_POSITION = SiderostatServo._find_position
+_FAIL = SiderostatServo._fail
+_ENTER = Loop._enter
+_SUPERVISOR_INIT = Supervisor.__init__
+
+DEFECTS = {
+    "power-race": Defect(
+        "ec1ab20",
+        "amplifiers lose their power between being opened and STANDBY",
+        [(DeviceJobs, "opens", lambda _self, _name: False)],
+    ),
+    "repeated-off": Defect(
+        "a0d343e",
+        "each `off` that is refused moves the mirror one step more",
+        [(StellarLoop, "rest", lambda self: self.mirror.step_to_bias())],
+    ),
+    "piezo-by-dac": Defect(
+        "a0d343e",
+        "the piezo amplifier is not read once the D/A has failed",
+        [(PiezoWatch, "ask", _ask_while_dac_ready)],
+    ),
+    "late-stop": Defect(
+        "bf6a8c0",
+        "a stop waits for the next tick, behind whatever that waits for",
+        [(Supervisor, "post", _post_waits)],
+    ),
+    "stop-while-opening": Defect(
+        "4a793ee",
+        "a stop while devices open is overtaken by STANDBY",
+        [(DeviceJobs, "abandon", lambda _self, _names: None)],
+    ),
+    "one-slot": Defect(
+        "a4b080e",
+        "the last failure has one slot: two that alternate are reported at every tick",
+        [(Loop, "fail", _one_slot)],
+    ),
+    "design-with-devices": Defect(
+        "89687bc",
+        "the device thread makes designs too, and the piezo amplifier is not read meanwhile",
+        [(Supervisor, "__init__", _designs_with_devices)],
+    ),
+    "old-readings": Defect(
+        "df0a423",
+        "the servo steers by readings of any age",
+        [(SiderostatServo, "__init__", _steer_by_any_reading)],
+    ),
+    "stall-is-stuck": Defect(
+        "f6dc181",
+        "motors that turned on while the computer stood still are a following error",
+        [(SiderostatServo, "_go_on_from", _go_on_as_before)],
+    ),
+    "star-forgotten": Defect(
+        "f9f5b71",
+        "motors that turned on while amplifiers did not answer are encoders with another zero",
+        [(SiderostatServo, "_find_position", _find_position_as_a_jump)],
+    ),
+    "powered-unread": Defect(
+        "bf6a8c0",
+        "motors get power before their encoders are read",
+        [(SiderostatServo, "_open", _open_unread)],
+    ),
+    "oldest-frame": Defect(
+        "a0d343e",
+        "after a stall the loop acts on the oldest frame, and stays behind",
+        [(CameraWatch, "next_frame", _oldest_frame)],
+    ),
+    "moves-in-a-fault": Defect(
+        "bf6a8c0",
+        "motors are servoed on after a fault",
+        [
+            (SiderostatServo, "_wanted_rad_s", _goes_on_in_a_fault),
+            (SiderostatServo, "_fail", _fail_and_go_on),
+            (Loop, "_enter", _safe_and_go_on),
+        ],
+    ),
+    "silent-camera": Defect(
+        "60f97e4",
+        "recover does not open a camera anew that is open and silent",
+        [(CameraWatch, "well", property(lambda self: self.ready))],
+    ),
+    "late-answer": Defect(
+        "4a793ee",
+        "an answer of the piezo amplifier from before it was opened anew is evaluated",
+        [(PiezoWatch, "forget", lambda self: setattr(self, "is_open", False))],
+    ),
+    "written-on": Defect(
+        "bf6a8c0",
+        "a D/A that did not confirm is written on",
+        [(MirrorStage, "ready", property(lambda _self: True, lambda _self, _value: None))],
+    ),
+}
+"""By name."""
+
+
+@contextmanager
+def put_back(name: str) -> Iterator[None]:
+    """Have a defect meanwhile; without a name, none."""
+    with ExitStack() as stack:
+        for owner, attribute, was in DEFECTS[name].patches if name else ():
+            stack.enter_context(patch.object(owner, attribute, was, create=True))
+        yield
