@@ -227,11 +227,16 @@ class Instrument:
             self.invariants.violated("a command is answered once", f"{number} is answered twice")
         self.invariants.answered(command, reply)
 
-    def lead_on(self, who: str) -> None:
-        """Give the command that leads every loop on towards its star."""
+    def lead_on(self, who: str, *, from_zero: bool = False) -> None:
+        """Give the command that leads every loop on towards its star, sought about the encoders' zero or not."""
         for name, loop in self.supervisor.loops.items() if self.running else ():
             make = _LEADS_ON.get(loop.mode)
-            if make is not None:
+            if make is Acquire and from_zero:
+                expected = Acquire(
+                    loop=name, expected_az_sky_arcsec=0.0, expected_el_sky_arcsec=0.0
+                )
+                self.give(who, expected)
+            elif make is not None:
                 self.give(who, make(loop=name))
 
     def answers_due(self) -> None:
@@ -319,13 +324,15 @@ def _recover(instrument: Instrument) -> None:
     instrument.give("ada", TakeOver())
     instrument.give("ada", Stop())
     end_s = time.now_s() + HEAL_S
+    # A supervisor that was killed during a search does not know where that began; its operator does.
+    from_zero_s = time.now_s() + HEAL_S / 3
     while time.now_s() < end_s:
         time.run_until(time.now_s() + 1.0)
         instrument.answers_due()
         loops = instrument.supervisor.loops
         if all(loop.mode in HOLDING for loop in loops.values()):
             break
-        instrument.lead_on("ada")
+        instrument.lead_on("ada", from_zero=time.now_s() > from_zero_s)
     else:
         modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
         instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)
