@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from random import Random
 
 import numpy as np
@@ -24,17 +25,28 @@ from fitctl.drivers.interface import (
     DeviceFault,
     DeviceIdentity,
     DeviceMismatch,
+    DiodeReading,
     Frame,
+    HexapodReading,
+    Pose,
     ServoReading,
 )
 from fitctl.model.metrology.part import MetrologyPart
 from fitctl.model.plant import Plant
 from fitctl.model.stellar_part import StellarPart
-from fitctl.simulation.devices import SimulatedAmplifiers, SimulatedCamera, SimulatedMirror
+from fitctl.simulation.devices import (
+    SimulatedAmplifiers,
+    SimulatedCamera,
+    SimulatedHexapod,
+    SimulatedMirror,
+    SimulatedPhotodiodes,
+)
 
 Floats = NDArray[np.float64]
 _STILL: AzEl = (0.0, 0.0)
 _MASTER_LOST = "heartbeat of the master lost"
+_REFERENCE_S = 5.0
+_SILENCE = frozenset({"deaf", "mute", "refuses", "garbled"})
 _MOST_LATE_FRAMES = 20
 
 
@@ -83,6 +95,8 @@ class SwarmAmplifiers:
         self._heard_s = 0.0
         self._watched = False
         self._late: ServoReading | None = None
+        self._staged_rad_s: AzEl | None = None
+        self._sync: tuple[float, float, ServoReading | None] | None = None
 
     # ------------------------------------------------------------ the driver
 
@@ -92,7 +106,7 @@ class SwarmAmplifiers:
         for _ in range(20):
             self.line.ask(self._nothing)
         self._heard_s = self._time.now_s()
-        self._late = None
+        self._late = self._staged_rad_s = self._sync = None
         self._inner.open()
         return _identity("amplifiers")
 
@@ -115,25 +129,51 @@ class SwarmAmplifiers:
         self.line.ask(self._power_down)
         self.line.ask(self._clear)
 
+    def stage(self, velocity_rad_s: AzEl) -> None:
+        """Have a command ready for the bus."""
+        if not self.line.connected or "unplugged" in self.line.faults:
+            raise self.line.broken()
+        self._commanded(self.name, velocity_rad_s)
+        self._staged_rad_s = velocity_rad_s
+
+    def synchronize(self) -> None:
+        """Send the command that is ready, if there is one; the drive acts, and reads its encoders."""
+        velocity_rad_s, self._staged_rad_s = self._staged_rad_s, None
+        if velocity_rad_s is None:
+            return
+        reading = None
+        if "deaf" not in self.line.faults:
+            self._hear(velocity_rad_s)
+            reading = self._read()
+        self._sync = self._time.now_s(), self.line.delay_s(), reading
+
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period, which waits for the encoders as long as a period lasts."""
-        line, began_s = self.line, self._time.now_s()
-        if not line.connected or "unplugged" in line.faults:
+        if self._sync is None:
+            if self._staged_rad_s is None:
+                self.stage(velocity_rad_s)
+            self.synchronize()
+        line, sync, self._sync = self.line, self._sync, None
+        if not line.connected or sync is None:
             raise line.broken()
-        self._commanded(self.name, velocity_rad_s)
-        delay_s = line.delay_s()
-        if line.faults and self._lost(velocity_rad_s, delay_s, began_s):
-            return None
-        self._hear(velocity_rad_s)
-        reading = self._read()
-        if delay_s > self._period_s:
-            self._time.sleep_until(began_s + self._period_s)
-            late, self._late = self._late, reading
-            return late
-        self._time.sleep(delay_s)
+        sent_s, delay_s, reading = sync
+        if line.faults and line.faults.keys() & _SILENCE:
+            if "garbled" in line.faults:
+                self._time.sleep_until(sent_s + min(delay_s, self._period_s))
+                raise line.garbled()
+            reading = None
+        late, self._late = self._late, None
+        if reading is None or delay_s > self._period_s:
+            self._time.sleep_until(sent_s + self._period_s)
+            self._late, reading = reading, late
+        else:
+            self._time.sleep_until(sent_s + delay_s)
         if not line.connected:
             raise line.broken()
-        self._heard_s = self._time.now_s()
+        if reading is not None:
+            self._heard_s = self._time.now_s()
+        elif self._time.now_s() - self._heard_s > self._alive_s:
+            raise line.timeout()
         return reading
 
     def close(self) -> None:
@@ -205,21 +245,6 @@ class SwarmAmplifiers:
         self._power_down()
         self.fault = _MASTER_LOST
 
-    def _lost(self, velocity_rad_s: AzEl, delay_s: float, began_s: float) -> bool:
-        """Whether a fault of the line keeps the answer from coming."""
-        faults = self.line.faults
-        if not {"deaf", "mute", "garbled", "refuses"} & faults.keys():
-            return False
-        if "deaf" not in faults:
-            self._hear(velocity_rad_s)
-        if "garbled" in faults:
-            self._time.sleep(min(delay_s, self._period_s))
-            raise self.line.garbled()
-        self._time.sleep_until(began_s + self._period_s)
-        if self._time.now_s() - self._heard_s > self._alive_s:
-            raise self.line.timeout()
-        return True
-
 
 class SwarmDac:
     """The D/A behind Modbus, with a watchdog."""
@@ -227,7 +252,6 @@ class SwarmDac:
     def __init__(
         self,
         mirror: SimulatedMirror,
-        plant: StellarPart,
         time: VirtualTime,
         rig: Rig,
         loop_name: str,
@@ -346,6 +370,113 @@ class SwarmPiezo:
         self.line.connected = False
 
 
+class SwarmPhotodiodes(SimulatedPhotodiodes):
+    """The photodiodes' converter at the other end of a network."""
+
+    def __init__(
+        self, plant: MetrologyPart, time: VirtualTime, rig: Rig, loop_name: str, random: Random
+    ) -> None:
+        super().__init__(plant, time, rig, loop_name)  # type: ignore[arg-type]
+        device = rig.metrology_loops[loop_name].sensor.device
+        self.line = Line(
+            "photodiodes", device.endpoint, time, random, 0.001, device.response_timeout_s
+        )
+        self._usual_s = self._round_trip_s
+
+    def open(self) -> DeviceIdentity:
+        """Connect and configure."""
+        self.line.open()
+        for _ in range(6):
+            self.line.ask(lambda: None)
+        return super().open()
+
+    def send_request(self) -> None:
+        """Ask for a sample."""
+        if not self.line.connected or "unplugged" in self.line.faults:
+            raise self.line.broken()
+        super().send_request()
+
+    def receive(self) -> DiodeReading | None:
+        """The newest sample, which a fault may keep."""
+        faults = self.line.faults
+        if not self.line.connected or "unplugged" in faults:
+            raise self.line.broken()
+        if "garbled" in faults:
+            raise self.line.garbled()
+        self._round_trip_s = self._usual_s * faults.get("slow", 1.0)
+        silent = bool(faults.keys() & _SILENCE)
+        reading = None if silent else super().receive()
+        now_s = self._clock.now_s()
+        if reading is not None or not self._requested_s:
+            return reading
+        if now_s - self._requested_s[0] > self.line.timeout_s:
+            self._requested_s.clear()
+            raise self.line.timeout()
+        return None
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.line.close()
+
+    def reset(self) -> None:
+        """It restarts."""
+        self.line.connected = False
+
+
+class SwarmHexapod(SimulatedHexapod):
+    """The hexapod's controller on a serial line."""
+
+    def __init__(self, plant: Plant, time: VirtualTime, rig: Rig, random: Random) -> None:
+        _, mocks = rig.mock_parts()
+        device = rig.collector.hexapod  # type: ignore[union-attr]
+        super().__init__(plant.collector, time, device, mocks.hexapod)  # type: ignore[arg-type]
+        self.line = Line("hexapod", device.endpoint, time, random, 0.01, device.response_timeout_s)
+        self._time = time
+
+    def open(self) -> DeviceIdentity:
+        """Connect and check."""
+        self.line.open()
+        for _ in range(10):
+            self.line.ask(lambda: None)
+        return super().open()
+
+    def reference(self) -> None:
+        """A reference move takes seconds."""
+        self.line.ask(lambda: None)
+        ends_s = self._time.now_s() + _REFERENCE_S
+        while self._time.now_s() < ends_s:
+            self._time.sleep(0.1)
+            self.line.ask(lambda: None)
+        super().reference()
+
+    def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
+        """Start a move."""
+        self.line.ask(partial(super().move_to, pose, velocity_mm_s))
+
+    def pose(self) -> HexapodReading:
+        """Where it is."""
+        return self.line.ask(super().pose)
+
+    def stop(self) -> None:
+        """Brake, and wait until it is at rest."""
+        self.line.ask(super().stop)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.line.close()
+
+    def reset(self) -> None:
+        """It restarts where it is, and has to be referenced."""
+        super().stop()
+        self._referenced = False
+        self.line.connected = False
+
+    @property
+    def moves(self) -> bool:
+        """Its platform moves now."""
+        return self._time.now_s() < self._trajectory.ends_s
+
+
 class SwarmCamera(SimulatedCamera):
     """The camera behind its network: frames come late, all at once, or not at all."""
 
@@ -361,10 +492,6 @@ class SwarmCamera(SimulatedCamera):
     def dim(self, part: float) -> None:
         """The spots have so much of their light."""
         self._scene._flux_dn = self._clear_dn * part
-
-    def undim(self) -> None:
-        """The spots have all of their light."""
-        self._scene._flux_dn = self._clear_dn
 
     def open(self) -> DeviceIdentity:
         """Take control."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from benchmarks.swarm.devices import SwarmAmplifiers
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.drivers.interface import AzEl
-from fitctl.logging.records import AnyRecord, Event, ModeChange, PiezoReading
+from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading
 from fitctl.messages.commands import AnyCommand, Recover, Reply, Standby, Stop
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.supervisor.supervisor import Supervisor
@@ -27,7 +27,7 @@ _SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
 _MOST_STEP_S = 2.0
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
-_MOST_ALIKE, _ALIKE_S = 20, 10.0
+_MOST_ALIKE = 3
 _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
 
 
@@ -66,7 +66,7 @@ class Invariants:
         self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
         self._power_up_s: dict[str, float] = {}
         self._stop_answered_s: dict[str, float] = {}
-        self._texts: dict[tuple[str, str], deque[float]] = {}
+        self._texts: Counter[str] = Counter()  # of errors, since devices were opened
         self._piezo_read_s: dict[str, float] = {}
 
     def watch(self, supervisor: Supervisor | None) -> None:
@@ -124,6 +124,8 @@ class Invariants:
                 self._mode_changed(record)
             case Event():
                 self._reported(record)
+            case DevicesOpened():
+                self._texts.clear()
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
 
@@ -138,10 +140,11 @@ class Invariants:
             self.violated("without a fault nothing fails", f"{name}: {change.reason}")
 
     def _reported(self, event: Event) -> None:
-        times_s = self._texts.setdefault((event.source, event.message), deque(maxlen=_MOST_ALIKE))
-        times_s.append(event.time_s)
-        if len(times_s) == _MOST_ALIKE and event.time_s - times_s[0] < _ALIKE_S:
-            self.violated("a cause is reported once", f"{event.source}: {event.message}")
+        if event.severity == "error" and event.source in self._rig.loops:
+            if "->" not in event.message:
+                self._texts[event.message] += 1
+            if self._texts[event.message] > _MOST_ALIKE:
+                self.violated("a cause is reported once", f"{event.source}: {event.message}")
         if "star's place is forgotten" in event.message:
             self.violated("encoders that count on keep the star's place", event.message)
 

@@ -17,9 +17,32 @@ from fitctl.drivers.interface import (
 
 Result = TypeVar("Result")
 
+_SLICE_S = 0.0005
+
 FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
 """Of a line, while they last: answers come late; requests are lost; answers are lost; the device refuses;
 answers make no sense; nothing is connected."""
+
+
+class Bus:
+    """A bus, as :class:`fitctl.drivers.interface.ServoBus`; what to do on it at once is added by its drives.
+
+    Attributes
+    ----------
+    meanwhile : callable or None
+        Called again and again while a drive waits for an answer.
+    drives : list of callable
+        Send what is staged.
+    """
+
+    def __init__(self) -> None:
+        self.meanwhile: Callable[[], None] | None = None
+        self.drives: list[Callable[[], None]] = []
+
+    def synchronize(self) -> None:
+        """Send all commands that are staged."""
+        for send in self.drives:
+            send()
 
 
 class Line:
@@ -42,6 +65,8 @@ class Line:
         Those in force, of `FAULTS`; of "slow", how much slower.
     connected : bool
         The driver has opened it, and it has not broken since.
+    bus : Bus or None
+        Whose other drives go on while this one waits.
     """
 
     def __init__(
@@ -57,6 +82,7 @@ class Line:
         self.endpoint = endpoint
         self.faults: dict[str, float] = {}
         self.connected = False
+        self.bus: Bus | None = None
         self.timeout_s = timeout_s
         self._time = time
         self._random = random
@@ -70,7 +96,7 @@ class Line:
         DeviceUnreachable
         """
         if "unplugged" in self.faults:
-            self._time.sleep(self._usual_s)
+            self._sleep(self._usual_s)
             raise self._unreachable("nothing")
         self.connected = True
 
@@ -97,9 +123,9 @@ class Line:
         if self.faults:
             return self._ask_badly(act)
         delay_s = self.delay_s()
-        self._time.sleep(delay_s / 2)
+        self._sleep(delay_s / 2)
         result = act()
-        self._time.sleep(delay_s / 2)
+        self._sleep(delay_s / 2)
         if not self.connected:  # closed, or reset, meanwhile
             raise self._unreachable("a broken connection")
         return result
@@ -108,26 +134,37 @@ class Line:
         began_s = self._time.now_s()
         if "unplugged" in self.faults:
             self.connected = False
-            self._time.sleep(self._usual_s)
+            self._sleep(self._usual_s)
             raise self._unreachable("a broken connection")
         delay_s = self.delay_s()
-        self._time.sleep(min(delay_s / 2, self.timeout_s))
+        self._sleep(min(delay_s / 2, self.timeout_s))
         if "deaf" in self.faults or delay_s / 2 > self.timeout_s:
-            self._time.sleep_until(began_s + self.timeout_s)
+            self._sleep_until(began_s + self.timeout_s)
             raise self.timeout()
         if "refuses" in self.faults:
-            self._time.sleep(min(delay_s / 2, self.timeout_s))
+            self._sleep(min(delay_s / 2, self.timeout_s))
             raise DeviceRefused(self.device, self.endpoint, "to obey", "a refusal", "ask it why")
         result = act()
         if "mute" in self.faults or delay_s > self.timeout_s:
-            self._time.sleep_until(began_s + self.timeout_s)
+            self._sleep_until(began_s + self.timeout_s)
             raise self.timeout()
-        self._time.sleep(delay_s / 2)
+        self._sleep(delay_s / 2)
         if "garbled" in self.faults:
             raise self.garbled()
         if not self.connected:
             raise self._unreachable("a broken connection")
         return result
+
+    def _sleep(self, duration_s: float) -> None:
+        self._sleep_until(self._time.now_s() + duration_s)
+
+    def _sleep_until(self, deadline_s: float) -> None:
+        """Wait, and let what shares the thread go on meanwhile."""
+        bus = self.bus
+        while bus is not None and bus.meanwhile is not None and self._time.now_s() < deadline_s:
+            self._time.sleep_until(min(deadline_s, self._time.now_s() + _SLICE_S))
+            bus.meanwhile()
+        self._time.sleep_until(deadline_s)
 
     def timeout(self) -> DeviceTimeout:
         """The error of an answer that did not come."""

@@ -14,6 +14,7 @@ from fitctl.messages.commands import (
     AnyCommand,
     Hold,
     Jog,
+    MoveCollector,
     Off,
     Recover,
     SetBiasOffset,
@@ -26,12 +27,14 @@ from fitctl.messages.commands import (
     TakeOver,
 )
 
-RIGS: dict[str, list[str]] = {
-    "fit-mock.toml": ["camera", "right siderostat", "right D/A", "right piezo"],
+RIGS: dict[str, tuple[str, ...]] = {
+    "fit-mock.toml": ("right",),
+    "fit-testbed.toml": ("right", "metrology", "left"),
 }
-"""Files of ``rigs/``, each with its devices."""
+"""Files of ``rigs/``, each with its loops."""
 DURATION_S = 120.0
 OPERATORS = ("ada", "ben", "cleo")
+_OF_ONE_LOOP = 0.3  # so many commands name one
 _WITHOUT_FAULTS = 0.15  # so many runs have none of a device
 _BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
 
@@ -144,6 +147,9 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     ),
     "controller": lambda random: SetController(name=random.choice(("eq20", "minimum-variance"))),
     "shutdown": lambda random: Shutdown() if random.random() < 0.2 else None,
+    "collector": lambda random: MoveCollector(
+        action=random.choice(("reference", "start", "start", "stop"))
+    ),
     "bias-offset": lambda random: SetBiasOffset(
         az_urad=random.uniform(-400, 400), el_urad=random.uniform(-400, 400)
     ),
@@ -151,10 +157,19 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
 """By their words; without a command, the one that leads on."""
 
 
+def devices_of(rig: str) -> list[str]:
+    """The devices of a rig."""
+    devices = ["camera"]
+    for loop in RIGS[rig]:
+        sensors = ("photodiodes",) if loop == "metrology" else ("D/A", "piezo")
+        devices += [f"{loop} {what}" for what in ("siderostat", *sensors)]
+    return [*devices, "hexapod"] if "metrology" in RIGS[rig] else devices
+
+
 def plan_of(seed: int) -> Plan:
     """The plan of a seed."""
     random = Random(seed)  # noqa: S311 - a repeatable draw
-    rig = random.choice(list(RIGS))
+    rig = random.choices(list(RIGS), [3, 1])[0]
     return drawn_plan(random, seed, rig)
 
 
@@ -164,7 +179,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     Each run has some kinds of faults and commands, and others not at all, at a pace of its own: what everything
     together would drown is found where most of it is left out.
     """
-    devices, duration_s = RIGS[rig], DURATION_S
+    loops, devices, duration_s = RIGS[rig], devices_of(rig), DURATION_S
     faults = random.sample(("reset", *FAULTS), random.randint(1, 1 + len(FAULTS)))
     struck = random.sample(devices, random.randint(1, len(devices)))
     words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
@@ -175,6 +190,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     if not fault_free:
         strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
+    people = OPERATORS[
+        : random.randint(1, len(OPERATORS))
+    ]  # who does not have the lease is refused
     attend_s = 10 ** random.uniform(0.0, 1.3)
     happenings: list[Happening] = []
     at_s = 0.1
@@ -191,7 +209,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
             happenings.append(random.choice(strikes)(random, at_s))
         else:
             command = _COMMANDS[random.choice(words)](random)
-            happenings.append(Order(at_s=at_s, who=random.choice(OPERATORS), command=command))
+            if command is not None and random.random() < _OF_ONE_LOOP:
+                command = msgspec.structs.replace(command, loop=random.choice(loops))
+            happenings.append(Order(at_s=at_s, who=random.choice(people), command=command))
     happenings.sort(key=lambda happening: happening.at_s)
     return Plan(seed=seed, rig=rig, settings=[], duration_s=duration_s, happenings=happenings)
 

@@ -13,9 +13,16 @@ from typing import Any
 
 import msgspec
 
-from benchmarks.swarm.devices import SwarmAmplifiers, SwarmCamera, SwarmDac, SwarmPiezo
+from benchmarks.swarm.devices import (
+    SwarmAmplifiers,
+    SwarmCamera,
+    SwarmDac,
+    SwarmHexapod,
+    SwarmPhotodiodes,
+    SwarmPiezo,
+)
 from benchmarks.swarm.invariants import Invariants, Violation
-from benchmarks.swarm.lines import Line
+from benchmarks.swarm.lines import Bus, Line
 from benchmarks.swarm.plan import Cloud, Happening, Kill, Order, Plan, Stall, Strike
 from benchmarks.swarm.threads import VirtualExecutor, VirtualTime, installed
 from fitctl.config import Rig, load_rig
@@ -24,8 +31,18 @@ from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.records import AnyRecord, ModeChange
 from fitctl.messages.command_table import COMMANDS
-from fitctl.messages.commands import Acquire, AnyCommand, Recover, Reply, Standby, Stop, TakeOver
+from fitctl.messages.commands import (
+    Acquire,
+    AnyCommand,
+    Recover,
+    Reply,
+    SetTarget,
+    Standby,
+    Stop,
+    TakeOver,
+)
 from fitctl.messages.modes import HOLDING, Mode
+from fitctl.model.metrology.part import MetrologyPart
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Admission, Sender
 from fitctl.simulation.devices import SimulatedMirror
@@ -115,7 +132,11 @@ class Instrument:
         self.camera = SwarmCamera(rig, time, self.plant, self._random("camera"))
         self._add("camera", self.camera)
         loops = {name: self._loop_devices(name) for name in rig.loops}
-        self.devices = Devices(self.camera, loops)
+        hexapod = None
+        if rig.collector is not None:
+            hexapod = SwarmHexapod(self.plant, time, rig, self._random("hexapod"))
+            self._add("hexapod", hexapod)
+        self.devices = Devices(self.camera, loops, hexapod)
         self.start()
 
     def _random(self, name: str) -> Random:
@@ -126,17 +147,25 @@ class Instrument:
         self.resets[name] = device.reset
 
     def _loop_devices(self, name: str) -> LoopDevices:
-        part = self.plant.stellar_loops[name]
-        random = self._random(name)
+        part, random, time, rig = self.plant.loops[name], self._random(name), self.time, self.rig
         self.amplifiers[name] = amplifiers = SwarmAmplifiers(
-            part, self.time, self.rig, name, random, self.invariants.velocity
+            part, time, rig, name, random, self.invariants.velocity
         )
-        mirror = SimulatedMirror(part, self.time, self.rig, name)  # type: ignore[arg-type]
-        dac = SwarmDac(mirror, part, self.time, self.rig, name, random, self.invariants.volts)
-        piezo = SwarmPiezo(mirror, self.time, self.rig, name, random)
-        for what, device in (("siderostat", amplifiers), ("D/A", dac), ("piezo", piezo)):
-            self._add(f"{name} {what}", device)
-        return LoopDevices(amplifiers, dac=dac, piezo=piezo)
+        self._add(f"{name} siderostat", amplifiers)
+        bus = None
+        if len(rig.loops) > 1:  # as fitctl.daemon.devices.can_buses
+            bus = amplifiers.line.bus = Bus()
+            bus.drives.append(amplifiers.synchronize)
+        if isinstance(part, MetrologyPart):
+            photodiodes = SwarmPhotodiodes(part, time, rig, name, random)
+            self._add(f"{name} photodiodes", photodiodes)
+            return LoopDevices(amplifiers, photodiodes=photodiodes, bus=bus)
+        mirror = SimulatedMirror(part, time, rig, name)  # type: ignore[arg-type]
+        dac = SwarmDac(mirror, time, rig, name, random, self.invariants.volts)
+        piezo = SwarmPiezo(mirror, time, rig, name, random)
+        self._add(f"{name} D/A", dac)
+        self._add(f"{name} piezo", piezo)
+        return LoopDevices(amplifiers, dac=dac, piezo=piezo, bus=bus)
 
     # ------------------------------------------------------------ the supervisor's process
 
@@ -228,7 +257,7 @@ class Instrument:
         self.invariants.answered(command, reply)
 
     def lead_on(self, who: str, *, from_zero: bool = False) -> None:
-        """Give the command that leads every loop on towards its star, sought about the encoders' zero or not."""
+        """Give the command that leads every loop on towards its star; `from_zero`, sought about there."""
         for name, loop in self.supervisor.loops.items() if self.running else ():
             make = _LEADS_ON.get(loop.mode)
             if make is Acquire and from_zero:
@@ -263,8 +292,8 @@ class Instrument:
             case Kill():
                 self.kill(happening.back_after_s)
             case Cloud():
-                self.camera.dim(happening.part)
-                self.time.call_at(self.time.now_s() + happening.lasts_s, self.camera.undim)
+                self._dim(happening.part)
+                self.time.call_at(self.time.now_s() + happening.lasts_s, partial(self._dim, 1.0))
             case Strike(fault="reset"):
                 self.resets[happening.device]()
             case Strike():
@@ -275,9 +304,14 @@ class Instrument:
                     partial(faults.pop, happening.fault, None),  # type: ignore[arg-type]
                 )
 
+    def _dim(self, part: float) -> None:
+        self.camera.dim(part)
+        for beam in self.plant.metrology_loops.values():
+            beam.state.laser[:] = part
+
     def heal(self) -> None:
         """End every fault."""
-        self.camera.undim()
+        self._dim(1.0)
         for line in self.lines.values():
             line.faults.clear()
 
@@ -323,6 +357,12 @@ def _recover(instrument: Instrument) -> None:
     time.run_until(time.now_s() + _BACK_S)
     instrument.give("ada", TakeOver())
     instrument.give("ada", Stop())
+    for (
+        name,
+        loop,
+    ) in instrument.rig.stellar_loops.items():  # two stars may have been sent to one place
+        target_px = loop.target_px
+        instrument.give("ada", SetTarget(loop=name, az_px=target_px.az, el_px=target_px.el))
     end_s = time.now_s() + HEAL_S
     # A supervisor that was killed during a search does not know where that began; its operator does.
     from_zero_s = time.now_s() + HEAL_S / 3
