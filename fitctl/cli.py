@@ -60,6 +60,7 @@ COMMANDS = {
     "record": Command("processes"),
     "metrics": Command("processes"),
     "gateway": Command("processes"),
+    "learner": Command("processes"),
     "fault": Command("try_out", "Inject faults into running mocks"),
     "log": Command("analyse", "Inspect, repair and convert logs"),
     "sequence": Command("operate", "Run, check and steer sequences of steps"),

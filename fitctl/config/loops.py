@@ -151,7 +151,8 @@ class Loop(Settings):
     the 1/e^2 diameter of its spots; other loops on the same camera subtract their light by it. ``sensor`` is
     how the star is measured: by Eq. 7's centre of gravity, or by a fit of a spot of that diameter.
     ``star_rate_sky_arcsec_s`` is how fast the star is known to move along the axes of the siderostat, with the
-    stages at rest; the siderostat follows it.
+    stages at rest; the siderostat follows it. ``learn`` says what the loop does with a design
+    that was learnt from its own frames: nothing, advise the operator, or use it.
     """
 
     kind: Literal["stellar"] = "stellar"
@@ -171,6 +172,7 @@ class Loop(Settings):
     coarse: Coarse
     vernier: Vernier
     prefilter: Prefilter
+    learn: Literal["off", "advise", "on"] = "advise"
 
     @property
     def flux_range_dn(self) -> tuple[float, float]:

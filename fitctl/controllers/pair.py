@@ -7,9 +7,9 @@ linear is here, once for all designs: the mirror's diamond, and the deadzone fee
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 HAND_OVER_S = 10.0
 """Time constant with which the siderostat takes over what a design found the mirror holding (choice)."""
 
+LEARNT: Final = "learnt"
+"""The controller that stands for the design that was learnt last."""
 _NO_EXCESS = np.zeros(2)
 INPUTS = ("error_px", "excess_px", "mirror_px", "motor_px", "target_px")
 OUTPUTS = ("mirror_px", "motor_step_px")
@@ -55,6 +57,8 @@ class Design:
         Everything that it was made from; with the name, enough to make it again.
     file : str
         The file that it was read from, absolute; empty when it was made from the rig's values.
+    learnt : bool
+        Made for a night that was learnt from a loop's own frames.
     """
 
     name: str
@@ -67,10 +71,17 @@ class Design:
     hysteresis_inverse: bool
     parameters: dict[str, Any] = field(repr=False)
     file: str = ""
+    learnt: bool = False
+
+    @property
+    def title(self) -> str:
+        """What people call it: its name, or `LEARNT`."""
+        return LEARNT if self.learnt else self.name
 
 
 Designer = Callable[[Rig, str, str], Design]
-"""Makes the design of a rig's loop by its controller's name or file; empty for the one of the rig file."""
+"""Makes the design of a rig's loop by its controller's name or file, or by the parameters of a learnt design
+(:func:`fitctl.controllers.design.document.parameters_json`); empty for the one of the rig file."""
 
 
 class Measurement(NamedTuple):
@@ -127,6 +138,21 @@ class Pair:
         self.target_origin_px = target_px
 
     @property
+    def holds_by_itself(self) -> bool:
+        """At rest, the design commands what it measures of the mirror: all that it remembers was measured."""
+        return abs(self.left_at_rest) < 0.1
+
+    def start_knowing(self, recent: Sequence[Measurement]) -> None:
+        """Begin in the state to which recent frames bring it, as if it had watched them.
+
+        For a design that holds by itself. The frames are in their order and without gaps.
+        """
+        first = recent[0]
+        self.start(first.mirror_rad, first.motor_rad, first.target_px)
+        for measured in recent:
+            self._advance(measured)
+
+    @property
     def saturated(self) -> bool:
         """The last wanted mirror angle was outside the diamond."""
         az_px, el_px = self.excess_px.tolist()
@@ -134,7 +160,18 @@ class Pair:
 
     def step(self, measured: Measurement) -> PairCommand:
         """One period."""
-        given, scale = self._given, self._scale
+        scale, made = self._scale, self._advance(measured)
+        wanted_rad = made[0].dot(scale.mirror_back.T)
+        mirror_rad = saturate_diamond(wanted_rad, self._range_rad)
+        # Fed back a frame later, where the camera takes nearly two: much as the error would have been
+        # had the mirror followed.
+        within = mirror_rad is wanted_rad
+        self.excess_px = _NO_EXCESS if within else scale.mirror_px(wanted_rad - mirror_rad)
+        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_back.T))
+
+    def _advance(self, measured: Measurement) -> Floats:
+        """One period of the linear system: its outputs, and its next state below them."""
+        given = self._given
         # The design's axes are the camera's; the stages' may be turned from them.
         motor_az_rad, motor_el_rad = measured.motor_rad.tolist()
         origin_az_rad, origin_el_rad = self.motor_origin_rad.tolist()
@@ -152,13 +189,7 @@ class Pair:
         )
         made = self.system.dot(given)  # `@` takes twice as long
         given[len(INPUTS) :] = made[len(OUTPUTS) :]
-        wanted_rad = made[0].dot(scale.mirror_back.T)
-        mirror_rad = saturate_diamond(wanted_rad, self._range_rad)
-        # Fed back a frame later, where the camera takes nearly two: much as the error would have been
-        # had the mirror followed.
-        within = mirror_rad is wanted_rad
-        self.excess_px = _NO_EXCESS if within else scale.mirror_px(wanted_rad - mirror_rad)
-        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_back.T))
+        return np.asarray(made)
 
     def _in_rad(self) -> Floats:
         """The design with its hand-over, but the stages in radians, as they are measured and commanded."""

@@ -220,6 +220,13 @@ def _children(
             "a new one is started",
             _GATEWAY_PATIENCE_S,
         ),
+        (
+            any(loop.learn != "off" for loop in rig.stellar_loops.values()),
+            "learner",
+            "learner",
+            "a new one is started; it learns anew",
+            PATIENCE_S,
+        ),
     )
     return [
         Child(name, [command, *same_rig], folder / f"{command}.err", again, note, patience_s)

@@ -230,6 +230,8 @@ class ControllerChange(Record, frozen=True, kw_only=True):
     siderostat_el_rad: float
     link_az_rad: float = math.nan
     link_el_rad: float = math.nan
+    reason: str = ""
+    design_json: str = ""  # as `fitctl design --out` saves it
 
 
 class QuantityReading(Record, frozen=True, kw_only=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,8 @@ from fitctl.loop.observation import Observation
 from fitctl.model.optics import AzEl, scales
 
 Floats = NDArray[np.float64]
+_RECENT_S = 3.0  # of frames from which another design knows the night
+_LEAST_RECENT_S = 0.5
 
 
 class Pointing:
@@ -44,6 +48,8 @@ class Pointing:
         self.coarse_step_rad_per_px = (
             loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * period_s
         )
+        self._recent: deque[Measurement] = deque(maxlen=round(_RECENT_S / period_s))
+        self._least_recent = round(_LEAST_RECENT_S / period_s)
         self.use(design)
 
     @property
@@ -71,7 +77,15 @@ class Pointing:
 
     def start_pair(self, held_rad: Floats, motor_rad: Floats) -> None:
         """Go on with the mirror held at `held_rad` and the motors at `motor_rad`, each shape (2,)."""
+        self._recent.clear()
         self.pair.start(held_rad, motor_rad, self.command_px)
+
+    def start_knowing(self) -> bool:
+        """Begin where recent frames bring the design; False where it has to begin from rest instead."""
+        if len(self._recent) < self._least_recent or not self.pair.holds_by_itself:
+            return False
+        self.pair.start_knowing(self._recent)
+        return True
 
     def step_coarse(self, observation: Observation, target_px: Floats) -> Floats | None:
         """One frame: the step of the motors' set-point, shape (2,); None where no star is visible."""
@@ -85,11 +99,14 @@ class Pointing:
         """One frame: what both stages shall do; None where no star is visible."""
         command_px = self.prefilter.step(target_px)
         if observation.star is None:
+            self._recent.clear()
             return None
         error_px = error_from(command_px, observation.star)
-        return self.pair.step(
-            Measurement(error_px, command_px, observation.law_mirror_rad, observation.beam_rad)
+        measured = Measurement(
+            error_px, command_px, observation.law_mirror_rad, observation.beam_rad
         )
+        self._recent.append(measured)
+        return self.pair.step(measured)
 
 
 def error_from(target_px: AzEl, star: Star) -> AzEl:

@@ -14,17 +14,19 @@ from numpy.typing import NDArray
 from fitctl.config import Loop as LoopSettings
 from fitctl.config import Rig
 from fitctl.controllers.centroid import OtherLight, Star
+from fitctl.controllers.design.document import design_json
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
 from fitctl.logging.records import ControllerChange, Tick
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
+from fitctl.loop.learning import Learning
 from fitctl.loop.link import BacklashFeedforward, Link
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
-from fitctl.loop.pointing import Pointing
+from fitctl.loop.pointing import Pointing, error_from
 from fitctl.loop.quantities import StellarQuantities, stellar_places
 from fitctl.loop.search import StarSearch
 from fitctl.loop.sky import Sky
@@ -89,6 +91,7 @@ class StellarLoop(Loop):
         self.search = StarSearch(rig, name, self.star_finder)
         self.following = Following(self.settings, scale)
         self.pointing = Pointing(rig, name, self.target_px, design)
+        self.learning = Learning(rig, name)
         self._limits = stellar_limits(rig, name)
         if self.settings.star_rate_sky_arcsec_s is not None:
             self.sky = Sky(self.settings, scale, rig.camera.period_s)
@@ -158,6 +161,7 @@ class StellarLoop(Loop):
         self.quantities.record_observation(observation)
         self.quantities.record_stages(observation, self.siderostat, self.mirror)
         self._evaluate_interlocks(observation.now_s)
+        self._evaluate_learning(observation)
         self._move(observation)
         self._decided_s = self._clock.now_s()
 
@@ -207,6 +211,25 @@ class StellarLoop(Loop):
         waits = self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
         if action not in {"hold", "flatten"} and not waits:
             self._laws[self.mode](observation)
+
+    def _evaluate_learning(self, observation: Observation) -> None:
+        """Go back to the design before, where the learnt one does worse."""
+        frame, star = observation.frame, observation.star
+        if frame is None:
+            return
+        target_px = self.pointing.command_px
+        why_back = self.learning.observe(
+            observation.now_s,
+            None if star is None else error_from(target_px, star),
+            target_px,
+            saturated=self.pointing.saturated,
+            hindered=self.mode is not Mode.VERNIER
+            or bool(self.waits_for)
+            or self.interlocks.action is not None,
+        )
+        if why_back and self.learning.before is not None:
+            self.learning.fell_back(why_back, observation.now_s)
+            self.use(self.learning.before, why_back, by_itself=True)
 
     def _find(self, frame: Frame, mirror_rad: Floats, beam_rad: Floats) -> Star | None:
         self.star_finder.exclude(
@@ -464,14 +487,15 @@ class StellarLoop(Loop):
     @property
     def controller(self) -> str:
         """The design at work in VERNIER."""
-        return self.pointing.design.name
+        return self.pointing.design.title
 
-    def use(self, design: Design) -> None:
+    def use(self, design: Design, reason: str = "", *, by_itself: bool = False) -> None:
         """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
+        self.learning.changed(self.pointing.design, design, by_itself=by_itself)
         now_s, before, motor_rad = self._clock.now_s(), self.controller, self.servo.position_rad
         link_rad = self._read_link(now_s)
         self.pointing.use(design)
-        if self.mode is Mode.VERNIER:
+        if self.mode is Mode.VERNIER and not self.pointing.start_knowing():
             self._start_pair(self._beam_rad(motor_rad))
         az_rad, el_rad = motor_rad.tolist()
         link_az_rad, link_el_rad = link_rad
@@ -480,14 +504,17 @@ class StellarLoop(Loop):
                 time_s=now_s,
                 loop=self.name,
                 source=before,
-                target=design.name,
+                target=design.title,
                 siderostat_az_rad=az_rad,
                 siderostat_el_rad=el_rad,
                 link_az_rad=link_az_rad,
                 link_el_rad=link_el_rad,
+                reason=reason,
+                design_json=design_json(design),
             )
         )
-        self._report_event("info", f"controller {before} -> {design.name}")
+        why = f": {reason}" if reason else ""
+        self._report_event("info", f"controller {before} -> {design.title}{why}")
 
     def start_experiment(self, name: str, drives: list[Drive]) -> bool:
         """Move the stages as told, from the next tick on; False where this mode has no star to watch."""
@@ -541,6 +568,7 @@ class StellarLoop(Loop):
             if mode is Mode.ACQUISITION
             else None,
             waits_for=self.waits_for,
+            learning=self.learning.state,
         )
 
     def begin(self, stack_v: Floats | None) -> None:

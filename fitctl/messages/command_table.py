@@ -117,6 +117,7 @@ COMMANDS = (
     CommandRow(commands.SequenceControl, "a commander's key"),
     CommandRow(commands.SequenceReport, "a commander's key", logged=False),
     CommandRow(commands.RecorderReport, "the Unix socket", logged=False),
+    CommandRow(commands.LearnerReport, "the Unix socket"),
 )
 _LOGGED_OF_REFUSED = 100  # characters of its loop, of its values and of the answer
 ROWS = {row.make: row for row in COMMANDS}

@@ -96,9 +96,12 @@ class SetBiasOffset(Command, frozen=True, kw_only=True):
 
 
 class SetController(Command, frozen=True, kw_only=True):
-    """Work with another design; in VERNIER the mirror goes on where it is. Files cannot be named here."""
+    """Work with another design; in VERNIER the mirror goes on where it is. Files cannot be named here.
 
-    name: ControllerName
+    "learnt" is the design that was learnt last from the loop's own frames.
+    """
+
+    name: ControllerName | Literal["learnt"]
 
 
 class Reset(Command, frozen=True, kw_only=True):
@@ -161,6 +164,39 @@ class RecorderReport(Command, frozen=True, kw_only=True):
     status: RecorderStatus
 
 
+class LearnerReport(Command, frozen=True, kw_only=True):
+    """The learner tells what it makes of a loop's night.
+
+    Attributes
+    ----------
+    design_json : str
+        Name and parameters of the learnt design; empty if there is none, and ``text`` says why.
+    text : str
+        The night, for people.
+    evaluated_s : float
+        Of frames.
+    present_px, learnt_px, bound_px : float
+        True residual that the design in force, the learnt one and the theoretical minimum leave of this night.
+        These and the following are 0 where they are not known.
+    learnt_camera_px : float
+        RMS of the error on frames that the learnt design is expected to leave, noise included.
+    measured_px : float
+        The same, measured with the design in force; of the worst axis.
+    worth_it : bool
+        The model fits the frames, and the learnt design leaves clearly less.
+    """
+
+    design_json: str
+    text: str
+    evaluated_s: float
+    present_px: float = 0.0
+    learnt_px: float = 0.0
+    bound_px: float = 0.0
+    learnt_camera_px: float = 0.0
+    measured_px: float = 0.0
+    worth_it: bool = False
+
+
 class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a sequence is; ``run`` tells two runs apart, ``wanted`` is what people ask of it."""
 
@@ -209,6 +245,7 @@ AnyCommand = (
     | TakeOver
     | Shutdown
     | RecorderReport
+    | LearnerReport
     | SequenceReport
     | SequenceControl
 )

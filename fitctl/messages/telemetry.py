@@ -21,7 +21,7 @@ from fitctl.logging.records import (
     RecorderStatus,
     Tick,
 )
-from fitctl.messages.commands import PROTOCOL_VERSION, SequenceStatus
+from fitctl.messages.commands import PROTOCOL_VERSION, LearnerReport, SequenceStatus
 
 
 class TrippedInterlock(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,6 +112,35 @@ class SpotPlace(msgspec.Struct, frozen=True, kw_only=True):
     el_offset_px: float
 
 
+class LearningState(msgspec.Struct, frozen=True, kw_only=True):
+    """What was learnt from a loop's own frames, and what became of it.
+
+    Attributes
+    ----------
+    setting : str
+        ``learn`` of the rig file.
+    state : str
+        "collecting" until the first report; "advice" where the learnt design would leave clearly less; "kept"
+        where it would not; "in force" while a learnt design is at work; "fell back" after it left too much.
+    text : str
+        The night, or what happened, for people.
+    report : LearnerReport, optional
+        The last one.
+    design_json : str
+        Of the learnt design in force; empty without.
+    expected_px, measured_px : float
+        RMS of the error on frames with the learnt design in force; NaN without.
+    """
+
+    setting: Literal["off", "advise", "on"]
+    state: Literal["collecting", "advice", "kept", "in force", "fell back"]
+    text: str = ""
+    report: LearnerReport | None = None
+    design_json: str = ""
+    expected_px: float = math.nan
+    measured_px: float = math.nan
+
+
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it.
 
@@ -142,6 +171,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     last_failure: LoopFailure | None = None
     kind: Literal["stellar", "metrology"] = "stellar"
     waits_for: str = ""
+    learning: LearningState | None = None
 
 
 class CollectorState(msgspec.Struct, frozen=True, kw_only=True):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.pair import LEARNT
 from fitctl.drivers import interface
 from fitctl.drivers.interface import (
     AzEl,
@@ -413,7 +414,8 @@ class LoggedExecutor(Executor):
         elif fn is design_for:
             _, loop, controller = args
             waiting = _Waiting(future, [loop], lambda: fn(*args))
-            self._designs.append(((loop, controller), waiting))
+            title = LEARNT if controller.startswith("{") else controller
+            self._designs.append(((loop, title), waiting))
         elif fn is close_devices:
             future.set_result(None)
         # What the piezo amplifier answers reaches its watch as the log has it.

@@ -16,6 +16,7 @@ from fitctl.clock import VirtualClock
 from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
+from fitctl.learn.learner import Learner
 from fitctl.logging.records import AnyRecord, MetrologyTick, ModeChange, Tick
 from fitctl.messages.commands import Acquire, AnyCommand, MoveCollector, Reply, Standby
 from fitctl.messages.modes import METROLOGY_MODES, Mode
@@ -83,6 +84,11 @@ class Simulation:
         self.hexapod = simulated_hexapod(self.plant, self.clock, rig)
         self.ticks: list[Tick] = []
         self.mode_changes: list[ModeChange] = []
+        self.learners = {
+            name: Learner(rig, name)
+            for name, loop in rig.stellar_loops.items()
+            if loop.learn == "on"  # advice is for people, and a run has none
+        }
         self.samples = dict.fromkeys(rig.metrology_loops, 0)
         self._on_record = record
         loops = {name: self._loop_devices(name) for name in rig.loops}
@@ -120,6 +126,8 @@ class Simulation:
     def _receive(self, record: AnyRecord) -> None:
         if isinstance(record, Tick):
             self.ticks.append(record)
+            if learner := self.learners.get(record.loop):
+                learner.add(record)
         elif isinstance(record, MetrologyTick):
             self.samples[record.loop] += not math.isnan(record.beam_az_m)
         elif isinstance(record, ModeChange):
@@ -139,6 +147,15 @@ class Simulation:
         end_s = self.clock.now_s() + duration_s
         while self.clock.now_s() < end_s - 1e-9:
             self.supervisor.step()
+            self._learn()
+
+    def _learn(self) -> None:
+        """Have the learners report, in no time: what they need to compute is no part of the virtual clock's."""
+        for name, learner in self.learners.items():
+            design = self.supervisor.stellar_loops[name].pointing.design
+            learner.watch(design.title, self.clock.now_s())
+            if learner.due:
+                self.supervisor.post(learner.report(design), lambda _: None)
 
     def acquire(self) -> None:
         """Power up and begin the search.

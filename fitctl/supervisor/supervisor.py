@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.controllers.pair import Designer
+from fitctl.controllers.pair import LEARNT, Designer
 from fitctl.drivers.interface import DeviceError, Devices, Frame, LoopDevices
 from fitctl.logging.records import (
     CAMERA,
@@ -35,6 +35,7 @@ from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
     Hold,
+    LearnerReport,
     MoveCollector,
     Off,
     Recover,
@@ -345,6 +346,8 @@ class Supervisor:
             return Reply(accepted=True, text="shutting down")
         if self.shutdown_wanted and not isinstance(command, Stop):
             return _refusal("shutting down")
+        if isinstance(command, LearnerReport):
+            return self._learn(command, names)
         return self._obey_for(command, names)
 
     def _obey_for(self, command: AnyCommand, names: list[str]) -> Reply:
@@ -416,10 +419,17 @@ class Supervisor:
         names = [name for name in names if name in self.stellar_loops]
         if not names:
             return _refusal(f"loop {command.loop} holds a metrology beam and has no design")
+        chosen: dict[str, str] = dict.fromkeys(names, command.name)
+        if command.name == LEARNT:
+            for name in names:
+                report = self.stellar_loops[name].learning.report
+                if report is None or not report.design_json:
+                    return _refusal(_nothing_learnt(name, report))
+                chosen[name] = report.design_json
         number = self.outcomes.begin(command, names)
         for name in names:
             # A design takes longer than a tick.
-            future = self._design_executor.submit(self._design, self.rig, name, command.name)
+            future = self._design_executor.submit(self._design, self.rig, name, chosen[name])
             ended = partial(self.outcomes.end, number, [name])
             self._designs.append(Job(future, partial(self._designed, name, command.name, ended)))
         self._finish_jobs()
@@ -428,6 +438,29 @@ class Supervisor:
             number=number,
             text="designing; fitctl status shows the controller at work",
         )
+
+    def _learn(self, report: LearnerReport, names: list[str]) -> Reply:
+        loop = self.stellar_loops.get(report.loop)
+        if loop is None:
+            return _refusal(f"a report on learning is on one stellar loop, not {', '.join(names)}")
+        news = loop.learning.accept(report)
+        if news:
+            self._journal.event("info", loop.name, news)
+        if loop.learning.wants_change(self._clock.now_s()):
+            future = self._design_executor.submit(
+                self._design, self.rig, loop.name, report.design_json
+            )
+            self._designs.append(Job(future, partial(self._designed_by_itself, loop)))
+            self._finish_jobs()
+        return Reply(accepted=True)
+
+    def _designed_by_itself(self, loop: StellarLoop, future: Future) -> None:
+        """Use a learnt design, if the loop is still calm; the learner's next report comes soon."""
+        error = future.exception()
+        if error is not None:
+            self._journal.event("warning", loop.name, f"no learnt design: {error_text(error)}")
+        elif loop.learning.wants_change(self._clock.now_s()):
+            loop.use(future.result(), loop.learning.why_change(), by_itself=True)
 
     def _designed(self, name: str, controller: str, ended: Ended, future: Future) -> None:
         error = future.exception()
@@ -493,6 +526,15 @@ class Supervisor:
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)
         self._record(record)
+
+
+def _nothing_learnt(name: str, report: LearnerReport | None) -> str:
+    if report is None:
+        return (
+            f"nothing is learnt of loop {name} yet; it takes a minute in VERNIER, and loops.{name}.learn must "
+            'not be "off"'
+        )
+    return f"nothing is learnt of loop {name}: {report.text}"
 
 
 def _refusal(text: str) -> Reply:

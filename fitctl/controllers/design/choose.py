@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,14 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.config import ConfigError, Rig
-from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
+from fitctl.controllers.design.basis import Basis, basis, basis_of, on_its_mirror
 from fitctl.controllers.design.eq20 import design_eq20
 from fitctl.controllers.design.files import load_design
 from fitctl.controllers.design.fslq import design_fslq
 from fitctl.controllers.design.linear_loop.sampled import sampled_loop
 from fitctl.controllers.design.lqg_ltr import design_lqg_ltr
+from fitctl.controllers.design.margins import KEPT, Required, margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import LEARNT, Design
 
 DESIGNS: dict[str, Callable[[Basis], Design]] = {
     "eq20": design_eq20,
@@ -27,7 +30,7 @@ DESIGNS: dict[str, Callable[[Basis], Design]] = {
 
 
 def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
-    """The design that a rig's loop asks for, or another by its name or its file (*.json).
+    """The design that a rig's loop asks for, or another by its name, its file (*.json) or its parameters.
 
     Raises
     ------
@@ -39,6 +42,8 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
     its_basis = basis(rig, loop_name)
     if chosen.endswith(".json"):
         design = load_design(Path(chosen), its_basis, DESIGNS)
+    elif chosen.startswith("{"):
+        design = _learnt(chosen, its_basis)
     elif chosen in DESIGNS:
         with solving(f"controller {chosen}", loop_name):
             design = DESIGNS[chosen](its_basis)
@@ -55,6 +60,29 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
         )
         raise ConfigError(msg)
     return design
+
+
+def _learnt(document_json: str, its_basis: Basis) -> Design:
+    """From its parameters; it must keep the margins that every learnt design is made with.
+
+    Raises
+    ------
+    ConfigError
+        If these are no parameters of a design, or the design has not the margins.
+    """
+    advice = "look at what fitctl design learn makes of the log"
+    try:
+        document = json.loads(document_json)
+        its_basis = basis_of(document["parameters"], its_basis)
+        design = DESIGNS[document["name"]](its_basis)
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        msg = f"controller {LEARNT}: its parameters cannot be used: {error!r}; {advice}"
+        raise ConfigError(msg) from None
+    required = Required()
+    if margins(design, its_basis, required).excess(required) > KEPT:
+        msg = f"controller {LEARNT}: its margins are not those that a learnt design must keep; {advice}"
+        raise ConfigError(msg)
+    return dataclasses.replace(design, learnt=True)
 
 
 @contextmanager

@@ -25,9 +25,16 @@ def design_json(design: Design) -> str:
         "outputs": list(OUTPUTS),
         "hysteresis_inverse": design.hysteresis_inverse,
         "parameters": design.parameters,
+        **({"learnt": True} if design.learnt else {}),
         **{name: getattr(design, name).tolist() for name in MATRICES},
     }
     return json.dumps(document, indent=1) + "\n"
+
+
+def parameters_json(design: Design) -> str:
+    """Name and parameters of a design, as short as they can be: enough to make it again."""
+    document = {"name": design.name, "parameters": design.parameters}
+    return json.dumps(document, separators=(",", ":"))
 
 
 def design_from_json(text: str) -> Design:
@@ -60,4 +67,5 @@ def design_from_json(text: str) -> Design:
         d,
         document["hysteresis_inverse"],
         document["parameters"],
+        learnt=document.get("learnt", False),
     )

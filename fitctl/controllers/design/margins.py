@@ -35,7 +35,8 @@ _ABOUT_LINE = 24  # points on each side of a line, which lie closer towards it
 _GAINS = 5  # looked at, from the least to the greatest
 _PENALTY = 10.0  # of a residual, for missing a margin by its whole size
 _TRIES = 250
-_KEPT = 1.001  # a search ends at a margin only within rounding
+KEPT = 1.001
+"""A search ends at a margin only within rounding."""
 # Where the search for a guard begins: noise and the guard's RMS in the sensor's noise, and its damping.
 _NOISE, _GUARD, _DAMPING = 1.02, 2.0, 0.5
 _WIDEST, _NARROWEST = 0.95, 0.02  # damping of a guard
@@ -189,7 +190,7 @@ def design_with_margins(basis: Basis, required: Required | None = None) -> Desig
     options = {"maxfev": _TRIES, "initial_simplex": corners, "fatol": 1e-4, "xatol": 1e-2}
     design = made(minimize(cost, begin, method="Nelder-Mead", options=options).x)
     kept = margins(design, basis, asked)
-    if kept.excess(asked) > _KEPT:
+    if kept.excess(asked) > KEPT:
         msg = (
             f"design: no minimum-variance pair with sensitivity at most {asked.peak_sensitivity:g}, gain "
             f"margin {asked.gain_margin_db:g} dB and phase margin {asked.phase_margin_deg:g} deg was found at "

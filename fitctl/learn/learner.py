@@ -1,0 +1,155 @@
+"""What a loop's ticks show of its night, again and again while it holds its star: the learner.
+
+It runs beside a supervisor, in a process of its own (:mod:`fitctl.learn.process`), and in a simulation, on the
+virtual clock. It decides nothing: what becomes of its reports, the loop does (:mod:`fitctl.loop.learning`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ConfigError, Rig
+from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.choose import solving
+from fitctl.controllers.design.document import parameters_json
+from fitctl.controllers.design.theory import loop_theory
+from fitctl.controllers.pair import Design
+from fitctl.error_budget import pieces_of
+from fitctl.learn.advice import Advice, advise
+from fitctl.learn.opened import LEAST_S, rebuild
+from fitctl.logging.records import Tick
+from fitctl.messages.commands import LearnerReport
+from fitctl.messages.modes import Mode
+
+Floats = NDArray[np.float64]
+FIRST_S = 60.0
+"""A first report after so many seconds of frames,"""
+EVERY_S = 30.0
+"""and another after each of so many more."""
+WINDOW_S = 240.0
+"""A night is estimated from the last frames: what is older was another night."""
+SETTLE_S = 5.0
+"""After the star was caught, or the target was moved, frames say more of that than of the night."""
+_FIELDS = tuple(
+    f"{name}_{axis}_{unit}"
+    for name, unit in (
+        ("error", "px"),
+        ("mirror", "rad"),
+        ("fsm", "rad"),
+        ("siderostat", "rad"),
+        ("link", "rad"),
+    )
+    for axis in ("az", "el")
+)
+_STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
+
+
+class Learner:
+    """One loop's.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    """
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        self._rig = rig
+        self._loop_name = loop_name
+        period_s = rig.camera.period_s
+        self._period_s = period_s
+        self._ticks: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / period_s))
+        self._columns = ("time_s", "mid_exposure_s", *_FIELDS)
+        self._new = 0
+        self._due_after = round(FIRST_S / period_s)
+        self._unsettled_s = -math.inf
+        self._target_px = (math.nan, math.nan)
+        self._design = ""
+        self._since_s = 0.0
+
+    def watch(self, design: str, now_s: float) -> None:
+        """The design in force now, by whatever tells one from another."""
+        if design != self._design:
+            self._design, self._since_s = design, now_s
+
+    def add(self, tick: Tick) -> None:
+        """One tick, in their order; kept if it shows the loop undisturbed."""
+        target_px = tick.target_az_px, tick.target_el_px
+        moved = not math.dist(target_px, self._target_px) <= _STILL_PX_PER_S * self._period_s
+        self._target_px = target_px
+        if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or moved:
+            self._unsettled_s = tick.time_s
+        elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
+            self._ticks.append(tuple(getattr(tick, name) for name in self._columns))
+            self._new += 1
+
+    @property
+    def due(self) -> bool:
+        """There are enough new frames for a report."""
+        return self._new >= self._due_after
+
+    def report(self, present: Design) -> LearnerReport:
+        """Estimate and design, with `present` in force; without an answer, the report's text says why."""
+        self._new, self._due_after = 0, round(EVERY_S / self._period_s)
+        try:
+            with solving("learn", self._loop_name):
+                return self._report(self._advice(present))
+        except (ConfigError, np.linalg.LinAlgError) as error:
+            return LearnerReport(
+                loop=self._loop_name,
+                design_json="",
+                text=str(error),
+                evaluated_s=len(self._ticks) * self._period_s,
+            )
+
+    def _advice(self, present: Design) -> Advice:
+        table = np.array(self._ticks)
+        ticks = dict(zip(self._columns, table.T, strict=True))
+        pieces = pieces_of(ticks["mid_exposure_s"], np.ones(len(table), bool))
+        theory = loop_theory(self._rig, self._loop_name, present)
+        error_px = np.stack([ticks["error_az_px"], ticks["error_el_px"]], axis=-1)
+        own = error_px[ticks["time_s"] >= self._since_s + SETTLE_S]
+        az_px, el_px = (
+            np.sqrt(np.mean(own**2, axis=0)).tolist()
+            if len(own) * self._period_s >= LEAST_S
+            else (0.0, 0.0)
+        )
+        return advise(
+            rebuild(theory, ticks, pieces),
+            (az_px, el_px),
+            basis(self._rig, self._loop_name),
+            present,
+        )
+
+    def _report(self, advice: Advice) -> LearnerReport:
+        return LearnerReport(
+            loop=self._loop_name,
+            design_json=parameters_json(advice.design),
+            text=_text(advice),
+            evaluated_s=advice.night.duration_s,
+            present_px=advice.present.residual_px,
+            learnt_px=advice.learnt.residual_px,
+            bound_px=advice.bound_px,
+            learnt_camera_px=advice.learnt.camera_px,
+            measured_px=max(advice.measured_px),
+            worth_it=advice.worth_it,
+        )
+
+
+def _text(advice: Advice) -> str:
+    """The night in one line."""
+    night = advice.night
+    lines = ", ".join(
+        f"{line.found.frequency_hz.value:.2f} Hz {max(rms.value for rms in line.found.rms_px):.3f} px"
+        f"{'' if line.counteracted else ' (left alone)'}"
+        for line in advice.lines
+    )
+    return (
+        f"air k/b1 {night.strength.value:.2f} px/s², b2/b1 {night.fast_pole.value:.1f} 1/s; "
+        f"noise {night.noise_px.value:.4f} px; lines {lines or 'none'}; "
+        f"{night.test.text}"
+    )

@@ -1,0 +1,76 @@
+"""The learner's process: reads telemetry as a console does, and reports to the supervisor.
+
+It has no part in the loop. Without it nothing is learnt, and nothing else changes.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+
+from fitctl.config import Rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.learn.learner import Learner
+from fitctl.messages.client import Client
+from fitctl.messages.commands import LearnerReport
+from fitctl.messages.telemetry import LoopState, Telemetry
+
+NICENESS = 19
+_POLL_S = 0.5
+
+
+class LoopLearner:
+    """A learner, and the design that its loop works with."""
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        self.loop_name = loop_name
+        self._rig = rig
+        self._learner = Learner(rig, loop_name)
+        self._controller = ""
+        self._report: Future[LearnerReport] | None = None
+
+    def hear(self, telemetry: Telemetry, state: LoopState) -> None:
+        """One message."""
+        learnt = "" if state.learning is None else state.learning.design_json
+        self._controller = learnt or state.controller_file or state.controller
+        self._learner.watch(self._controller, telemetry.time_s)
+        for tick in telemetry.ticks:
+            if tick.loop == self.loop_name:
+                self._learner.add(tick)
+
+    def work(self, executor: ThreadPoolExecutor) -> LearnerReport | None:
+        """Begin a report that is due, beside the messages; the one that is ready."""
+        ready = None
+        if self._report is not None and self._report.done():
+            ready, self._report = self._report.result(), None
+        if self._report is None and self._learner.due:
+            self._report = executor.submit(self._make, self._controller)
+        return ready
+
+    def _make(self, controller: str) -> LearnerReport:
+        return self._learner.report(design_for(self._rig, self.loop_name, controller))
+
+
+def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:
+    """Learn from a supervisor's telemetry until `stop`."""
+    os.nice(NICENESS)
+    learners = {
+        name: LoopLearner(rig, name)
+        for name, loop in rig.stellar_loops.items()
+        if loop.learn != "off"
+    }
+    with ThreadPoolExecutor(1) as executor:
+        while not stop.is_set():
+            with suppress(ConnectionError):
+                telemetry = client.receive(_POLL_S)
+                if telemetry is None:
+                    continue
+                for state in telemetry.loops:
+                    if learner := learners.get(state.name):
+                        learner.hear(telemetry, state)
+                for learner in learners.values():
+                    report = learner.work(executor)
+                    if report is not None:
+                        client.send(report)

@@ -1,0 +1,214 @@
+"""What a loop does with a design that was learnt from its own frames: advise it, use it, and go back.
+
+The learner (:mod:`fitctl.learn.learner`) estimates and designs elsewhere; here is only what must be decided at
+a tick. All of it follows from the ticks and the learner's reports, so that a replay decides alike.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fitctl.config import Rig
+from fitctl.controllers.pair import Design
+from fitctl.messages.commands import LearnerReport
+from fitctl.messages.telemetry import LearningState
+from fitctl.model.optics import AzEl
+
+CALM_S = 2.0
+"""A design is changed only after so long in VERNIER without saturation, and with star and target at rest."""
+PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
+"""After a way back, no change of design by itself for so long; twice as long after each further one."""
+# The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS.
+_WATCHES = ((0.3, 2.0), (10.0, 1.25))
+_STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
+_NEWS = 0.1  # by which part a gain must differ from the one last reported to be reported again
+
+
+class Learning:
+    """One loop's.
+
+    Attributes
+    ----------
+    report : LearnerReport or None
+        The learner's last.
+    in_force : LearnerReport or None
+        That of the learnt design at work.
+    before : Design or None
+        At work before it, and again after a way back.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        self.setting = rig.stellar_loops[loop_name].learn
+        self.report: LearnerReport | None = None
+        self.in_force: LearnerReport | None = None
+        self.before: Design | None = None
+        self._loop_name = loop_name
+        self._still_px = _STILL_PX_PER_S * rig.camera.period_s
+        self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
+        self._means_px2 = [[0.0, 0.0] for _ in _WATCHES]
+        self._limit_px = math.inf
+        self._by_hand = False
+        self._calm_since_s: float | None = None
+        self._paused_until_s = -math.inf
+        self._pause_s = PAUSE_S
+        self._last_target_px: AzEl = (math.nan, math.nan)
+        self._told = 0.0  # the part gained that an operator was told last
+        self._fell_back = ""
+
+    # ------------------------------------------------------------ reports
+
+    def accept(self, report: LearnerReport) -> str:
+        """Keep a report; an event's text where there is news for an operator, else empty."""
+        self.report = report
+        gained = self._gained if report.worth_it else 0.0
+        if abs(gained - self._told) < _NEWS or (self.setting == "on" and not self._by_hand):
+            return ""
+        self._told = gained
+        if not gained:
+            return "the design in force leaves as little as a learnt one would"
+        return f"{self._what_is_gained()}; to apply it: {self.command}"
+
+    def wants_change(self, now_s: float) -> bool:
+        """Whether the design that was learnt last is to be made and used, without being asked."""
+        report = self.report
+        return (
+            self.setting == "on"
+            and not self._by_hand
+            and report is not None
+            and report.worth_it
+            and now_s >= self._paused_until_s
+            and self.is_calm(now_s)
+        )
+
+    def is_calm(self, now_s: float) -> bool:
+        """Nothing hinders a change of design: see `CALM_S`."""
+        return self._calm_since_s is not None and now_s - self._calm_since_s >= CALM_S
+
+    @property
+    def command(self) -> str:
+        """What an operator types to use the learnt design."""
+        return f"fitctl send controller learnt --loop {self._loop_name}"
+
+    def _what_is_gained(self) -> str:
+        report = self.report
+        if report is None:
+            return ""
+        return (
+            f"a design learnt from {report.evaluated_s:.0f} s of frames would leave {report.learnt_px:.4f} px "
+            f"instead of {report.present_px:.4f} ({self._gained:.0%} less; bound {report.bound_px:.4f})"
+        )
+
+    @property
+    def _gained(self) -> float:
+        report = self.report
+        return 0.0 if report is None else 1.0 - report.learnt_px / report.present_px
+
+    # ------------------------------------------------------------ changes
+
+    def why_change(self) -> str:
+        """The reason for a change of design, for event and log."""
+        return self._what_is_gained()
+
+    def changed(self, before: Design, now: Design, *, by_itself: bool) -> None:
+        """Another design is at work."""
+        self._told = 0.0
+        if not now.learnt:
+            if not by_itself:
+                self._by_hand, self._fell_back = True, ""
+            self.in_force = self.before = None
+            return
+        report = self.report
+        if report is None:  # no design is learnt without one
+            return
+        self._by_hand, self._fell_back = False, ""
+        self.in_force = report
+        if not before.learnt:
+            self.before = before
+        self._limit_px = max(report.measured_px, report.learnt_camera_px)
+        for means in self._means_px2:
+            means[:] = [report.learnt_camera_px**2] * 2
+
+    def fell_back(self, reason: str, now_s: float) -> None:
+        """The design before is at work again."""
+        self._fell_back = reason
+        self._paused_until_s = now_s + self._pause_s
+        self._pause_s = min(2 * self._pause_s, MOST_PAUSE_S)
+
+    def observe(
+        self,
+        now_s: float,
+        error_px: AzEl | None,
+        target_px: AzEl,
+        *,
+        saturated: bool,
+        hindered: bool,
+    ) -> str:
+        """One frame: why to go back to the design before, or empty.
+
+        Parameters
+        ----------
+        error_px : tuple of float or None
+            None without a star.
+        target_px : tuple of float
+            As the prefilter has it.
+        saturated : bool
+            The mirror is at the end of its range.
+        hindered : bool
+            The loop is not in VERNIER, waits, or an interlock acts.
+        """
+        moved = not math.dist(target_px, self._last_target_px) <= self._still_px
+        self._last_target_px = target_px
+        if hindered or error_px is None or moved:
+            self._calm_since_s = None
+            return ""
+        if saturated:
+            self._calm_since_s = None
+        elif self._calm_since_s is None:
+            self._calm_since_s = now_s
+        return "" if self.in_force is None else self._why_back(error_px)
+
+    def _why_back(self, error_px: AzEl) -> str:
+        worse = ""
+        for (over_s, factor), keep, means in zip(
+            _WATCHES, self._keep, self._means_px2, strict=True
+        ):
+            for axis in (0, 1):
+                means[axis] = keep * means[axis] + (1.0 - keep) * error_px[axis] ** 2
+            rms_px = math.sqrt(max(means))
+            if rms_px > factor * self._limit_px:
+                worse = (
+                    f"the learnt design leaves {rms_px:.4f} px on frames over {over_s:g} s; the design before "
+                    f"left {self._limit_px:.4f}"
+                )
+        return worse
+
+    # ------------------------------------------------------------ for consoles
+
+    @property
+    def state(self) -> LearningState:
+        """As consoles show it."""
+        report, in_force = self.report, self.in_force
+        text = "" if report is None else report.text
+        if in_force is not None:
+            measured_px = math.sqrt(max(self._means_px2[-1]))
+            return LearningState(
+                setting=self.setting,
+                state="in force",
+                text=text,
+                report=report,
+                design_json=in_force.design_json,
+                expected_px=in_force.learnt_camera_px,
+                measured_px=measured_px,
+            )
+        if self._fell_back:
+            return LearningState(
+                setting=self.setting, state="fell back", text=self._fell_back, report=report
+            )
+        if report is None:
+            return LearningState(setting=self.setting, state="collecting")
+        return LearningState(
+            setting=self.setting,
+            state="advice" if report.worth_it else "kept",
+            text=text,
+            report=report,
+        )

@@ -1,0 +1,254 @@
+"""What a loop does with a learnt design: advise, change over without a bump, and go back."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.basis import Line, basis
+from fitctl.controllers.design.document import parameters_json
+from fitctl.controllers.design.margins import design_with_margins
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
+from fitctl.logging.records import ControllerChange, Event
+from fitctl.loop.learning import CALM_S, PAUSE_S
+from fitctl.messages.commands import (
+    Acquire,
+    LearnerReport,
+    SetController,
+    SetTarget,
+    Standby,
+)
+from fitctl.messages.modes import Mode
+from fitctl.simulation.simulation import Simulation
+
+SHAKEN = (
+    "loops.right.vernier.controller=minimum-variance",
+    "plant.loops.right.lines=[{frequency_hz=6.0,rms_px=0.0707,direction_deg=45.0,damping=0.005,"
+    "drift_hz_per_min=0.0}]",
+)
+# The design for a line of 0.05 px at 6 Hz, on the rig's air and noise.
+LINE = Line(frequency_hz=6.0, damping=0.01, rms_px=0.05)
+PAPER = basis(load_rig(default_rig_path()), "right")
+
+
+@functools.cache
+def learnt_json(*lines):
+    return parameters_json(design_with_margins(dataclasses.replace(PAPER, lines=lines)))
+
+
+def report(*, worth_it=True, lines=(LINE,), design_json="", **values):
+    values = {
+        "present_px": 0.1,
+        "learnt_px": 0.024,
+        "bound_px": 0.0236,
+        "learnt_camera_px": 0.026,
+        "measured_px": 0.1,
+    } | values
+    return LearnerReport(
+        loop="right",
+        design_json=design_json or learnt_json(*lines),
+        text="a line at 6 Hz",
+        evaluated_s=60.0,
+        worth_it=worth_it,
+        **values,
+    )
+
+
+class Night:
+    """A rig that holds its star; the test is its learner."""
+
+    def __init__(self, *overrides, learn="on"):
+        rig = load_rig(default_rig_path(), [*overrides, f"loops.right.learn={learn}"])
+        self.records = []
+        self.simulation = Simulation(rig, 1, record=self.records.append, history_s=60.0)
+        self.simulation.learners.clear()
+        self.rig = rig
+        self.loop = self.simulation.supervisor.stellar_loops["right"]
+        for command in (Standby(), Acquire()):
+            assert self.simulation.command(command).accepted
+        while self.loop.mode is not Mode.VERNIER:
+            self.simulation.run(0.1)
+        self.simulation.run(10.0)
+
+    def report(self, **values):
+        return self.simulation.command(report(**values))
+
+    def events(self):
+        return [record.message for record in self.records if isinstance(record, Event)]
+
+    def changes(self):
+        return [record for record in self.records if isinstance(record, ControllerChange)]
+
+    def error_px(self, seconds):
+        """True error over the last seconds, shape (steps, 2)."""
+        part, now_s = self.simulation.plants["right"], self.simulation.clock.now_s()
+        return part.history_px(now_s - seconds, now_s)[:, 0, 0] - self.loop.target_px
+
+
+@pytest.fixture
+def shaken():
+    return Night(*SHAKEN)
+
+
+# ---------------------------------------------------------------- advice
+
+
+def test_advice_tells_the_gain_and_the_command_once(shaken):
+    night = Night(*SHAKEN, learn="advise")
+    for _ in range(3):
+        assert night.report().accepted
+        night.simulation.run(1.0)
+    told = [text for text in night.events() if "learnt" in text]
+
+    assert len(told) == 1
+    assert "0.0240 px instead of 0.1000 (76% less; bound 0.0236)" in told[0]
+    assert night.loop.learning.command in told[0]
+    assert night.loop.controller == "minimum-variance"
+    assert night.loop.state(0.0).learning.state == "advice"
+
+
+def test_a_night_that_the_design_in_force_suits_gives_no_event():
+    night = Night(learn="advise")
+    night.report(worth_it=False)
+
+    assert not any("learnt" in text for text in night.events())
+    assert night.loop.state(0.0).learning.state == "kept"
+
+
+def test_the_operator_applies_what_was_advised():
+    night = Night(*SHAKEN, learn="advise")
+    refused = night.simulation.command(SetController(name="learnt"))
+    night.report()
+    assert night.simulation.command(SetController(name="learnt")).accepted
+
+    assert not refused.accepted
+    assert "nothing is learnt of loop right yet" in refused.text
+    assert night.loop.controller == "learnt"
+
+
+def test_parameters_without_margins_are_refused():
+    night = Night(learn="on")
+    greedy = design_minimum_variance(dataclasses.replace(PAPER, noise_px=0.0005))
+    night.report(design_json=parameters_json(greedy))
+
+    assert night.loop.controller == "eq20"
+    assert "controller learnt: its margins are not those" in night.events()[-1]
+
+
+# ---------------------------------------------------------------- the change
+
+
+@pytest.mark.parametrize("before", ["eq20", "minimum-variance"])
+def test_the_change_is_without_a_bump(before):
+    night = Night(*SHAKEN, f"loops.right.vernier.controller={before}")
+    before_px = night.error_px(5.0)
+    peak_px = np.abs(before_px - before_px.mean(axis=0)).max()
+    night.report()
+    night.simulation.run(2.0)
+    after_px = np.abs(night.error_px(2.0))
+    night.simulation.run(10.0)
+    held_px = night.error_px(8.0)
+
+    assert night.loop.controller == "learnt"
+    assert after_px.max() < 1.25 * peak_px
+    assert np.sqrt(np.mean(held_px**2, axis=0)).max() < 0.03  # 0.1 px before
+
+
+def test_the_same_design_goes_on_where_it_was():
+    """Had it begun from rest, it would not know the line for seconds."""
+    nights = [Night(*SHAKEN) for _ in range(2)]
+    for night in nights:
+        night.report()
+        night.simulation.run(20.0)
+    nights[0].report()
+    nights[1].report(worth_it=False)
+    for night in nights:
+        night.simulation.run(2.0)
+    changed_px, unchanged_px = (night.error_px(2.0) for night in nights)
+
+    assert [len(night.changes()) for night in nights] == [2, 1]
+    assert np.abs(changed_px - unchanged_px).max() < 0.03  # 0.12 px if it began from rest
+
+
+def test_a_change_says_why_and_has_the_design(shaken):
+    shaken.report()
+    (change,) = shaken.changes()
+
+    assert (change.source, change.target) == ("minimum-variance", "learnt")
+    assert "would leave 0.0240 px instead of 0.1000" in change.reason
+    assert '"learnt": true' in change.design_json
+
+
+def test_the_same_night_on_the_same_report_is_changed_at_once_and_only_once(shaken):
+    shaken.report()
+    shaken.report(worth_it=False)
+    shaken.simulation.run(5.0)
+
+    assert len(shaken.changes()) == 1
+
+
+@pytest.mark.parametrize("learn", ["off", "advise"])
+def test_nothing_changes_unless_the_rig_file_says_on(learn):
+    night = Night(*SHAKEN, learn=learn)
+    night.report()
+
+    assert not night.changes()
+
+
+def test_what_the_operator_chose_stays(shaken):
+    shaken.simulation.command(SetController(name="fslq"))
+    shaken.report()
+
+    assert shaken.loop.controller == "fslq"
+    assert any(shaken.loop.learning.command in text for text in shaken.events())
+
+
+def test_while_the_target_moves_nothing_changes(shaken):
+    shaken.simulation.command(SetTarget(az_px=24.5, el_px=19.5))
+    shaken.simulation.run(0.2)
+    shaken.report()
+    assert not shaken.changes()
+
+    shaken.simulation.run(15.0 + CALM_S)
+    shaken.report()
+    assert len(shaken.changes()) == 1
+
+
+# ---------------------------------------------------------------- the way back
+
+
+def test_a_design_that_does_worse_is_left_within_a_second():
+    """It was made for another night: it expects a line where there is none, and misses the one that is."""
+    night = Night(*SHAKEN)
+    night.report(lines=(), measured_px=0.05, learnt_camera_px=0.05)
+    night.simulation.run(1.0)
+    _, back = night.changes()
+
+    assert (back.source, back.target) == ("learnt", "minimum-variance")
+    assert "the learnt design leaves" in back.reason
+    assert night.loop.state(0.0).learning.state == "fell back"
+
+
+def test_after_a_way_back_there_is_a_pause():
+    night = Night(*SHAKEN)
+    night.report(lines=(), measured_px=0.02, learnt_camera_px=0.02)
+    night.simulation.run(5.0)
+    night.report()
+    assert night.loop.controller == "minimum-variance"
+
+    night.simulation.run(PAUSE_S)
+    night.report()
+    assert night.loop.controller == "learnt"
+
+
+def test_a_design_that_does_as_expected_stays(shaken):
+    shaken.report()
+    shaken.simulation.run(60.0)
+    state = shaken.loop.state(0.0).learning
+
+    assert state.state == "in force"
+    assert state.measured_px == pytest.approx(state.expected_px, rel=0.2)
+    assert math.isclose(state.expected_px, 0.026)
