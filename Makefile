@@ -13,6 +13,7 @@ COUNT ?= 200
 SOAK_S ?= 3600
 HOURS ?= 1
 FAULT_RESULTS ?= .fault-results.json
+MISWIRED_RESULTS ?= .miswired-results.json
 # Two instruments side by side: one takes less than half a core.
 FAULTS := tests/faults --numprocesses 2 --dist loadgroup
 
@@ -20,7 +21,7 @@ FAULTS := tests/faults --numprocesses 2 --dist loadgroup
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types contract pytest test-instrument test-parts test-slow test-console test-faults test-faults-part test-faults-testbed reliability test-peers mutants bench-console bench-devices bench-recorder bench-report bench-flood bench-learn bench-loop bench-sim bench-testbed swarm soak fuzz docs dist dist-test lock clean
+.PHONY: $(shell sed -n 's/^\([a-z-]*\):.*/\1/p' $(MAKEFILE_LIST))
 
 help:  ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -94,6 +95,11 @@ test-faults-testbed: $(READY)  ## The fault catalogue's rows on the whole testbe
 reliability: $(READY)  ## The fault catalogue, and its results into docs/fault-catalogue.md
 	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
 	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
+
+# One after the other: each judges real motions in real time.
+test-miswired: $(READY)  ## Commissioning of rigs that are wired wrongly, and the results into docs/commissioning.md
+	FITCTL_MISWIRED_RESULTS=$(CURDIR)/$(MISWIRED_RESULTS) $(BIN)/pytest -m miswired tests/miswired $(ARGS)
+	cd tests && ../$(BIN)/python -m miswired.report ../$(MISWIRED_RESULTS)
 
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
 	$(BIN)/pytest -m peer tests/peers $(ARGS)

@@ -41,6 +41,7 @@ COMMANDS = {
     "demo": Command("try_out", "Run the whole instrument on mock devices"),
     "mocks": Command("try_out", "Serve the rig's mock devices"),
     "doctor": Command("set_up", "Check that the devices of a rig answer"),
+    "commission": Command("set_up", "Prove a rig step by step, from wiring to star"),
     "discover": Command("set_up", "List cameras, serial ports and CAN interfaces"),
     "run": Command("operate", "Supervise a rig"),
     "console": Command("operate", "Open the operator console"),

@@ -22,7 +22,8 @@ from typing import Any, NoReturn
 import coverage
 import pytest
 
-MARKED = "not slow and not peer and not fault and not terminal and not dist"  # the tests marked long count
+# The tests marked long count too.
+MARKED = "not slow and not peer and not fault and not miswired and not terminal and not dist"
 PLUGINS = ("-p", "no:cacheprovider", "-p", __name__, "-m", MARKED)
 
 

@@ -30,6 +30,7 @@ from fitctl.config.base import (
     TimeoutS,
 )
 from fitctl.config.conflict import Conflict, Conflicts, Part, at_least, at_most
+from fitctl.config.wiring import AmplifierWiring, Channels
 
 HALF_WINDOW_PX = 3  # of Eq. 7's 7x7 window, about its central pixel
 FULL_SCALE_DN = {"Mono8": 255, "Mono12": 4095, "Mono16": 65535}
@@ -268,6 +269,7 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
     acceleration_limit_rad_s2: Annotated[float, Field(gt=0, le=1e7)]
     servo: ServoSettings
     device: AmplifierDevice
+    wiring: AmplifierWiring | None = None
     backlash_sky_arcsec: NonNegative | None = None
 
     @property
@@ -290,7 +292,10 @@ AnySiderostat = Siderostat[SiderostatDevice]
 
 
 class ModbusDacDevice(Settings):
-    """A Modbus D/A converter: consecutive holding registers, one a channel."""
+    """A Modbus D/A converter: consecutive holding registers, one a channel.
+
+    ``channels`` names the channels of stack 1 to 3, from 1 to 3; without it, they are in this order.
+    """
 
     driver: Literal["modbus_dac"]
     transport: Literal["tcp", "rtu"]
@@ -304,6 +309,7 @@ class ModbusDacDevice(Settings):
     full_scale_v: OutputV
     bits: Annotated[int, Field(ge=8, le=16)]
     response_timeout_s: TimeoutS
+    channels: Channels | None = None
 
     @model_validator(mode="after")
     def _can_be_reached(self) -> ModbusDacDevice:
@@ -338,7 +344,10 @@ class ModbusDacDevice(Settings):
 
 
 class Mdt693Device(Settings):
-    """A Thorlabs MDT693A or MDT693B."""
+    """A Thorlabs MDT693A or MDT693B.
+
+    ``channels`` names the channels of stack 1 to 3, x as 1, y as 2 and z as 3; without it, they are x, y, z.
+    """
 
     driver: Literal["mdt693"]
     port: SerialPort
@@ -348,6 +357,7 @@ class Mdt693Device(Settings):
     limit_v: float
     poll_s: Annotated[float, Field(ge=0.2, le=60)]
     follow_tolerance_v: Positive
+    channels: Channels | None = None
 
     @field_validator("limit_v")
     @classmethod

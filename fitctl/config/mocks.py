@@ -23,12 +23,22 @@ from fitctl.config.devices import HexapodTravel
 
 
 class DacMock(Settings):
-    """Settings of the mock D/A."""
+    """Settings of the mock D/A.
+
+    Attributes
+    ----------
+    true_full_scale_v : float, optional
+        Where its outputs have another range than ``fsm.dac.full_scale_v`` says.
+    bytes_swapped : bool
+        It takes the low byte of a register for the high one.
+    """
 
     watchdog_s: Positive
     watchdog_latches: bool
     safe_v: NonNegative
     unknown_unit: Literal["refuse", "ignore", "serve"]
+    true_full_scale_v: Positive | None = None
+    bytes_swapped: bool = False
 
 
 class Mdt693Mock(Settings):
@@ -58,6 +68,8 @@ class Mdt693Mock(Settings):
         Largest step of the arrow keys.
     push_command : str
         What the command is called that says whether knobs must be pushed.
+    true_gains : list of float, optional
+        Of the channels, where they are not as ``fsm.piezo.gain`` says; 0 is an input with nothing plugged in.
     """
 
     model: Literal["MDT693A", "MDT693B"]
@@ -77,6 +89,7 @@ class Mdt693Mock(Settings):
     xyzvoltage: bool
     dacstep_max: Literal[1000, 5000]
     push_command: Literal["pushdisable", "disablepush"]
+    true_gains: Annotated[list[NonNegative], Field(min_length=3, max_length=3)] | None = None
 
 
 class GigeMock(Settings):
@@ -204,10 +217,17 @@ class C887Mock(Settings):
 
 
 class SiderostatMocks(Settings):
-    """Where the mock amplifiers of one siderostat listen, and how they are."""
+    """Where the mock amplifiers of one siderostat listen, and how they are.
+
+    Attributes
+    ----------
+    velocity_gains : list of float, optional
+        How many times faster than commanded each axis of the amplifiers turns its motor.
+    """
 
     slcan_port: Port
     drive_command_timeout_s: Positive
+    velocity_gains: Annotated[list[Finite], Field(min_length=2, max_length=2)] | None = None
     ensemble: EnsembleMock | None = None  # where siderostat.device is one
     bal_analog: BalAnalogMock | None = None  # likewise
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from fitctl.config import Siderostat, SiderostatMocks
+from fitctl.config.wiring import STRAIGHT
 from fitctl.mocks.bal_analog.station import BalAnalogMockStation
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.cia402.slcan import SlcanAdapter
 from fitctl.mocks.ensemble.controller import EnsembleControllerMock
 from fitctl.mocks.faults import Faults
-from fitctl.mocks.motors import Motors
+from fitctl.mocks.motors import Motors, WiredMotors
 
 
 class AmplifierMock(Protocol):
@@ -37,6 +38,9 @@ def amplifier_mock(
 
     A drive whose CAN bus has others too is on `adapter`.
     """
+    wiring, gains = siderostat.wiring, mocks.velocity_gains
+    if wiring is not None or gains is not None:
+        motors = WiredMotors(motors, wiring or STRAIGHT, gains or [1.0, 1.0])
     match siderostat.device.driver:
         case "ensemble" if mocks.ensemble is not None:
             return EnsembleControllerMock(siderostat, mocks.ensemble, motors)

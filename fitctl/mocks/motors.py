@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
+from fitctl.config.wiring import AmplifierWiring
 from fitctl.mocks.faults import FaultKind, Faults
 
 AXES = ("az", "el")
@@ -33,6 +34,47 @@ class Motors(Protocol):
     def set_enabled(self, axis: int, enabled: bool) -> None:
         """Give one motor current, or take it away."""
         ...
+
+
+class WiredMotors:
+    """Motors on the amplifiers' axes as a rig's cables have them: axis 0 and 1 in place of az and el.
+
+    Parameters
+    ----------
+    motors : Motors
+    wiring : AmplifierWiring
+    velocity_gains : sequence of float
+        How many times faster than commanded axis 0 and 1 turn their motors.
+    """
+
+    def __init__(
+        self, motors: Motors, wiring: AmplifierWiring, velocity_gains: Sequence[float]
+    ) -> None:
+        self._motors = motors
+        self._velocity_gains = velocity_gains
+        self._axes = wiring.axes
+        self._velocity_signs, self._encoder_signs = wiring.velocity_signs, wiring.encoder_signs
+
+    def position_rad(self) -> Sequence[float]:
+        """What the encoders on axis 0 and 1 count, as angles."""
+        turned = [
+            sign * angle
+            for sign, angle in zip(self._encoder_signs, self._motors.position_rad(), strict=True)
+        ]
+        return [turned[self._axes.index(axis)] for axis in range(2)]
+
+    def command_velocity_rad_s(self, first: float, second: float) -> None:
+        """Drive the motors on axis 0 and 1."""
+        commanded = (first * self._velocity_gains[0], second * self._velocity_gains[1])
+        az, el = (
+            sign * commanded[axis]
+            for sign, axis in zip(self._velocity_signs, self._axes, strict=True)
+        )
+        self._motors.command_velocity_rad_s(az, el)
+
+    def set_enabled(self, axis: int, enabled: bool) -> None:
+        """Give the motor on one axis current, or take it away."""
+        self._motors.set_enabled(self._axes.index(axis), enabled)
 
 
 class FaultyMotors:

@@ -196,15 +196,19 @@ class StarTestbed:
 
     def __init__(self, rig: Rig, name: str, mocks: LoopMocks, live: LivePlant) -> None:
         fsm = rig.stellar_loops[name].fsm
-        self.piezo = Mdt693Mock(
-            mocks.mdt693,
-            fsm.piezo,
-            lambda volts: live.set_stack_v(name, [volt / fsm.piezo.gain for volt in volts]),
-            port=mocks.mdt693_port,
-        )
-        self.dac = ModbusDacMock(
-            fsm.dac, mocks.dac, self.piezo.set_external_input_v, port=mocks.modbus_port
-        )
+        straight = [1, 2, 3]
+        dac_channels = fsm.dac.channels or straight
+        piezo_channels = fsm.piezo.channels or straight
+
+        def to_stacks(volts: Sequence[float]) -> None:
+            live.set_stack_v(name, [volts[n - 1] / fsm.piezo.gain for n in piezo_channels])
+
+        def to_amplifier(volts: Sequence[float]) -> None:
+            cables = dict(zip(piezo_channels, dac_channels, strict=True))
+            self.piezo.set_external_input_v([volts[cables[n] - 1] for n in straight])
+
+        self.piezo = Mdt693Mock(mocks.mdt693, fsm.piezo, to_stacks, port=mocks.mdt693_port)
+        self.dac = ModbusDacMock(fsm.dac, mocks.dac, to_amplifier, port=mocks.modbus_port)
 
 
 class Testbed:

@@ -13,7 +13,7 @@ import pytest
 from served import Served
 
 from fitctl.cli import main
-from fitctl.commands.set_up.doctor import PROBES
+from fitctl.commissioning.asking import PROBES
 from fitctl.config import default_rig_path
 from fitctl.drivers.interface import DeviceIdentity
 from fitctl.drivers.probe import Probe

@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -21,63 +20,17 @@ from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
-from fitctl.config import Loop, Rig
+from fitctl.commissioning.asking import Finding, examine_all, parts_of
+from fitctl.config import Rig
 from fitctl.config.simulated import mixture, places
-from fitctl.drivers.bal_analog.driver import probe_bal_analog
-from fitctl.drivers.c887.driver import probe_c887
-from fitctl.drivers.cia402.configure import probe_drive
-from fitctl.drivers.ensemble.driver import probe_ensemble
-from fitctl.drivers.gige.probe import probe_camera
-from fitctl.drivers.interface import DeviceError, DeviceIdentity, DeviceTimeout, DeviceUnreachable
-from fitctl.drivers.labjack_t7.driver import probe_labjack
-from fitctl.drivers.mdt693.driver import probe_mdt693
-from fitctl.drivers.modbus_dac.probe import probe_dac
-from fitctl.drivers.probe import Probe
+from fitctl.drivers.interface import DeviceIdentity
 from fitctl.messages.endpoints import COMMAND_SOCKET, service_folder
 from fitctl.messages.telemetry import Telemetry
 from fitctl.text import plain
 
 _WIDEST = 118
 _FIRST_REPORT_S = 3.0
-_CAN_DRIVER = "cia402"
 _NOT_STARTED = "simulated, and the mocks are not started: run `fitctl mocks` with this rig"
-PROBES: dict[str, Callable[[Any], Probe]] = {
-    "gige": probe_camera,
-    "aravis": probe_camera,
-    "cia402": probe_drive,
-    "ensemble": probe_ensemble,
-    "bal_analog": probe_bal_analog,
-    "modbus_dac": probe_dac,
-    "mdt693": probe_mdt693,
-    "labjack_t7": probe_labjack,
-    "c887": probe_c887,
-}
-
-
-class Finding(NamedTuple):
-    """What became of asking one device.
-
-    Attributes
-    ----------
-    device : str
-    driver : str
-    found : bool
-        Something answered.
-    identity : DeviceIdentity or None
-    round_trip_ms : float or None
-    disagreements : list of str
-        Empty where all is as the rig file says.
-    note : str
-        What to know of it that is no failure.
-    """
-
-    device: str
-    driver: str
-    found: bool
-    identity: DeviceIdentity | None
-    round_trip_ms: float | None
-    disagreements: list[str]
-    note: str = ""
 
 
 def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
@@ -94,7 +47,7 @@ def ask_devices(rig: Rig, *, as_json: bool) -> int:
     """Ask every device of a rig, print what they answer; returns the exit status."""
     logging.disable()  # libraries print on stderr what is in the table
     running = _running_supervisor(rig)
-    findings = without_mocks(rig, _examine_all(rig)) if running is None else reported(rig, running)
+    findings = without_mocks(rig, examine_all(rig)) if running is None else reported(rig, running)
     asked = "devices" if running is None else "supervisor"
     if as_json:
         documents = [_plain(one) for one in findings]
@@ -109,32 +62,6 @@ def ask_devices(rig: Rig, *, as_json: bool) -> int:
                 " not asked the devices, which it would disturb. To have them asked, end it first."
             )
     return FAILED if any(finding.disagreements for finding in findings) else 0
-
-
-def _examine_all(rig: Rig) -> list[Finding]:
-    """Ask all devices at once, but drives on one CAN bus one after the other: its adapter serves one."""
-    buses = {name: number for number, drives in enumerate(rig.can_buses) for name in drives}
-    lines: dict[Any, list[tuple[str, str, Any]]] = {}
-    parts = list(_parts(rig))
-    for part in parts:
-        device, driver, _ = part
-        line = buses[device.removesuffix(" siderostat")] if driver == _CAN_DRIVER else device
-        lines.setdefault(line, []).append(part)
-    with ThreadPoolExecutor(len(lines)) as pool:
-        asked = pool.map(lambda line: [examine(*part) for part in line], lines.values())
-        findings = {finding.device: finding for line in asked for finding in line}
-    return [findings[device] for device, _, _ in parts]
-
-
-def examine(device: str, driver: str, settings: Any) -> Finding:
-    """Ask one device; `settings` is what its driver takes from the rig file."""
-    try:
-        probe = PROBES[driver](settings)
-    except DeviceError as error:
-        found = not isinstance(error, (DeviceUnreachable, DeviceTimeout))
-        return Finding(device, driver, found, None, None, [str(error)])
-    round_trip_ms = 1e3 * probe.round_trip_s
-    return Finding(device, driver, True, probe.identity, round_trip_ms, list(probe.disagreements))
 
 
 def without_mocks(rig: Rig, findings: list[Finding]) -> list[Finding]:
@@ -152,7 +79,7 @@ def without_mocks(rig: Rig, findings: list[Finding]) -> list[Finding]:
 
 def reported(rig: Rig, running: Telemetry) -> list[Finding]:
     """What the running supervisor reports of its devices."""
-    drivers = {device.removesuffix(" amplifier"): driver for device, driver, _ in _parts(rig)}
+    drivers = {device.removesuffix(" amplifier"): driver for device, driver, _ in parts_of(rig)}
     findings = []
     for health in running.devices:
         trouble = {
@@ -188,19 +115,6 @@ def _running_supervisor(rig: Rig) -> Telemetry | None:
         return None
     finally:
         client.close()
-
-
-def _parts(rig: Rig) -> Iterator[tuple[str, str, Any]]:
-    yield "camera", rig.camera.device.driver, rig.camera
-    for name, loop in rig.loops.items():
-        yield f"{name} siderostat", loop.siderostat.device.driver, loop.siderostat
-        if isinstance(loop, Loop):
-            yield f"{name} D/A", loop.fsm.dac.driver, loop.fsm.dac
-            yield f"{name} piezo amplifier", loop.fsm.piezo.driver, loop.fsm.piezo
-        else:
-            yield f"{name} photodiodes", loop.sensor.device.driver, loop.sensor.device
-    if rig.collector is not None:
-        yield "hexapod", rig.collector.hexapod.driver, rig.collector.hexapod
 
 
 def _plain(finding: Finding) -> dict[str, Any]:

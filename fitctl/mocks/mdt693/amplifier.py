@@ -29,7 +29,7 @@ class Amplifier:
     settings : Mdt693Mock
         Switch, knobs, and how well it measures.
     gain : float
-        From external input to output.
+        From external input to output, where the settings have no others.
     on_outputs : callable
         Gets the three output voltages whenever one changes.
     now_s : callable
@@ -48,7 +48,7 @@ class Amplifier:
         now_s: Callable[[], float],
     ) -> None:
         self._settings = settings
-        self._gain = gain
+        self._gains = settings.true_gains or [gain] * len(CHANNELS)
         self._on_outputs = on_outputs
         self._now_s = now_s
         self._noise = np.random.default_rng(0)
@@ -175,7 +175,7 @@ class Amplifier:
             self._settings.knobs_v[i]
             + self._set_v[i]
             + self._scan_v
-            + self._external_v[i] * self._gain
+            + self._external_v[i] * self._gains[i]
         )
         return min(self.high_v(i), max(self.low_v(i), wanted))
 

@@ -93,7 +93,10 @@ class ModbusDacMock:
         """What the three channels give now."""
         if self.faults.value("reboot") is not None:
             return [0.0] * CHANNELS
-        return decode_counts(self._counts, self._dac.full_scale_v, self._dac.bits)
+        full_scale_v = self._settings.true_full_scale_v or self._dac.full_scale_v
+        swapped = self._settings.bytes_swapped
+        counts = [_swapped(count) for count in self._counts] if swapped else self._counts
+        return decode_counts(counts, full_scale_v, self._dac.bits)
 
     async def start(self) -> Endpoints:
         """Listen, and give the plant its first outputs.
@@ -153,3 +156,8 @@ class ModbusDacMock:
             self._latched = False
             self._counts = list(self._safe)
             self._on_outputs(self.outputs_v)
+
+
+def _swapped(count: int) -> int:
+    """A register's two bytes the other way round."""
+    return (count & 0xFF) << 8 | count >> 8

@@ -1,0 +1,204 @@
+"""`fitctl commission`: from devices that answer to a star held, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.printing import say, to_json
+from fitctl.commands.shared.rig import named_rig
+from fitctl.commands.shared.terminal import has_terminal
+from fitctl.commissioning.outcome import State
+from fitctl.commissioning.record import Commissioning, Entry, Files, load, writable
+from fitctl.commissioning.run import Course, chosen, do, skip
+from fitctl.commissioning.steps import Task, tasks_of
+from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+from fitctl.config.simulated import places
+
+_MARKS: dict[State, str] = {
+    "passed": "passed",
+    "corrected": "corrected",
+    "failed": "FAILED",
+    "skipped": "skipped",
+}
+
+
+def commission(
+    rig: RigOption = None,
+    overrides: SetOption = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before a step; for mocks only.")
+    ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="STEP", help="Do this step, also if it was done; may be repeated."),
+    ] = None,
+    until: Annotated[str, typer.Option(metavar="STEP", help="Stop when this step is done.")] = "",
+    skipped: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--skip", metavar="STEP=REASON", help="Leave a step out; the reason is recorded."
+        ),
+    ] = None,
+    list_steps: Annotated[
+        bool, typer.Option("--list", help="List the steps, what each moves, and what is done.")
+    ] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="For record and rig file; without it, the rig file's."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Commission a rig: prove it step by step, correct its rig file, and stop at the first trouble.
+
+    Each step prints what it will move and by how much, asks once, and stops by itself at the first sign of
+    the unexpected. What was done is kept beside the rig file; the next call goes on from there. No
+    supervisor may run. Exit status 1 if a step fails or is not done.
+
+    Example: fitctl commission --rig my-rig.toml --only amplifiers
+    """
+    path = named_rig(rig) or default_rig_path()
+    settings = load_rig(path, overrides or ())
+    _require_permission(settings, yes=yes)
+    files = Files(path, _folder(path, folder))
+    course = Course(
+        path,
+        tuple(overrides or ()),
+        files,
+        load(files.record, settings.name),
+        _reporter(silent=as_json),
+    )
+    tasks = tasks_of(settings)
+    wanted = chosen(tasks, _known(tasks, only or []))
+    if until:
+        last = chosen(tasks, _known(tasks, [until]))[-1]
+        wanted = [task for task in wanted if tasks.index(task) <= tasks.index(last)]
+    if list_steps:
+        _list(course, tasks)
+        return
+    for text in skipped or []:
+        _skip(course, tasks, text)
+    _do_all(course, wanted, again=bool(only), yes=yes)
+    _conclude(course, tasks, as_json=as_json)
+    if not all(course.record.done(task.name) for task in wanted):
+        raise typer.Exit(FAILED)
+
+
+def _require_permission(rig: Rig, *, yes: bool) -> None:
+    real = [place.device for place in places(rig).values() if not place.simulated]
+    if yes and real:
+        msg = f"commission: --yes is for mocks; these devices are real: {', '.join(real)}"
+        raise ConfigError(msg)
+    if not yes and not has_terminal():
+        msg = "commission: asks before each step, which needs a terminal; on mocks, give --yes"
+        raise ConfigError(msg)
+
+
+def _folder(path: Path, folder: Path | None) -> Path:
+    wanted = folder or (Path.cwd() if path == default_rig_path() else path.parent)
+    if not wanted.is_dir() or not writable(wanted):
+        msg = f"commission: {wanted}: nothing can be written there; choose another with --folder"
+        raise ConfigError(msg)
+    return wanted
+
+
+def _reporter(*, silent: bool) -> Callable[[str], None]:
+    return (lambda _line: None) if silent else (lambda line: say(f"    {line}"))
+
+
+def _known(tasks: list[Task], names: list[str]) -> list[str]:
+    for name in names:
+        if not chosen(tasks, [name]):
+            there_are = ", ".join(task.name for task in tasks)
+            msg = f"commission: no step {name!r}; there are {there_are}"
+            raise ConfigError(msg)
+    return names
+
+
+def _skip(course: Course, tasks: list[Task], text: str) -> None:
+    name, _, reason = text.partition("=")
+    if not reason.strip():
+        msg = f"commission: --skip {text}: expected STEP=REASON, such as star='cloudy'"
+        raise ConfigError(msg)
+    for task in chosen(tasks, _known(tasks, [name])):
+        skip(course, task, reason.strip())
+
+
+def _do_all(course: Course, wanted: list[Task], *, again: bool, yes: bool) -> None:
+    """Do what is left to do, up to the first trouble."""
+    for task in wanted:
+        if course.record.done(task.name) and not again:
+            continue
+        if missing := course.missing(task):
+            course.report(f"{task.name}: not before {', '.join(missing)}")
+            return
+        course.report(f"{task.name}: {task.step.title}. About {task.step.takes_s:g} s.")
+        course.report(f"Moves: {task.step.moves(course.site(task, course.rig(task.name)))}.")
+        if not yes and not typer.confirm("Go?", default=False):
+            course.report("stopped; the next call goes on here")
+            return
+        entry = do(course, task)
+        for line in _entry_lines(task.name, entry):
+            course.report(line)
+        if entry.state == "failed":
+            return
+
+
+def _entry_lines(name: str, entry: Entry) -> list[str]:
+    lines = [f"{_MARKS[entry.state]}: {name}, {entry.took_s:.1f} s", *entry.lines]
+    lines += [f"rig file: {key} = {value}" for key, value in flat(entry.found).items()]
+    return [*lines, *([entry.trouble] if entry.trouble else [])]
+
+
+def flat(table: dict, under: str = "") -> dict[str, object]:
+    """A fragment's values by their whole keys."""
+    found: dict[str, object] = {}
+    for key, value in table.items():
+        whole = f"{under}.{key}" if under else key
+        found |= flat(value, whole) if isinstance(value, dict) else {whole: value}
+    return found
+
+
+def _list(course: Course, tasks: list[Task]) -> None:
+    rig = course.rig()
+    for task in tasks:
+        entry = course.record.tasks.get(task.name)
+        state = "to do" if entry is None else f"{_MARKS[entry.state]} {entry.at}"
+        say(f"{task.name:<24} {state:<32} {task.step.title}")
+        say(f"{'':<24} moves: {task.step.moves(course.site(task, rig))}")
+
+
+def verdict(record: Commissioning, tasks: list[Task]) -> str:
+    """What the record comes to, in one line."""
+    states = {task.name: record.tasks.get(task.name) for task in tasks}
+    failed = [name for name, entry in states.items() if entry and entry.state == "failed"]
+    skipped = [name for name, entry in states.items() if entry and entry.state == "skipped"]
+    left = [name for name, entry in states.items() if entry is None]
+    if failed:
+        return f"not commissioned: {', '.join(failed)} failed"
+    if left:
+        return f"not commissioned yet: {', '.join(left)} to do"
+    if skipped:
+        return f"commissioned, but for what was skipped: {', '.join(skipped)}"
+    return "commissioned"
+
+
+def _conclude(course: Course, tasks: list[Task], *, as_json: bool) -> None:
+    record, files = course.record, course.files
+    if as_json:
+        document = {
+            "rig": record.rig,
+            "verdict": verdict(record, tasks),
+            "tasks": record.tasks,
+            "found": record.found(order=[task.name for task in tasks]),
+            "files": {"record": str(files.record), "rig": str(files.rig)},
+        }
+        say(to_json(document))
+        return
+    say(f"{record.rig}: {verdict(record, tasks)}")
+    say(f"record: {files.record}; rig file with what was found: {files.rig}")

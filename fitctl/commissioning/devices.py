@@ -1,0 +1,20 @@
+"""Devices: each answers, and is what the rig file says."""
+
+from __future__ import annotations
+
+from fitctl.commissioning.asking import examine_all
+from fitctl.commissioning.outcome import Outcome, Site
+
+
+def check_devices(site: Site) -> Outcome:
+    """Ask every device who it is; nothing is set, nothing moves."""
+    findings = examine_all(site.rig)
+    lines, troubles, figures = [], [], {}
+    for finding in findings:
+        who = finding.identity
+        name = "" if who is None else " ".join(filter(None, (who.maker, who.model, who.serial)))
+        troubles += [f"{finding.device}: {one}" for one in finding.disagreements]
+        if finding.round_trip_ms is not None:
+            figures[f"{finding.device}_round_trip_ms"] = finding.round_trip_ms
+            lines.append(f"{finding.device}: {name}, {finding.round_trip_ms:.2f} ms a question")
+    return Outcome(lines, figures, trouble="; ".join(troubles))

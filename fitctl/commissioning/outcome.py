@@ -1,0 +1,96 @@
+"""What a step of a commissioning works on, and what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from fitctl.clock import Clock, MonotonicClock
+from fitctl.config import Loop, Rig
+
+State = Literal["passed", "corrected", "failed", "skipped"]
+DONE: frozenset[str] = frozenset({"passed", "corrected", "skipped"})
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a step.
+
+    Attributes
+    ----------
+    lines : list of str
+        What was seen, for people.
+    figures : dict
+        What was measured, by a name with its unit.
+    found : dict
+        What the rig file must say instead, as tables of the rig file; empty where it is right.
+    trouble : str
+        What is wrong that no rig file can put right; empty if nothing.
+    """
+
+    lines: list[str] = field(default_factory=list)
+    figures: dict[str, float] = field(default_factory=dict)
+    found: dict[str, Any] = field(default_factory=dict)
+    trouble: str = ""
+
+    @property
+    def state(self) -> State:
+        """How the step ended."""
+        if self.trouble:
+            return "failed"
+        return "corrected" if self.found else "passed"
+
+
+class StepError(Exception):
+    """A step has stopped before its end; the text names the thing and what to do.
+
+    Parameters
+    ----------
+    text : str
+    figures : mapping, optional
+        What was measured until then.
+    """
+
+    def __init__(self, text: str, figures: Mapping[str, float] | None = None) -> None:
+        super().__init__(text)
+        self.figures = dict(figures or {})
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a step works on.
+
+    Attributes
+    ----------
+    rig : Rig
+        As the rig file says, with what earlier steps have found.
+    name : str
+        Of the loop; empty for a step that is of the whole rig.
+    report : callable
+        Prints a line while the step runs.
+    rig_path : Path
+    overrides : tuple of str
+        With which a process that is started for the step gets the same rig.
+    figures : dict
+        What earlier steps have measured, by ``task.figure``.
+    clock : Clock
+    """
+
+    rig: Rig
+    name: str
+    report: Callable[[str], None]
+    rig_path: Path
+    overrides: tuple[str, ...]
+    figures: Mapping[str, float] = field(default_factory=dict)
+    clock: Clock = field(default_factory=MonotonicClock)
+
+    @property
+    def loop(self) -> Loop:
+        """The stellar loop."""
+        return self.rig.stellar_loops[self.name]
+
+    def found(self, **tables: Any) -> dict[str, Any]:
+        """Tables of this loop, as a fragment of a rig file."""
+        return {"loops": {self.name: tables}}

@@ -1,0 +1,192 @@
+"""What a commissioning has found, beside its rig file: a record to go on from, and a rig file to run with."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tomli_w
+import tomlkit
+
+from fitctl.commissioning.outcome import DONE, Outcome, State
+from fitctl.config import ConfigError
+from fitctl.config.reading import lay_over
+from fitctl.files import read_regular, replaced_whole
+
+_MOST_BYTES = 16 << 20
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One task, as it was done last.
+
+    Attributes
+    ----------
+    state : str
+    at : str
+        When it ended, ISO 8601, UTC.
+    took_s : float
+    lines : list of str
+    figures : dict
+    found : dict
+        Tables of the rig file.
+    trouble : str
+        Why it failed, or the reason for which it was skipped.
+    tries : int
+        How often it was done, this time included.
+    """
+
+    state: State
+    at: str
+    took_s: float
+    lines: list[str]
+    figures: dict[str, float]
+    found: dict[str, Any]
+    trouble: str = ""
+    tries: int = 1
+
+
+class Commissioning(msgspec.Struct):
+    """The record of a rig's commissioning."""
+
+    rig: str
+    tasks: dict[str, Entry] = {}
+
+    def enter(
+        self, task: str, outcome: Outcome, took_s: float, state: State | None = None
+    ) -> Entry:
+        """Write down what came of a task."""
+        earlier = self.tasks.get(task)
+        self.tasks[task] = Entry(
+            state or outcome.state,
+            time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            round(took_s, 3),
+            outcome.lines,
+            {name: float(f"{value:.6g}") for name, value in outcome.figures.items()},
+            outcome.found,
+            outcome.trouble,
+            1 if earlier is None else earlier.tries + 1,
+        )
+        return self.tasks[task]
+
+    def done(self, task: str) -> bool:
+        """Whether a task need not be done again."""
+        return task in self.tasks and self.tasks[task].state in DONE
+
+    def found(self, before: str = "", order: list[str] | None = None) -> dict[str, Any]:
+        """What all tasks have found, or those before one of them in an order."""
+        names = list(self.tasks) if order is None else [n for n in order if n in self.tasks]
+        together: dict[str, Any] = {}
+        for name in names[: names.index(before)] if before in names else names:
+            lay_over(together, _copy(self.tasks[name].found))
+        return together
+
+    def figures(self) -> dict[str, float]:
+        """All figures, by ``task.figure``."""
+        return {
+            f"{task}.{name}": value
+            for task, entry in self.tasks.items()
+            for name, value in entry.figures.items()
+        }
+
+
+def _copy(table: dict[str, Any]) -> dict[str, Any]:
+    return {key: _copy(value) if isinstance(value, dict) else value for key, value in table.items()}
+
+
+class Files:
+    """Where a commissioning's files are.
+
+    Parameters
+    ----------
+    rig_path : Path
+    folder : Path
+        Where they are written.
+
+    Attributes
+    ----------
+    record, found, rig, page : Path
+        The record; the fragment with what was found; the rig file that includes it; the page to file.
+    """
+
+    def __init__(self, rig_path: Path, folder: Path) -> None:
+        stem = rig_path.name.removesuffix(".toml")
+        self._source = rig_path
+        self.record = folder / f"{stem}.commissioning.json"
+        self.found = folder / f"{stem}.found.toml"
+        self.rig = folder / f"{stem}.commissioned.toml"
+        self.page = folder / f"{stem}.commissioning.html"
+
+    def write_rig(self, found: dict[str, Any]) -> None:
+        """Write what was found, and the rig file with its comments, that includes it."""
+        note = "# Found by `fitctl commission`, and laid over the rig file by its include list.\n\n"
+        _write(self.found, (note + tomli_w.dumps(found)).encode())
+        document = tomlkit.parse(self._source.read_text(encoding="utf-8"))
+        nearby = self._source.parent.resolve() == self.rig.parent.resolve()
+
+        def placed(name: str) -> str:
+            return name if nearby else str((self._source.parent / name).resolve())
+
+        inherited: list[str] = []
+        if "base" in document:
+            base = str(document["base"])
+            under = tomlkit.parse((self._source.parent / base).read_text(encoding="utf-8"))
+            inherited = list(map(str, under.get("include", [])))
+            document["base"] = placed(base)
+        names = list(map(str, document.get("include", inherited)))
+        include = [*map(placed, names), self.found.name]
+        text = tomlkit.dumps(document)
+        if "include" in document:
+            document["include"] = include
+            text = tomlkit.dumps(document)
+        else:  # a key of the document itself stands before its first table
+            text = f"include = {tomlkit.item(include).as_string()}\n{text}"
+        _write(self.rig, text.encode())
+
+
+def load(path: Path, rig_name: str) -> Commissioning:
+    """The record of a rig; an empty one where there is none.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, or is another rig's.
+    """
+    try:
+        record = msgspec.json.decode(read_regular(path, _MOST_BYTES), type=Commissioning)
+    except FileNotFoundError:
+        return Commissioning(rig_name)
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+        msg = f"{path}: cannot be read as a record of a commissioning: {error}; move it away to begin anew"
+        raise ConfigError(msg) from None
+    if record.rig != rig_name:
+        msg = f"{path}: is of rig {record.rig}, expected {rig_name}; move it away to begin anew"
+        raise ConfigError(msg)
+    return record
+
+
+def save(path: Path, record: Commissioning) -> None:
+    """Write a record whole.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be written.
+    """
+    _write(path, msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        with replaced_whole(path) as file:
+            file.write(content)
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror}; choose another place with --folder"
+        raise ConfigError(msg) from None
+
+
+def writable(folder: Path) -> bool:
+    """Whether files can be written there."""
+    return os.access(folder, os.W_OK)

@@ -1,0 +1,115 @@
+"""Do the tasks of a commissioning one after the other, and write down what comes of each."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import NamedTuple
+
+from fitctl.commissioning.outcome import Outcome, Site, StepError
+from fitctl.commissioning.record import Commissioning, Entry, Files, save
+from fitctl.commissioning.steps import Task, tasks_of
+from fitctl.config import Rig, load_rig
+from fitctl.config.reading import lay_over, read_parts, rig_from_parts
+from fitctl.daemon.locks import only_master
+from fitctl.drivers.interface import DeviceError
+
+_TRIES = 3  # what a correction brings to light may need another
+
+
+class Course(NamedTuple):
+    """A commissioning under way.
+
+    Attributes
+    ----------
+    rig_path : Path
+    overrides : tuple of str
+    files : Files
+    record : Commissioning
+    report : callable
+        Prints a line.
+    """
+
+    rig_path: Path
+    overrides: tuple[str, ...]
+    files: Files
+    record: Commissioning
+    report: Callable[[str], None]
+
+    def rig(self, before: str = "") -> Rig:
+        """The rig file with what was found, or with what was found before a task."""
+        laid = read_parts(self.rig_path, self.overrides)
+        order = [task.name for task in tasks_of(load_rig(self.rig_path, self.overrides))]
+        lay_over(laid.document, self.record.found(before, order))
+        return rig_from_parts(laid, str(self.rig_path))
+
+    def missing(self, task: Task) -> list[str]:
+        """Tasks that must be done before this one, and are not."""
+        return [name for name in task.needs() if not self.record.done(name)]
+
+    def site(self, task: Task, rig: Rig) -> Site:
+        """What a task works on."""
+        return Site(
+            rig, task.loop, self.report, self.files.rig, self.overrides, self.record.figures()
+        )
+
+
+def do(course: Course, task: Task) -> Entry:
+    """Do a task; where it corrects the rig, again with the correction, until nothing is left to correct."""
+    began_s = time.monotonic()
+    found: dict[str, object] = {}
+    lines: list[str] = []
+    rig = course.rig(task.name)
+    course.files.write_rig(course.record.found(task.name, [t.name for t in tasks_of(rig)]))
+    for attempt in range(_TRIES):
+        outcome = _attempt(course.site(task, rig), task)
+        lines += outcome.lines
+        if outcome.trouble or not outcome.found:
+            break
+        lay_over(found, outcome.found)
+        rig = _corrected(course, task, found)
+        outcome = Outcome(outcome.lines, outcome.figures, found)
+        if attempt + 1 == _TRIES:
+            what = "what was corrected is still not as expected"
+            outcome = Outcome(outcome.lines, outcome.figures, found, what)
+    whole = Outcome(lines, outcome.figures, found, outcome.trouble)
+    entry = course.record.enter(task.name, whole, time.monotonic() - began_s)
+    save(course.files.record, course.record)
+    course.files.write_rig(course.record.found(order=[t.name for t in tasks_of(rig)]))
+    return entry
+
+
+def skip(course: Course, task: Task, reason: str) -> Entry:
+    """Leave a task out, for a reason that stays in the record."""
+    entry = course.record.enter(task.name, Outcome(trouble=reason), 0.0, "skipped")
+    save(course.files.record, course.record)
+    return entry
+
+
+def _attempt(site: Site, task: Task) -> Outcome:
+    try:
+        with nullcontext() if task.step.supervised else only_master(site.rig):
+            return task.step.run(site)
+    except StepError as error:
+        return Outcome(figures=error.figures, trouble=str(error))
+    except DeviceError as error:
+        return Outcome(trouble=str(error))
+
+
+def _corrected(course: Course, task: Task, found: dict[str, object]) -> Rig:
+    laid = read_parts(course.rig_path, course.overrides)
+    order = [one.name for one in tasks_of(load_rig(course.rig_path, course.overrides))]
+    before = course.record.found(task.name, order)
+    lay_over(before, found)
+    course.files.write_rig(before)
+    lay_over(laid.document, before)
+    return rig_from_parts(laid, str(course.rig_path))
+
+
+def chosen(tasks: Sequence[Task], only: Sequence[str]) -> list[Task]:
+    """The tasks that names ask for: of a task, or of a step, which is of every loop that has it."""
+    return [
+        task for task in tasks if not only or {task.name, task.name.rpartition(".")[2]} & set(only)
+    ]

@@ -1,0 +1,98 @@
+"""The steps of a commissioning in their order: one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Literal, NamedTuple
+
+from fitctl.commissioning import amplifiers, devices
+from fitctl.commissioning.outcome import Outcome, Site
+from fitctl.config import Rig
+
+_NOTHING = "nothing"
+
+
+class Step(NamedTuple):
+    """A step.
+
+    Attributes
+    ----------
+    title : str
+        What it does, for people.
+    of : str
+        ``rig``: done once. ``siderostat``: once for each loop. ``star``: once for each stellar loop.
+    moves : callable
+        What it moves and by how much.
+    needs : tuple of str
+        Steps that must be done before.
+    takes_s : float
+        About how long.
+    run : callable
+    supervised : bool
+        It runs a supervisor, which has the devices then.
+    """
+
+    title: str
+    of: Literal["rig", "siderostat", "star"]
+    moves: Callable[[Site], str]
+    needs: tuple[str, ...]
+    takes_s: float
+    run: Callable[[Site], Outcome]
+    supervised: bool = False
+
+
+def _nothing(_site: Site) -> str:
+    return _NOTHING
+
+
+STEPS: dict[str, Step] = {
+    "devices": Step(
+        "Every device answers and is what the rig file says",
+        "rig",
+        _nothing,
+        (),
+        5.0,
+        devices.check_devices,
+    ),
+    "amplifiers": Step(
+        "Each motor stands, turns on command, and its encoder counts it",
+        "siderostat",
+        amplifiers.moves,
+        ("devices",),
+        5.0,
+        amplifiers.check_amplifiers,
+    ),
+}
+
+
+class Task(NamedTuple):
+    """A step of one loop, or of the rig.
+
+    Attributes
+    ----------
+    name : str
+        ``devices``, or with its loop ``right.amplifiers``.
+    loop : str
+        Empty for a step of the rig.
+    step : Step
+    """
+
+    name: str
+    loop: str
+    step: Step
+
+    def needs(self) -> Iterator[str]:
+        """Names of the tasks that must be done before."""
+        for name in self.step.needs:
+            of_rig = STEPS[name].of == "rig"
+            yield name if of_rig or not self.loop else f"{self.loop}.{name}"
+
+
+def tasks_of(rig: Rig) -> list[Task]:
+    """All tasks of a rig, in their order."""
+    loops = {"rig": [""], "siderostat": list(rig.loops), "star": list(rig.stellar_loops)}
+    return [
+        Task(f"{loop}.{name}" if loop else name, loop, step)
+        for name, step in STEPS.items()
+        for loop in loops[step.of]
+    ]

@@ -1,0 +1,142 @@
+"""Each rig of the catalogue through `fitctl commission`: real processes, real wires, real time."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from fitctl.config import default_rig_path
+from fitctl.mocks.bench import StagesNow, StagesQuestion, ask_bench
+from miswired.catalogue import CATALOGUE
+
+pytestmark = [pytest.mark.miswired, pytest.mark.timeout(300)]
+LOOK_S = 0.02
+
+
+class Watched(threading.Thread):
+    """Asks the bench where the stages truly are, whatever commissioning believes."""
+
+    def __init__(self, port):
+        super().__init__(daemon=True)
+        self.ending = threading.Event()
+        self.port = port
+        self.first = ask_bench(port, StagesQuestion(loop="right"), StagesNow)
+        self.most_rad = self.most_v = 0.0
+
+    def run(self):
+        while not self.ending.wait(LOOK_S):
+            now = ask_bench(self.port, StagesQuestion(loop="right"), StagesNow)
+            self.most_rad = max(self.most_rad, largest(now.motor_rad, self.first.motor_rad))
+            self.most_v = max(self.most_v, largest(now.stack_v, self.first.stack_v))
+
+    def end(self):
+        self.ending.set()
+        self.join()
+
+
+def largest(now, first):
+    return max(abs(a - b) for a, b in zip(now, first, strict=True))
+
+
+def settings(pairs):
+    return [part for pair in pairs for part in ("--set", pair)]
+
+
+@contextmanager
+def mocks_of(rig, wrong, seed=0):
+    """Mocks wired as the entry says; their endpoints, and the bench's port."""
+    arguments = ["mocks", "--rig", str(rig), "--free-ports", "--json", "--seed", str(seed)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fitctl", *arguments, *settings(wrong)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        endpoints = json.loads(process.stdout.readline())
+        devices = [f"{key}={value}" for key, value in endpoints.items() if key[:6] != "mocks."]
+        yield devices, int(endpoints["mocks.bench_port"])
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+def values(table, under=""):
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from values(value, f"{under}{key}.")
+        else:
+            yield f"{under}{key}", value
+
+
+def commissioned(folder, entry):
+    """What commissioning makes of an entry, and how far the stages truly moved."""
+    rig = default_rig_path().with_name(entry.rig)
+    with mocks_of(rig, entry.wrong) as (devices, bench_port):
+        watched = Watched(bench_port)
+        watched.start()
+        # The sockets in the test's folder: several entries run beside each other.
+        own = [*devices, f"service.folder={folder}/sockets", f"logging.folder={folder}"]
+        began_s = time.monotonic()
+        run = subprocess.run(
+            [
+                *(
+                    sys.executable,
+                    "-m",
+                    "fitctl",
+                    "commission",
+                    "--rig",
+                    str(rig),
+                    "--yes",
+                    "--json",
+                ),
+                *("--folder", str(folder), "--until", entry.step, *settings(own)),
+            ],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        took_s = time.monotonic() - began_s
+        watched.end()
+    assert run.stdout, run.stderr
+    return json.loads(run.stdout), watched, took_s
+
+
+@pytest.mark.parametrize("entry", CATALOGUE, ids=lambda entry: entry.name)
+def test_commissioning_finds_it(entry, tmp_path):
+    result, watched, took_s = commissioned(tmp_path, entry)
+    troubles = {name: task["trouble"] for name, task in result["tasks"].items() if task["trouble"]}
+    found = dict(values(result["found"]))
+    remember(entry, found, troubles, watched, took_s)
+    if entry.named:
+        assert entry.named in " ".join(troubles.values()), result
+    else:
+        assert not troubles
+        if not entry.found:
+            assert not found
+    for key, value in entry.found.items():
+        assert found[key] == pytest.approx(value, rel=0.1, abs=3.0 if "deg" in key else 1e-9)
+    assert watched.most_rad <= entry.most_rad
+    assert watched.most_v <= entry.most_v
+
+
+def remember(entry, found, troubles, watched, took_s):
+    """Add the result to the file that FITCTL_MISWIRED_RESULTS names."""
+    path = os.environ.get("FITCTL_MISWIRED_RESULTS")
+    if not path:
+        return
+    file = Path(path)
+    results = json.loads(file.read_text()) if file.exists() else {}
+    results[entry.name] = {
+        "found": found,
+        "troubles": troubles,
+        "most_rad": watched.most_rad,
+        "most_v": watched.most_v,
+        "took_s": took_s,
+    }
+    file.write_text(json.dumps(results, indent=1))
