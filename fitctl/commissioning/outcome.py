@@ -75,6 +75,8 @@ class Site:
         With which a process that is started for the step gets the same rig.
     figures : dict
         What earlier steps have measured, by ``task.figure``.
+    quick : bool
+        A short acceptance.
     clock : Clock
     """
 
@@ -84,6 +86,7 @@ class Site:
     rig_path: Path
     overrides: tuple[str, ...]
     figures: Mapping[str, float] = field(default_factory=dict)
+    quick: bool = False
     clock: Clock = field(default_factory=MonotonicClock)
 
     @property

@@ -30,6 +30,8 @@ class Course(NamedTuple):
     record : Commissioning
     report : callable
         Prints a line.
+    quick : bool
+        A short acceptance.
     """
 
     rig_path: Path
@@ -37,6 +39,7 @@ class Course(NamedTuple):
     files: Files
     record: Commissioning
     report: Callable[[str], None]
+    quick: bool = False
 
     def rig(self, before: str = "") -> Rig:
         """The rig file with what was found, or with what was found before a task."""
@@ -52,7 +55,13 @@ class Course(NamedTuple):
     def site(self, task: Task, rig: Rig) -> Site:
         """What a task works on."""
         return Site(
-            rig, task.loop, self.report, self.files.rig, self.overrides, self.record.figures()
+            rig,
+            task.loop,
+            self.report,
+            self.files.rig,
+            self.overrides,
+            self.record.figures(),
+            quick=self.quick,
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
-from fitctl.commissioning import amplifiers, devices
+from fitctl.commissioning import amplifiers, camera, closed, devices, plate, stacks
 from fitctl.commissioning.outcome import Outcome, Site
 from fitctl.config import Rig
 
@@ -54,6 +54,22 @@ STEPS: dict[str, Step] = {
         5.0,
         devices.check_devices,
     ),
+    "camera": Step(
+        "The camera's dark, noise, frame rate and delay are what the rig file says",
+        "rig",
+        _nothing,
+        ("devices",),
+        8.0,
+        camera.check_camera,
+    ),
+    "stacks": Step(
+        "Each D/A channel moves its stack, seen in the piezo amplifier's readback",
+        "star",
+        stacks.moves,
+        ("devices",),
+        12.0,
+        stacks.check_stacks,
+    ),
     "amplifiers": Step(
         "Each motor stands, turns on command, and its encoder counts it",
         "siderostat",
@@ -61,6 +77,57 @@ STEPS: dict[str, Step] = {
         ("devices",),
         5.0,
         amplifiers.check_amplifiers,
+    ),
+    "star": Step(
+        "The star is on the camera, alone, and as bright as the rig file says",
+        "star",
+        plate.star_moves,
+        ("camera", "amplifiers"),
+        60.0,
+        plate.check_star,
+    ),
+    "siderostat": Step(
+        "How the star moves with each motor: scale, rotation, mirror image",
+        "star",
+        plate.siderostat_moves,
+        ("star", "amplifiers"),
+        40.0,
+        plate.check_siderostat,
+    ),
+    "mirror": Step(
+        "How the star moves with each stack: order, scale, rotation",
+        "star",
+        plate.mirror_moves,
+        ("star", "stacks"),
+        20.0,
+        plate.check_mirror,
+    ),
+    "gentle": Step(
+        "The first closed loop: the siderostat at a tenth of its gain",
+        "star",
+        closed.gentle_moves,
+        ("siderostat", "mirror"),
+        40.0,
+        closed.check_gentle,
+        supervised=True,
+    ),
+    "loop": Step(
+        "The whole loop holds the star",
+        "star",
+        closed.whole_moves,
+        ("gentle",),
+        50.0,
+        closed.check_whole,
+        supervised=True,
+    ),
+    "acceptance": Step(
+        "Acceptance: acquisitions, STOP after each, and a long hold",
+        "star",
+        closed.accept_moves,
+        ("loop",),
+        600.0,
+        closed.check_acceptance,
+        supervised=True,
     ),
 }
 

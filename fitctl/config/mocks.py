@@ -93,11 +93,24 @@ class Mdt693Mock(Settings):
 
 
 class GigeMock(Settings):
-    """Settings of the mock camera."""
+    """Settings of the mock camera.
+
+    Attributes
+    ----------
+    true_frame_rate_hz : float, optional
+        Where it runs at another rate than it is set to.
+    quarter_turns : int
+        By how many right angles its picture is turned, azimuth towards elevation; for a square sensor.
+    mirrored : bool
+        Its picture is mirrored along azimuth, before it is turned.
+    """
 
     description: Literal["xml", "zip"]
     resends: bool
     clock: bool
+    true_frame_rate_hz: Positive | None = None
+    quarter_turns: Annotated[int, Field(ge=0, le=3)] = 0
+    mirrored: bool = False
 
 
 class EnsembleMock(Settings):

@@ -279,6 +279,8 @@ class Testbed:
             truth.exposure_instants,
         )
         self._exposures = 0
+        self._mirrored = mocks.camera.mirrored
+        self._quarter_turns = mocks.camera.quarter_turns
         self._camera = GigeCameraMock(
             rig.true_camera,
             mocks.camera,
@@ -381,12 +383,14 @@ class Testbed:
 
     def _render(self, mid_exposure_s: float) -> NDArray[np.uint16]:
         self._exposures += 1
-        return self._scene.frame(
+        picture = self._scene.frame(
             self._live.exposure_px(mid_exposure_s),
             self._live.plant.pixel_key,
             self._exposures,
             self._live.pixel_noise_dn(mid_exposure_s),
         )
+        mirrored = picture[:, ::-1] if self._mirrored else picture
+        return np.ascontiguousarray(np.rot90(mirrored, -self._quarter_turns))
 
     async def _keep_up(self) -> None:
         """Advance in small pieces also when nobody looks, so that nobody ever waits for an hour's steps."""

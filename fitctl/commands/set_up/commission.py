@@ -45,6 +45,9 @@ def commission(
             "--skip", metavar="STEP=REASON", help="Leave a step out; the reason is recorded."
         ),
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A short acceptance: 3 acquisitions and 20 s.")
+    ] = False,
     list_steps: Annotated[
         bool, typer.Option("--list", help="List the steps, what each moves, and what is done.")
     ] = False,
@@ -72,6 +75,7 @@ def commission(
         files,
         load(files.record, settings.name),
         _reporter(silent=as_json),
+        quick,
     )
     tasks = tasks_of(settings)
     wanted = chosen(tasks, _known(tasks, only or []))

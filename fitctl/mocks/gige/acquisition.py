@@ -56,6 +56,8 @@ class Acquisition:
     stream : Stream
     seen_at : float
         Which part of the exposure must have passed.
+    true_rate_hz : float, optional
+        Where it runs at another rate than it is set to.
 
     Attributes
     ----------
@@ -73,7 +75,9 @@ class Acquisition:
         stream: Stream,
         *,
         seen_at: float = 0.5,
+        true_rate_hz: float | None = None,
     ) -> None:
+        self._true_rate_hz = true_rate_hz
         self.frames_sent = 0
         self.late_frames = 0
         self.worst_late_s = 0.0
@@ -173,7 +177,7 @@ class Acquisition:
     def _following_start_s(self, settings: AcquisitionSettings) -> float:
         if settings.single_frame or settings.triggered:
             return math.inf
-        return self._start_s + self._exposures / settings.frame_rate_hz
+        return self._start_s + self._exposures / (self._true_rate_hz or settings.frame_rate_hz)
 
     def _emit(self, frame: _InFlight) -> None:
         late_s = time.monotonic() - frame.due_s

@@ -104,6 +104,7 @@ class GigeCameraMock:
             self._camera.frame_delay_s,
             stream,
             seen_at=1.0 if self._smears else 0.5,
+            true_rate_hz=self._settings.true_frame_rate_hz,
         )
         self._started = stream, acquisition, self._registers(stream, acquisition)
         try:
