@@ -13,6 +13,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from fitctl import __version__
+from fitctl.commands.shared.examples import EXAMPLES
 from fitctl.commands.shared.exits import INTERRUPTED, UNUSABLE
 from fitctl.commands.shared.printing import say, say_lines
 from fitctl.commands.shared.welcome import welcome
@@ -23,61 +24,80 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 class Command(NamedTuple):
-    """Where a command's module is, and what ``--help`` says of it: at most 45 characters.
+    """Where a command's module is, and its line in ``--help``.
 
     Attributes
     ----------
     group : str
         The module is ``fitctl.commands.GROUP.NAME``.
     summary : str
-        Empty for a command that is not for people, which ``--help`` does not list.
+        At most 45 characters. Empty for a command that people do not need; ``--help`` omits it.
     """
 
     group: str
     summary: str = ""
 
 
+# The headings of ``--help``, in order.
+GROUPS = {
+    "try_out": "Try",
+    "set_up": "Set up",
+    "operate": "Operate",
+    "analyse": "Analyse",
+    "design": "Design",
+}
 COMMANDS = {
     "demo": Command("try_out", "Run the whole instrument on mock devices"),
-    "mocks": Command("try_out", "Serve the rig's mock devices"),
+    "mocks": Command("try_out", "Serve the mock devices of a rig"),
+    "fault": Command("try_out", "Inject faults into running mocks"),
+    "init": Command("set_up", "Write a rig file for your hardware"),
+    "check": Command("set_up", "Validate a rig file"),
+    "discover": Command("set_up", "List cameras, serial ports and CAN interfaces"),
     "doctor": Command("set_up", "Check that the devices of a rig answer"),
     "commission": Command("set_up", "Prove a rig step by step, from wiring to star"),
-    "discover": Command("set_up", "List cameras, serial ports and CAN interfaces"),
+    "keys": Command("set_up", "Manage keys for remote access"),
     "run": Command("operate", "Supervise a rig"),
     "console": Command("operate", "Open the operator console"),
-    "send": Command("operate", "Send one command to the supervisor"),
-    "rehearse": Command("operate", "Show what a command would do"),
     "status": Command("operate", "Show the state of the instrument"),
     "watch": Command("operate", "Print a line a second, and every event"),
-    "simulate": Command("design", "Acquire and hold a star on a virtual clock"),
+    "send": Command("operate", "Send one command to the supervisor"),
+    "rehearse": Command("operate", "Show what a command would do"),
+    "sequence": Command("operate", "Run, check and steer sequences of steps"),
+    "report": Command("analyse", "Make a report of a night from its logs"),
+    "plot": Command("analyse", "Plot fields of a log in the terminal"),
+    "log": Command("analyse", "Inspect, repair and convert logs"),
     "replay": Command("analyse", "Run the frames of a log through today's code"),
+    "simulate": Command("design", "Acquire and hold a star on a virtual clock"),
     "identify": Command("design", "Measure the parameters of a rig"),
     "design": Command("design", "Design the controllers of a loop"),
     "figures": Command("design", "Make the paper's figures from this system"),
-    "init": Command("set_up", "Write a rig file for your hardware"),
-    "report": Command("analyse", "Make a report of a night from its logs"),
-    "plot": Command("analyse", "Plot fields of a log in the terminal"),
-    "check": Command("set_up", "Validate a rig file"),
     "record": Command("processes"),
     "metrics": Command("processes"),
     "gateway": Command("processes"),
     "learner": Command("processes"),
-    "fault": Command("try_out", "Inject faults into running mocks"),
-    "log": Command("analyse", "Inspect, repair and convert logs"),
-    "sequence": Command("operate", "Run, check and steer sequences of steps"),
-    "keys": Command("set_up", "Manage keys for remote access"),
 }
 
 
 def load_command(name: str) -> Any:
-    """The command with its options; imports its module, which may take a second."""
+    """The command with its options and examples; imports its module, which may take a second."""
     module = importlib.import_module(f"fitctl.commands.{COMMANDS[name].group}.{name}")
     alone = typer.Typer(rich_markup_mode=None)
     if hasattr(module, "app"):
         alone.add_typer(module.app, name=name)
     else:
         alone.command(name, **getattr(module, "SETTINGS", {}))(getattr(module, name))
-    return typer.main.get_group(alone).commands[name]
+    command = typer.main.get_group(alone).commands[name]
+    _add_examples(command, name)
+    return command
+
+
+def _add_examples(command: Any, path: str) -> None:
+    """End the help of a command, and of each command below it, with its examples."""
+    if path in EXAMPLES:
+        # A paragraph that begins with \b is not rewrapped.
+        command.epilog = "\n".join(("\b", "Examples:", *(f"  {each}" for each in EXAMPLES[path])))
+    for name, below in getattr(command, "commands", {}).items():
+        _add_examples(below, f"{path} {name}")
 
 
 class LazyGroup(TyperGroup):
@@ -95,11 +115,25 @@ class LazyGroup(TyperGroup):
         name, command, rest = super().resolve_command(ctx, args)
         return name, None if command is None else load_command(str(command.name)), rest
 
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """List the commands under the headings of their groups, in one column."""
+        width = max(map(len, COMMANDS))
+        for group, heading in GROUPS.items():
+            listed = [
+                (name.ljust(width), command.summary)
+                for name, command in COMMANDS.items()
+                if command.group == group
+            ]
+            with formatter.section(heading):
+                formatter.write_dl(listed)
+
 
 app = typer.Typer(
     name="fitctl",
     cls=LazyGroup,
-    help="Points starlight: acquires a star, pulls it in and holds it to a fraction of a pixel.",
+    help="Acquire a star, pull it in, and hold it to a fraction of a pixel.",
+    epilog="Run fitctl COMMAND --help for the options of a command, with examples.",
+    context_settings={"help_option_names": ["-h", "--help"]},
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -54,14 +54,6 @@ def test_help_and_completion_of_commands_do_not_import_what_is_slow():
     assert result.stdout.splitlines()[-1] == "[]"
 
 
-def test_help_lists_every_command_with_its_whole_summary():
-    lines = fitctl("--help").stdout.split("\nCommands:\n")[1].splitlines()
-
-    listed = {name: command.summary for name, command in COMMANDS.items() if command.summary}
-    assert dict(line.split(maxsplit=1) for line in lines) == listed
-    assert max(map(len, listed.values())) <= 45
-
-
 def test_a_console_without_a_terminal_says_what_to_use_instead():
     result = fitctl("console", timeout_s=20)
 

@@ -20,23 +20,23 @@ from fitctl.logging import copying, exporting, folder, verifying
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
-app = typer.Typer(
-    help="Look into logs, mend them, make other files from them.", no_args_is_help=True
-)
+app = typer.Typer(help="Inspect, repair and convert logs.", no_args_is_help=True)
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")]
 LogsArgument = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP files.")]
 OutOption = Annotated[
     Path | None,
-    typer.Option("--out", metavar="FILE", help="The new log; else beside LOG, its name says how."),
+    typer.Option(
+        "--out", metavar="FILE", help="The new log. [default: LOG_cut.mcap, LOG_recovered.mcap]"
+    ),
 ]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="An existing file of that name may go.")
-]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")]
 TopicOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--topic", metavar="TOPIC", help="Only this, such as '/fit/right/*'; may be repeated."
+        "--topic",
+        metavar="TOPIC",
+        help="Only these topics, such as '/fit/right/*'; may be repeated.",
     ),
 ]
 
@@ -52,9 +52,11 @@ class Format(StrEnum):
 @app.command()
 def info(
     log: LogArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="All of it, also the rig file.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print everything as one JSON object, with the rig file.")
+    ] = False,
 ) -> None:
-    """Say what a log holds."""
+    """Show what a log holds."""
     found, kept, recording = log_info(log), folder.is_kept(log), folder.in_use(log)
     if as_json:
         say(to_json(_info_document(found, kept=kept, recording=recording)))
@@ -89,14 +91,14 @@ def _info_document(found: LogInfo, *, kept: bool, recording: bool) -> dict[str, 
 @app.command()
 def summary(
     logs: LogsArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="A JSON object a line.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")] = False,
     most_bytes: Annotated[
-        int, typer.Option(min=1, metavar="BYTES", help="Only name larger files.")
+        int, typer.Option(min=1, metavar="BYTES", help="Only name files that are larger.")
     ] = 1 << 40,
 ) -> None:
-    """Print when each log begins, how long it is, and how well its loops held: a line for each, as it is read.
+    """Print start, length and RMS of each log.
 
-    The verdict is that of fitctl report. Example: fitctl log summary logs/*.mcap
+    Prints one line for each log as soon as it is read. The verdict is that of `fitctl report`.
     """
     for log in logs:
         line = _summary(log, most_bytes)
@@ -150,7 +152,10 @@ def _summary(log: Path, most_bytes: int) -> LogSummary:
 
 @app.command()
 def verify(logs: LogsArgument) -> None:
-    """Read logs from end to end: checksums, index, order, every message. Exit status 1 if one is not whole."""
+    """Check that logs are whole.
+
+    Reads each log from end to end: checksums, index, order, every message. Exit status 1 if one is damaged.
+    """
     problems = 0
     for log in logs:
         verdict = verifying.verify(log)
@@ -166,7 +171,10 @@ def verify(logs: LogsArgument) -> None:
 
 @app.command()
 def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
-    """Make a whole log from one that was cut off or damaged. LOG itself stays as it is."""
+    """Make a whole log from a damaged one.
+
+    LOG itself does not change.
+    """
     if folder.in_use(log):
         msg = f"{log}: is being recorded just now; there is nothing to mend"
         raise ConfigError(msg)
@@ -189,13 +197,16 @@ def cut(
     ] = "0",
     to: Annotated[
         str | None,
-        typer.Option("--to", metavar="TIME", help="The same; what is at it is not copied."),
+        typer.Option("--to", metavar="TIME", help="End of the span, exclusive, in the same form."),
     ] = None,
     topic: TopicOption = None,
     out: OutOption = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Copy a span of time, some topics, or both. UTC times look like 2026-11-21T09:18:30.5."""
+    """Copy a span of time, some topics, or both.
+
+    UTC times look like 2026-11-21T09:18:30.5.
+    """
     found = log_info(log)
     from_ns = time_ns("--from", from_, found)
     to_ns = 2**63 if to is None else time_ns("--to", to, found)
@@ -218,7 +229,10 @@ def merge(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The new log.")],
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Join logs by time, such as those of one night, or what a crash tore in two."""
+    """Join logs in the order of time.
+
+    For example the logs of one night, or the two halves of a log that a crash cut in two.
+    """
     records, doubles = copying.merge(logs, out, overwrite=overwrite)
     also = f"; {doubles} were in two logs" if doubles else ""
     say(f"{out}: {records} records of {len(logs)} logs{also}")
@@ -231,10 +245,15 @@ def export(
     topic: TopicOption = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder; else beside LOG, with its name."),
+        typer.Option(
+            "--out", metavar="DIR", help="Folder for the tables. [default: LOG_FORMAT beside LOG]"
+        ),
     ] = None,
 ) -> None:
-    """Write each topic as a table, with units in the names of the columns."""
+    """Write each topic of a log as a table.
+
+    The names of the columns have units.
+    """
     target = out or log.with_name(f"{log.stem}_{format_}")
     files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
     for file, rows in sorted(files.items()):
@@ -247,9 +266,12 @@ def export(
 @app.command()
 def keep(
     logs: LogsArgument,
-    undo: Annotated[bool, typer.Option("--undo", help="No longer keep them.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Remove the protection.")] = False,
 ) -> None:
-    """Mark logs, so that the recorder never deletes them; the mark is an empty file LOG.keep beside each."""
+    """Protect logs from deletion by the recorder.
+
+    Makes an empty file LOG.keep beside each log.
+    """
     for log in logs:
         folder.keep(log, kept=not undo)
         say(f"{log}: {'no longer kept' if undo else 'kept'}")

@@ -31,15 +31,18 @@ def plot(
     from_: Annotated[
         str, typer.Option("--from", metavar="TIME", help="Seconds after LOG's start, or UTC.")
     ] = "0",
-    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same.")] = None,
-    window: Annotated[
-        bool, typer.Option("--window", help="In a window, not in the terminal.")
-    ] = False,
+    to: Annotated[
+        str | None, typer.Option("--to", metavar="TIME", help="End of the plot, in the same form.")
+    ] = None,
+    window: Annotated[bool, typer.Option("--window", help="Open a window instead.")] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="As a picture: PNG, SVG or PDF.")
+        Path | None, typer.Option(metavar="FILE", help="Write a picture instead: PNG, SVG or PDF.")
     ] = None,
 ) -> None:
-    """Draw fields of a log in the terminal, one panel for each unit."""
+    """Plot fields of a log in the terminal.
+
+    Draws one panel for each unit.
+    """
     if out is not None and out.suffix.lower() not in _PICTURES:
         msg = f"plot: --out {out}: expected a name that ends in {', '.join(sorted(_PICTURES))}"
         raise ConfigError(msg)

@@ -42,17 +42,17 @@ _OPEN_LOOP = (
 def replay(
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG...", help="All files of one run, from its first on."),
+        typer.Argument(metavar="LOG...", help="All files of one run, from the first on."),
     ],
     rig: Annotated[
         Path | None,
-        typer.Option("--rig", metavar="FILE", help="Rig file; without it, the one in the log."),
+        typer.Option("--rig", metavar="FILE", help="Rig file. [default: the one in the log]"),
     ] = None,
     overrides: SetOption = None,
     controller: ControllerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Feed a log's frames through today's code, and show where it decides otherwise.
+    """Run the frames of a log through today's code, and show where it decides differently.
 
     Exit status 0 if every mode and every command is the same to the last bit, 1 if not, 2 if the log
     cannot be replayed. A changed command changes no frames.

@@ -29,10 +29,10 @@ def report(
         typer.Argument(metavar="LOG...", help="Files of one run, or a folder: its newest run."),
     ],
     compare: Annotated[
-        bool, typer.Option("--compare", help="Each LOG is a night of its own; side by side.")
+        bool, typer.Option("--compare", help="Compare nights side by side; each LOG is one night.")
     ] = False,
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="As PDF too; needs Chromium or Chrome.")
+        bool, typer.Option("--pdf", help="Also write a PDF; needs Chromium or Chrome.")
     ] = False,
     pdf_without_sandbox: Annotated[
         bool,
@@ -40,19 +40,19 @@ def report(
             "--pdf-without-sandbox", help="As --pdf, also where Chromium has no sandbox (root)."
         ),
     ] = False,
-    show: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
+    show: Annotated[bool, typer.Option("--open", help="Open the report in the browser.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder for everything; else beside the first LOG."),
+        typer.Option(metavar="DIR", help="Folder for everything. [default: beside the first LOG]"),
     ] = None,
     rig: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Judge by this rig file, not by the one in the log."),
+        typer.Option(metavar="FILE", help="Rig file. [default: the one in the log]"),
     ] = None,
 ) -> None:
-    """Say on one page whether a night was good: verdict, plots, losses, configuration.
+    """Make a report of a night: verdict, plots, losses, configuration.
 
-    One HTML file that needs nothing from elsewhere, every plot as PNG and SVG, all figures as JSON.
+    Writes one self-contained HTML page, every plot as PNG and SVG, and all figures as JSON.
     """
     settings = None if rig is None else rig_of(rig, None)
     if compare and not 2 <= len(logs) <= MOST_NIGHTS:

@@ -67,11 +67,10 @@ def design(
         ),
     ] = None,
 ) -> None:
-    """Design the loop's controllers from the rig file: margins, residual, and the bound for any.
+    """Design the controllers of a loop: margins, residual, and the theoretical minimum of the residual.
 
-    vernier is LQG/LTR as the paper does it; compare sets all pairs side by side. learn estimates a night
-    (air path, noise, vibrations) from a log and designs the pair for it:
-    fitctl design learn night.mcap --out learnt.json
+    vernier designs the paper's LQG/LTR; compare shows all pairs side by side. learn estimates air path, noise
+    and vibrations of a night from a log, and designs a pair for that night.
     """
     if out is not None and out.suffix != ".json":
         msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"

@@ -19,20 +19,20 @@ from fitctl.identify.errors import IdentifyError
 
 def figures(
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for everything; made if missing.")
+        Path, typer.Option(metavar="DIR", help="Folder for everything; created if missing.")
     ],
     rig: RigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",
     seed: SeedOption = 0,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Few and short runs: to see how it looks.")
+        bool, typer.Option("--quick", help="Make few and short runs, for a first look.")
     ] = False,
 ) -> None:
-    """Make the paper's figures from this system, and measure what every controller shows.
+    """Make the paper's figures from this system, and measure every controller.
 
-    Figs. 3, 5, 6, 7, 9, 11 and 12 as PNG and SVG, with captions and beside the paper's numbers in
-    figures.md; residuals, attenuation, steps and piston in performance.md; both as JSON too.
+    Writes Figs. 3, 5, 6, 7, 9, 11 and 12 as PNG and SVG, and figures.md with captions and the paper's numbers
+    beside ours. performance.md has residuals, attenuation, steps and piston. Writes both tables as JSON too.
     """
     settings = rig_of(rig, overrides)
     require_plant(settings)

@@ -63,27 +63,30 @@ def identify(
     overrides: SetOption = None,
     loop: LoopOption = "right",
     log: Annotated[
-        Path | None, typer.Option(help="Learn from this log (or bench file) of an earlier run.")
+        Path | None,
+        typer.Option(metavar="LOG", help="Use this log (or bench file) of an earlier run."),
     ] = None,
     simulated: Annotated[
-        bool, typer.Option("--simulate", help="Experiment on the virtual clock, in seconds.")
+        bool, typer.Option("--simulate", help="Make the experiment on the virtual clock.")
     ] = False,
     mock: Annotated[
-        bool, typer.Option("--mock", help="Start the rig's mock devices and experiment on them.")
+        bool, typer.Option("--mock", help="Start the mock devices of the rig for the experiment.")
     ] = False,
     seed: SeedOption = 0,
     out: Annotated[
-        Path | None, typer.Option(help="The rig fragment; by default RIG-LOOP-WHAT.toml.")
+        Path | None,
+        typer.Option(metavar="FILE", help="The fragment. [default: RIG-LOOP-WHAT.toml]"),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="The plot; by default beside the fragment, as PNG.")
+        Path | None,
+        typer.Option(metavar="FILE", help="The plot. [default: a PNG beside the fragment]"),
     ] = None,
 ) -> None:
-    """Measure what a rig truly is, and write it as a fragment that its rig file includes.
+    """Measure the parameters of a rig, and write a fragment that its rig file includes.
 
-    Without --log, --simulate or --mock the rig's running supervisor does the experiment: the loop must
-    hold a star in VERNIER. The stages move open loop meanwhile; a stop ends it at once. What is of a link
-    is evaluated from the log of a sequence: give it with --log.
+    Without --log, --simulate or --mock, the running supervisor makes the experiment: the loop must hold a star
+    in VERNIER. The stages then move open loop; STOP ends the experiment at once. The parameters of a link come
+    from the log of a sequence: name it with --log.
     """
     if what not in EXPERIMENTS:
         msg = f"identify: {what} cannot be identified; there are {', '.join(EXPERIMENTS)}"

@@ -43,20 +43,20 @@ def simulate(
     controller: ControllerOption = None,
     seed: SeedOption = 0,
     duration: Annotated[
-        float, typer.Option(min=1.0, max=1e6, help="Seconds of virtual time.")
+        float, typer.Option(min=1.0, max=1e6, help="Virtual time, in seconds.")
     ] = 120.0,
     runs: Annotated[
-        int, typer.Option(min=1, help="How many, with seeds from --seed on, on every core.")
+        int, typer.Option(min=1, help="Number of runs, with seeds from --seed on.")
     ] = 1,
     scheduler: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:port.")
     ] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Acquire and hold on the virtual clock: same supervisor and plant, no wires, much faster.
+    """Acquire and hold a star on a virtual clock: the same supervisor and plant, much faster.
 
-    With --runs, means, percentiles and the worst seeds of many runs; each is the run that its seed
-    gives alone.
+    With --runs, prints means, percentiles and the worst seeds of many runs. Each seed gives the same run alone
+    and among others.
     """
     settings = rig_of(rig, with_controller(rig, overrides, controller))
     require_plant(settings)

@@ -50,10 +50,10 @@ def console(
     web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
 ) -> None:
-    """Attach an operator console to the running supervisor of a rig.
+    """Open the operator console on a running supervisor.
 
-    With --remote, the margins of screen Loop and the sequences need that rig's own file too, with --rig. With
-    --log, no supervisor needs to run, and nothing can be sent.
+    With --remote, also name the rig file with --rig if you need sequences and the margins on the screen Loop.
+    With --log, the console shows a log: it needs no supervisor and sends no commands.
     """
     # A browser's page runs this command too, with a driver of textual-serve in place of a terminal.
     if not (web or "TEXTUAL_DRIVER" in os.environ or has_terminal()):

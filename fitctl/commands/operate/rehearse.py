@@ -24,28 +24,29 @@ SETTINGS = {"context_settings": {"ignore_unknown_options": True}}
 
 
 def rehearse(
-    command: Annotated[str, typer.Argument(help="As fitctl send has it: target, jog, recover ...")],
-    values: Annotated[list[str] | None, typer.Argument(help="What it needs.")] = None,
+    command: Annotated[
+        str, typer.Argument(help="A command of fitctl send: target, jog, recover ...")
+    ],
+    values: Annotated[list[str] | None, typer.Argument(help="Values of the command.")] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
     remote: RemoteOption = None,
     loop: Annotated[
         str,
-        typer.Option(help="One loop by name; without it, all.", autocompletion=completion.loops),
+        typer.Option(
+            help="Name of one loop. [default: all loops]", autocompletion=completion.loops
+        ),
     ] = "",
     limit_s: Annotated[
         float, typer.Option("--limit", metavar="SECONDS", min=1.0, help="Give up after this time.")
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what a command would do, without giving it.
+    """Show what a command would do, without sending it.
 
-    Reads the present modes, stages and targets of the running instrument, puts a simulation of the rig there,
-    and gives the command to the simulation on the virtual clock. Prints where the stages end and which
-    interlocks trip. Needs the plant section of the rig file. A star that is not measured now is assumed on
-    its target.
-
-    Example: fitctl rehearse target 24 19.5 --loop right
+    Reads the present modes, stages and targets of the running instrument, and starts a simulation of the rig
+    from them. Sends the command to the simulation, and prints where the stages end and which interlocks trip.
+    The rig file needs a plant section. A star that is not measured now is assumed to be on its target.
     """
     from fitctl.simulation.rehearsal import RehearsalError
     from fitctl.simulation.rehearsal import rehearse as rehearsed

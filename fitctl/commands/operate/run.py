@@ -17,7 +17,10 @@ def run(
     controller: ControllerOption = None,
     parent_pid: ParentOption = None,
 ) -> None:
-    """Supervise the rig until Ctrl-C or a shutdown command; attach with `fitctl console`."""
+    """Supervise a rig until Ctrl-C or the command `shutdown`.
+
+    The rig starts in OFF. Attach to it with `fitctl console`, or send commands with `fitctl send`.
+    """
     bound_memory()
     rig = named_rig(rig) or default_rig_path()
     overrides = with_controller(rig, overrides, controller)

@@ -19,12 +19,13 @@ from fitctl.messages.running import running_rigs
 
 
 class SendCommand(TyperCommand):
-    """Its help ends with every command, from the table that they are made from."""
+    """Its help lists every command before the examples, from the table that all interfaces use."""
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Add them."""
+        """Add the commands."""
         with formatter.section("Commands"):
             formatter.write_dl([(row.usage, row.help) for row in WORDS.values()])
+        super().format_epilog(ctx, formatter)
 
 
 # -1 is a value, not an option.
@@ -32,35 +33,35 @@ SETTINGS = {"cls": SendCommand, "context_settings": {"ignore_unknown_options": T
 
 
 def send(
-    command: Annotated[str, typer.Argument(help="One of those below.")],
-    values: Annotated[list[str] | None, typer.Argument(help="What it needs.")] = None,
+    command: Annotated[str, typer.Argument(help="One of the commands below.")],
+    values: Annotated[list[str] | None, typer.Argument(help="Values of the command.")] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
     remote: RemoteOption = None,
     loop: Annotated[
         str,
-        typer.Option(help="One loop by name; without it, all.", autocompletion=completion.loops),
+        typer.Option(
+            help="Name of one loop. [default: all loops]", autocompletion=completion.loops
+        ),
     ] = "",
     wait: Annotated[
         bool | None,
-        typer.Option("--wait/--no-wait", help="Wait for what the command leads to, or do not."),
+        typer.Option("--wait/--no-wait", help="Wait until the command has succeeded or failed."),
     ] = None,
     timeout_s: Annotated[
         float | None,
-        typer.Option(
-            "--timeout", metavar="SECONDS", min=0.1, help="Wait so long at most; implies --wait."
-        ),
+        typer.Option("--timeout", metavar="SECONDS", min=0.1, help="Longest wait; implies --wait."),
     ] = None,
 ) -> None:
-    """Give one command to the running supervisor of a rig.
+    """Send one command to the supervisor.
 
-    On a terminal, a command that takes time (standby, recover, acquire, off, controller, shutdown) is followed
-    until what it asks for has happened or failed. Elsewhere, --wait does that.
+    On a terminal, fitctl waits until a command that takes time (standby, recover, acquire, off, controller,
+    shutdown) has succeeded or failed. Elsewhere, it waits only with --wait.
 
-    Exit status: 0 if the command was accepted and, with --wait, has happened. 1 if it was refused, failed or
-    was ended by another command, or no supervisor answers. 2 for a mistake on the command line. 3 if no
-    supervisor runs. 4 if it is still under way after --timeout. 130 after Ctrl-C, which ends the waiting, not
-    the command.
+    Exit status: 0 if the command was accepted and, with --wait, succeeded. 1 if it was refused, failed or was
+    ended by another command, or if no supervisor answers. 2 for a mistake on the command line. 3 if no
+    supervisor runs. 4 if the command is still under way after --timeout. 130 after Ctrl-C, which ends the
+    waiting, not the command.
     """
     wanted = command_of(command, values or [], loop)
     if remote is None and named_rig(rig) is None and not overrides and isinstance(wanted, Stop):

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fitctl.simulation.simulation import Simulation
 
 app = typer.Typer(
-    help="Run, check and steer sequences of acquisition and experiment steps.",
+    help="Run, check and steer sequences of steps.",
     no_args_is_help=True,
 )
 
@@ -64,8 +64,8 @@ OutOption = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        metavar="FOLDER",
-        help="Where calibrations are written: fragments for the rig file's include list.",
+        metavar="DIR",
+        help="Folder for calibrations: fragments for the include list of the rig file.",
     ),
 ]
 
@@ -87,13 +87,16 @@ def _parted(overrides: list[str] | None) -> tuple[list[str], list[str]]:
 @app.command("list")
 def list_(
     files: Annotated[
-        list[Path] | None, typer.Argument(metavar="[FILE...]", help="These, not the shipped ones.")
+        list[Path] | None,
+        typer.Argument(
+            metavar="[FILE...]", help="Sequence files. [default: the shipped sequences]"
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Every step with every key, as JSON.")
     ] = False,
 ) -> None:
-    """Print the shipped sequences."""
+    """List the shipped sequences."""
     from fitctl.sequences.reading import read_sequence
 
     listed = {path: read_sequence(path) for path in files or shipped_sequences()}
@@ -111,7 +114,7 @@ def list_(
 
 @app.command()
 def check(file: SequenceArgument, rig: RigOption = None, overrides: StepSetOption = None) -> None:
-    """Say what is wrong with a sequence for a rig, without the instrument."""
+    """Validate a sequence for a rig."""
     settings, sequence = _load(file, rig, overrides)
     say(f"{file}: well; {len(sequence.steps)} steps for rig {settings.name}")
 
@@ -123,17 +126,17 @@ def dry_run(
     overrides: StepSetOption = None,
     seed: SeedOption = 0,
     present: Annotated[
-        bool, typer.Option("--present", help="Begin with the stages and stars of the running rig.")
+        bool, typer.Option("--present", help="Start from the stages and stars of the running rig.")
     ] = False,
     remote: RemoteOption = None,
     as_json: JsonOption = False,
     out: OutOption = None,
 ) -> None:
-    """Run a whole sequence on the virtual clock, in seconds, and print what every attempt gave.
+    """Run a whole sequence on a virtual clock.
 
-    What it measures of the simulated rig is written only where --out says. With --present, the simulation
-    begins where the running instrument's stages and stars are now; a star that is not measured is assumed on
-    its target.
+    Takes seconds, and prints the result of every attempt. Writes calibrations of the simulated rig only with
+    --out. With --present, the simulation starts from the stages and stars of the running instrument; a star
+    that is not measured now is assumed to be on its target.
     """
     from fitctl.sequences.links import SimulatedLink
 
@@ -165,7 +168,10 @@ def run(
     as_json: JsonOption = False,
     out: OutOption = Path(),
 ) -> None:
-    """Run a sequence on the rig's running supervisor. Ctrl-C ends its step, holds the stages, and ends."""
+    """Run a sequence on the instrument.
+
+    Ctrl-C ends the present step, holds the stages, and ends the sequence.
+    """
     from fitctl.sequences.reading import read_sequence
 
     if remote is None:
@@ -185,19 +191,25 @@ def run(
 
 @app.command()
 def pause(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
-    """Pause the sequence that is running: after its step, or at once within hold and wait."""
+    """Pause the running sequence.
+
+    It pauses after the present step, or at once within the steps hold and wait.
+    """
     _steer("pause", rig, overrides, remote)
 
 
 @app.command()
 def resume(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
-    """Let a paused sequence go on."""
+    """Continue a paused sequence."""
     _steer("resume", rig, overrides, remote)
 
 
 @app.command()
 def stop(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
-    """End the sequence that is running; its stages are held. For SAFE, see `fitctl send stop`."""
+    """End the running sequence; hold its stages.
+
+    For SAFE, see `fitctl send stop`.
+    """
     _steer("stop", rig, overrides, remote)
 
 

@@ -27,9 +27,9 @@ def status(
     remote: RemoteOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say how the running instrument of a rig is.
+    """Show the state of the instrument.
 
-    Exit status 0 if all is well, 1 if something is not, 3 if no supervisor answers.
+    Exit status 0 if all is well, 1 if there is trouble, 3 if no supervisor answers.
     """
     client = connect("status", rig, overrides, remote)
     try:

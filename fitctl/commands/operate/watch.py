@@ -83,7 +83,7 @@ def watch(
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="Without it, until Ctrl-C.")
     ] = None,
 ) -> None:
-    """Print a line a second about the running instrument, and every event as it comes."""
+    """Print a line a second, and every event."""
     client = connect("watch", rig, overrides, remote)
     text = to_json if as_json else _text
     received = False

@@ -25,12 +25,13 @@ def check(
     overrides: SetOption = None,
     show: Annotated[
         bool,
-        typer.Option(
-            "--show", help="Print every value in force and where it comes from, as a rig file."
-        ),
+        typer.Option("--show", help="Print every value in force, and the file that sets it."),
     ] = False,
 ) -> None:
-    """Read a rig file and say whether it is well."""
+    """Validate a rig file.
+
+    Prints every mistake with its key and what was expected. Exit status 0 if there is none, 2 otherwise.
+    """
     path = named_rig(rig) or default_rig_path()
     parts = read_parts(path, overrides or ())
     settings = rig_from_parts(parts, str(path))

@@ -21,16 +21,19 @@ from fitctl.drivers.labjack_t7.discovery import discover_labjacks
 def discover(
     broadcast: Annotated[
         str,
-        typer.Option(metavar="ADDRESS", help="Where cameras and LabJacks are asked who they are."),
+        typer.Option(metavar="ADDRESS", help="Broadcast address of cameras and LabJacks."),
     ] = "255.255.255.255",
     wait_s: Annotated[
-        float, typer.Option("--wait", min=0.01, max=60.0, help="For their answers, seconds.")
+        float,
+        typer.Option(
+            "--wait", min=0.01, max=60.0, help="How long to wait for answers, in seconds."
+        ),
     ] = 1.0,
     as_json: JsonOption = False,
 ) -> None:
     """List cameras, LabJacks, serial ports and CAN interfaces.
 
-    Cameras and LabJacks are asked by a broadcast. A C-887 has no documented way to be found.
+    Sends a broadcast to which cameras and LabJacks answer. A C-887 has no documented way of discovery.
     """
     with ThreadPoolExecutor() as pool:
         cameras = pool.submit(_cameras, broadcast, wait_s)

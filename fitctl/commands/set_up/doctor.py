@@ -34,11 +34,11 @@ _NOT_STARTED = "simulated, and the mocks are not started: run `fitctl mocks` wit
 
 
 def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
-    """Ask every device of the rig who it is; nothing is set, nothing moves.
+    """Check that the devices of a rig answer. Sets nothing and moves nothing.
 
-    While the rig's supervisor runs, print what it reports of its devices instead, and ask none.
-    Exit status 1 if a device is missing or is not as the rig file says. Mocks that are not started do
-    not count.
+    Reads the identity of each device. While the supervisor of the rig runs, prints what the supervisor
+    reports about its devices instead. Exit status 1 if a device is missing or differs from the rig file.
+    Mocks that do not run are not counted.
     """
     raise typer.Exit(ask_devices(rig_of(named_rig(rig), overrides), as_json=as_json))
 

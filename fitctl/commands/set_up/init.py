@@ -59,16 +59,17 @@ def init(
     left_mdt693: Annotated[str | None, _device(f"Testbed: {_PIEZOS}")] = None,
     hexapod: Annotated[str | None, _device("Testbed: c887:PORT or mock.")] = None,
     mocks: Annotated[
-        bool, typer.Option("--mocks", help="Ask nothing: what is not said is a mock.")
+        bool, typer.Option("--mocks", help="Ask no questions: unnamed devices are mocks.")
     ] = False,
     ask_devices: Annotated[
-        bool, typer.Option("--doctor/--no-doctor", help="Ask the devices at the end.")
+        bool, typer.Option("--doctor/--no-doctor", help="Check the devices at the end.")
     ] = True,
 ) -> None:
-    """Write a rig file of your own: asks what hardware is there, or is told by options.
+    """Write a rig file for your hardware.
 
-    The rig points one star; with --testbed it is the whole testbed. Nothing is overwritten. At the end the
-    devices are asked who they are, as `fitctl doctor` does; the exit status is 1 if one disagrees.
+    Asks for each device that no option names. The rig points one star; with --testbed it is the whole testbed.
+    Never overwrites a file. At the end it checks the devices as `fitctl doctor` does; the exit status is 1 if
+    one of them differs from the rig file.
     """
     options = {
         "camera": camera,

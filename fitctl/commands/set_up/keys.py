@@ -13,31 +13,37 @@ from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.messages.keys import allowed_keys, new_key, revoke_key
 
 app = typer.Typer(
-    help="Keys with which others reach the rig from other machines: to command it, or to watch.",
+    help="Manage keys for remote access.",
     no_args_is_help=True,
 )
 
-NameArgument = Annotated[str, typer.Argument(help="Whose it is: a-z, 0-9, - and _.")]
+NameArgument = Annotated[str, typer.Argument(help="Name of the person: a-z, 0-9, - and _.")]
 
 
 @app.command()
 def new(
     name: NameArgument,
-    viewer: Annotated[bool, typer.Option("--viewer", help="May watch and not command.")] = False,
+    viewer: Annotated[
+        bool, typer.Option("--viewer", help="Allow watching only, no commands.")
+    ] = False,
     host: Annotated[
         str,
         typer.Option(
             metavar="ADDRESS",
-            help="How they reach this machine; without it, service.tcp_address.",
+            help="Address of this machine. [default: service.tcp_address]",
         ),
     ] = "",
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The key file; by default NAME.key.toml.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Key file to write. [default: NAME.key.toml]"),
     ] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
 ) -> None:
-    """Allow somebody in, and write the key file that they need: whoever has it is them."""
+    """Allow a person in, and write their key file.
+
+    Anyone who holds the key file can act as that person.
+    """
     settings = rig_of(named_rig(rig), overrides)
     path = out or Path(f"{name}.key.toml")
     key = new_key(settings, name, "viewer" if viewer else "commander", host, path)
@@ -48,7 +54,7 @@ def new(
 
 @app.command("list")
 def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
-    """Print whose keys are allowed, and what each may do."""
+    """List the allowed keys and their roles."""
     keys, problems = allowed_keys(rig_of(named_rig(rig), overrides))
     for key in keys.values():
         say(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
@@ -59,6 +65,9 @@ def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
 
 @app.command()
 def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
-    """Let a key in no more; a running supervisor drops its holder at once."""
+    """Revoke a key.
+
+    A running supervisor disconnects its holder at once.
+    """
     revoke_key(rig_of(named_rig(rig), overrides), name)
     say(f"{name} is let in no more")

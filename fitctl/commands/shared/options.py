@@ -14,7 +14,7 @@ RigOption = Annotated[
     typer.Option(
         "--rig",
         metavar="FILE",
-        help="Rig file. Without it: FITCTL_RIG, the rig that runs, or fit-mock.toml.",
+        help="Rig file. [default: FITCTL_RIG, the running rig, or fit-mock.toml]",
         autocompletion=completion.rigs,
     ),
 ]
@@ -26,23 +26,21 @@ SetOption = Annotated[
 ]
 RemoteOption = Annotated[
     Path | None,
-    typer.Option(
-        "--remote", metavar="FILE", help="A key file: the rig is on another machine that knows it."
-    ),
+    typer.Option("--remote", metavar="FILE", help="Key file of a rig on another machine."),
 ]
 SeedOption = Annotated[
-    int, typer.Option(min=0, help="Of the plant's randomness and the star's place.")
+    int, typer.Option(min=0, help="Seed of the plant's noise and the star's position.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
 LoopOption = Annotated[
-    str, typer.Option("--loop", help="One loop by name.", autocompletion=completion.loops)
+    str, typer.Option("--loop", help="Name of one loop.", autocompletion=completion.loops)
 ]
 ControllerOption = Annotated[
     str | None,
     typer.Option(
         "--controller",
         metavar="NAME",
-        help="eq20, lqg-ltr, minimum-variance, fslq, or a saved file.",
+        help="eq20, lqg-ltr, minimum-variance, fslq, or a saved design.",
         autocompletion=completion.controllers,
     ),
 ]

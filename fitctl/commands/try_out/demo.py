@@ -40,10 +40,10 @@ def demo(
     overrides: SetOption = None,
     seed: SeedOption = 0,
     duration: Annotated[
-        float, typer.Option(min=1.0, help="Seconds to run without a console.")
+        float, typer.Option(min=1.0, help="How long to run without a console, in seconds.")
     ] = 60.0,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No console, also on a terminal.")
+        bool, typer.Option("--headless", help="Open no console, even on a terminal.")
     ] = False,
     as_json: JsonOption = False,
     controller: ControllerOption = None,
@@ -52,10 +52,10 @@ def demo(
         typer.Option("--testbed", help="Two stars, metrology and a moving collector."),
     ] = False,
 ) -> None:
-    """Run the whole instrument on mock devices: see a star acquired and held.
+    """Run the whole instrument on mock devices: acquire a star and hold it.
 
-    On a terminal the console comes up. Without one, or with --headless, the same runs for a while and
-    a summary is printed at the end.
+    On a terminal, the demo opens the console. Without a terminal, or with --headless, it runs for --duration
+    seconds and prints a summary.
     """
     if testbed and rig is not None:
         msg = "demo: --testbed is the rig rigs/fit-testbed.toml; leave out --testbed, or --rig"

@@ -19,7 +19,7 @@ from fitctl.messages.endpoints import service_folder
 from fitctl.messages.running import running_rigs
 from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
-app = typer.Typer(help="Make something go wrong with running mock devices.", no_args_is_help=True)
+app = typer.Typer(help="Inject faults into running mocks.", no_args_is_help=True)
 
 DeviceArgument = Annotated[
     str,
@@ -28,7 +28,7 @@ DeviceArgument = Annotated[
         autocompletion=completion.devices,
     ),
 ]
-PartOption = Annotated[str, typer.Option(help="Of the device, where the kind has parts.")]
+PartOption = Annotated[str, typer.Option(help="Part of the device, for kinds that have parts.")]
 
 
 @app.command("set")
@@ -38,42 +38,52 @@ def set_(
         str,
         typer.Argument(help="`fitctl fault kinds` lists them.", autocompletion=completion.faults),
     ],
-    value: Annotated[float | None, typer.Argument(help="In the kind's unit.")] = None,
+    value: Annotated[float | None, typer.Argument(help="In the unit of the kind.")] = None,
     part: PartOption = "",
     for_s: Annotated[
-        float | None, typer.Option("--for", metavar="SECONDS", help="Without it, until cleared.")
+        float | None,
+        typer.Option(
+            "--for",
+            metavar="SECONDS",
+            help="End the fault after this time. [default: when cleared]",
+        ),
     ] = None,
-    probability: Annotated[float, typer.Option(help="That it hits, each time.")] = 1.0,
+    probability: Annotated[
+        float, typer.Option(help="Probability that the fault hits a message or frame.")
+    ] = 1.0,
     rig: RigOption = None,
     overrides: SetOption = None,
 ) -> None:
-    """Begin a fault."""
+    """Start a fault.
+
+    The mocks print which faults act afterwards. `fitctl fault kinds` lists the kinds of each device.
+    """
     _change(rig, overrides, SetFault(device, kind, part, value, for_s, probability))
 
 
 @app.command("clear")
 def clear(
     device: Annotated[
-        str, typer.Argument(help="Without it, all devices.", autocompletion=completion.devices)
+        str, typer.Argument(help="[default: all devices]", autocompletion=completion.devices)
     ] = "",
-    kind: Annotated[str, typer.Argument(help="Without it, all kinds.")] = "",
+    kind: Annotated[str, typer.Argument(help="[default: all kinds]")] = "",
     part: PartOption = "",
     rig: RigOption = None,
     overrides: SetOption = None,
 ) -> None:
-    """End faults."""
+    """End faults of one device, or of all devices."""
     _change(rig, overrides, ClearFaults(device, kind, part))
 
 
 @app.command("now")
 def now(rig: RigOption = None, overrides: SetOption = None) -> None:
-    """Print what is wrong now."""
+    """Show the faults that act now."""
     _change(rig, overrides, ListFaults())
 
 
 @app.command("kinds")
 def kinds_() -> None:
-    """Print what can go wrong with each device."""
+    """List the kinds of fault of each device."""
     for device, table in kinds().items():
         say(device)
         for name, kind in table.items():

@@ -58,7 +58,7 @@ def mocks(
     ] = None,
     parent_pid: ParentOption = None,
 ) -> None:
-    """Serve the rig's mock devices on 127.0.0.1 until Ctrl-C, and print where they listen."""
+    """Serve the mock devices of a rig on 127.0.0.1 until Ctrl-C, and print their addresses."""
     settings = rig_of(rig, overrides)
     if faults is not None:
         settings = _with_script(settings, faults)
