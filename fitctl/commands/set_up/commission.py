@@ -62,8 +62,6 @@ def commission(
     Each step prints what it will move and by how much, asks once, and stops by itself at the first sign of
     the unexpected. What was done is kept beside the rig file; the next call goes on from there. No
     supervisor may run. Exit status 1 if a step fails or is not done.
-
-    Example: fitctl commission --rig my-rig.toml --only amplifiers
     """
     path = named_rig(rig) or default_rig_path()
     settings = load_rig(path, overrides or ())

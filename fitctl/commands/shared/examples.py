@@ -19,6 +19,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "fitctl check --rig my-rig.toml --show",
     ),
     "discover": ("fitctl discover", "fitctl discover --broadcast 192.168.1.255"),
+    "commission": (
+        "fitctl commission --rig my-rig.toml",
+        "fitctl commission --rig my-rig.toml --only amplifiers",
+    ),
     "doctor": ("fitctl doctor --rig my-rig.toml",),
     "keys": ("fitctl keys new anna --viewer", "fitctl keys list"),
     "keys new": (
