@@ -26,6 +26,7 @@ from fitctl.messages.commands import SequenceStatus
 from fitctl.messages.telemetry import (
     CollectorState,
     FringeOptics,
+    LearningState,
     LoopFailure,
     LoopLimits,
     LoopState,
@@ -159,6 +160,7 @@ class FakeSupervisor:
         self.reason = ""
         self.stopped_by = "anna"
         self.waits_for: dict[str, str] = {}
+        self.learning: LearningState | None = None
         self.bias_offset_urad = (0.0, 0.0)
         self.controller_file = ""
         self.search_again: SearchAgain | None = None
@@ -270,6 +272,7 @@ class FakeSupervisor:
             last_failure=self.last_failure,
             kind="metrology" if is_beam else "stellar",
             waits_for=self.waits_for.get(loop, ""),
+            learning=None if is_beam else self.learning,
         )
 
     def _fringe(self, loop: str) -> SpotPlace:

@@ -1,6 +1,8 @@
 """What a simulation does while it is logged, and the replay of such a log."""
 
 import pytest
+from learner_reports import SHAKEN
+from learner_reports import report as learner_report
 from simulated import TWO_STARS, darken, failing, until
 
 from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_log
@@ -181,6 +183,19 @@ def interlocks(simulation):
     simulation.run(0.5)
 
 
+def a_learnt_design(simulation):
+    """One that is worth it, and one that is not what it promised."""
+    hold_a_star(simulation)
+    simulation.run(3.0)
+    simulation.command(learner_report())
+    simulation.run(5.0)
+    simulation.command(learner_report(lines=(), measured_px=0.03, learnt_camera_px=0.03))
+    simulation.run(2.0)
+    assert simulation.supervisor.loops["right"].learning.state.state == "fell back"
+    simulation.command(SetController(name="learnt"))
+    simulation.run(2.0)
+
+
 def two_loops():
     document = load_rig(default_rig_path(), [SOON]).model_dump(mode="json")
     for loops in (document[part]["loops"] for part in ("plant", "mocks")):
@@ -230,6 +245,7 @@ COURSES = {
     "nothing opens": (nothing_that_opens, [], {"STANDBY", "IN_REACH"}),
     "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
+    "a learnt design": (a_learnt_design, [*SHAKEN, "loops.right.learn=on"], {"IN_REACH"}),
     "a stall": (a_stall, [], {"IN_REACH"}),
     "a refused Off": (an_off_that_waits_for_the_mirror, [SOON], {"IN_REACH"}),
     "the D/A takes nothing": (_fails("dac", "send_v"), [], FAULT),

@@ -80,7 +80,8 @@ def fit_air_path(series_px: Floats, period_s: float, start: AirPathModel) -> Air
     if at_bound or not np.all(np.linalg.eigvalsh(curvature) > 0):
         msg = (
             "air path: the centroids do not show Eq. 8 and a noise floor (no likeliest one within a factor "
-            "of 20 of the rig file's); expected a minute or more with the stages at rest; record longer"
+            "of 20 of the rig file's); expected a minute or more with the stages at rest and "
+            "no vibration; record longer, or look for vibrations with fitctl design learn"
         )
         raise IdentifyError(msg)
     spread = Z_95 * np.sqrt(np.diag(np.linalg.inv(curvature)))

@@ -16,6 +16,9 @@ from fitctl.identify.air_fit import AirFit, fit_air_path
 from fitctl.identify.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.frames import Tracks
+from fitctl.learn.fit_test import FitTest, fit_test
+from fitctl.learn.opened import Series, periodograms
+from fitctl.learn.spectrum import air_of, air_px2_per_hz, white_px2_per_hz
 from fitctl.model.air_path import rms_px, state_space
 from fitctl.model.drives import Drive
 
@@ -66,6 +69,8 @@ class AirPathResult:
     frequency_hz : array, shape (frequencies,)
     psd_px2_per_hz : array, shape (frequencies, spots, 2)
         Welch, one-sided, means removed.
+    test : FitTest
+        Whether the joint fit explains the pointing spot's spectrum.
     """
 
     loop: str
@@ -75,6 +80,7 @@ class AirPathResult:
     relative: list[RelativeMotion]
     frequency_hz: Floats
     psd_px2_per_hz: Floats
+    test: FitTest
 
     def fragment(self) -> dict[str, Any]:
         """What to lay over the rig file: the air path that designs are made for."""
@@ -90,6 +96,12 @@ class AirPathResult:
         if self.tracks.duration_s < RECOMMENDED_S:
             lines.append(f"shorter than {RECOMMENDED_S:.0f} s: the intervals are wide")
         lines.append(f"pointing spot, both axes: {_fit_text(self.joint)}")
+        lines.append(f"test of fit: {self.test.text}")
+        if not self.test.fits:
+            lines.append(
+                "Do not use this air path: Eq. 8 does not explain these frames. A vibration looks like strong "
+                "air; fitctl design learn tells them apart, in a log of the star held in VERNIER"
+            )
         for spot, pair in enumerate(self.fits):
             lines += [
                 f"spot {spot} ({self.tracks.flux_dn[spot]:.0f} DN) {axis}: {_fit_text(fit)}"
@@ -172,15 +184,28 @@ def analyse(rig: Rig, loop_name: str, tracks: Tracks) -> AirPathResult:
         detrend="constant",
         axis=0,
     )
+    joint = fit_air_path(px[:, 0], period_s, start)
     return AirPathResult(
         loop=loop_name,
         tracks=tracks,
-        joint=fit_air_path(px[:, 0], period_s, start),
+        joint=joint,
         fits=fits,
         relative=[_relative(px, fits, spot) for spot in range(1, px.shape[1])],
         frequency_hz=frequency_hz,
         psd_px2_per_hz=psd,
+        test=_test(joint, px[:, 0], period_s),
     )
+
+
+def _test(joint: AirFit, star_px: Floats, period_s: float) -> FitTest:
+    """Of a fit, on the series that it was made of, shape (frames, 2)."""
+    opened = periodograms([Series(star_px, np.zeros_like(star_px))], period_s)
+    if opened is None:
+        msg = "air path: too few frames in a row for a test of fit; take a longer record"
+        raise IdentifyError(msg)
+    density = air_px2_per_hz(air_of(joint.model), opened.frequency_hz, period_s)
+    density = density + white_px2_per_hz(joint.noise_px.value, period_s)
+    return fit_test(opened, np.broadcast_to(density[:, None], opened.disturbance.shape), 1.0, 0.0)
 
 
 def model_psd_px2_per_hz(fit: AirFit, frequency_hz: Floats, period_s: float) -> Floats:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import HEADER, Columns, column_blocks
 from fitctl.logging.records import (
+    ControllerChange,
     DeviceHealth,
     Event,
     LoopTiming,
@@ -33,6 +34,7 @@ from fitctl.report.run import Run
 _ROWS = 2_000  # of a topic, held as they come before they find their place
 _KINDS: dict[Any, str] = {
     LoopTiming: "timing",
+    ControllerChange: "changes",
     ModeChange: "modes",
     Event: "events",
     DeviceHealth: "health",
@@ -118,8 +120,8 @@ class Gathered:
         By loop; fields as in :mod:`fitctl.logging.records`. Without any, `timing` has no more than its times.
     overlap : dict of str to array, or None
         The tilt between the stars of the rig's ``fringes.loops`` on each frame; None if the rig has no fringes.
-    modes, events, health, attempts : list of dict
-        Records with their fields; of `health` only what differs from before.
+    modes, changes, events, health, attempts : list of dict
+        Records with their fields; `changes` are of controllers; of `health` only what differs from before.
     lost : int or None
         Records lost on the way to the log; None if nothing says.
     """
@@ -129,6 +131,7 @@ class Gathered:
     timing: dict[str, Columns]
     overlap: Columns | None
     modes: list[dict[str, Any]]
+    changes: list[dict[str, Any]]
     events: list[dict[str, Any]]
     health: list[dict[str, Any]]
     attempts: list[dict[str, Any]]
@@ -173,12 +176,14 @@ def gather(run: Run) -> Gathered:
         _in_order(room)
     of_loop = {loop: rooms[topic] for topic, (loop, _) in series.items() if loop}
     modes = [row for loop in loops for row in _rows(blocks["modes", loop])]
+    changes = [row for loop in loops for row in _rows(blocks["changes", loop])]
     return Gathered(
         run=run,
         ticks={loop: of_loop[loop] for loop in loops},
         timing={loop: _joined(blocks["timing", loop]) for loop in loops},
         overlap=next((rooms[topic] for topic, (loop, _) in series.items() if not loop), None),
         modes=sorted(modes, key=itemgetter("time_s")),
+        changes=sorted(changes, key=itemgetter("time_s")),
         events=_rows(blocks["events", ""]),
         health=health,
         attempts=_rows(blocks["attempts", ""]),

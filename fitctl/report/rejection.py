@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import re
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from fitctl.controllers.design.files import design_of
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.controllers.design.theory import loop_theory
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import LEARNT, Design
 from fitctl.error_budget import Budget, LoopTheory, budget, motion, regular
 from fitctl.figures.attenuation import (
     SEGMENT_S,
@@ -36,7 +36,6 @@ from fitctl.report.selection import Selection
 
 Floats = NDArray[np.float64]
 AT_HZ = (0.25, 0.5, 1.0, 2.0, 5.0)
-_CHANGE = re.compile(r"controller (.+) -> (.+)")
 
 
 class Predicted(NamedTuple):
@@ -152,11 +151,11 @@ def last_design(gathered: Gathered, loop_name: str) -> Design:
 
 
 def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float, str]]:
-    """Begin, end and name of what was in force, from the run's description and its events."""
+    """Begin, end and name of what was in force, from the run's description and its changes."""
     changes = [
-        (event["time_s"], *change.groups())
-        for event in gathered.events
-        if event["name"] == loop_name and (change := _CHANGE.fullmatch(event["message"]))
+        (change["time_s"], str(change["source"]), str(change["target"]))
+        for change in gathered.changes
+        if change["loop"] == loop_name
     ]
     logged = _logged_design(gathered, loop_name)
     vernier = gathered.run.rig.stellar_loops[loop_name].vernier
@@ -196,10 +195,10 @@ def _predicted(
 
 
 def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> Design:
-    """As it was logged; one that came later is made again by its name."""
+    """As it was logged, of several of one name the last; one that was not logged is made again by its name."""
     rig: Rig = gathered.run.rig
-    logged = _logged_design(gathered, loop_name)
-    if logged.get("name") == name:
+    logged = _logged_design(gathered, loop_name, name)
+    if _title(logged) == name:
         return design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
     if name not in DESIGNS:  # a text of the log, which must never become a path
         msg = f"{name}: its matrices are not in the log"
@@ -207,6 +206,19 @@ def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> 
     return design_for(rig, loop_name, name)
 
 
-def _logged_design(gathered: Gathered, loop_name: str) -> dict[str, Any]:
+def _logged_design(gathered: Gathered, loop_name: str, name: str = "") -> dict[str, Any]:
+    """The design with which a loop began, or the last of a name that came later."""
     text = gathered.run.metadata.get("designs", {}).get(loop_name)
-    return json.loads(text, parse_int=float) if text else {}
+    for change in gathered.changes:
+        if change["loop"] == loop_name and change["target"] == name:
+            text = change.get("design_json") or text
+    try:
+        logged = json.loads(text or "{}", parse_int=float)
+    except (ValueError, RecursionError):  # no design that this fitctl wrote
+        return {}
+    return logged if isinstance(logged, dict) else {}
+
+
+def _title(logged: Mapping[str, Any]) -> str:
+    """What people call a logged design."""
+    return LEARNT if logged.get("learnt") else str(logged.get("name", ""))

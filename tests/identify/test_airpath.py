@@ -1,8 +1,12 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
+from benchmarks.linear_loop import course_px
 from fitctl.config import AirPathModel, rig_from_document
+from fitctl.controllers.design.basis import Line, basis
 from fitctl.identify import airpath
 from fitctl.identify.air_fit import fit_air_path
 from fitctl.identify.errors import IdentifyError
@@ -170,3 +174,25 @@ def test_the_plan_moves_nothing_for_a_minute(rig):
     (drive,) = airpath.plan(rig, "right")
     assert drive.amplitude == 0
     assert drive.duration_s > 60
+
+
+# ---------------------------------------------------------------- what Eq. 8 does not explain
+
+
+def test_air_alone_passes_the_test_of_fit(result):
+    assert result.test.fits
+    assert any(line.startswith("test of fit: the model fits") for line in result.lines())
+
+
+def test_a_vibration_is_not_taken_for_air_without_a_warning(rig, result):
+    """It makes the air look several times as strong."""
+    tracks, line = result.tracks, Line(frequency_hz=3.1, damping=0.01, rms_px=0.02)
+    paper = dataclasses.replace(basis(rig, "right"), lines=(line,))
+    star_px = course_px(paper, len(tracks.px), seed=1)
+    noise_px = 0.01 * np.random.default_rng(1).standard_normal(tracks.px.shape)
+    shaken = dataclasses.replace(tracks, px=star_px[:, None] + noise_px)
+    found = airpath.analyse(rig, "right", shaken)
+
+    assert found.joint.gain_px.value / found.joint.b1_s2.value > 1.5  # 0.87 in truth
+    assert not found.test.fits
+    assert any("Do not use this air path" in line for line in found.lines())

@@ -15,7 +15,7 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.document import design_json
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import Event
+from fitctl.logging.records import ControllerChange, Event
 from tests.logged_simulation import LoggedSimulation
 
 PLANTED = "planted-by-the-log"
@@ -96,8 +96,18 @@ def test_no_file_that_a_log_names_is_opened(tmp_path, monkeypatch, opened_paths)
     def course(simulation):
         hold_a_star(simulation)
         to = folder / "design.json"
-        message = f"controller eq20 -> {to}"
-        simulation.log(Event(time_s=1.0, severity="info", source="right", message=message))
+        for text in ("{", json.dumps({"name": str(to), "learnt": True}), "[1]"):
+            simulation.log(
+                ControllerChange(
+                    time_s=1.0,
+                    loop="right",
+                    source="eq20",
+                    target=str(to),
+                    siderostat_az_rad=0.0,
+                    siderostat_el_rad=0.0,
+                    design_json=text,
+                )
+            )
 
     log = log_of(tmp_path / "run.mcap", course, change)
     del opened_paths[:]

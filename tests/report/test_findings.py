@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from learner_reports import LINE, report
 from report_samples import record
 
 from fitctl.controllers.design.basis import basis
@@ -102,6 +103,26 @@ def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
     assert [one.controller for one in found] == ["eq20", "minimum-variance"]
     assert all(one.predicted is not None for one in found)
     assert found[1].evaluated_s == pytest.approx(12.0, abs=1.0)
+
+
+def test_a_learnt_design_is_judged_as_it_was_logged(rig, tmp_path):
+    def course(simulation):
+        simulation.acquire()
+        simulation.run(15.0)
+        simulation.command(report(lines=(LINE,)))
+        simulation.command(SetController(loop="right", name="learnt"))
+        simulation.run(12.0)
+
+    path = tmp_path / "learnt.mcap"
+    record(with_controller(rig, "right", "eq20"), path, course)
+    (found,) = (
+        one
+        for one in find(find_run([path])).loops["right"].rejections
+        if one.controller == "learnt"
+    )
+
+    at_hz = found.spectra.frequency_hz
+    assert found.predicted.rejection[np.abs(at_hz - LINE.frequency_hz).argmin()] > 2.0
 
 
 def test_a_disturbance_that_cannot_be_designed_for_leaves_the_measurement(held, rig):

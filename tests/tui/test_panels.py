@@ -5,8 +5,8 @@ import msgspec
 import pytest
 
 from fitctl.logging.records import Event
-from fitctl.messages.commands import Look, SequenceStatus, SetTarget
-from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.messages.commands import LearnerReport, Look, SequenceStatus, SetTarget
+from fitctl.messages.telemetry import LearningState, TrippedInterlock
 from fitctl.tui.alarms import AlarmBook, counts
 from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.jog import JogPad
@@ -382,3 +382,50 @@ def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():
 def test_a_place_is_read_from_the_palette(query, command):
     found = parse_place(query)
     assert (found and found[1]) == command
+
+
+# ---------------------------------------------------------------- what was learnt
+
+
+def learnt(state, **values):
+    report = LearnerReport(
+        loop="right",
+        design_json="{}",
+        text="a line at 6 Hz",
+        evaluated_s=60.0,
+        present_px=0.1,
+        learnt_px=0.024,
+    )
+    return LearningState(setting="on", state=state, text="a line at 6 Hz", report=report, **values)
+
+
+@pytest.mark.parametrize(
+    ("learning", "expected"),
+    [
+        (LearningState(setting="advise", state="collecting"), ["collecting frames in VERNIER"]),
+        (learnt("kept"), ["no other design would leave clearly less", "a line at 6 Hz"]),
+        (
+            learnt("advice"),
+            ["0.0240 px instead of 0.1000", "fitctl send controller learnt --loop right"],
+        ),
+        (
+            learnt("in force", design_json="{}", expected_px=0.026, measured_px=0.027),
+            ["on frames 0.0270 px, expected 0.0260"],
+        ),
+        (learnt("fell back"), ["fell back to the design before"]),
+    ],
+    ids=lambda value: getattr(value, "state", ""),
+)
+def test_the_design_panel_shows_what_was_learnt(learning, expected):
+    supervisor = FakeSupervisor()
+    supervisor.learning = learning
+    drawn_lines = plain(margins(shown(supervisor)).draw(70, 12))
+    assert drawn_lines[1].startswith("learning")
+    for part in expected:
+        assert any(part in line for line in drawn_lines), part
+
+
+def test_a_loop_that_does_not_learn_has_no_row_for_it():
+    supervisor = FakeSupervisor()
+    supervisor.learning = LearningState(setting="off", state="collecting")
+    assert not any("learning" in line for line in plain(margins(shown(supervisor)).draw(70, 12)))

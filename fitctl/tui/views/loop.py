@@ -19,6 +19,9 @@ NEEDS_RIG = (
     "Margins follow from the rig file, which is not known here: leave the console, and give it that file too, "
     "with --rig FILE."
 )
+LEARNT_HERE = (
+    "A learnt design has a sensitivity of at most 2, and margins of at least 6 dB and 35°."
+)
 FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known here."
 
 
@@ -59,6 +62,8 @@ class LoopScreen(View):
             self._job = self.console.start_job(["design", wanted.design, *options])
 
     def _why_unknown(self, loop: LoopState) -> str:
+        if loop.learning is not None and loop.learning.design_json:
+            return LEARNT_HERE
         if loop.controller_file and self.console.remote_arguments:
             return FILE_ELSEWHERE
         return NEEDS_RIG if self.console.rig_arguments is None else ""

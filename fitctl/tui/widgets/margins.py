@@ -103,6 +103,7 @@ class Margins(Panel):
         file = Path(loop.state.controller_file).name
         head = [text("design ", DIM), text(loop.state.controller, INK, bold=True)]
         lines: list[Line] = [[*head, text(f" of {file}", DIM)] if file else head]
+        lines += learning_lines(loop.state, columns)
         unknown = self._why_unknown(loop.state)
         if unknown:
             return [
@@ -131,6 +132,34 @@ class Margins(Panel):
             [text("attenuates".ljust(_NAME_COLUMNS), DIM), text(attenuation.strip(), INK)],
             _figure("should leave", figures["residual_px"], "px, true star", ".4f"),
         ][:rows]
+
+
+def learning_lines(loop: LoopState, columns: int) -> list[Line]:
+    """What was learnt of the night, and what became of it; no line of a loop that does not learn."""
+    learning = loop.learning
+    if learning is None or learning.setting == "off":
+        return []
+    report = learning.report
+    gain, colour = "", INK
+    if learning.state == "collecting":
+        gain, colour = "collecting frames in VERNIER", DIM
+    elif learning.state == "kept":
+        gain = "no other design would leave clearly less"
+    elif learning.state == "advice" and report is not None:
+        gain = f"advice: {report.learnt_px:.4f} px instead of {report.present_px:.4f}"
+        colour = ORANGE
+    elif learning.state == "in force":
+        gain = f"on frames {learning.measured_px:.4f} px, expected {learning.expected_px:.4f}"
+    elif learning.state == "fell back":
+        gain, colour = "fell back to the design before", ORANGE
+    lines = [[text("learning".ljust(_NAME_COLUMNS), DIM), text(gain, colour)]]
+    if learning.state == "advice":
+        command = f"fitctl send controller learnt --loop {loop.name}"
+        lines.append([text("to apply".ljust(_NAME_COLUMNS), DIM), text(command, INK)])
+    if learning.text:
+        night = shorten(learning.text, columns - _NAME_COLUMNS)
+        lines.append([text("night".ljust(_NAME_COLUMNS), DIM), text(night, DIM)])
+    return lines
 
 
 def _figure(name: str, value: float, unit: str, form: str = ".2f") -> Line:

@@ -1,0 +1,195 @@
+"""What a loop leaves that learns while it observes, on nights that its rig file does not know.
+
+For each night and seed, two simulations of the whole instrument on the virtual clock: with the rig's
+minimum-variance design throughout, and with `learn = "on"`. Both see the same air and the same lines. True
+residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them the bound of
+the night, which knows everything about it.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as fitctl itself has it
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.basis import Line, basis
+from fitctl.controllers.design.linear_loop.bound import bound
+from fitctl.logging.records import AnyRecord, ControllerChange
+from fitctl.simulation.simulation import Simulation
+from fitctl.simulation.statistics import true_residual_rms
+
+LOOP = "right"
+BEGIN_S, END_S = 120.0, 300.0
+FIT = ("loops.right.sensor=fit",)
+CONTROLLER = f"loops.{LOOP}.vernier.controller=minimum-variance"
+AIR = f"plant.loops.{LOOP}.air_path"
+
+
+def lines(*frequencies_hz: float, rms_px: float, damping: float = 0.005, drift: float = 0.0) -> str:
+    """An override: lines that move both axes by `rms_px` each."""
+    along = np.sqrt(2.0) * rms_px
+    rows = ",".join(
+        f"{{frequency_hz={hz},rms_px={along:.6f},direction_deg=45.0,damping={damping},"
+        f"drift_hz_per_min={drift}}}"
+        for hz in frequencies_hz
+    )
+    return f"plant.loops.{LOOP}.lines=[{rows}]"
+
+
+def air_gains(*at_s_and_gain: tuple[float, float]) -> str:
+    """An override: the air path's gain changes on the way."""
+    rows = ",".join(
+        f"{{at_s={at_s},loops={{{LOOP}={{air_path={{gain_px={gain},b1_s2=0.517,b2_s=2.5}}}}}}}}"
+        for at_s, gain in at_s_and_gain
+    )
+    return f"plant.timeline=[{rows}]"
+
+
+class Night(NamedTuple):
+    """A night, its goal, what the rig file has of it, what it has not, and what the bound differs by."""
+
+    name: str
+    goal: str
+    known: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
+    lines: tuple[Line, ...] = ()
+    for_bound: tuple[str, ...] = ()
+
+
+def shaken(*frequencies_hz: float, rms_px: float, damping: float = 0.005) -> tuple[Line, ...]:
+    """Lines for the bound."""
+    return tuple(Line(hz, damping, rms_px) for hz in frequencies_hz)
+
+
+SIX = lines(6.0, rms_px=0.05)
+NIGHTS = [
+    Night("the paper's, centroid", "1.08"),
+    Night("the paper's, fit", "1.05", FIT),
+    Night("30 % hysteresis", "1.08", (), (f"plant.loops.{LOOP}.hysteresis.loop_width_fraction=0.3",)),
+    Night("b1_s2 0.1", "1.08", (), (f"{AIR}.b1_s2=0.1",)),
+    Night("gain_px 0.9", "1.08", (), (f"{AIR}.gain_px=0.9",)),
+    Night("gain_px 0.2", "1.08", (), (f"{AIR}.gain_px=0.2",)),
+    Night(
+        "noise 60 DN",
+        "1.08",
+        (),
+        ("plant.timeline=[{at_s=0.5,pixel_noise_dn=60.0}]",),
+        for_bound=("camera.pixel_noise_dn=60.0",),
+    ),
+    Night("6 Hz, 0.05 px", "1.15", (), (SIX,), shaken(6.0, rms_px=0.05)),
+    Night("6 Hz, 0.05 px, fit", "1.15", FIT, (SIX,), shaken(6.0, rms_px=0.05)),
+    Night(
+        "3.1, 8.7, 14 Hz, 0.02 px",
+        "1.15",
+        (),
+        (lines(3.1, 8.7, 14.0, rms_px=0.02),),
+        shaken(3.1, 8.7, 14.0, rms_px=0.02),
+    ),
+    Night(
+        "48.9 Hz, 0.05 px",
+        "5 % above fixed",
+        (),
+        (lines(48.9, rms_px=0.05, damping=0.0005),),
+        shaken(48.9, rms_px=0.05, damping=0.0005),
+    ),
+    Night(
+        "6 Hz, 0.05 px, drifts 0.05 Hz a minute",
+        "2 % above fixed",
+        (),
+        (lines(6.0, rms_px=0.05, drift=0.05),),
+        shaken(6.0, rms_px=0.05),
+    ),
+    Night(
+        "air gain 0.45 to 0.9 within a minute",
+        "2 % above fixed",
+        (),
+        (air_gains(*((150.0 + 10.0 * n, 0.45 + 0.075 * n) for n in range(1, 7))),),
+    ),
+]
+
+
+class Outcome(NamedTuple):
+    """One seed: residuals of the worst axis in px, and how often the design changed."""
+
+    fixed_px: float
+    learnt_px: float
+    changes: int
+    ways_back: int
+
+
+def residual(settings: Sequence[str], seed: int) -> tuple[float, int, int]:
+    """Of one run, with its changes of design, and those back."""
+    changes: list[ControllerChange] = []
+
+    def record(made: AnyRecord) -> None:
+        if isinstance(made, ControllerChange):
+            changes.append(made)
+
+    rig = load_rig(default_rig_path(), [CONTROLLER, *settings])
+    simulation = Simulation(rig, seed, record=record, history_s=END_S + 1.0)
+    simulation.acquire()
+    simulation.run(END_S - simulation.clock.now_s())
+    target_px = simulation.supervisor.stellar_loops[LOOP].target_px
+    left_px = true_residual_rms(simulation.plants[LOOP], target_px, BEGIN_S, END_S)
+    back = sum(change.target != "learnt" for change in changes)
+    return float(left_px.max()), len(changes), back
+
+
+def outcome(night: Night, seed: int) -> Outcome:
+    """Both runs of one seed."""
+    settings = [*night.known, *night.unknown]
+    fixed_px, *_ = residual([*settings, f"loops.{LOOP}.learn=off"], seed)
+    learnt_px, changes, back = residual([*settings, f"loops.{LOOP}.learn=on"], seed)
+    return Outcome(fixed_px, learnt_px, changes, back)
+
+
+def bound_px(night: Night) -> float:
+    """Of one who knows the night; where it changes on the way, of its first half minute."""
+    rig = load_rig(default_rig_path(), [*night.known, *night.unknown, *night.for_bound])
+    air, own = rig.mock_parts()[0].stellar_loops[LOOP].air_path, basis(rig, LOOP)
+    true_air = own.air_path.model_copy(
+        update={name: getattr(air, name) for name in ("gain_px", "b1_s2", "b2_s")}
+    )
+    return bound(dataclasses.replace(own, air_path=true_air, lines=night.lines)).residual_px
+
+
+def main() -> None:
+    """Print a row of a Markdown table for each night."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--nights", default="", help="only those whose name holds this")
+    parser.add_argument("--processes", type=int, default=2)
+    arguments = parser.parse_args()
+    print(
+        "| night | fixed px | learning px | bound px | learning over bound | over fixed, worst seed | goal "
+        "| changes, of them back |"
+    )
+    print("| --- " * 8 + "|")
+    with ProcessPoolExecutor(arguments.processes) as pool:
+        for night in NIGHTS:
+            if arguments.nights not in night.name:
+                continue
+            found = list(pool.map(partial(outcome, night), range(arguments.seeds)))
+            fixed_px, learnt_px = np.mean([one[:2] for one in found], axis=0)
+            worst = max(one.learnt_px / one.fixed_px for one in found)
+            least_px = bound_px(night)
+            print(
+                f"| {night.name} | {fixed_px:.4f} | {learnt_px:.4f} | {least_px:.4f} "
+                f"| {learnt_px / least_px:.3f} | {worst:.3f} | {night.goal} "
+                f"| {sum(one.changes for one in found)}, {sum(one.ways_back for one in found)} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
