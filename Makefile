@@ -129,6 +129,9 @@ bench-sim: $(READY)  ## How many times real time the simulation and the batch ru
 bench-learn: $(READY)  ## What learnt designs leave of nights that the rig file does not know (five minutes)
 	$(BIN)/python -m benchmarks.learn $(ARGS)
 
+bench-learn-online: $(READY)  ## What a loop leaves that learns while it observes (half an hour)
+	$(BIN)/python -m benchmarks.learn_online $(ARGS)
+
 bench-testbed: $(READY)  ## What the testbed reaches while its collector moves, beside its goals (ten minutes)
 	$(BIN)/python -m benchmarks.testbed $(ARGS)
 

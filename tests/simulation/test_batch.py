@@ -462,3 +462,8 @@ def test_a_feedforward_that_the_batch_does_not_model_is_refused():
 def test_servos_of_different_rates_are_refused():
     with pytest.raises(BatchRefusalError, match="rates of its servos differ"):
         Batch(rig_of_testbed("loops.left.siderostat.servo.rate_hz=1000.0"))
+
+
+def test_a_loop_that_learns_is_refused():
+    with pytest.raises(BatchRefusalError, match="loop right learns"):
+        Batch(rig_with("loops.right.learn=on"))

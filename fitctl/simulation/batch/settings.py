@@ -282,6 +282,10 @@ def rig_settings(
     if acting:
         msg = f"interlock {acting[0]} may act, and the batch has no interlocks"
         raise BatchRefusalError(msg)
+    learning = [name for name, loop in rig.stellar_loops.items() if loop.learn == "on"]
+    if learning:
+        msg = f"loop {learning[0]} learns, and the batch's designs stay as they are"
+        raise BatchRefusalError(msg)
     camera = rig.true_camera
     truth, _ = rig.mock_parts()
     if truth.hot_pixels or camera.dark_file is not None:

@@ -1,0 +1,172 @@
+"""The learner beside a loop: which frames it learns from, when it reports, and what."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import msgspec
+import numpy as np
+import pytest
+from fake_supervisor import FakeSupervisor
+from learner_reports import SHAKEN, learnt_json
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, Learner
+from fitctl.learn.process import LoopLearner
+from fitctl.messages.commands import MAX_COMMAND_BYTES
+from fitctl.messages.telemetry import LearningState
+from fitctl.simulation.simulation import Simulation
+from fitctl.simulation.statistics import true_residual_rms
+
+PERIOD_S = 0.02
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig(default_rig_path(), SHAKEN)
+
+
+@pytest.fixture(scope="module")
+def ticks(rig):
+    """Of the night with a line at 6 Hz, under the rig's own design."""
+    simulation = Simulation(rig, 1)
+    simulation.acquire()
+    simulation.run(90.0)
+    return [tick for tick in simulation.ticks if tick.loop == "right"]
+
+
+@pytest.fixture(scope="module")
+def vernier(ticks):
+    held = [tick for tick in ticks if tick.mode == "VERNIER" and not tick.fsm_saturated]
+    return held[round(SETTLE_S / PERIOD_S) :]
+
+
+def fed(rig, ticks):
+    learner = Learner(rig, "right")
+    for tick in ticks:
+        learner.add(tick)
+    return learner
+
+
+def test_a_first_report_is_due_after_a_minute_of_frames(rig, vernier):
+    settle = round(SETTLE_S / PERIOD_S)
+    assert not fed(rig, vernier[: round(FIRST_S / PERIOD_S)]).due
+    assert fed(rig, vernier[: settle + round(FIRST_S / PERIOD_S) + 1]).due
+
+
+@pytest.mark.parametrize(
+    "disturbed",
+    [
+        {"mode": "EXPERIMENT"},
+        {"mode": "COARSE"},
+        {"star_visible": False},
+        {"fsm_saturated": True},
+        {"number": -1},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_frames_of_a_disturbed_loop_are_left_out(rig, vernier, disturbed):
+    learner = fed(rig, [msgspec.structs.replace(tick, **disturbed) for tick in vernier])
+
+    assert not learner._ticks
+
+
+def test_after_a_step_of_the_target_frames_are_left_out(rig, vernier):
+    before, after = vernier[:1000], vernier[1000:1500]
+    stepped = [msgspec.structs.replace(tick, target_az_px=25.0) for tick in after]
+    kept = len(fed(rig, before)._ticks)
+
+    assert len(fed(rig, before + stepped)._ticks) == kept + 500 - round(SETTLE_S / PERIOD_S)
+
+
+def test_a_report_has_the_night_and_a_design_that_can_be_made_again(rig, ticks):
+    learner = fed(rig, ticks)
+    learner.watch("minimum-variance", 0.0)
+    report = learner.report(design_for(rig, "right"))
+
+    assert report.worth_it
+    assert "6.0" in report.text
+    assert report.bound_px <= report.learnt_px < 0.3 * report.present_px
+    assert report.measured_px == pytest.approx(0.1, rel=0.3)
+    assert design_for(rig, "right", report.design_json).learnt
+    assert len(msgspec.msgpack.encode(report)) < MAX_COMMAND_BYTES
+    assert not learner.due
+
+
+def test_most_lines_still_fit_into_a_command():
+    lines = [{"frequency_hz": np.pi, "damping": np.pi / 700, "rms_px": np.pi / 70}] * 8
+    document = json.loads(learnt_json()) | {"lines": lines, "guard": lines[0]}
+
+    assert 2 * len(json.dumps(document)) < MAX_COMMAND_BYTES
+
+
+def test_without_a_long_enough_piece_the_report_says_so(rig, vernier):
+    report = fed(rig, vernier[:300]).report(design_for(rig, "right"))
+
+    assert not report.design_json
+    assert not report.worth_it
+    assert "the longest piece in VERNIER is" in report.text
+
+
+def test_a_learning_loop_leaves_little_of_a_night_that_its_rig_file_does_not_know():
+    night = load_rig(default_rig_path(), [*SHAKEN, "loops.right.learn=on"])
+    simulation = Simulation(night, 1, history_s=200.0)
+    simulation.acquire()
+    simulation.run(150.0)
+    loop = simulation.supervisor.stellar_loops["right"]
+    left_px = true_residual_rms(simulation.plants["right"], loop.target_px, 120.0, 150.0)
+
+    assert loop.controller == "learnt"
+    assert left_px.max() < 0.030  # 0.1 px with the rig's own design
+
+
+# ---------------------------------------------------------------- beside a supervisor
+
+
+def message(ticks, **state):
+    telemetry = FakeSupervisor().message()
+    loop = msgspec.structs.replace(telemetry.loops[0], **state)
+    return msgspec.structs.replace(telemetry, ticks=list(ticks), loops=[loop])
+
+
+def test_the_process_reports_once_it_has_heard_enough(rig, ticks):
+    learner = LoopLearner(rig, "right")
+    reports = []
+    with ThreadPoolExecutor(1) as executor:
+        for first in range(0, len(ticks), 500):
+            heard = message(ticks[first : first + 500], controller="minimum-variance")
+            learner.hear(heard, heard.loops[0])
+            reports.append(learner.work(executor))
+        executor.submit(int).result()
+        reports.append(learner.work(executor))
+    (report,) = (each for each in reports if each is not None)
+
+    assert report.loop == "right"
+    assert report.worth_it
+
+
+def test_the_process_knows_the_learnt_design_in_force(rig, ticks):
+    learning = LearningState(setting="on", state="in force", design_json=learnt_json())
+    heard = message(ticks, controller="learnt", learning=learning)
+    learner = LoopLearner(rig, "right")
+    learner.hear(heard, heard.loops[0])
+    with ThreadPoolExecutor(1) as executor:
+        assert learner.work(executor) is None
+        executor.submit(int).result()
+        report = learner.work(executor)
+
+    assert report.present_px == pytest.approx(
+        0.1, rel=0.3
+    )  # it was made for a night without the line
+
+
+def test_reports_follow_each_other_by_their_time(rig, vernier):
+    learner = fed(rig, vernier)
+    learner.report(design_for(rig, "right"))
+    frames = round(EVERY_S / PERIOD_S)
+    later = [msgspec.structs.replace(tick, time_s=tick.time_s + 100.0) for tick in vernier[:frames]]
+    for tick in later[:-1]:
+        learner.add(tick)
+    assert not learner.due
+    learner.add(later[-1])
+    assert learner.due
