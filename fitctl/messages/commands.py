@@ -10,11 +10,13 @@ from typing import Any, Literal
 
 import msgspec
 
-from fitctl.config import ControllerName, Motion
+from fitctl.config import CONTROLLERS, ControllerName, Motion
 from fitctl.logging.records import Event, RecorderStatus, SequenceAttempt
 from fitctl.model.drives import Drive
 
 PROTOCOL_VERSION = 1
+ControllerChoice = ControllerName | Literal["learnt"]
+CONTROLLER_CHOICES: tuple[ControllerChoice, ...] = (*CONTROLLERS, "learnt")
 MAX_COMMAND_BYTES = 4096  # what is longer never reaches the supervisor
 
 
@@ -101,7 +103,7 @@ class SetController(Command, frozen=True, kw_only=True):
     "learnt" is the design that was learnt last from the loop's own frames.
     """
 
-    name: ControllerName | Literal["learnt"]
+    name: ControllerChoice
 
 
 class Reset(Command, frozen=True, kw_only=True):

@@ -14,10 +14,10 @@ from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
-from fitctl.config import CONTROLLERS
 from fitctl.messages.client import Client
 from fitctl.messages.command_table import ROWS, WORDS, command_of
 from fitctl.messages.commands import (
+    CONTROLLER_CHOICES,
     AnyCommand,
     RecentEvents,
     Reply,
@@ -426,7 +426,7 @@ class ConsoleApp(App[None]):
             )
         take_over = ROWS[TakeOver]
         yield SystemCommand("Take over", take_over.help, partial(self.send, TakeOver()))
-        for name in CONTROLLERS:
+        for name in CONTROLLER_CHOICES:
             set_controller = partial(self.send, SetController(name=name))
             about = "In VERNIER the mirror goes on where it is"
             yield SystemCommand(f"controller {name}", about, set_controller)
