@@ -96,9 +96,8 @@ reliability: $(READY)  ## The fault catalogue, and its results into docs/fault-c
 	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
 	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
 
-# One after the other: each judges real motions in real time.
 test-miswired: $(READY)  ## Commissioning of rigs that are wired wrongly, and the results into docs/commissioning.md
-	FITCTL_MISWIRED_RESULTS=$(CURDIR)/$(MISWIRED_RESULTS) $(BIN)/pytest -m miswired tests/miswired $(ARGS)
+	FITCTL_MISWIRED_RESULTS=$(CURDIR)/$(MISWIRED_RESULTS) $(BIN)/pytest -m miswired tests/miswired --numprocesses 2 $(ARGS)
 	cd tests && ../$(BIN)/python -m miswired.report ../$(MISWIRED_RESULTS)
 
 test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs

@@ -240,6 +240,9 @@ def _siderostat_outcome(site: Site, seen: Floats, furthest_rad: float) -> Outcom
         found["axis_gains"] = [[round(float(one), 3) for one in row] for row in gains]
     elif abs(relative - 1) > _SCALE_APART:
         found["spur_gear_ratio"] = round(loop.siderostat.spur_gear_ratio / relative, 2)
+        if relative < 1:  # the motors' own travel stays as it was
+            travel_arcsec = loop.siderostat.travel_sky_arcsec * relative
+            found["travel_sky_arcsec"] = round(travel_arcsec * 0.995, 1)
         lines.append(
             "the gear is taken for the cause; if it is right by its data sheet, correct ball_screw_m_per_rad, "
             "lever_arm_m or optics.focal_length_m instead"

@@ -119,6 +119,10 @@ class Files:
         self.rig = folder / f"{stem}.commissioned.toml"
         self.page = folder / f"{stem}.commissioning.html"
 
+    def write_page(self, text: str) -> None:
+        """Write the page to file."""
+        _write(self.page, text.encode())
+
     def write_rig(self, found: dict[str, Any]) -> None:
         """Write what was found, and the rig file with its comments, that includes it."""
         note = "# Found by `fitctl commission`, and laid over the rig file by its include list.\n\n"
@@ -154,17 +158,28 @@ def load(path: Path, rig_name: str) -> Commissioning:
     ConfigError
         If the file cannot be read, or is another rig's.
     """
-    try:
-        record = msgspec.json.decode(read_regular(path, _MOST_BYTES), type=Commissioning)
-    except FileNotFoundError:
+    if not path.exists():
         return Commissioning(rig_name)
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
-        msg = f"{path}: cannot be read as a record of a commissioning: {error}; move it away to begin anew"
-        raise ConfigError(msg) from None
+    record = load_any(path)
     if record.rig != rig_name:
         msg = f"{path}: is of rig {record.rig}, expected {rig_name}; move it away to begin anew"
         raise ConfigError(msg)
     return record
+
+
+def load_any(path: Path) -> Commissioning:
+    """The record of some rig.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read.
+    """
+    try:
+        return msgspec.json.decode(read_regular(path, _MOST_BYTES), type=Commissioning)
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+        msg = f"{path}: cannot be read as a record of a commissioning: {error}; name or move it"
+        raise ConfigError(msg) from None
 
 
 def save(path: Path, record: Commissioning) -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from fitctl.commissioning.outcome import Outcome, Site, StepError
 from fitctl.commissioning.record import Commissioning, Entry, Files, save
 from fitctl.commissioning.steps import Task, tasks_of
-from fitctl.config import Rig, load_rig
+from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.config.reading import lay_over, read_parts, rig_from_parts
 from fitctl.daemon.locks import only_master
 from fitctl.drivers.interface import DeviceError
@@ -78,16 +78,36 @@ def do(course: Course, task: Task) -> Entry:
         if outcome.trouble or not outcome.found:
             break
         lay_over(found, outcome.found)
-        rig = _corrected(course, task, found)
         outcome = Outcome(outcome.lines, outcome.figures, found)
+        try:
+            rig = _corrected(course, task, found)
+        except ConfigError as error:
+            what = (
+                f"with what was found, the rig file contradicts itself: {error}; correct it by hand"
+            )
+            outcome = Outcome(outcome.lines, outcome.figures, {}, what)
+            found = {}
+            break
         if attempt + 1 == _TRIES:
             what = "what was corrected is still not as expected"
             outcome = Outcome(outcome.lines, outcome.figures, found, what)
     whole = Outcome(lines, outcome.figures, found, outcome.trouble)
+    earlier = course.record.tasks.get(task.name)
+    if earlier is not None and earlier.found != found:
+        _forget_dependents(course, task)
     entry = course.record.enter(task.name, whole, time.monotonic() - began_s)
     save(course.files.record, course.record)
     course.files.write_rig(course.record.found(order=[t.name for t in tasks_of(rig)]))
     return entry
+
+
+def _forget_dependents(course: Course, task: Task) -> None:
+    """What was measured with other values of the rig file is to be measured again."""
+    stale = {task.name}
+    for later in tasks_of(course.rig()):
+        if stale & set(later.needs()):
+            stale.add(later.name)
+            course.record.tasks.pop(later.name, None)
 
 
 def skip(course: Course, task: Task, reason: str) -> Entry:
@@ -112,9 +132,10 @@ def _corrected(course: Course, task: Task, found: dict[str, object]) -> Rig:
     order = [one.name for one in tasks_of(load_rig(course.rig_path, course.overrides))]
     before = course.record.found(task.name, order)
     lay_over(before, found)
-    course.files.write_rig(before)
     lay_over(laid.document, before)
-    return rig_from_parts(laid, str(course.rig_path))
+    rig = rig_from_parts(laid, str(course.rig_path))
+    course.files.write_rig(before)
+    return rig
 
 
 def chosen(tasks: Sequence[Task], only: Sequence[str]) -> list[Task]:

@@ -16,7 +16,7 @@ from fitctl.model.optics import scales
 
 Floats = NDArray[np.float64]
 ANY_FLUX = Range(low=1e-6, high=1e9)
-MOST_RAD_S = 2.0
+MOST_RAD_S = 4.0
 _GAIN_PER_S = 15.0
 _THERE_RAD = 0.01
 _FRAMES = 40  # averages the air

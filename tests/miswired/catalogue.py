@@ -307,6 +307,7 @@ OPTICS = [
     _optics(
         "spur gear 20 % off",
         f"{SIDEROSTAT}.spur_gear_ratio=30.0",
+        f"{SIDEROSTAT}.travel_sky_arcsec=990.0",
         found={f"{SIDEROSTAT}.spur_gear_ratio": 30.0},
     ),
     _optics(

@@ -1,5 +1,6 @@
 """Each rig of the catalogue through `fitctl commission`: real processes, real wires, real time."""
 
+import fcntl
 import json
 import os
 import subprocess
@@ -130,13 +131,16 @@ def remember(entry, found, troubles, watched, took_s):
     path = os.environ.get("FITCTL_MISWIRED_RESULTS")
     if not path:
         return
-    file = Path(path)
-    results = json.loads(file.read_text()) if file.exists() else {}
-    results[entry.name] = {
-        "found": found,
-        "troubles": troubles,
-        "most_rad": watched.most_rad,
-        "most_v": watched.most_v,
-        "took_s": took_s,
-    }
-    file.write_text(json.dumps(results, indent=1))
+    with Path(path).open("a+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # several workers write
+        file.seek(0)
+        results = json.loads(file.read() or "{}")
+        results[entry.name] = {
+            "found": found,
+            "troubles": troubles,
+            "most_rad": watched.most_rad,
+            "most_v": watched.most_v,
+            "took_s": took_s,
+        }
+        file.truncate(0)
+        file.write(json.dumps(results, indent=1))

@@ -14,7 +14,8 @@ from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig
 from fitctl.commands.shared.terminal import has_terminal
 from fitctl.commissioning.outcome import State
-from fitctl.commissioning.record import Commissioning, Entry, Files, load, writable
+from fitctl.commissioning.page import change_texts, changes, flat, page, verdict
+from fitctl.commissioning.record import Commissioning, Entry, Files, load, load_any, writable
 from fitctl.commissioning.run import Course, chosen, do, skip
 from fitctl.commissioning.steps import Task, tasks_of
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
@@ -55,6 +56,10 @@ def commission(
         Path | None,
         typer.Option(metavar="FOLDER", help="For record and rig file; without it, the rig file's."),
     ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="RECORD", help="Compare with the record of another commissioning."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Commission a rig: prove it step by step, correct its rig file, and stop at the first trouble.
@@ -75,6 +80,7 @@ def commission(
         _reporter(silent=as_json),
         quick,
     )
+    earlier = None if compare is None else load_any(compare)
     tasks = tasks_of(settings)
     wanted = chosen(tasks, _known(tasks, only or []))
     if until:
@@ -86,7 +92,7 @@ def commission(
     for text in skipped or []:
         _skip(course, tasks, text)
     _do_all(course, wanted, again=bool(only), yes=yes)
-    _conclude(course, tasks, as_json=as_json)
+    _conclude(course, tasks, earlier, as_json=as_json)
     if not all(course.record.done(task.name) for task in wanted):
         raise typer.Exit(FAILED)
 
@@ -157,15 +163,6 @@ def _entry_lines(name: str, entry: Entry) -> list[str]:
     return [*lines, *([entry.trouble] if entry.trouble else [])]
 
 
-def flat(table: dict, under: str = "") -> dict[str, object]:
-    """A fragment's values by their whole keys."""
-    found: dict[str, object] = {}
-    for key, value in table.items():
-        whole = f"{under}.{key}" if under else key
-        found |= flat(value, whole) if isinstance(value, dict) else {whole: value}
-    return found
-
-
 def _list(course: Course, tasks: list[Task]) -> None:
     rig = course.rig()
     for task in tasks:
@@ -175,32 +172,31 @@ def _list(course: Course, tasks: list[Task]) -> None:
         say(f"{'':<24} moves: {task.step.moves(course.site(task, rig))}")
 
 
-def verdict(record: Commissioning, tasks: list[Task]) -> str:
-    """What the record comes to, in one line."""
-    states = {task.name: record.tasks.get(task.name) for task in tasks}
-    failed = [name for name, entry in states.items() if entry and entry.state == "failed"]
-    skipped = [name for name, entry in states.items() if entry and entry.state == "skipped"]
-    left = [name for name, entry in states.items() if entry is None]
-    if failed:
-        return f"not commissioned: {', '.join(failed)} failed"
-    if left:
-        return f"not commissioned yet: {', '.join(left)} to do"
-    if skipped:
-        return f"commissioned, but for what was skipped: {', '.join(skipped)}"
-    return "commissioned"
-
-
-def _conclude(course: Course, tasks: list[Task], *, as_json: bool) -> None:
+def _conclude(
+    course: Course, tasks: list[Task], earlier: Commissioning | None, *, as_json: bool
+) -> None:
     record, files = course.record, course.files
+    titles = {task.name: task.step.title for task in tasks}
+    files.write_page(page(record, titles, earlier))
     if as_json:
         document = {
             "rig": record.rig,
-            "verdict": verdict(record, tasks),
+            "verdict": verdict(record, titles),
             "tasks": record.tasks,
-            "found": record.found(order=[task.name for task in tasks]),
-            "files": {"record": str(files.record), "rig": str(files.rig)},
+            "found": record.found(order=list(titles)),
+            "files": {
+                "record": str(files.record),
+                "rig": str(files.rig),
+                "page": str(files.page),
+            },
         }
         say(to_json(document))
         return
-    say(f"{record.rig}: {verdict(record, tasks)}")
-    say(f"record: {files.record}; rig file with what was found: {files.rig}")
+    if earlier is not None:
+        for change in changes(record, earlier):
+            now, then, relative = change_texts(change)
+            say(f"{change.figure:<56} {now:>12} {then:>12} {relative:>9}")
+    say(f"{record.rig}: {verdict(record, titles)}")
+    say(f"record: {files.record}")
+    say(f"page: {files.page}")
+    say(f"rig file with what was found: {files.rig}")

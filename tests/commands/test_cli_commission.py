@@ -1,0 +1,113 @@
+"""`fitctl commission` on the command line: when it asks, what it refuses, what it lists."""
+
+import json
+
+import pytest
+
+from fitctl.cli import main
+from fitctl.commissioning import steps
+from fitctl.commissioning.outcome import Outcome
+from fitctl.commissioning.steps import STEPS, Step
+
+REAL = "loops.right.siderostat.device.channel=/dev/ttyACM0"
+
+
+@pytest.fixture
+def commission(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["commission", *arguments])
+        captured = capsys.readouterr()
+        return end.value.code or 0, captured.out + captured.err
+
+    return run
+
+
+@pytest.fixture
+def two_steps(monkeypatch):
+    """Two steps that move nothing; how often each was done."""
+    done = []
+
+    def step(name, *needs):
+        def run(_site):
+            done.append(name)
+            return Outcome(figures={"x": float(len(done))})
+
+        return Step(f"step {name}", "star", lambda _site: "nothing", needs, 1.0, run)
+
+    monkeypatch.setattr(steps, "STEPS", {"one": step("one"), "two": step("two", "one")})
+    return done
+
+
+def test_real_devices_are_never_commissioned_without_asking(commission):
+    status, text = commission("--yes", "--set", REAL)
+    assert status == 2
+    assert "--yes is for mocks; these devices are real: right siderostat" in text
+
+
+def test_without_a_terminal_it_asks_nobody(commission):
+    status, text = commission()
+    assert status == 2
+    assert "needs a terminal" in text
+
+
+def test_the_list_has_every_step_and_what_it_moves(commission):
+    status, text = commission("--list", "--yes")
+    assert status == 0
+    for name in STEPS:
+        assert name in text
+    assert "each motor by 0.03 rad and back" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--only", "nonsense"), "no step 'nonsense'; there are devices"),
+        (("--skip", "star"), "expected STEP=REASON"),
+        (("--compare", "missing.json"), "missing.json"),
+        (("--folder", "/nowhere"), "--folder"),
+    ],
+)
+def test_a_wrong_option_is_named(commission, arguments, named):
+    status, text = commission("--yes", *arguments)
+    assert status == 2
+    assert named in text
+
+
+def test_the_next_call_goes_on_where_the_last_one_ended(commission, two_steps):
+    status, text = commission("--yes", "--until", "one")
+    assert (status, two_steps) == (0, ["one"])
+    assert "to do" in text
+    status, text = commission("--yes")
+    assert (status, two_steps) == (0, ["one", "two"])
+    assert "fit-mock: commissioned" in text
+    commission("--yes", "--only", "one")
+    assert two_steps == ["one", "two", "one"]
+
+
+def test_a_step_is_not_done_before_what_it_needs(commission, two_steps):
+    status, text = commission("--yes", "--only", "two")
+    assert status == 1
+    assert two_steps == []
+    assert "right.two: not before right.one" in text
+
+
+def test_a_reason_stays_in_the_record(commission, two_steps):
+    status, text = commission("--yes", "--json", "--skip", "one=no lamp tonight")
+    assert (status, two_steps) == (0, ["two"])
+    result = json.loads(text)
+    assert result["tasks"]["right.one"]["state"] == "skipped"
+    assert result["tasks"]["right.one"]["trouble"] == "no lamp tonight"
+    assert result["verdict"].startswith("commissioned, but for what was skipped")
+
+
+def test_two_commissionings_are_compared(commission, two_steps, tmp_path):
+    commission("--yes", "--until", "one")
+    earlier = tmp_path / "earlier.json"
+    (tmp_path / "fit-mock.commissioning.json").rename(earlier)
+    status, text = commission("--yes", "--until", "one", "--compare", str(earlier))
+    assert status == 0
+    assert "+100.0%" in text
+    assert "+100.0%" in (tmp_path / "fit-mock.commissioning.html").read_text()

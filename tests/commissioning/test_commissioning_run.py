@@ -1,0 +1,181 @@
+"""The course of a commissioning: order, repeats, corrections, what is kept."""
+
+import shutil
+
+import pytest
+
+from fitctl.commissioning import steps
+from fitctl.commissioning.outcome import Outcome, StepError
+from fitctl.commissioning.page import changes, page, verdict
+from fitctl.commissioning.record import Commissioning, Files, load
+from fitctl.commissioning.run import Course, chosen, do, skip
+from fitctl.commissioning.steps import Step, tasks_of
+from fitctl.config import ConfigError, default_rig_path, load_rig
+
+GEAR = {"loops": {"right": {"siderostat": {"spur_gear_ratio": 26.0}}}}
+
+
+def step(run, *needs, of="star"):
+    return Step("a step", of, lambda _site: "nothing", needs, 1.0, run)
+
+
+def gear_of(site):
+    return site.rig.loops["right"].siderostat.spur_gear_ratio
+
+
+def corrects_the_gear(site):
+    return Outcome(["seen"], {"gear": gear_of(site)}, {} if gear_of(site) == 26.0 else GEAR)
+
+
+@pytest.fixture
+def course(tmp_path):
+    path = tmp_path / "rig.toml"
+    shutil.copy(default_rig_path(), path)
+    return again(path)
+
+
+def again(path):
+    files = Files(path, path.parent)
+    return Course(path, (), files, load(files.record, "fit-mock"), lambda _line: None)
+
+
+@pytest.fixture
+def table(monkeypatch):
+    def use(**table):
+        monkeypatch.setattr(steps, "STEPS", table)
+
+    return use
+
+
+def task(course, name):
+    return chosen(tasks_of(course.rig()), [name])[0]
+
+
+def test_a_correction_is_proved_by_a_second_measurement_and_kept(course, table):
+    table(gear=step(corrects_the_gear))
+    entry = do(course, task(course, "gear"))
+    assert (entry.state, entry.figures["gear"]) == ("corrected", 26.0)
+    assert entry.found == GEAR
+    kept = load_rig(course.files.rig)
+    assert kept.loops["right"].siderostat.spur_gear_ratio == 26.0
+    original = load_rig(course.rig_path)
+    assert original.loops["right"].siderostat.spur_gear_ratio == 25.0
+    assert "# The default rig" in course.files.rig.read_text()
+
+
+def test_a_correction_that_helps_nothing_fails(course, table):
+    table(gear=step(lambda _site: Outcome(found=GEAR)))
+    entry = do(course, task(course, "gear"))
+    assert entry.state == "failed"
+    assert "still not as expected" in entry.trouble
+
+
+def test_a_correction_that_the_rig_file_contradicts_is_named_and_not_written(course, table):
+    far = {"loops": {"right": {"siderostat": {"spur_gear_ratio": 40.0}}}}
+    table(gear=step(lambda _site: Outcome(found=far)))
+    entry = do(course, task(course, "gear"))
+    assert entry.state == "failed"
+    assert "travel_sky_arcsec" in entry.trouble
+    assert load_rig(course.files.rig).loops["right"].siderostat.spur_gear_ratio == 25.0
+
+
+def test_a_later_step_works_with_what_earlier_ones_found_and_a_repeat_without_its_own(
+    course, table
+):
+    seen = []
+    table(
+        gear=step(corrects_the_gear),
+        later=step(lambda site: seen.append(gear_of(site)) or Outcome(), "gear"),
+    )
+    do(course, task(course, "gear"))
+    do(course, task(course, "later"))
+    assert seen == [26.0]
+    first = []
+    table(gear=step(lambda site: first.append(gear_of(site)) or Outcome()))
+    do(course, task(course, "gear"))
+    assert first == [25.0]
+
+
+def test_another_result_of_a_repeat_makes_what_depends_on_it_to_do_again(course, table):
+    well = step(lambda _site: Outcome(), "gear")
+    table(gear=step(corrects_the_gear), later=well, aside=step(lambda _site: Outcome()))
+    for name in ("gear", "later", "aside"):
+        do(course, task(course, name))
+    do(course, task(course, "gear"))
+    assert course.record.done("right.later")  # the same was found
+    table(gear=step(lambda _site: Outcome()), later=well, aside=well)
+    do(course, task(course, "gear"))
+    assert not course.record.done("right.later")
+    assert "right.later" not in course.record.tasks
+
+
+def test_the_record_goes_on_where_it_ended(course, table):
+    table(one=step(lambda _site: Outcome()), two=step(lambda _site: Outcome(), "one"))
+    assert course.missing(task(course, "two")) == ["right.one"]
+    do(course, task(course, "one"))
+    resumed = again(course.rig_path)
+    assert resumed.missing(task(resumed, "two")) == []
+    assert resumed.record == course.record
+
+
+def test_a_step_that_stops_keeps_its_reason_and_its_figures(course, table):
+    def stops(_site):
+        raise StepError("the cable", {"furthest_rad": 0.01})
+
+    table(one=step(stops))
+    entry = do(course, task(course, "one"))
+    assert (entry.state, entry.trouble, entry.figures) == (
+        "failed",
+        "the cable",
+        {"furthest_rad": 0.01},
+    )
+    assert verdict(course.record, ["right.one"]) == "not commissioned: right.one failed"
+
+
+def test_what_is_skipped_counts_as_done_with_its_reason(course, table):
+    table(one=step(lambda _site: Outcome()))
+    skip(course, task(course, "one"), "cloudy")
+    assert course.record.done("right.one")
+    assert course.record.tasks["right.one"].trouble == "cloudy"
+    assert "skipped: right.one" in verdict(course.record, ["right.one"])
+
+
+def test_a_rig_file_with_base_and_includes_keeps_them(tmp_path, table):
+    shutil.copy(default_rig_path(), tmp_path / "under.toml")
+    (tmp_path / "part.toml").write_text("camera = { bias_dn = 990.0 }\n")
+    rig = tmp_path / "rig.toml"
+    rig.write_text('base = "under.toml"\ninclude = ["part.toml"]\nname = "fit-mock"\n')
+    course = again(rig)
+    table(gear=step(corrects_the_gear))
+    do(course, task(course, "gear"))
+    kept = load_rig(course.files.rig)
+    assert kept.camera.bias_dn == 990.0
+    assert kept.loops["right"].siderostat.spur_gear_ratio == 26.0
+
+
+def test_another_rigs_record_is_refused(course, table):
+    table(one=step(lambda _site: Outcome()))
+    do(course, task(course, "one"))
+    with pytest.raises(ConfigError, match="is of rig fit-mock"):
+        load(course.files.record, "other")
+
+
+def test_the_page_has_every_step_and_compares_figures(course, table):
+    table(one=step(lambda _site: Outcome(["<b>"], {"x": 2.0})))
+    do(course, task(course, "one"))
+    earlier = Commissioning("fit-mock")
+    earlier.enter("right.one", Outcome(figures={"x": 1.0}), 1.0)
+    (change,) = changes(course.record, earlier)
+    assert (change.now, change.then, change.relative) == (2.0, 1.0, 1.0)
+    text = page(course.record, {"right.one": "a step", "right.two": "another"}, earlier)
+    assert "&lt;b&gt;" in text
+    assert "<b>" not in text
+    assert "+100.0%" in text
+    assert "not done" in text
+
+
+def test_the_shipped_table_needs_only_steps_that_come_before(rig):
+    before = set()
+    for one in tasks_of(rig):
+        assert set(one.needs()) <= before
+        before.add(one.name)
