@@ -47,14 +47,12 @@ class Watch:
 
     def brightest(self, frames: int = 5) -> Star | None:
         """The brightest spot of the next frames."""
-        found: list[Star] = []
-        for frame in self._frames(frames):
-            found += self._sensor.candidates(frame.image)
+        found = [star for spots in self._spots(frames) for star in spots]
         return max(found, key=lambda star: star.flux_dn, default=None)
 
     def spots(self, frames: int = 10) -> list[Star]:
         """All spots of one frame, brightest first: the frame that has most."""
-        each = [list(self._sensor.candidates(frame.image)) for frame in self._frames(frames)]
+        each = self._spots(frames)
         most = max(each, key=len)
         return sorted(most, key=lambda star: -star.flux_dn)
 
@@ -66,11 +64,11 @@ class Watch:
         StepError
             If it is not on most frames.
         """
-        places = []
-        for frame in self._frames(frames):
-            spots = list(self._sensor.candidates(frame.image))
-            if spots:
-                places.append(max(spots, key=lambda star: star.flux_dn).position_px)
+        places = [
+            max(spots, key=lambda star: star.flux_dn).position_px
+            for spots in self._spots(frames)
+            if spots
+        ]
         if len(places) < _LEAST_FRAMES * frames:
             msg = (
                 f"the star is on {len(places)} of {frames} frames: it has left the field; "
@@ -113,6 +111,14 @@ class Watch:
         apart = self.goal_rad - self.motors.position_rad
         az, el = np.clip(_GAIN_PER_S * apart, -MOST_RAD_S, MOST_RAD_S).tolist()
         self.motors.exchange((az, el))
+
+    def _spots(self, count: int) -> list[list[Star]]:
+        """All spots of each of the next frames; the amplifiers hear from us also while frames are evaluated."""
+        each = []
+        for frame in self._frames(count):
+            self._hold()
+            each.append(list(self._sensor.candidates(frame.image)))
+        return each
 
     def _frames(self, count: int) -> list[Frame]:
         """The next frames that are exposed from now on; motors are held meanwhile."""

@@ -1,4 +1,4 @@
-"""The table of docs/commissioning.md from the results of a run: ``python -m miswired.report FILE``."""
+"""The tables of docs/commissioning.md from the results of a run: ``python -m miswired.report FILE``."""
 
 import json
 import re
@@ -7,11 +7,15 @@ from pathlib import Path
 
 from documents import ROOT, table
 
+from fitctl.commissioning.outcome import Site
+from fitctl.commissioning.steps import STEPS
+from fitctl.config import default_rig_path, load_rig
+
 from .catalogue import CATALOGUE
 
 PAGE = ROOT / "docs" / "commissioning.md"
 HEADER = ["what is wrong", "must be", "result", "largest motion of a motor", "of a stack", "took"]
-MARKED = re.compile(r"(<!-- results: begin -->\n).*?(<!-- results: end -->)", re.DOTALL)
+STEPS_HEADER = ["step", "what it proves", "what it moves", "needs", "takes"]
 
 
 def promised(entry):
@@ -47,11 +51,28 @@ def rows(results):
         yield [entry.name, promised(entry), outcome(result), *measured]
 
 
+def steps_table():
+    """A row for each step, as it is on the default rig."""
+    rig = load_rig(default_rig_path())
+    rows = []
+    for name, step in STEPS.items():
+        site = Site(rig, "" if step.of == "rig" else "right", print, default_rig_path(), ())
+        needs = ", ".join(f"`{one}`" for one in step.needs)
+        rows.append([f"`{name}`", step.title, step.moves(site), needs, f"{step.takes_s:g} s"])
+    return table(STEPS_HEADER, rows)
+
+
+def marked(page, name, text):
+    """The page with a text between the marks of that name."""
+    within = re.compile(rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)", re.DOTALL)
+    return within.sub(lambda m: m[1] + text + "\n" + m[2], page)
+
+
 def main(path):
-    """Write the table."""
+    """Write both tables."""
     results = json.loads(Path(path).read_text())
-    text = table(HEADER, rows(results))
-    PAGE.write_text(MARKED.sub(lambda m: m[1] + text + "\n" + m[2], PAGE.read_text()))
+    page = marked(PAGE.read_text(), "steps", steps_table())
+    PAGE.write_text(marked(page, "results", table(HEADER, rows(results))))
 
 
 if __name__ == "__main__":

@@ -67,6 +67,20 @@ def mocks_of(rig, wrong, seed=0):
         process.communicate(timeout=30)
 
 
+ALONG = {  # keys that change with another one
+    "siderostat.travel_sky_arcsec": "siderostat.spur_gear_ratio",
+    "other_spots": "star_flux_dn",
+    "fsm.piezo.channels": "fsm.dac.channels",
+}
+
+
+def expected(key, found):
+    """Whether a key may change where the catalogue's keys must."""
+    within = [one.rpartition(".")[0] for one in found if "wiring" in one or "per_v" in one]
+    along = next((by for end, by in ALONG.items() if key.endswith(end)), "none")
+    return key in found or key.rpartition(".")[0] in within or any(along in one for one in found)
+
+
 def values(table, under=""):
     for key, value in table.items():
         if isinstance(value, dict):
@@ -118,8 +132,7 @@ def test_commissioning_finds_it(entry, tmp_path):
         assert entry.named in " ".join(troubles.values()), result
     else:
         assert not troubles
-        if not entry.found:
-            assert not found
+        assert not [key for key in found if not expected(key, entry.found)]
     for key, value in entry.found.items():
         assert found[key] == pytest.approx(value, rel=0.1, abs=3.0 if "deg" in key else 1e-9)
     assert watched.most_rad <= entry.most_rad
