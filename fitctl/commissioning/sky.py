@@ -19,6 +19,7 @@ ANY_FLUX = Range(low=1e-6, high=1e9)
 MOST_RAD_S = 4.0
 _GAIN_PER_S = 15.0
 _THERE_RAD = 0.01
+_AWAY_RAD = 0.2
 _FRAMES = 40  # averages the air
 _LEAST_FRAMES = 0.6  # of these must show the star
 
@@ -84,17 +85,29 @@ class Watch:
         Raises
         ------
         StepError
-            If one does not get there.
+            If one does not get there, or goes the other way, or the angle is beyond the travel.
         """
         if self.motors is None:
             msg = "the motors have no power"
             raise StepError(msg)
         self.goal_rad = np.array(goal_rad, dtype=float)
+        travel_rad = self._site.loop.siderostat.travel_rad
+        if np.max(np.abs(self.goal_rad)) > travel_rad:
+            msg = (
+                f"({goal_rad[0]:.1f}, {goal_rad[1]:.1f}) rad is beyond the travel of "
+                f"{travel_rad:.1f} rad from the "
+                "encoders' zero; bring the siderostat nearer to its middle"
+            )
+            raise StepError(msg)
         began_rad = np.array(self.motors.position_rad)
         way_rad = np.max(np.abs(self.goal_rad - began_rad))
         until_s = self._site.clock.now_s() + 2 * way_rad / MOST_RAD_S + 2.0
         while np.max(np.abs(self.goal_rad - self.motors.position_rad)) > _THERE_RAD:
             self._hold()
+            apart_rad = np.max(np.abs(self.goal_rad - self.motors.position_rad))
+            if apart_rad > way_rad + _AWAY_RAD:
+                msg = "a motor goes away from where it is sent; repeat the step amplifiers"
+                raise StepError(msg)
             if self._site.clock.now_s() > until_s:
                 at = ", ".join(f"{one:.2f}" for one in self.motors.position_rad)
                 msg = (

@@ -67,3 +67,20 @@ def test_a_fault_of_an_amplifier_ends_the_step_with_power_off(step, monkeypatch)
     bench, _, text = step()
     assert "azimuth: x" in text
     assert not bench.powered
+
+
+def test_an_interrupt_takes_the_power_away(step, monkeypatch):
+    def interrupted(self, _velocity):
+        if self.powered:
+            self.powered_at_interrupt = True
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    clock = VirtualClock()
+    bench = BenchAmplifiers(clock)
+    monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
+    monkeypatch.setattr(BenchAmplifiers, "exchange", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        check_amplifiers(site_of(RIG, clock))
+    assert bench.powered_at_interrupt
+    assert not bench.powered

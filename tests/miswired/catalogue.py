@@ -40,7 +40,7 @@ class Entry(NamedTuple):
     found: dict[str, Any] = {}  # noqa: RUF012
     named: str = ""
     most_rad: float = 0.05
-    most_v: float = 0.0
+    most_v: float = 0.35
     rig: str = CIA402
 
 
@@ -201,6 +201,7 @@ CAMERA = [
             f"{WIRING}.velocity_signs": [-1, 1],
             f"{WIRING}.encoder_signs": [-1, 1],
             f"{FSM}.dac.channels": [3, 2, 1],
+            MIRROR_DEG: -90.0,
         },
     ),
     _turned(
@@ -256,7 +257,9 @@ CAMERA = [
     ),
     _camera(
         "two stars",
-        "mocks.faults=[{ device = 'camera', kind = 'star_double', value = 9.0 }]",
+        "plant.loops.right.spots=["
+        "{ name = 'pointing', offset_px = { az = 0.0, el = 0.0 }, flux_dn = 28000.0, diameter_px = 3.0 }, "
+        "{ name = 'second', offset_px = { az = -9.0, el = -8.0 }, flux_dn = 27000.0, diameter_px = 3.0 }]",
         step="star",
         named="two spots could be the star",
         most_rad=0.05,
