@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import asdict
 from enum import StrEnum
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,6 +15,15 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.log_time import time_ns
+from fitctl.commands.shared.logs import (
+    LatestOption,
+    chosen_log,
+    chosen_logs,
+    logging_rig,
+    logs_in,
+    rig_name,
+)
+from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
@@ -22,8 +32,12 @@ from fitctl.logging.reading import LogInfo, log_info
 
 app = typer.Typer(help="Inspect, repair and convert logs.", no_args_is_help=True)
 
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")]
-LogsArgument = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP files.")]
+LogArgument = Annotated[
+    Path | None, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")
+]
+LogsArgument = Annotated[
+    list[Path] | None, typer.Argument(metavar="LOG...", help="MCAP files, finished or not.")
+]
 OutOption = Annotated[
     Path | None,
     typer.Option(
@@ -49,21 +63,70 @@ class Format(StrEnum):
     npz = "npz"
 
 
+@app.command("list")
+def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+    """List the logs of a rig, the newest last.
+
+    Reads the folder `logging.folder` of the rig file. Exit status 1 if a log in it cannot be read.
+    """
+    where = Path(logging_rig("log list", rig, overrides).logging.folder)
+    logs, problems = logs_in(where)
+    if as_json:
+        say(to_json([_listed(log) for log in logs]))
+    elif not logs:
+        say(f"{where}: no logs")
+    else:
+        for log in logs:
+            begin = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(log.start_s))
+            span = f"{begin}  {log.duration_s:9.1f} s" if log.counts else "without any record"
+            size = f"{log.path.stat().st_size / 1e6:9.1f} MB"
+            say(f"{log.path}  {span:<36}  {size}  {rig_name(log)}, {_state(log.path, log)}")
+    for problem in problems:
+        say(problem, err=True)
+    raise typer.Exit(FAILED if problems else 0)
+
+
+def _listed(found: LogInfo) -> dict[str, object]:
+    document = _info_document(
+        found, kept=folder.is_kept(found.path), recording=folder.in_use(found.path)
+    )
+    del document["counts"], document["metadata"]
+    return document | {"rig": rig_name(found)}
+
+
+def _state(log: Path, found: LogInfo) -> str:
+    unfinished = (
+        "being recorded" if folder.in_use(log) else "cut off; `fitctl log recover` mends it"
+    )
+    return ("finished" if found.finished else unfinished) + (
+        "; kept" if folder.is_kept(log) else ""
+    )
+
+
 @app.command()
 def info(
-    log: LogArgument,
+    logs: LogsArgument = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print everything as one JSON object, with the rig file.")
     ] = False,
+    latest: LatestOption = False,
+    rig: RigOption = None,
 ) -> None:
-    """Show what a log holds."""
-    found, kept, recording = log_info(log), folder.is_kept(log), folder.in_use(log)
-    if as_json:
-        say(to_json(_info_document(found, kept=kept, recording=recording)))
-        return
-    unfinished = "being recorded" if recording else "cut off; `fitctl log recover` mends it"
-    state = "finished" if found.finished else unfinished
-    say(f"{found.path}: {state}{'; kept' if kept else ''}")
+    """Show what logs hold.
+
+    With --json, prints one object a line for each log.
+    """
+    for log in chosen_logs("log info", logs, rig, latest=latest):
+        found = log_info(log)
+        if as_json:
+            kept, recording = folder.is_kept(log), folder.in_use(log)
+            say(to_json(_info_document(found, kept=kept, recording=recording)))
+        else:
+            _print_info(found)
+
+
+def _print_info(found: LogInfo) -> None:
+    say(f"{found.path}: {_state(found.path, found)}")
     if found.counts:
         start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(found.start_s))
         say(f"from {start}, {found.duration_s:.1f} s")
@@ -90,17 +153,19 @@ def _info_document(found: LogInfo, *, kept: bool, recording: bool) -> dict[str, 
 
 @app.command()
 def summary(
-    logs: LogsArgument,
+    logs: LogsArgument = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")] = False,
     most_bytes: Annotated[
         int, typer.Option(min=1, metavar="BYTES", help="Only name files that are larger.")
     ] = 1 << 40,
+    latest: LatestOption = False,
+    rig: RigOption = None,
 ) -> None:
     """Print start, length and RMS of each log.
 
     Prints one line for each log as soon as it is read. The verdict is that of `fitctl report`.
     """
-    for log in logs:
+    for log in chosen_logs("log summary", logs, rig, latest=latest):
         line = _summary(log, most_bytes)
         if as_json:
             say(to_json(line))
@@ -151,30 +216,47 @@ def _summary(log: Path, most_bytes: int) -> LogSummary:
 
 
 @app.command()
-def verify(logs: LogsArgument) -> None:
+def verify(
+    logs: LogsArgument = None,
+    latest: LatestOption = False,
+    rig: RigOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Check that logs are whole.
 
     Reads each log from end to end: checksums, index, order, every message. Exit status 1 if one is damaged.
     """
-    problems = 0
-    for log in logs:
+    problems, documents = 0, []
+    for log in chosen_logs("log verify", logs, rig, latest=latest):
         verdict = verifying.verify(log)
         problems += len(verdict.problems)
+        if as_json:
+            documents.append({"path": str(log), "whole": not verdict.problems, **asdict(verdict)})
+            continue
         say(
             f"{log}: {'not whole' if verdict.problems else 'whole'}; {verdict.records} records, "
             f"{verdict.lost} lost on the way, {verdict.frames_missing} frames missing"
         )
         for problem in verdict.problems:
             say(f"  {problem}")
+    if as_json:
+        say(to_json(documents))
     raise typer.Exit(FAILED if problems else 0)
 
 
 @app.command()
-def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption = False) -> None:
+def recover(
+    log: LogArgument = None,
+    out: OutOption = None,
+    overwrite: OverwriteOption = False,
+    latest: LatestOption = False,
+    rig: RigOption = None,
+) -> None:
     """Make a whole log from a damaged one.
 
     LOG itself does not change.
     """
+    log = chosen_log("log recover", log, rig, latest=latest)
     if folder.in_use(log):
         msg = f"{log}: is being recorded just now; there is nothing to mend"
         raise ConfigError(msg)
@@ -191,7 +273,7 @@ def recover(log: LogArgument, out: OutOption = None, overwrite: OverwriteOption 
 
 @app.command()
 def cut(
-    log: LogArgument,
+    log: LogArgument = None,
     from_: Annotated[
         str, typer.Option("--from", metavar="TIME", help="Seconds after LOG's start, or UTC.")
     ] = "0",
@@ -202,11 +284,14 @@ def cut(
     topic: TopicOption = None,
     out: OutOption = None,
     overwrite: OverwriteOption = False,
+    latest: LatestOption = False,
+    rig: RigOption = None,
 ) -> None:
     """Copy a span of time, some topics, or both.
 
     UTC times look like 2026-11-21T09:18:30.5.
     """
+    log = chosen_log("log cut", log, rig, latest=latest)
     found = log_info(log)
     from_ns = time_ns("--from", from_, found)
     to_ns = 2**63 if to is None else time_ns("--to", to, found)
@@ -225,7 +310,7 @@ def cut(
 
 @app.command()
 def merge(
-    logs: LogsArgument,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP files.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The new log.")],
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -240,8 +325,8 @@ def merge(
 
 @app.command()
 def export(
-    log: LogArgument,
     format_: Annotated[Format, typer.Option("--format", help="CSV has no frames.")],
+    log: LogArgument = None,
     topic: TopicOption = None,
     out: Annotated[
         Path | None,
@@ -249,11 +334,14 @@ def export(
             "--out", metavar="DIR", help="Folder for the tables. [default: LOG_FORMAT beside LOG]"
         ),
     ] = None,
+    latest: LatestOption = False,
+    rig: RigOption = None,
 ) -> None:
     """Write each topic of a log as a table.
 
     The names of the columns have units.
     """
+    log = chosen_log("log export", log, rig, latest=latest)
     target = out or log.with_name(f"{log.stem}_{format_}")
     files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
     for file, rows in sorted(files.items()):
@@ -265,14 +353,16 @@ def export(
 
 @app.command()
 def keep(
-    logs: LogsArgument,
+    logs: LogsArgument = None,
     undo: Annotated[bool, typer.Option("--undo", help="Remove the protection.")] = False,
+    latest: LatestOption = False,
+    rig: RigOption = None,
 ) -> None:
     """Protect logs from deletion by the recorder.
 
     Makes an empty file LOG.keep beside each log.
     """
-    for log in logs:
+    for log in chosen_logs("log keep", logs, rig, latest=latest):
         folder.keep(log, kept=not undo)
         say(f"{log}: {'no longer kept' if undo else 'kept'}")
 

@@ -11,6 +11,8 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.log_time import time_ns
+from fitctl.commands.shared.logs import LatestOption, chosen_logs
+from fitctl.commands.shared.options import RigOption
 from fitctl.commands.shared.printing import say
 from fitctl.config import ConfigError
 from fitctl.logging.reading import log_info
@@ -20,12 +22,12 @@ _PICTURES = {".png", ".svg", ".pdf"}
 
 
 def plot(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")],
-    what: Annotated[
+    words: Annotated[
         list[str],
         typer.Argument(
-            metavar="TOPIC...",
-            help="/fit/right/tick.error_az_px, a topic, or a field; * is anything.",
+            metavar="LOG TOPIC...",
+            help="An MCAP file (not with --latest), then topics or fields such as "
+            "/fit/right/tick.error_az_px or error_az_px; * is anything.",
         ),
     ],
     from_: Annotated[
@@ -38,6 +40,8 @@ def plot(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a picture instead: PNG, SVG or PDF.")
     ] = None,
+    latest: LatestOption = False,
+    rig: RigOption = None,
 ) -> None:
     """Plot fields of a log in the terminal.
 
@@ -46,6 +50,11 @@ def plot(
     if out is not None and out.suffix.lower() not in _PICTURES:
         msg = f"plot: --out {out}: expected a name that ends in {', '.join(sorted(_PICTURES))}"
         raise ConfigError(msg)
+    named, what = ([], words) if latest else ([Path(words[0])], words[1:])
+    if not what:
+        msg = "plot: expected a topic or a field after the log, such as error_az_px"
+        raise ConfigError(msg)
+    log = chosen_logs("plot", named, rig, latest=latest)[-1]
     found = log_info(log)
     from_ns = time_ns("--from", from_, found) if found.counts else 0
     to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.logs import LatestOption, chosen_logs
 from fitctl.commands.shared.options import ControllerOption, JsonOption, SetOption
 from fitctl.commands.shared.printing import progress_line, say, to_json
 from fitctl.commands.shared.rig import controller_overrides
@@ -41,9 +42,9 @@ _OPEN_LOOP = (
 
 def replay(
     logs: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(metavar="LOG...", help="All files of one run, from the first on."),
-    ],
+    ] = None,
     rig: Annotated[
         Path | None,
         typer.Option("--rig", metavar="FILE", help="Rig file. [default: the one in the log]"),
@@ -51,12 +52,14 @@ def replay(
     overrides: SetOption = None,
     controller: ControllerOption = None,
     as_json: JsonOption = False,
+    latest: LatestOption = False,
 ) -> None:
     """Run the frames of a log through today's code, and show where it decides differently.
 
     Exit status 0 if every mode and every command is the same to the last bit, 1 if not, 2 if the log
     cannot be replayed. A changed command changes no frames.
     """
+    logs = chosen_logs("replay", logs, rig, latest=latest)
     with whole_run(logs) as info, logged_files(info) as files:
         settings = _rig(info, files, rig, overrides or [], controller)
         dark_file = None if rig else missing_dark_file(info, settings)

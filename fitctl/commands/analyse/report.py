@@ -6,10 +6,12 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.printing import say
+from fitctl.commands.shared.logs import LatestOption, chosen_logs
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError
 from fitctl.report.compare import make_comparison
@@ -25,9 +27,9 @@ MOST_NIGHTS = 6
 
 def report(
     logs: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(metavar="LOG...", help="Files of one run, or a folder: its newest run."),
-    ],
+    ] = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Compare nights side by side; each LOG is one night.")
     ] = False,
@@ -49,11 +51,17 @@ def report(
         Path | None,
         typer.Option(metavar="FILE", help="Rig file. [default: the one in the log]"),
     ] = None,
+    latest: LatestOption = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print all figures as one JSON object, as in report.json."),
+    ] = False,
 ) -> None:
     """Make a report of a night: verdict, plots, losses, configuration.
 
     Writes one self-contained HTML page, every plot as PNG and SVG, and all figures as JSON.
     """
+    logs = chosen_logs("report", logs, rig, latest=latest)
     settings = None if rig is None else rig_of(rig, None)
     if compare and not 2 <= len(logs) <= MOST_NIGHTS:
         msg = f"report: --compare takes 2 to {MOST_NIGHTS} logs or folders, got {len(logs)}"
@@ -69,16 +77,19 @@ def report(
     except OSError as error:
         msg = f"report: {folder}: cannot be written: {error.strerror or error}; name another folder with --out"
         raise ConfigError(msg) from None
-    for night in nights:
-        _print_verdict(night)
-    say(f"written: {page}")
+    if as_json:
+        say(to_json(msgspec.json.decode((folder / "report.json").read_bytes())))
+    else:
+        for night in nights:
+            _print_verdict(night)
+        say(f"written: {page}")
     if pdf or pdf_without_sandbox:
         try:
             print_pdf(page, page.with_suffix(".pdf"), sandbox=not pdf_without_sandbox)
         except PdfError as error:
             say(f"report: {error}", err=True)
             raise typer.Exit(FAILED) from None
-        say(f"written: {page.with_suffix('.pdf')}")
+        say(f"written: {page.with_suffix('.pdf')}", err=as_json)
     if show and not webbrowser.open(page.resolve().as_uri()):
         say(f"report: no browser could be opened; open {page} yourself", err=True)
         raise typer.Exit(FAILED)

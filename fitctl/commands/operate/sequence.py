@@ -113,9 +113,18 @@ def list_(
 
 
 @app.command()
-def check(file: SequenceArgument, rig: RigOption = None, overrides: StepSetOption = None) -> None:
+def check(
+    file: SequenceArgument,
+    rig: RigOption = None,
+    overrides: StepSetOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Validate a sequence for a rig."""
     settings, sequence = _load(file, rig, overrides)
+    if as_json:
+        found = {"file": str(file), "steps": len(sequence.steps), "rig": settings.name}
+        say(to_json(found))
+        return
     say(f"{file}: well; {len(sequence.steps)} steps for rig {settings.name}")
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from fitctl.commands.shared.options import RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.plant import check_plant
-from fitctl.commands.shared.printing import say
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig
-from fitctl.config import Rig, default_rig_path
+from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.config.origins import Mark, Marks, marks_at
 from fitctl.config.reading import read_parts, rig_from_parts
 from fitctl.config.simulated import mixture
@@ -21,24 +22,44 @@ _DEFAULT = "default"
 
 
 def check(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="RIG", help="Rig file, in place of --rig.")
+    ] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
     show: Annotated[
         bool,
         typer.Option("--show", help="Print every value in force, and the file that sets it."),
     ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Validate a rig file.
 
     Prints every mistake with its key and what was expected. Exit status 0 if there is none, 2 otherwise.
     """
-    path = named_rig(rig) or default_rig_path()
+    if file is not None and rig is not None:
+        msg = f"check: expected one rig file, got {file} and --rig {rig}"
+        raise ConfigError(msg)
+    path = file or named_rig(rig) or default_rig_path()
     parts = read_parts(path, overrides or ())
     settings = rig_from_parts(parts, str(path))
     check_plant(settings)
     if show:
         for line in _lines(settings, parts.marks):
             say(line)
+        return
+    if as_json:
+        mixed = list(mixture(settings))
+        say(
+            to_json(
+                {
+                    "file": str(path),
+                    "rig": settings.name,
+                    "loops": list(settings.loops),
+                    "notes": mixed,
+                }
+            )
+        )
         return
     loops = ", ".join(settings.loops)
     say(f"{path}: well; rig {settings.name}, loops {loops}")

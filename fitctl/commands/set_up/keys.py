@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fitctl.commands.shared.options import RigOption, SetOption
-from fitctl.commands.shared.printing import say
+from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.messages.keys import allowed_keys, new_key, revoke_key
 
@@ -53,10 +53,12 @@ def new(
 
 
 @app.command("list")
-def list_(rig: RigOption = None, overrides: SetOption = None) -> None:
+def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
     """List the allowed keys and their roles."""
     keys, problems = allowed_keys(rig_of(named_rig(rig), overrides))
-    for key in keys.values():
+    if as_json:
+        say(to_json([{"name": k.name, "role": k.role, "public": k.public} for k in keys.values()]))
+    for key in () if as_json else keys.values():
         say(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
     for problem in problems:
         say(problem, err=True)

@@ -15,8 +15,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "fault kinds": ("fitctl fault kinds",),
     "init": ("fitctl init my-rig.toml", "fitctl init my-rig.toml --mocks"),
     "check": (
-        "fitctl check --rig my-rig.toml",
-        "fitctl check --rig my-rig.toml --show",
+        "fitctl check my-rig.toml",
+        "fitctl check my-rig.toml --show",
     ),
     "discover": ("fitctl discover", "fitctl discover --broadcast 192.168.1.255"),
     "commission": (
@@ -48,15 +48,16 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sequence pause": ("fitctl sequence pause",),
     "sequence resume": ("fitctl sequence resume",),
     "sequence stop": ("fitctl sequence stop",),
-    "report": ("fitctl report logs", "fitctl report --compare monday.mcap tuesday.mcap"),
+    "report": ("fitctl report --latest", "fitctl report --compare monday.mcap tuesday.mcap"),
     "plot": (
-        "fitctl plot night.mcap error_az_px error_el_px",
+        "fitctl plot --latest error_az_px error_el_px",
         "fitctl plot night.mcap /fit/right/tick.error_az_px --from 60 --to 90",
     ),
-    "log": ("fitctl log info night.mcap", "fitctl log export night.mcap --format csv"),
-    "log info": ("fitctl log info night.mcap", "fitctl log info night.mcap --json"),
+    "log": ("fitctl log list", "fitctl log export night.mcap --format csv"),
+    "log list": ("fitctl log list", "fitctl log list --rig my-rig.toml --json"),
+    "log info": ("fitctl log info --latest", "fitctl log info logs/*.mcap"),
     "log summary": ("fitctl log summary logs/*.mcap",),
-    "log verify": ("fitctl log verify night.mcap",),
+    "log verify": ("fitctl log verify --latest", "fitctl log verify logs/*.mcap"),
     "log recover": ("fitctl log recover night.mcap",),
     "log cut": (
         "fitctl log cut night.mcap --from 60 --to 90 --out minute.mcap",
@@ -65,7 +66,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "log merge": ("fitctl log merge first.mcap second.mcap --out night.mcap",),
     "log export": ("fitctl log export night.mcap --format parquet --topic '/fit/right/*'",),
     "log keep": ("fitctl log keep night.mcap", "fitctl log keep --undo night.mcap"),
-    "replay": ("fitctl replay night.mcap", "fitctl replay night.mcap --controller fslq"),
+    "replay": ("fitctl replay --latest", "fitctl replay night.mcap --controller fslq"),
     "simulate": ("fitctl simulate --seed 3", "fitctl simulate --runs 100 --duration 60"),
     "identify": (
         "fitctl identify hysteresis --mock",

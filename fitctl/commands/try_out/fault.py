@@ -10,8 +10,8 @@ import typer
 
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.fault_kinds import kinds
-from fitctl.commands.shared.options import RigOption, SetOption
-from fitctl.commands.shared.printing import say
+from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address_or_shipped, show_rig
 from fitctl.config import ConfigError, Rig
@@ -53,12 +53,15 @@ def set_(
     ] = 1.0,
     rig: RigOption = None,
     overrides: SetOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Start a fault.
 
     The mocks print which faults act afterwards. `fitctl fault kinds` lists the kinds of each device.
     """
-    _change(rig, overrides, SetFault(device, kind, part, value, for_s, probability))
+    _change(
+        rig, overrides, SetFault(device, kind, part, value, for_s, probability), as_json=as_json
+    )
 
 
 @app.command("clear")
@@ -70,20 +73,28 @@ def clear(
     part: PartOption = "",
     rig: RigOption = None,
     overrides: SetOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """End faults of one device, or of all devices."""
-    _change(rig, overrides, ClearFaults(device, kind, part))
+    _change(rig, overrides, ClearFaults(device, kind, part), as_json=as_json)
 
 
 @app.command("now")
-def now(rig: RigOption = None, overrides: SetOption = None) -> None:
+def now(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
     """Show the faults that act now."""
-    _change(rig, overrides, ListFaults())
+    _change(rig, overrides, ListFaults(), as_json=as_json)
 
 
 @app.command("kinds")
-def kinds_() -> None:
+def kinds_(as_json: JsonOption = False) -> None:
     """List the kinds of fault of each device."""
+    if as_json:
+        document = {
+            device: {name: kind._asdict() for name, kind in table.items()}
+            for device, table in kinds().items()
+        }
+        say(to_json(document))
+        return
     for device, table in kinds().items():
         say(device)
         for name, kind in table.items():
@@ -106,7 +117,11 @@ def _as_running(rig: Rig, overrides: list[str] | None) -> Rig:
 
 
 def _change(
-    path: Path | None, overrides: list[str] | None, question: SetFault | ClearFaults | ListFaults
+    path: Path | None,
+    overrides: list[str] | None,
+    question: SetFault | ClearFaults | ListFaults,
+    *,
+    as_json: bool,
 ) -> None:
     """Change or list faults of the mocks of a rig, and print the rig and the faults that remain.
 
@@ -137,6 +152,9 @@ def _change(
     if now.error:
         msg = f"fault: {now.error}"
         raise ConfigError(msg)
+    if as_json:
+        say(to_json(now.active))
+        return
     for line in map(_line, now.active):
         say(line)
     if not now.active:

@@ -1,0 +1,77 @@
+"""The logs of a rig: all of them, and the newest run, for ``--latest``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitctl.commands.shared.rig import rig_of
+from fitctl.commands.shared.supervisor import address_or_shipped
+from fitctl.config import ConfigError, Rig
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import LogInfo, log_info
+
+LatestOption = Annotated[
+    bool, typer.Option("--latest", help="Use the newest log of the rig, in place of LOG.")
+]
+
+
+def logging_rig(command: str, rig: Path | None, overrides: list[str] | None = None) -> Rig:
+    """The rig whose logs a command reads: ``--rig``, ``FITCTL_RIG``, the running rig, or the shipped one."""
+    found = address_or_shipped(command, rig, overrides)
+    return rig_of(found.file, found.settings)
+
+
+def logs_in(folder: Path) -> tuple[list[LogInfo], list[str]]:
+    """The logs in a folder that can be read, oldest first, and what is wrong with each other one."""
+    logs, problems = [], []
+    for path in sorted(folder.glob("*.mcap")):
+        try:
+            logs.append(log_info(path))
+        except LogError as error:
+            problems.append(str(error))
+    return sorted(logs, key=lambda log: log.start_s if log.counts else 0.0), problems
+
+
+def rig_name(log: LogInfo) -> str:
+    """The name of the rig that a log is of; empty for a log that fitctl did not record."""
+    return log.metadata.get("rig", {}).get("name", "")
+
+
+def chosen_logs(
+    command: str, logs: Sequence[Path] | None, rig: Path | None, *, latest: bool
+) -> list[Path]:
+    """The logs that a command line names, or with ``--latest`` all files of the newest run of the rig.
+
+    Raises
+    ------
+    ConfigError
+        If there are both, or neither, or the rig has no log.
+    """
+    if logs and latest:
+        msg = f"{command}: --latest chooses the log; leave out --latest, or {logs[0]}"
+        raise ConfigError(msg)
+    if logs:
+        return list(logs)
+    if not latest:
+        msg = f"{command}: expected a LOG; name one, or give --latest for the newest log of the rig"
+        raise ConfigError(msg)
+    settings = logging_rig(command, rig)
+    folder = Path(settings.logging.folder)
+    of_rig = [log for log in logs_in(folder)[0] if log.counts and rig_name(log) == settings.name]
+    if not of_rig:
+        msg = (
+            f"{command}: --latest: {folder} has no log of rig {settings.name}; name a LOG, or another rig "
+            "with --rig"
+        )
+        raise ConfigError(msg)
+    clock = of_rig[-1].metadata.get("clock")
+    return [log.path for log in of_rig if log.metadata.get("clock") == clock]
+
+
+def chosen_log(command: str, log: Path | None, rig: Path | None, *, latest: bool) -> Path:
+    """As :func:`chosen_logs`, for a command that reads one file: with ``--latest`` the newest."""
+    return chosen_logs(command, None if log is None else [log], rig, latest=latest)[-1]

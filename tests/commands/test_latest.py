@@ -1,0 +1,151 @@
+"""`fitctl log list`, and `--latest` in place of a LOG: the newest run of the rig that is addressed."""
+
+import json
+
+import msgspec
+import pytest
+from log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
+
+from fitctl.cli import main
+from fitctl.config import default_rig_path, load_rig
+
+RIG = load_rig(default_rig_path()).name
+DAY_S = 86400.0
+
+
+def run_of(name, later_s):
+    """The first record of a run of a rig that began later than the sample's."""
+    wall_s = RUN_INFO.wall_minus_monotonic_s + later_s
+    return msgspec.structs.replace(RUN_INFO, rig_name=name, wall_minus_monotonic_s=wall_s)
+
+
+@pytest.fixture
+def logs(tmp_path, monkeypatch):
+    """Two runs of the shipped rig and a newer one of another; names do not sort as times do."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FITCTL_RIG", str(default_rig_path()))
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for file, name, later_s in (
+        ("z.mcap", RIG, 0.0),
+        ("b.mcap", RIG, DAY_S),
+        ("a.mcap", "another", 2 * DAY_S),
+    ):
+        path = folder / file
+        info = run_of(name, later_s)
+        write_log(path, [info, *one_of_each(), tick(2)], start_s=WALL_S + later_s)
+    return folder
+
+
+@pytest.fixture
+def fitctl(capsys):
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main([str(one) for one in arguments])
+        printed = capsys.readouterr()
+        return end.value.code or 0, printed.out.strip(), printed.err.strip()
+
+    return run
+
+
+def test_list_has_every_log_of_the_folder_oldest_first(fitctl, logs):
+    status, text, _ = fitctl("log", "list")
+
+    assert status == 0
+    assert [line.split()[0] for line in text.splitlines()] == [
+        "logs/z.mcap",
+        "logs/b.mcap",
+        "logs/a.mcap",
+    ]
+    listed = json.loads(fitctl("log", "list", "--json")[1])
+    assert [one["rig"] for one in listed] == [RIG, RIG, "another"]
+    assert all(one["finished"] and not one["kept"] for one in listed)
+
+
+def test_list_names_a_file_that_cannot_be_read(fitctl, logs):
+    (logs / "torn.mcap").write_bytes(b"nothing of MCAP")
+
+    status, text, problems = fitctl("log", "list")
+
+    assert status == 1
+    assert len(text.splitlines()) == 3
+    assert "torn.mcap" in problems
+
+
+@pytest.mark.parametrize("command", [("log", "info"), ("log", "verify")])
+def test_latest_is_the_newest_log_of_the_rig_by_time_not_by_name(fitctl, logs, command):
+    _, text, _ = fitctl(*command, "--latest")
+
+    assert text.startswith("logs/b.mcap: ")
+
+
+def test_latest_goes_before_the_topics_of_a_plot(fitctl, logs):
+    by_name = fitctl("plot", "logs/b.mcap", "record*")
+
+    assert fitctl("plot", "--latest", "record*") == by_name
+    assert "logs/b.mcap" in "".join(by_name[1:])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("log", "info"),
+        ("log", "verify"),
+        ("log", "cut"),
+        ("log", "recover"),
+        ("log", "keep"),
+        ("log", "export", "--format", "csv"),
+        ("log", "summary"),
+        ("replay",),
+        ("report",),
+    ],
+)
+def test_without_log_and_without_latest_the_error_names_both(fitctl, logs, arguments):
+    status, text, problem = fitctl(*arguments)
+
+    assert (status, text) == (2, "")
+    assert "LOG" in problem
+    assert "--latest" in problem
+
+
+def test_a_log_and_latest_are_too_many(fitctl, logs):
+    status, _, problem = fitctl("log", "info", "logs/z.mcap", "--latest")
+
+    assert status == 2
+    assert "leave out --latest, or logs/z.mcap" in problem
+
+
+def test_latest_of_a_rig_without_logs_names_folder_and_rig(fitctl, logs):
+    for path in logs.glob("[bz].mcap"):
+        path.unlink()
+
+    status, _, problem = fitctl("log", "info", "--latest")
+
+    assert status == 2
+    assert f"logs has no log of rig {RIG}" in problem
+
+
+def test_info_of_several_logs_as_json_is_an_object_a_line(fitctl, logs):
+    _, text, _ = fitctl("log", "info", *sorted(logs.glob("*.mcap")), "--json")
+
+    documents = [json.loads(line) for line in text.splitlines()]
+    assert [one["path"][-6:] for one in documents] == ["a.mcap", "b.mcap", "z.mcap"]
+
+
+def test_checks_and_faults_have_json_for_programs(fitctl, logs):
+    checked = json.loads(fitctl("check", default_rig_path(), "--json")[1])
+    kinds = json.loads(fitctl("fault", "kinds", "--json")[1])
+    whole = json.loads(fitctl("log", "verify", "--latest", "--json")[1])
+    sequence = json.loads(fitctl("sequence", "check", "jog", "--json")[1])
+
+    assert checked["rig"] == RIG
+    assert kinds["camera"]["freeze"]["text"]
+    assert whole[0]["whole"] is True
+    assert sequence["steps"] > 1
+
+
+def test_check_refuses_two_rig_files(fitctl, logs):
+    status, _, problem = fitctl("check", "one.toml", "--rig", "two.toml")
+
+    assert status == 2
+    assert "expected one rig file" in problem
