@@ -245,7 +245,7 @@ def test_a_camera_alone_in_its_network_is_discovered(tmp_path):
         f"{sys.executable} -m fitctl mocks --set mocks.gvcp_port=3956 --set mocks.bench_port=0 --json"
         " >mocks.out & mocks=$!\n"
         "for i in $(seq 100); do [ -s mocks.out ] && break; sleep 0.1; done\n"
-        f"{sys.executable} -m fitctl discover --broadcast 127.0.0.1 --wait 2 --json; status=$?\n"
+        f"{sys.executable} -m fitctl discover --broadcast 127.0.0.1 --timeout 2 --json; status=$?\n"
         "kill $mocks; wait $mocks; exit $status\n"
     )
     result = subprocess.run(

@@ -38,7 +38,7 @@ _MOCK_VERNIER_S = 60.0
 _MOCK_SETTLE_S = 5.0
 _BENCH_ONLY = (
     "the response is measured on a bench of its own, with a position-sensing detector: give its "
-    "record with --log FILE (NPZ or CSV), or --mock for the mock bench"
+    "record with --log FILE (NPZ or CSV), or --mocks for the mock bench"
 )
 
 
@@ -70,7 +70,7 @@ def identify(
         bool, typer.Option("--simulate", help="Make the experiment on the virtual clock.")
     ] = False,
     mock: Annotated[
-        bool, typer.Option("--mock", help="Start the mock devices of the rig for the experiment.")
+        bool, typer.Option("--mocks", help="Start the mock devices of the rig for the experiment.")
     ] = False,
     seed: SeedOption = 0,
     out: Annotated[
@@ -84,7 +84,7 @@ def identify(
 ) -> None:
     """Measure the parameters of a rig, and write a fragment that its rig file includes.
 
-    Without --log, --simulate or --mock, the running supervisor makes the experiment: the loop must hold a star
+    Without --log, --simulate or --mocks, the running supervisor makes the experiment: the loop must hold a star
     in VERNIER. The stages then move open loop; STOP ends the experiment at once. The parameters of a link come
     from the log of a sequence: name it with --log.
     """
@@ -99,7 +99,7 @@ def identify(
         )
         raise ConfigError(msg)
     if (log is not None) + simulated + mock > 1:
-        msg = "identify: --log, --simulate and --mock exclude each other; give one, or none for the rig"
+        msg = "identify: --log, --simulate and --mocks exclude each other; give one, or none for the rig"
         raise ConfigError(msg)
     if not (log or simulated or mock):
         found = address("identify", rig, overrides)

@@ -38,7 +38,8 @@ def rehearse(
         ),
     ] = "",
     limit_s: Annotated[
-        float, typer.Option("--limit", metavar="SECONDS", min=1.0, help="Give up after this time.")
+        float,
+        typer.Option("--timeout", metavar="SECONDS", min=1.0, help="Give up after this time."),
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:

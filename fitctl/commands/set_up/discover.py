@@ -26,7 +26,7 @@ def discover(
     wait_s: Annotated[
         float,
         typer.Option(
-            "--wait", min=0.01, max=60.0, help="How long to wait for answers, in seconds."
+            "--timeout", metavar="SECONDS", min=0.01, max=60.0, help="Longest wait for answers."
         ),
     ] = 1.0,
     as_json: JsonOption = False,

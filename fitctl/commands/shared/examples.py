@@ -69,7 +69,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "replay": ("fitctl replay --latest", "fitctl replay night.mcap --controller fslq"),
     "simulate": ("fitctl simulate --seed 3", "fitctl simulate --runs 100 --duration 60"),
     "identify": (
-        "fitctl identify hysteresis --mock",
+        "fitctl identify hysteresis --mocks",
         "fitctl identify airpath --log night.mcap",
     ),
     "design": (
