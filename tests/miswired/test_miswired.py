@@ -134,7 +134,10 @@ def test_commissioning_finds_it(entry, tmp_path):
         assert not troubles
         assert not [key for key in found if not expected(key, entry.found)]
     for key, value in entry.found.items():
-        assert found[key] == pytest.approx(value, rel=0.1, abs=3.0 if "deg" in key else 1e-9)
+        if key.endswith("_deg"):
+            assert abs((found[key] - value + 180) % 360 - 180) < 3.0
+        else:
+            assert found[key] == pytest.approx(value, rel=0.1)
     assert watched.most_rad <= entry.most_rad
     assert watched.most_v <= entry.most_v
 
