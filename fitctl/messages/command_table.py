@@ -99,7 +99,7 @@ COMMANDS = (
         "off",
         "o",
         "Off",
-        question="Disable the amplifiers and let go of all devices?",
+        question="Disable the amplifiers and close all devices?",
         wait_s=60.0,
     ),
     CommandRow(commands.SetTarget, "the instrument", "target"),

@@ -54,7 +54,7 @@ class Acquire(Command, frozen=True, kw_only=True):
 
 
 class Hold(Command, frozen=True, kw_only=True):
-    """Stop tracking where the stages are."""
+    """Stop tracking, and hold the stages where they are."""
 
 
 class Stop(Command, frozen=True, kw_only=True):
@@ -66,54 +66,54 @@ class Recover(Command, frozen=True, kw_only=True):
 
 
 class Off(Command, frozen=True, kw_only=True):
-    """From STANDBY or SAFE: disable amplifiers, let go of devices."""
+    """From STANDBY or SAFE: disable amplifiers, close devices."""
 
 
 class SetTarget(Command, frozen=True, kw_only=True):
-    """Move the point where the star is held, through the prefilter."""
+    """Move the point where the loop holds the star, through the prefilter."""
 
     az_px: float
     el_px: float
 
 
 class Look(Command, frozen=True, kw_only=True):
-    """In COARSE and VERNIER: put the window on another place, and follow the star there from now on."""
+    """In COARSE and VERNIER: move the window, and follow the star there from now on."""
 
     az_px: float
     el_px: float
 
 
 class Jog(Command, frozen=True, kw_only=True):
-    """In STANDBY: move the siderostat from where it is held, by angles on the sky."""
+    """In STANDBY: move the siderostat by angles on the sky."""
 
     az_sky_arcsec: float
     el_sky_arcsec: float
 
 
 class SetBiasOffset(Command, frozen=True, kw_only=True):
-    """In STANDBY: how far from its bias the mirror rests, until it is powered up anew or made safe."""
+    """In STANDBY: offset the mirror from its bias, until SAFE or the next power-up."""
 
     az_urad: float
     el_urad: float
 
 
 class SetController(Command, frozen=True, kw_only=True):
-    """Work with another design; in VERNIER the mirror goes on where it is. Files cannot be named here.
+    """Switch to another design, by name; in VERNIER the mirror continues from where it is.
 
-    "learnt" is the design that was learnt last from the loop's own frames.
+    "learnt" is the newest design learnt from the frames of the loop.
     """
 
     name: ControllerChoice
 
 
 class Reset(Command, frozen=True, kw_only=True):
-    """Let a tripped interlock go, by its name in the rig file."""
+    """Reset a tripped interlock, by its name in the rig file."""
 
     name: str
 
 
 class MoveCollector(Command, frozen=True, kw_only=True):
-    """Reference the hexapod (reference), or begin or end the collector's motion (start, stop).
+    """Reference the hexapod (reference), or start or stop the collector's motion (start, stop).
 
     What is given of a motion that begins stands in place of the rig file's ``collector.motion``, this once.
     Files cannot be named here: ``kind`` "file" is the rig file's.
@@ -145,15 +145,15 @@ class Experiment(Command, frozen=True, kw_only=True):
 
 
 class Status(Command, frozen=True, kw_only=True):
-    """Tell the mode of every loop; from whoever has the instrument, keep it."""
+    """Show the mode of every loop; renews the lease of the commander."""
 
 
 class RecentEvents(Command, frozen=True, kw_only=True):
-    """Tell the last events, also those from before you were there."""
+    """Show the last events, also those from before you connected."""
 
 
 class TakeOver(Command, frozen=True, kw_only=True):
-    """Take the instrument over from whoever has it."""
+    """Take the instrument over from the present commander."""
 
 
 class Shutdown(Command, frozen=True, kw_only=True):

@@ -112,9 +112,15 @@ def _loud(state: ConsoleState, alarms: AlarmBook) -> bool:
 # In the footer these come before a screen's own keys.
 ALARM_KEYS = (
     Key(
-        "k", "k", "Acknowledge", "app.acknowledge", "you have seen the alarms", "", _unacknowledged
+        "k",
+        "k",
+        "Acknowledge",
+        "app.acknowledge",
+        "acknowledge the alarms shown",
+        "",
+        _unacknowledged,
     ),
-    Key("u", "u", "Silence", "app.silence", "no bell for these alarms", "", _loud),
+    Key("u", "u", "Silence", "app.silence", "silence the bell for these alarms", "", _loud),
     Key(
         "v",
         "v",
@@ -160,13 +166,13 @@ TIME_KEYS = (
 KEYS = (
     Key("t", "t", "Target", "screen.aim", "put a cursor on the focal plane", "operate", _has_star),
     Key("i", "i", "Look", "screen.look", "follow the star at the cursor", "operate", _has_star),
-    Key("j", "j", "Jog", "screen.jog", "move a stage by the arrow keys", "operate", _by_hand),
+    Key("j", "j", "Jog", "screen.jog", "move a stage with the arrow keys", "operate", _by_hand),
     Key(
         "d",
         "d",
         "Rehearse",
         "app.rehearse",
-        "what a command would do, without giving it",
+        "what a command would do, without sending it",
         "operate",
         _live,
     ),
@@ -177,23 +183,25 @@ KEYS = (
     Key(
         "enter", "enter", "More", "screen.more", "all about the chosen device or reading", "devices"
     ),
-    Key("n", "n", "Reset", "screen.reset", "let the chosen interlock go", "devices"),
+    Key("n", "n", "Reset", "screen.reset", "reset the chosen interlock", "devices"),
     Key("w", "w", "Window", "app.window", "over 10, 60 or 1 s", "loop"),
     Key("up,down", "↑↓", "Choose", "", "choose a sequence or a parameter", "sequences"),
     Key("tab", "tab", "Other list", "app.focus_next", "sequences or parameters", "sequences"),
     Key("enter", "enter", "Edit", "screen.edit", "change the chosen parameter", "sequences"),
-    Key("d", "d", "Dry run", "screen.dry_run", "the whole of it on the virtual clock", "sequences"),
+    Key("d", "d", "Dry run", "screen.dry_run", "run it on a virtual clock", "sequences"),
     Key("g", "g", "Go", "screen.go", "run it on the instrument", "sequences"),
-    Key("p", "p", "Pause", "screen.pause", "pause it, or let it go on", "sequences", _sequence),
-    Key("z", "z", "End it", "screen.end", "end it; its stages are held", "sequences", _sequence),
+    Key("p", "p", "Pause", "screen.pause", "pause or continue it", "sequences", _sequence),
+    Key("z", "z", "End it", "screen.end", "end it and hold the stages", "sequences", _sequence),
     Key("f", "f", "File", "screen.file", "open a sequence file of your own", "sequences"),
     Key("up,down", "↑↓", "Choose", "", "choose a log", "logs"),
     Key("enter", "enter", "Info", "screen.tool('info')", "what the chosen log holds", "logs"),
-    Key("m", "m", "Keep", "screen.keep", "mark it, so that it is never deleted; or not", "logs"),
-    Key("f", "f", "Verify", "screen.tool('verify')", "whether it is whole", "logs"),
-    Key("t", "t", "Report", "screen.tool('report')", "one page about it", "logs"),
-    Key("y", "y", "Replay", "screen.tool('replay')", "decide its frames again", "logs"),
-    Key("slash", "/", "Find", "screen.filter", "only what has the words that you type", "help"),
+    Key("m", "m", "Keep", "screen.keep", "protect it from deletion, or undo that", "logs"),
+    Key("f", "f", "Verify", "screen.tool('verify')", "check that it is whole", "logs"),
+    Key("t", "t", "Report", "screen.tool('report')", "make a report of it", "logs"),
+    Key("y", "y", "Replay", "screen.tool('replay')", "run its frames through today's code", "logs"),
+    Key(
+        "slash", "/", "Find", "screen.filter", "show only rows with the words that you type", "help"
+    ),
     *ALARM_KEYS,
     *TIME_KEYS,
     Key("e", "e", "Events", "app.events", "all events at full length"),
