@@ -15,45 +15,46 @@ LONGEST_S = 86_400.0
 LoopName = Annotated[
     str,
     Field(
-        description="the loop that works; may be left out where the rig has only one, and where the step is "
-        "for every loop or for none"
+        description="name of the loop; optional if the rig has only one, or if the step is for all or none"
     ),
 ]
 TimeoutS = Annotated[
     float,
-    Field(gt=0, le=LONGEST_S, description="the most that is waited beyond the step's own time"),
+    Field(gt=0, le=LONGEST_S, description="longest wait beyond the step's own duration"),
 ]
-Attempts = Annotated[int, Field(ge=1, le=20, description="how often it is tried in all")]
+Attempts = Annotated[int, Field(ge=1, le=20, description="number of attempts in all")]
 SearchRadius = Annotated[
-    Positive | None, Field(description="of the first attempt; without it, the rig file's")
+    Positive | None, Field(description="radius of the first attempt; default: the rig file's")
 ]
 RadiusGrowth = Annotated[
-    float, Field(ge=1, le=10, description="of the radius, from an attempt to the next")
+    float, Field(ge=1, le=10, description="factor of the radius from one attempt to the next")
 ]
 LargestOffset = Annotated[
     Positive | None,
-    Field(description="no search goes farther; without it, the radius does not grow"),
+    Field(description="limit of all searches; without it, the radius does not grow"),
 ]
-SettleS = Annotated[NonNegative, Field(le=600, description="before, does not count")]
+SettleS = Annotated[NonNegative, Field(le=600, description="time before the measurement starts")]
 DurationS = Annotated[float, Field(gt=0, le=LONGEST_S)]
 DwellS = Annotated[DurationS, Field(description="at each place")]
-SteadyAfterS = Annotated[NonNegative, Field(description="of a dwell: from then on its RMS counts")]
+SteadyAfterS = Annotated[
+    NonNegative, Field(description="time within a dwell before the RMS is measured")
+]
 OffsetPx = Annotated[Finite, Field(description="from the rig file's target_px, on the focal plane")]
 RmsLimitPx = Annotated[
     Positive | None,
-    Field(description="largest RMS of an axis; without it, the rig file's requirement_px"),
+    Field(description="largest RMS of an axis; default: the rig file's requirement_px"),
 ]
 ExpectedSkyArcsec = Annotated[
     Finite | None,
     Field(
-        description="where the star is, from where the encoders read zero; without it, on the target or "
-        "where it was last"
+        description="position of the star, from the zero of the encoders; default: on the target, or its last "
+        "position"
     ),
 ]
 StarFluxDn = Annotated[
     Positive | None,
     Field(
-        description="of the star: one that is not within `flux_range` of it is another; without it, the rig "
+        description="brightness: a star that is not within `flux_range` of it is rejected; default: the rig "
         "file's"
     ),
 ]
@@ -69,7 +70,7 @@ class Step(Settings):
 
 
 class Standby(Step):
-    """Devices on and ready, a star let go, the stages held where they are: STANDBY; without a loop, all."""
+    """Power up the devices, stop tracking, and hold the stages: STANDBY. Without a loop, all loops."""
 
     step: Literal["standby"] = "standby"
     timeout_s: TimeoutS = 60.0
@@ -77,10 +78,10 @@ class Standby(Step):
 
 
 class Acquire(Step):
-    """Devices on, search for the star, pull it in, until it is held; one that is held stays so.
+    """Power up the devices, search for the star, pull it in and hold it. A loop that holds a star keeps it.
 
-    Where it is expected somewhere, or has a flux of its own, a star that is held is let go first. Of a
-    metrology loop it is the beam. Without a loop, every loop acquires, those that hold a link first.
+    With an expected position or a flux, the loop stops tracking its star first. A metrology loop acquires its
+    beam. Without a loop, all loops acquire; the step waits first for those that hold a link.
     """
 
     step: Literal["acquire"] = "acquire"
@@ -90,8 +91,8 @@ class Acquire(Step):
     field_overlap: Annotated[
         FieldOverlap | None,
         Field(
-            description="of the field, between turns: more is a finer and slower search; without it, the "
-            "rig file's"
+            description="overlap of the field between turns of the spiral: more makes the search finer and "
+            "slower; default: the rig file's"
         ),
     ] = None
     expected_az_sky_arcsec: ExpectedSkyArcsec = None
@@ -105,7 +106,7 @@ class Hold(Step):
     """Hold the star or the beam for a time and compare the RMS of each axis with the requirement."""
 
     step: Literal["hold"] = "hold"
-    duration_s: Annotated[DurationS, Field(description="for how long the RMS counts")]
+    duration_s: Annotated[DurationS, Field(description="duration of the RMS measurement")]
     settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     timeout_s: TimeoutS = 60.0
@@ -122,7 +123,7 @@ class Star(Settings):
 
 
 class Stars(Step):
-    """A list of stars, one after the other: acquire each where it is expected, and hold it as `hold` does."""
+    """Acquire a list of stars one after the other, each at its position, and hold each as `hold` does."""
 
     step: Literal["stars"] = "stars"
     stars: Annotated[
@@ -130,16 +131,17 @@ class Stars(Step):
         Field(
             min_length=1,
             max_length=1000,
-            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and, of its own, `duration_s` "
+            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and optionally `duration_s` "
             "and `star_flux_dn`",
         ),
     ] = None
     file: Annotated[
-        str, Field(description="TOML, YAML or CSV with the stars, beside the sequence's own file")
+        str,
+        Field(description="TOML, YAML or CSV file with the stars, beside the sequence's own file"),
     ] = ""
-    duration_s: Annotated[DurationS, Field(description="for how long the RMS of each counts")] = (
-        30.0
-    )
+    duration_s: Annotated[
+        DurationS, Field(description="duration of the RMS measurement of each star")
+    ] = 30.0
     settle_s: SettleS = 10.0
     rms_limit_px: RmsLimitPx = None
     search_radius_sky_arcsec: SearchRadius = None
@@ -147,9 +149,9 @@ class Stars(Step):
     max_offset_sky_arcsec: LargestOffset = None
     on_failure: Annotated[
         Literal["skip", "stop"],
-        Field(description="what follows a star that is not found or not held well"),
+        Field(description="what to do after a star that is not found or not held well"),
     ] = "skip"
-    least_held: Annotated[Count, Field(description="with fewer, the step has failed")] = 1
+    least_held: Annotated[Count, Field(description="the step fails if fewer stars were held")] = 1
     timeout_s: TimeoutS = 120.0
 
 
@@ -161,7 +163,7 @@ class Moving(Step):
         Positive, Field(description="a step that goes farther than this is refused")
     ] = 5.0
     max_offset_sky_arcsec: Annotated[
-        Positive | None, Field(description="the same on the sky, where it is given")
+        Positive | None, Field(description="the same limit on the sky")
     ] = None
 
 
@@ -174,7 +176,7 @@ class Visiting(Moving):
 
 
 class Target(Visiting):
-    """A step of the commanded position (Fig. 11); the star stays there."""
+    """Move the target in one step (Fig. 11); the star stays there."""
 
     step: Literal["target"] = "target"
     offset_az_px: OffsetPx
@@ -182,14 +184,14 @@ class Target(Visiting):
 
 
 class Jog(Visiting):
-    """Both axes to one side, to the other and back (Fig. 12)."""
+    """Move the target on both axes to one side, to the other side, and back (Fig. 12)."""
 
     step: Literal["jog"] = "jog"
-    jog_px: Annotated[Positive, Field(description="each axis, to either side")] = 1.0
+    jog_px: Annotated[Positive, Field(description="on each axis, to either side")] = 1.0
 
 
 class Raster(Visiting):
-    """Places on a grid about the target, row by row, to and fro; then back to the target."""
+    """Move the target through the places of a grid, row by row, to and fro, and back."""
 
     step: Literal["raster"] = "raster"
     columns: Annotated[Count, Field(le=21, description="in azimuth")] = 3
@@ -200,15 +202,15 @@ class Raster(Visiting):
 
 
 class Controller(Step):
-    """Work with another design from now on."""
+    """Switch to another design."""
 
     step: Literal["controller"] = "controller"
-    name: Annotated[ControllerName, Field(description="as `fitctl send controller` takes it")]
+    name: Annotated[ControllerName, Field(description="as in `fitctl send controller`")]
     timeout_s: TimeoutS = 60.0
 
 
 class Experiment(Moving):
-    """The motions of an identification, open loop; its log is for `fitctl identify WHAT --log`."""
+    """Make the motions of an identification, open loop; the log is for `fitctl identify WHAT --log`."""
 
     step: Literal["experiment"] = "experiment"
     what: Annotated[
@@ -218,7 +220,7 @@ class Experiment(Moving):
 
 
 class Chirp(Moving):
-    """A sine of rising or falling frequency on one axis of one stage, open loop."""
+    """Move one axis of one stage in a sine of rising or falling frequency, open loop."""
 
     step: Literal["chirp"] = "chirp"
     channel: Annotated[
@@ -242,7 +244,7 @@ class PlateScale(Moving):
         Field(le=0.5, description="largest standard deviation of a scale that is accepted"),
     ] = 0.02
     max_residual_px: Annotated[
-        Positive, Field(description="largest RMS that the fit may leave unexplained")
+        Positive, Field(description="largest accepted RMS of the rest of the fit")
     ] = 0.5
     max_rotation_deg: Annotated[
         Positive,
@@ -253,35 +255,39 @@ class PlateScale(Moving):
 
 
 class Dark(Step):
-    """The camera's bias and noise, from frames without a star: close the shutter before."""
+    """Measure bias and noise of the camera from frames without a star: close the shutter first."""
 
     step: Literal["dark"] = "dark"
-    frames: Annotated[int, Field(ge=10, le=2000, description="how many are taken")] = 100
+    frames: Annotated[int, Field(ge=10, le=2000, description="number of frames")] = 100
     max_bright_pixels: Annotated[
-        int, Field(ge=0, description="with more pixels 5 times the noise above the bias, it fails")
+        int,
+        Field(
+            ge=0,
+            description="the step fails with more pixels that are 5 times the noise above the bias",
+        ),
     ] = 5
 
 
 class Wait(Step):
-    """Nothing, for a time."""
+    """Wait for a time."""
 
     step: Literal["wait"] = "wait"
     duration_s: Annotated[DurationS, Field(description="how long")]
 
 
 class Collector(Step):
-    """Reference the hexapod, begin a motion of the collector, or end it.
+    """Reference the hexapod, or start or stop a motion of the collector.
 
-    A motion goes on during the steps that follow. The sequence stops it where it ends, however it ends.
+    A motion continues during the next steps. The sequence stops it at its end, also after a failure.
     """
 
     step: Literal["collector"] = "collector"
     action: Annotated[
-        Literal["reference", "start", "stop"], Field(description="as `fitctl send collector`")
+        Literal["reference", "start", "stop"], Field(description="as in `fitctl send collector`")
     ]
     kind: Annotated[
         Motion | None,
-        Field(description="of the motion; what is not given of it is the rig file's"),
+        Field(description="kind of the motion; the rig file provides the values that you omit"),
     ] = None
     direction_deg: Annotated[
         Finite | None, Field(description="from the link's azimuth towards elevation")
@@ -303,18 +309,18 @@ class Collector(Step):
 
 
 class Visibility(Step):
-    """The tilt between the two stars of `[fringes]`, and the visibility that it leaves, for a time."""
+    """Measure the tilt between the two stars of `[fringes]`, and the resulting visibility, for a time."""
 
     step: Literal["visibility"] = "visibility"
-    duration_s: Annotated[DurationS, Field(description="for how long it is measured")]
+    duration_s: Annotated[DurationS, Field(description="duration of the measurement")]
     settle_s: SettleS = 10.0
     least_visibility: Annotated[
-        Positive | None, Field(le=1, description="with a smaller mean, the step has failed")
+        Positive | None, Field(le=1, description="the step fails if the mean is smaller")
     ] = None
 
 
 class CollectorScan(Step):
-    """Move the collector to and fro along both axes of the link; its log is for `fitctl identify feedforward`.
+    """Move the collector to and fro along both axes of the link; the log is for `fitctl identify feedforward`.
 
     The loop holds its star over the link meanwhile. The collector ends where it began.
     """
@@ -341,7 +347,7 @@ class BeamScan(Step):
 
 
 class Ambient(Step):
-    """Sample the photodiodes without the beam, for `fitctl identify ambient`: block the laser before."""
+    """Sample the photodiodes without the beam, for `fitctl identify ambient`: block the laser first."""
 
     step: Literal["ambient"] = "ambient"
     duration_s: Annotated[DurationS, Field(le=600, description="for how long")] = 20.0
@@ -363,7 +369,7 @@ class Overlap(Moving):
     ] = 7.0
     dwell_s: Annotated[DurationS, Field(description="at each of five places")] = 20.0
     steady_after_s: Annotated[
-        NonNegative, Field(description="of a dwell: from then on its frames count")
+        NonNegative, Field(description="time within a dwell before its frames are used")
     ] = 5.0
     max_error_px: Annotated[
         Positive, Field(description="largest standard deviation of an offset that is accepted")
@@ -371,7 +377,7 @@ class Overlap(Moving):
 
 
 class Off(Step):
-    """Hold, mirror to its bias, amplifiers disabled, devices let go: OFF; without a loop, all."""
+    """Move the mirror to its bias, disable amplifiers, close devices: OFF. Without a loop, all loops."""
 
     step: Literal["off"] = "off"
 

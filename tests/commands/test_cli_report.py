@@ -138,7 +138,7 @@ def test_a_browser_that_is_there_prints_the_page(tmp_path):
         (["report", "LOG", "--rig", "missing.toml"], "missing.toml"),
         (["report", "LOG", "--out", "file/below"], "cannot be written"),
         (["report", "file"], "is not an MCAP log"),
-        (["report"], "Missing argument"),
+        (["report"], "expected a LOG"),
         (["plot", "LOG", "colour"], "has no colour"),
         (["plot", "LOG", "/fit/right/tick"], "too many to look at"),
         (["plot", "LOG", "star_flux_dn", "--from", "noon"], "--from noon: expected seconds"),
