@@ -151,7 +151,7 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
         action=random.choice(("reference", "start", "start", "stop"))
     ),
     "bias-offset": lambda random: SetBiasOffset(
-        az_urad=random.uniform(-400, 400), el_urad=random.uniform(-400, 400)
+        az_urad=random.uniform(-100, 100), el_urad=random.uniform(-100, 100)
     ),
 }
 """By their words; without a command, the one that leads on."""

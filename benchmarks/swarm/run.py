@@ -377,8 +377,8 @@ def _recover(instrument: Instrument) -> None:
         modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
         instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)
     now_s = time.now_s()
-    for loop in instrument.supervisor.loops.values():
-        for outcome in instrument.supervisor.outcomes.add_to(loop.state(now_s)).outcomes:
+    for each in instrument.supervisor.loops.values():
+        for outcome in instrument.supervisor.outcomes.add_to(each.state(now_s)).outcomes:
             longest_s = next(row.wait_s for row in COMMANDS if row.word == outcome.command)
             if outcome.state == "under way" and now_s - outcome.began_s > longest_s:
                 instrument.invariants.violated(

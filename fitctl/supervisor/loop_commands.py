@@ -33,7 +33,11 @@ StellarLoops = Sequence[StellarLoop]
 
 
 def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
-    """Hold the star elsewhere; empty, or why not."""
+    """Hold one loop's star elsewhere; empty, or why not."""
+    if (
+        len(loops) != 1
+    ):  # two stars on one place are lost, and searched for and lost again and again
+        return f"one loop has a target; name it: {', '.join(loop.name for loop in loops)}"
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"target {rig.camera.window_range_text}"
     for loop in loops:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Hold, Standby
+from fitctl.messages.commands import Acquire, Hold, SetTarget, Standby
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -164,3 +164,16 @@ def test_a_star_that_shows_only_on_the_other_half_of_the_frame_does_not_disturb_
 
     monkeypatch.undo()
     held.assert_both_held()
+
+
+def test_a_target_is_of_one_loop_so_that_two_stars_are_not_sent_to_one_place():
+    simulation = TwoStars()
+    targets_px = {name: simulation.loop(name).target_px.tolist() for name in TARGET_PX}
+
+    refused = simulation.command(SetTarget(az_px=20.0, el_px=20.0))
+    assert not refused.accepted
+    assert refused.text == "one loop has a target; name it: right, left"
+    assert targets_px == {name: simulation.loop(name).target_px.tolist() for name in TARGET_PX}
+
+    assert simulation.command(SetTarget(loop=LEFT, az_px=12.0, el_px=22.0)).accepted
+    assert simulation.loop(RIGHT).target_px.tolist() == targets_px[RIGHT]
