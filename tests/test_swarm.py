@@ -1,5 +1,6 @@
 """The supervisor under everything at once, on virtual time: a few fixed seeds of `make swarm`."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import sys
 import msgspec
 import pytest
 
+from benchmarks.swarm.__main__ import met
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike, plan_of
 from benchmarks.swarm.run import run_plan
@@ -174,3 +176,59 @@ def test_a_stop_is_obeyed_while_a_device_does_not_answer():
 
     assert result.violations == []
     assert result.modes["SAFE"] >= 1
+
+
+def test_the_command_prints_one_object_and_ends_well_where_nothing_is_violated():
+    ran = subprocess.run(
+        [sys.executable, "-m", "benchmarks.swarm", "--hours", "0.01", "--seed", "1", "--jobs", "1"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = json.loads(ran.stdout)
+
+    assert ran.stderr.startswith("seed 1\n")
+    assert found["violations"] == []
+    assert found["simulated_hours"] >= 0.01
+    assert sum(found["happenings"].values()) > 0
+    assert found["kinds_that_met_within_1_s"] == len(found["pairs_that_met_within_1_s"])
+
+
+def test_happenings_within_a_second_have_met():
+    orders = [
+        Order(at_s=at_s, who="ada", command=command)
+        for at_s, command in ((1.0, Stop()), (1.9, Hold()), (2.5, Recover()))
+    ]
+    plan = msgspec.structs.replace(OVERTAKEN, happenings=orders)
+
+    assert list(met(plan)) == [("Hold", "Stop"), ("Hold", "Recover")]
+
+
+def test_a_machine_that_stands_still_holds_every_thread_and_no_device(time):
+    seen = []
+
+    def thread():
+        time.sleep_until(1.0)
+        seen.append(("thread", time.now_s()))
+
+    time.spawn(thread, "waits")
+    time.call_at(0.5, lambda: time.stall(2.0))
+    time.call_at(1.5, lambda: seen.append(("device", time.now_s())))
+    time.run_until(5.0)
+
+    assert seen == [("device", 1.5), ("thread", 2.5)]
+
+
+def test_the_threads_of_a_process_that_is_killed_never_go_on(time):
+    seen = []
+
+    def thread():
+        time.sleep_until(1.0)
+        seen.append("thread")
+
+    time.new_process()
+    time.spawn(thread, "waits")
+    time.call_at(0.5, time.kill_process)
+    time.run_until(2.0)
+
+    assert seen == []

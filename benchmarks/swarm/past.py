@@ -16,7 +16,6 @@ from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.modes import Mode, Trigger
-from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.device_jobs import DeviceJobs
@@ -149,7 +148,7 @@ DEFECTS = {
         [(PiezoWatch, "ask", _ask_while_dac_ready)],
     ),
     "late-stop": Defect(
-        "bf6a8c0",
+        "like 6448f81",
         "a stop waits for the next tick, behind whatever that waits for",
         [(Supervisor, "post", _post_waits)],
     ),
@@ -159,7 +158,7 @@ DEFECTS = {
         [(DeviceJobs, "abandon", lambda _self, _names: None)],
     ),
     "one-slot": Defect(
-        "a4b080e",
+        "a0d343e",
         "the last failure has one slot: two that alternate are reported at every tick",
         [(Loop, "fail", _one_slot)],
     ),
@@ -201,21 +200,6 @@ DEFECTS = {
             (SiderostatServo, "_fail", _fail_and_go_on),
             (Loop, "_enter", _safe_and_go_on),
         ],
-    ),
-    "silent-camera": Defect(
-        "60f97e4",
-        "recover does not open a camera anew that is open and silent",
-        [(CameraWatch, "well", property(lambda self: self.ready))],
-    ),
-    "late-answer": Defect(
-        "4a793ee",
-        "an answer of the piezo amplifier from before it was opened anew is evaluated",
-        [(PiezoWatch, "forget", lambda self: setattr(self, "is_open", False))],
-    ),
-    "written-on": Defect(
-        "bf6a8c0",
-        "a D/A that did not confirm is written on",
-        [(MirrorStage, "ready", property(lambda _self: True, lambda _self, _value: None))],
     ),
 }
 """By name."""
