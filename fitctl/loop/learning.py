@@ -60,13 +60,13 @@ class Learning:
     def accept(self, report: LearnerReport) -> str:
         """Keep a report; an event's text where there is news for an operator, else empty."""
         self.report = report
-        gained = self._gained if report.worth_it else 0.0
+        gained = _gained(report) if report.worth_it else 0.0
         if abs(gained - self._told) < _NEWS or (self.setting == "on" and not self._by_hand):
             return ""
         self._told = gained
         if not gained:
             return "the design in force leaves as little as a learnt one would"
-        return f"{self._what_is_gained()}; to apply it: {self.command}"
+        return f"{self.what_is_gained(report)}; to apply it: {self.command}"
 
     def wants_change(self, now_s: float) -> bool:
         """Whether the design that was learnt last is to be made and used, without being asked."""
@@ -89,36 +89,22 @@ class Learning:
         """What an operator types to use the learnt design."""
         return f"fitctl send controller learnt --loop {self._loop_name}"
 
-    def _what_is_gained(self) -> str:
-        report = self.report
-        if report is None:
-            return ""
+    def what_is_gained(self, report: LearnerReport) -> str:
+        """By a report's design; the reason for a change, for event and log."""
         return (
             f"a design learnt from {report.evaluated_s:.0f} s of frames would leave {report.learnt_px:.4f} px "
-            f"instead of {report.present_px:.4f} ({self._gained:.0%} less; bound {report.bound_px:.4f})"
+            f"instead of {report.present_px:.4f} ({_gained(report):.0%} less; bound {report.bound_px:.4f})"
         )
-
-    @property
-    def _gained(self) -> float:
-        report = self.report
-        return 0.0 if report is None else 1.0 - report.learnt_px / report.present_px
 
     # ------------------------------------------------------------ changes
 
-    def why_change(self) -> str:
-        """The reason for a change of design, for event and log."""
-        return self._what_is_gained()
-
-    def changed(self, before: Design, now: Design, *, by_itself: bool) -> None:
-        """Another design is at work."""
+    def changed(self, before: Design, report: LearnerReport | None, *, by_itself: bool) -> None:
+        """Another design is at work: a learnt one with its report, or another without."""
         self._told = 0.0
-        if not now.learnt:
+        if report is None:
             if not by_itself:
                 self._by_hand, self._fell_back = True, ""
             self.in_force = self.before = None
-            return
-        report = self.report
-        if report is None:  # no design is learnt without one
             return
         self._by_hand, self._fell_back = False, ""
         self.in_force = report
@@ -212,3 +198,24 @@ class Learning:
             text=text,
             report=report,
         )
+
+
+def _gained(report: LearnerReport) -> float:
+    """The part of the residual that a report's design would take away."""
+    return 1.0 - report.learnt_px / report.present_px
+
+
+def refused_report(report: LearnerReport) -> str:
+    """Why a report's figures cannot be; empty if they can."""
+    figures_px = (
+        report.present_px,
+        report.learnt_px,
+        report.bound_px,
+        report.learnt_camera_px,
+        report.measured_px,
+    )
+    if not all(math.isfinite(px) and px >= 0 for px in figures_px):
+        return f"a learner's report needs finite residuals, got {figures_px}"
+    if report.worth_it and not (report.design_json and 0 < report.learnt_px < report.present_px):
+        return "a design that is worth a change leaves less than the present one; this report's does not"
+    return ""

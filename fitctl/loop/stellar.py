@@ -32,7 +32,7 @@ from fitctl.loop.search import StarSearch
 from fitctl.loop.sky import Sky
 from fitctl.loop.star_finder import StarFinder
 from fitctl.loop.tick_record import TickRecords, TickTimes
-from fitctl.messages.commands import Acquire
+from fitctl.messages.commands import Acquire, LearnerReport
 from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger
 from fitctl.messages.telemetry import LoopLimits, LoopState, SpotPlace
 from fitctl.model.drives import Drive
@@ -489,9 +489,19 @@ class StellarLoop(Loop):
         """The design at work in VERNIER."""
         return self.pointing.design.title
 
-    def use(self, design: Design, reason: str = "", *, by_itself: bool = False) -> None:
-        """Work with another design from the next tick on; in VERNIER the mirror goes on where it is."""
-        self.learning.changed(self.pointing.design, design, by_itself=by_itself)
+    def use(
+        self,
+        design: Design,
+        reason: str = "",
+        *,
+        report: LearnerReport | None = None,
+        by_itself: bool = False,
+    ) -> None:
+        """Work with another design from the next tick on; in VERNIER the mirror goes on where it is.
+
+        A learnt design comes with its report; `by_itself` is without an operator's command.
+        """
+        self.learning.changed(self.pointing.design, report, by_itself=by_itself)
         now_s, before, motor_rad = self._clock.now_s(), self.controller, self.servo.position_rad
         link_rad = self._read_link(now_s)
         self.pointing.use(design)

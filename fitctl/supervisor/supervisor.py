@@ -26,6 +26,7 @@ from fitctl.logging.records import (
     QuantityReading,
     Severity,
 )
+from fitctl.loop.learning import refused_report
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop, metrology_loop
 from fitctl.loop.overlap import OverlapMeter
@@ -419,19 +420,22 @@ class Supervisor:
         names = [name for name in names if name in self.stellar_loops]
         if not names:
             return _refusal(f"loop {command.loop} holds a metrology beam and has no design")
-        chosen: dict[str, str] = dict.fromkeys(names, command.name)
+        learnt: dict[str, LearnerReport] = {}
         if command.name == LEARNT:
             for name in names:
                 report = self.stellar_loops[name].learning.report
                 if report is None or not report.design_json:
                     return _refusal(_nothing_learnt(name, report))
-                chosen[name] = report.design_json
+                learnt[name] = report
         number = self.outcomes.begin(command, names)
         for name in names:
             # A design takes longer than a tick.
-            future = self._design_executor.submit(self._design, self.rig, name, chosen[name])
+            report = learnt.get(name)
+            chosen = command.name if report is None else report.design_json
+            future = self._design_executor.submit(self._design, self.rig, name, chosen)
             ended = partial(self.outcomes.end, number, [name])
-            self._designs.append(Job(future, partial(self._designed, name, command.name, ended)))
+            done = partial(self._designed, name, command.name, report, ended)
+            self._designs.append(Job(future, done))
         self._finish_jobs()
         return Reply(
             accepted=True,
@@ -443,6 +447,9 @@ class Supervisor:
         loop = self.stellar_loops.get(report.loop)
         if loop is None:
             return _refusal(f"a report on learning is on one stellar loop, not {', '.join(names)}")
+        why_not = refused_report(report)
+        if why_not:
+            return _refusal(why_not)
         news = loop.learning.accept(report)
         if news:
             self._journal.event("info", loop.name, news)
@@ -450,22 +457,30 @@ class Supervisor:
             future = self._design_executor.submit(
                 self._design, self.rig, loop.name, report.design_json
             )
-            self._designs.append(Job(future, partial(self._designed_by_itself, loop)))
+            self._designs.append(Job(future, partial(self._designed_by_itself, loop, report)))
             self._finish_jobs()
         return Reply(accepted=True)
 
-    def _designed_by_itself(self, loop: StellarLoop, future: Future) -> None:
+    def _designed_by_itself(self, loop: StellarLoop, report: LearnerReport, future: Future) -> None:
         """Use a learnt design, if the loop is still calm; the learner's next report comes soon."""
         error = future.exception()
         if error is not None:
             self._journal.event("warning", loop.name, f"no learnt design: {error_text(error)}")
         elif loop.learning.wants_change(self._clock.now_s()):
-            loop.use(future.result(), loop.learning.why_change(), by_itself=True)
+            reason = loop.learning.what_is_gained(report)
+            loop.use(future.result(), reason, report=report, by_itself=True)
 
-    def _designed(self, name: str, controller: str, ended: Ended, future: Future) -> None:
+    def _designed(
+        self,
+        name: str,
+        controller: str,
+        report: LearnerReport | None,
+        ended: Ended,
+        future: Future,
+    ) -> None:
         error = future.exception()
         if error is None:
-            self.stellar_loops[name].use(future.result())
+            self.stellar_loops[name].use(future.result(), report=report)
             ended(f"controller {controller} is at work", failed=False)
         else:
             why = error_text(error)

@@ -103,6 +103,23 @@ def test_parameters_without_margins_are_refused():
     assert "controller learnt: its margins are not those" in night.events()[-1]
 
 
+@pytest.mark.parametrize(
+    "figures",
+    [
+        {"present_px": 0.0},
+        {"present_px": math.nan},
+        {"learnt_camera_px": math.inf},
+        {"learnt_px": 0.2},
+    ],
+)
+def test_a_report_that_cannot_be_is_refused_and_changes_nothing(shaken, figures):
+    reply = shaken.report(**figures)
+
+    assert not reply.accepted
+    assert "report" in reply.text
+    assert not shaken.changes()
+
+
 # ---------------------------------------------------------------- the change
 
 
