@@ -187,10 +187,10 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     print(
-        "| night | fixed px | learning px | bound px | learning over bound | over fixed, worst seed | goal "
-        "| changes, of them back |"
+        "| night | seeds | fixed px | learning px | bound px | learning over bound | over fixed, worst seed "
+        "| goal | changes, of them back |"
     )
-    print("| --- " * 8 + "|")
+    print("| --- " * 9 + "|")
     with ProcessPoolExecutor(arguments.processes) as pool:
         for night in NIGHTS:
             if arguments.nights not in night.name:
@@ -201,7 +201,8 @@ def main() -> None:
             least_px = bound_px(night)
             beside = f"{least_px:.4f} | {learnt_px / least_px:.3f}" if night.bounded else "- | -"
             print(
-                f"| {night.name} | {fixed_px:.4f} | {learnt_px:.4f} | {beside} | {worst:.3f} | {night.goal} "
+                f"| {night.name} | {len(found)} | {fixed_px:.4f} | {learnt_px:.4f} | {beside} "
+                f"| {worst:.3f} | {night.goal} "
                 f"| {sum(one.changes for one in found)}, {sum(one.ways_back for one in found)} |",
                 flush=True,
             )
