@@ -60,10 +60,12 @@ def digest(seed, hash_seed):
     ).stdout
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_records_in_any_process():
     assert digest(7, "1") == digest(7, "2") != digest(8, "1")
 
 
+@pytest.mark.long
 def test_a_defect_of_the_past_that_is_put_back_is_found():
     with put_back("stop-while-opening"):
         violation = run_plan(OVERTAKEN).violations[0]
@@ -71,6 +73,7 @@ def test_a_defect_of_the_past_that_is_put_back_is_found():
     assert run_plan(OVERTAKEN).violations == []
 
 
+@pytest.mark.long
 def test_a_plan_is_shrunk_to_what_violates():
     idle = [Order(at_s=0.01 * number, who="ada", command=Hold()) for number in range(6, 9)]
     plan = msgspec.structs.replace(OVERTAKEN, happenings=[*idle, *OVERTAKEN.happenings])
@@ -178,6 +181,7 @@ def test_a_stop_is_obeyed_while_a_device_does_not_answer():
     assert result.modes["SAFE"] >= 1
 
 
+@pytest.mark.long
 def test_the_command_prints_one_object_and_ends_well_where_nothing_is_violated():
     ran = subprocess.run(
         [sys.executable, "-m", "benchmarks.swarm", "--hours", "0.01", "--seed", "1", "--jobs", "1"],
