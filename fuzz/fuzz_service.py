@@ -77,6 +77,15 @@ _VALUES = {
     "frequency_hz": 0.05,
     "rms_mm_s": 0.2,
     "correlation_s": 5.0,
+    "design_json": "{}",
+    "text": "air 0.45 px, 6 Hz line 0.05 px",
+    "evaluated_s": 60.0,
+    "present_px": 0.02,
+    "learnt_px": 0.015,
+    "bound_px": 0.014,
+    "learnt_camera_px": 0.018,
+    "measured_px": 0.022,
+    "worth_it": True,
 }
 _RECORDER = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_written=9)
 # Where a field of one command means something else.

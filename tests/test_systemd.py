@@ -69,8 +69,10 @@ def test_its_sockets_are_for_their_owner_in_the_folder_that_systemd_makes():
 
 def test_every_line_that_the_document_explains_is_in_the_unit():
     page = (ROOT / "docs" / "running-as-a-service.md").read_text()
-    explained = page.split("### What the unit says, and why")[1]
-    lines = re.findall(r"`([A-Z]\w+=[^`…]*)…?`", explained.split("Change one for your site")[0])
+    explained = page.split("### What the unit sets, and why")[1]
+    lines = re.findall(
+        r"`([A-Z]\w+=[^`…]*)…?`", explained.split("To change a setting for your site")[0]
+    )
     text = UNIT.read_text()
 
     assert len(lines) > 8

@@ -8,7 +8,7 @@ import select
 import pytest
 
 from fitctl import config
-from fitctl.commands.set_up.doctor import PROBES
+from fitctl.commissioning.asking import PROBES
 from fitctl.drivers.interface import DeviceError, DeviceUnreachable
 
 RIGS = config.default_rig_path().parent
