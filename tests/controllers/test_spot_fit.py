@@ -129,7 +129,7 @@ def test_light_that_is_everywhere_does_not_pull_the_spot():
 def test_two_steps_are_enough_from_nearly_half_a_pixel_away(az, el, az_off, el_off, flux_dn):
     found = FIT.place(light(az, el, flux_dn=flux_dn), az + az_off, el + el_off)
     assert (found.az_px, found.el_px) == pytest.approx((az, el), abs=5e-4)
-    # Weights are those of the nearest node: over 400 000 places the worst was 0.56 %, 0.2 % of them above 0.4 %.
+    # Weights are those of the nearest node: of 400 000 places the worst was 0.56 %, 0.2 % above 0.4 %.
     assert found.flux_dn == pytest.approx(flux_dn, rel=6e-3)
 
 
