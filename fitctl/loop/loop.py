@@ -221,7 +221,7 @@ class Loop(ABC):
         self._enter(source, motor_rad)
         motor_az_rad, motor_el_rad = motor_rad.tolist()
         link_az_rad, link_el_rad = link_rad
-        self.last_change = ModeChange(
+        change = ModeChange(
             time_s=now_s,
             loop=self.name,
             source=source.name,
@@ -234,7 +234,9 @@ class Loop(ABC):
             link_az_rad=link_az_rad,
             link_el_rad=link_el_rad,
         )
-        self._journal.record(self.last_change)
+        if source is not self.mode or self.last_change is None:
+            self.last_change = change  # a STOP of a loop that is SAFE leaves the fault as its reason
+        self._journal.record(change)
         self._report_event(
             _SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}"
         )

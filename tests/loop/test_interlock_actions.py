@@ -10,7 +10,7 @@ from served import until
 
 from fitctl.config import QUANTITIES
 from fitctl.daemon.machine import Machine, wall_minus_monotonic_s
-from fitctl.messages.commands import Experiment, Hold, Off, Recover, Reset, SetTarget, Standby
+from fitctl.messages.commands import Experiment, Hold, Off, Recover, Reset, SetTarget, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import Drive
 
@@ -54,6 +54,19 @@ def test_an_experiment_ends_when_its_stages_are_held(action):
 
     assert bench.until(lambda: bench.loop.mode is Mode.COARSE, 2.0)
     assert bench.loop.last_change.reason == bench.tripped["frame_age"].reason
+
+
+def test_a_stop_of_a_loop_that_is_safe_leaves_the_fault_as_its_reason():
+    bench = struck("frame_missing")
+    assert bench.until(lambda: bench.loop.mode is Mode.SAFE, 2.0)
+    change = bench.loop.last_change
+    assert change.trigger == "FAULT"
+
+    assert bench.simulation.command(Stop()).accepted
+    bench.run(0.1)
+
+    assert bench.loop.mode is Mode.SAFE
+    assert bench.loop.last_change is change
 
 
 def test_what_is_tripped_and_safe_stays_in_force_until_it_is_reset():

@@ -177,8 +177,12 @@ class LoggedRun:
         )
 
     def _changes_at(self, time_s: float) -> dict[str, ModeChange]:
-        """The newest change of each loop's mode until a time."""
-        return {change.loop: change for change in self._changes if change.time_s <= time_s}
+        """The change that led each loop into its mode at a time."""
+        return {
+            change.loop: change
+            for change in self._changes
+            if change.time_s <= time_s and change.source != change.target
+        }
 
     def _frame_at(self, time_s: float) -> FrameRecord | None:
         frame = None
