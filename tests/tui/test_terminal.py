@@ -13,11 +13,14 @@ from pathlib import Path
 import pytest
 
 CONSOLE = """
+import faulthandler
+import signal
 import sys
 from pathlib import Path
 from fitctl.messages.client import Client
 from fitctl.tui.app import ConsoleApp
 
+faulthandler.register(signal.SIGUSR1, file=open(sys.argv[2], "w"))
 ConsoleApp(Client(Path(sys.argv[1]))).run()
 """
 CONTINUED_WHILE_IT_WRITES = """
@@ -48,8 +51,9 @@ class OnTerminal:
         termios.tcsetwinsize(self.inside, (40, 140))
         self.modes_before = termios.tcgetattr(self.inside)
         self.shown = b""
+        self._stacks = folder.with_name("stacks")
         self.process = subprocess.Popen(
-            [sys.executable, "-c", program, str(folder)],
+            [sys.executable, "-c", program, str(folder), str(self._stacks)],
             stdin=self.inside,
             stdout=self.inside,
             stderr=self.inside,
@@ -74,10 +78,17 @@ class OnTerminal:
         self.process.send_signal(signal.SIGSTOP)
         os.waitpid(self.process.pid, os.WUNTRACED)
         self.process.send_signal(signal.SIGCONT)
-        until(
-            lambda: b"Operate" in self.shown[before:].partition(TO_ALTERNATE_SCREEN)[2],
-            "drawn anew",
-        )
+        try:
+            until(
+                lambda: b"Operate" in self.shown[before:].partition(TO_ALTERNATE_SCREEN)[2],
+                "drawn anew",
+            )
+        except AssertionError as error:
+            self.process.send_signal(signal.SIGUSR1)
+            time.sleep(1.0)
+            since = self.shown[before : before + 4000]
+            error.add_note(f"shown since: {since!r}\n{self._stacks.read_text()}")
+            raise
 
 
 def until(holds, what):
