@@ -126,6 +126,23 @@ def a_stall(simulation):
     assert simulation.ticks[-1].frames_skipped == 9
 
 
+def a_mirror_that_the_watchdog_moves(simulation):
+    """The machine stands still until the D/A acts by itself; the second time, it does not answer after that."""
+    simulation.command(Standby())
+    assert simulation.command(SetBiasOffset(az_urad=100.0, el_urad=0.0)).accepted
+    simulation.run(1.0)
+    dac = simulation.devices.loops["right"].dac
+    simulation.clock.sleep_until(simulation.clock.now_s() + 0.4)
+    dac._stack_v[:] = 5.0
+    simulation.run(0.5)
+    reads, dac.read_v = dac.read_v, failing(TIMEOUT)
+    simulation.clock.sleep_until(simulation.clock.now_s() + 0.4)
+    simulation.run(0.5)
+    dac.read_v = reads
+    simulation.command(Recover())
+    hold_a_star_from_standby(simulation)
+
+
 def an_off_that_waits_for_the_mirror(simulation):
     """A refused Off takes the mirror to its bias, and with it what the next search starts from."""
     simulation.command(Standby())
@@ -247,6 +264,7 @@ COURSES = {
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
     "a learnt design": (a_learnt_design, [*SHAKEN, "loops.right.learn=on"], {"IN_REACH"}),
     "a stall": (a_stall, [], {"IN_REACH"}),
+    "the D/A's own watchdog": (a_mirror_that_the_watchdog_moves, [SOON], {"FAULT", "IN_REACH"}),
     "a refused Off": (an_off_that_waits_for_the_mirror, [SOON], {"IN_REACH"}),
     "the D/A takes nothing": (_fails("dac", "send_v"), [], FAULT),
     "the D/A confirms nothing": (_fails("dac", "confirm"), [], FAULT),

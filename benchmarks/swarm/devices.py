@@ -269,7 +269,6 @@ class SwarmDac:
         self._watchdog_s, self._safe_v = settings.watchdog_s, settings.safe_v
         self._written_s = -math.inf
         self._watched = False
-        self._went_by_itself = False
         self._unconfirmed: tuple[Floats, float] | None = None
 
     def open(self) -> DeviceIdentity:
@@ -277,7 +276,6 @@ class SwarmDac:
         self._unconfirmed = None
         self.line.open()
         self.read_v()
-        self._went_by_itself = False
         return _identity("D/A")
 
     def send_v(self, volts: Floats) -> None:
@@ -285,10 +283,7 @@ class SwarmDac:
         self.confirm()
         if not self.line.connected or "unplugged" in self.line.faults:
             raise self.line.broken()
-        # Where it went by itself is no step of the supervisor's.
-        before_v = volts if self._went_by_itself else self._mirror.read_v()
-        self._written(self.name, volts, before_v)
-        self._went_by_itself = False
+        self._written(self.name, volts, self._mirror.read_v())
         self._unconfirmed = volts.copy(), self._time.now_s()
 
     def confirm(self) -> None:
@@ -312,7 +307,6 @@ class SwarmDac:
 
     def reset(self) -> None:
         """It restarts at its safe voltages."""
-        self._went_by_itself = True
         self._mirror.send_v(np.full(3, self._safe_v))
         self.line.connected = False
 
@@ -329,7 +323,6 @@ class SwarmDac:
             self._time.call_at(due_s, self._watch)
             return
         self._watched = False
-        self._went_by_itself = True
         self._mirror.send_v(np.full(3, self._safe_v))
 
 

@@ -211,6 +211,15 @@ class DevicesOpened(Record, frozen=True, kw_only=True):
     error: str
 
 
+class OutputsFound(Record, frozen=True, kw_only=True):
+    """The D/A was read after a pause, and its outputs were not those last sent; NaN if it did not answer."""
+
+    loop: str
+    stack1_v: float
+    stack2_v: float
+    stack3_v: float
+
+
 class DeviceFailure(Record, frozen=True, kw_only=True):
     """A device failed while it was used; told once, however long it lasts. The kind is the error's class."""
 
@@ -371,6 +380,7 @@ AnyRecord = (
     | FrameRecord
     | ModeChange
     | DevicesOpened
+    | OutputsFound
     | DeviceFailure
     | ControllerChange
     | QuantityReading

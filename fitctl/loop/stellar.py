@@ -6,6 +6,7 @@ diamond -> D/A write and siderostat set-point -> record.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -18,7 +19,7 @@ from fitctl.controllers.design.document import design_json
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
-from fitctl.logging.records import ControllerChange, Tick
+from fitctl.logging.records import ControllerChange, OutputsFound, Tick
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
 from fitctl.loop.learning import Learning
@@ -120,6 +121,8 @@ class StellarLoop(Loop):
         servo = self.servo.read_state()
         begun_s = self._clock.now_s()
         self._experiments.record_injections(self.mirror)
+        if self._writes_dac:
+            self._use_dac(self._find_mirror)
         star = None
         if frame is None:
             mirror_rad, motor_rad = self.mirror.now_rad, servo.position_rad
@@ -167,13 +170,40 @@ class StellarLoop(Loop):
 
     def send(self) -> None:
         """Send the D/A its voltages, at every tick, so that its watchdog sees that we live."""
-        if self.mirror.ready and self.mode not in {Mode.OFF, Mode.EXPERIMENT}:
+        if self._writes_dac:
             self._use_dac(self.mirror.send)
 
     def confirm(self) -> None:
         """Wait until the D/A confirms its voltages."""
         self._use_dac(self.mirror.confirm)
         self._done_s = self._clock.now_s()
+
+    @property
+    def _writes_dac(self) -> bool:
+        return self.mirror.ready and self.mode not in {Mode.OFF, Mode.EXPERIMENT}
+
+    def _find_mirror(self) -> None:
+        """After a pause without writes, go on from where the D/A's own watchdog has put the mirror."""
+        try:
+            found_v = self.mirror.find_after_pause()
+        except DeviceError:
+            self._record_found(np.full(3, math.nan))
+            raise
+        if found_v is not None:
+            self._record_found(found_v)
+            self._report_event(
+                "warning",
+                "the D/A's outputs are not those last written: its own watchdog has moved the mirror; "
+                "the loop goes on from there",
+            )
+
+    def _record_found(self, stack_v: Floats) -> None:
+        v1, v2, v3 = stack_v.tolist()
+        self._journal.record(
+            OutputsFound(
+                time_s=self._clock.now_s(), loop=self.name, stack1_v=v1, stack2_v=v2, stack3_v=v3
+            )
+        )
 
     def _use_dac(self, action: Callable[[], None]) -> None:
         try:

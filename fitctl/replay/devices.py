@@ -33,6 +33,7 @@ from fitctl.logging.records import (
     ExperimentStart,
     InjectionRecord,
     ModeChange,
+    OutputsFound,
 )
 from fitctl.replay.log import LoggedStep
 from fitctl.stages.injector import Injection, Injector
@@ -314,7 +315,10 @@ class LoggedMirror(MirrorStage):
         """What is known of it in a step."""
         self._tick = step.ticks.get(self._name)
         failed = failures(step, self._name)
-        self._logged_dac.load_tick(self._tick, failed.get("D/A"))
+        found = step.of(OutputsFound, self._name)
+        self._logged_dac.load_tick(
+            self._tick, failed.get("D/A"), _stacks(found[0]) if found else self._mirror.stack_v
+        )
         self._logged_injector.load_step(step, self._name)
         self.injector.fault = failed.get("injector", self.injector.fault)
 
@@ -339,17 +343,24 @@ class LoggedMirror(MirrorStage):
 
 
 class LoggedDac(NoDevice):
-    """Confirms voltages when the log says so, or fails as it says."""
+    """Confirms voltages when the log says so, has the outputs that were found then, or fails as it says."""
 
     def __init__(self, clock: LoggedClock) -> None:
         self._clock = clock
         self._written_s = math.nan
         self._error: DeviceError | None = None
+        self._outputs_v = np.full(3, math.nan)
 
-    def load_tick(self, tick: Any, error: DeviceError | None) -> None:
-        """How the next write ends."""
+    def load_tick(self, tick: Any, error: DeviceError | None, outputs_v: Floats) -> None:
+        """How the next write ends, and what the outputs are found to be; not a number where that failed."""
         self._written_s = math.nan if tick is None else tick.fsm_written_s
-        self._error = error
+        self._error, self._outputs_v = error, outputs_v
+
+    def read_v(self) -> Floats:
+        """As found then."""
+        if self._error is not None and np.isnan(self._outputs_v).any():
+            raise self._error
+        return self._outputs_v
 
     def confirm(self) -> None:
         """At the time of the log."""

@@ -29,6 +29,7 @@ from fitctl.logging.records import (
     LoopTiming,
     MetrologyTick,
     ModeChange,
+    OutputsFound,
     Overlap,
     PiezoReading,
     QuantityReading,
@@ -41,7 +42,14 @@ from fitctl.messages.modes import Mode
 _AT_THE_START_S = 10.0  # the first record of a run comes within this
 # What a step begins with; then come its ticks, each after what led to it; then the frame, and the rest.
 _BEGIN = {CommandRecord, ControllerChange, DevicesOpened, PiezoReading, QuantityReading}
-_BEFORE_TICK = {ControllerChange, DeviceFailure, ExperimentStart, InjectionRecord, ModeChange}
+_BEFORE_TICK = {
+    ControllerChange,
+    DeviceFailure,
+    ExperimentStart,
+    InjectionRecord,
+    ModeChange,
+    OutputsFound,
+}
 _AT_THE_END = {DeviceHealth, LoopTiming, Overlap, RecorderStatus}
 _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}

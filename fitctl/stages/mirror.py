@@ -17,6 +17,7 @@ from fitctl.stages.injector import Injection, Injector, stack_v_per_px
 
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3  # of mirror angles; frames are far younger when they are used
+_UNWRITTEN_S = 0.2  # after so long without a write, the D/A's own watchdog may have acted
 
 
 class MirrorStage:
@@ -78,6 +79,7 @@ class MirrorStage:
         self._mirror = Mirror(fsm)
         self._most_slew_v = fsm.slew_v_per_s * rig.camera.period_s
         self._begun_s = math.nan  # of a write that is not confirmed yet
+        self._known_s = -math.inf  # when the outputs were last written, or read
         self._lowest_v = self._highest_v = self.stack_v
         shortest_s = min(rig.camera.period_s, self.injector.period_s)
         self._history: deque[tuple[float, Floats]] = deque(
@@ -115,6 +117,7 @@ class MirrorStage:
         self.drain_commanded_range()
         self.written_s = self._clock.now_s()
         self._begun_s = math.nan
+        self._known_s = -math.inf  # the other devices were opened since
         self.ready = True
 
     def move_to(self, mirror_rad: Floats, *, hysteresis_inverse: bool) -> None:
@@ -165,6 +168,35 @@ class MirrorStage:
         self.sent_s, self._begun_s = self._clock.now_s(), begun_s
         self.ready = True
 
+    def find_after_pause(self) -> Floats | None:
+        """Read the D/A where it was not written to for long: its own watchdog may have moved the mirror.
+
+        The next steps then go on from where it is, and not from where it was.
+
+        Returns
+        -------
+        array, shape (3,), or None
+            The outputs, where they are not what was written.
+
+        Raises
+        ------
+        DeviceError
+            If it does not answer; then nothing more is sent until :meth:`start_from`.
+        """
+        now_s = self._clock.now_s()
+        if now_s - self._known_s <= _UNWRITTEN_S:
+            return None
+        self.ready = False
+        found_v = self._dac.read_v()
+        self.ready, self._known_s = True, now_s
+        if not np.abs(found_v - self._mirror.stack_v).max() > self._fsm.dac.step_v:
+            return None  # what is not a number, too
+        self._mirror.written(found_v)
+        self.stack_v, self.command_rad = self._mirror.stack_v, self._mirror.angles_rad
+        self._extend_commanded_range(found_v)
+        self._history.append((now_s, self.command_rad))
+        return found_v
+
     def confirm(self) -> None:
         """Wait until the D/A confirms what was sent; nothing to wait for is well.
 
@@ -179,7 +211,7 @@ class MirrorStage:
         self.ready = False
         self._dac.confirm()
         self.ready = True
-        self.written_s = self._clock.now_s()
+        self.written_s = self._known_s = self._clock.now_s()
         self.round_trip_s = self.written_s - begun_s
         self._extend_commanded_range(self.stack_v)
         self._mirror.written(self.stack_v)
@@ -203,5 +235,5 @@ class MirrorStage:
             self._extend_commanded_range(stack_v)
             self.stack_v, self.command_rad = stack_v, self._mirror.angles_rad
             self._history.append((time_s, self.command_rad))
-            self.written_s = time_s
+            self.written_s = self._known_s = time_s
         return injections
