@@ -7,6 +7,7 @@ from simulated import TWO_STARS, darken, failing, until
 
 from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_log
 from fitctl.drivers.interface import DeviceMismatch, DeviceTimeout
+from fitctl.logging.records import StarPlace
 from fitctl.messages.commands import (
     Acquire,
     Experiment,
@@ -143,6 +144,20 @@ def a_mirror_that_the_watchdog_moves(simulation):
     hold_a_star_from_standby(simulation)
 
 
+def a_star_of_a_killed_supervisor(simulation):
+    """The search begins where a supervisor before this one had its star."""
+    place = StarPlace(
+        time_s=0.0,
+        loop="right",
+        az_px=-20.0,
+        el_px=40.0,
+        siderostat_az_rad=0.0,
+        siderostat_el_rad=0.0,
+    )
+    simulation.supervisor.recall([place])
+    hold_a_star(simulation)
+
+
 def an_off_that_waits_for_the_mirror(simulation):
     """A refused Off takes the mirror to its bias, and with it what the next search starts from."""
     simulation.command(Standby())
@@ -265,6 +280,7 @@ COURSES = {
     "a learnt design": (a_learnt_design, [*SHAKEN, "loops.right.learn=on"], {"IN_REACH"}),
     "a stall": (a_stall, [], {"IN_REACH"}),
     "the D/A's own watchdog": (a_mirror_that_the_watchdog_moves, [SOON], {"FAULT", "IN_REACH"}),
+    "a star of a killed supervisor": (a_star_of_a_killed_supervisor, [], {"IN_REACH"}),
     "a refused Off": (an_off_that_waits_for_the_mirror, [SOON], {"IN_REACH"}),
     "the D/A takes nothing": (_fails("dac", "send_v"), [], FAULT),
     "the D/A confirms nothing": (_fails("dac", "confirm"), [], FAULT),

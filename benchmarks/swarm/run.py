@@ -29,7 +29,7 @@ from fitctl.config import Rig, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import Devices, LoopDevices
-from fitctl.logging.records import AnyRecord, ModeChange
+from fitctl.logging.records import AnyRecord, ModeChange, StarPlace
 from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import (
     Acquire,
@@ -56,6 +56,7 @@ _ANSWER_S = 5.0
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
 _MOST_DESIGN_S = 20.0
+_SAVED_S = 1.0  # so often a supervisor leaves where its stars are
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
     Mode.OFF: Standby,
@@ -125,6 +126,10 @@ class Instrument:
         self._encode = msgspec.msgpack.Encoder().encode
         self._unanswered: dict[int, tuple[float, str]] = {}
         self._posted = 0
+        self._places: list[StarPlace] = []
+        self.found_s: dict[
+            str, float
+        ] = {}  # by loop: its star was found, and is not to be forgotten
         self.amplifiers: dict[str, SwarmAmplifiers] = {}
         self.invariants = Invariants(rig, time, self.amplifiers)
         if not any(isinstance(one, Strike | Stall) for one in plan.happenings):
@@ -183,6 +188,7 @@ class Instrument:
             design_executor=VirtualExecutor(self.time, "design"),
             record_frames=False,
         )
+        self.supervisor.recall(self._places)
         self._designs_take_time = True
         self.admission = Admission(self.rig.service.lease_s)
         self.invariants.watch(self.supervisor)
@@ -196,6 +202,8 @@ class Instrument:
         """The supervisor's process is gone, and a new one comes."""
         if self.running:
             self.time.kill_process()
+            saved_s = self.time.now_s() - 2 * _SAVED_S
+            self.found_s = {name: at_s for name, at_s in self.found_s.items() if at_s < saved_s}
             self._end(back_after_s)
 
     def _end(self, back_after_s: float) -> None:
@@ -206,10 +214,12 @@ class Instrument:
 
     def _main(self) -> None:
         """As :func:`fitctl.daemon.run.run_supervisor` does it."""
-        supervisor, tick = self.supervisor, self.invariants.tick
+        supervisor, tick, saved_s = self.supervisor, self.invariants.tick, 0.0
         while not supervisor.shutdown_wanted:
             supervisor.step()
             tick()
+            if self.time.now_s() - saved_s > _SAVED_S:
+                saved_s, self._places = self.time.now_s(), supervisor.star_places
         supervisor.stop("shutting down")
         end_s = self.time.now_s() + _WIND_DOWN_S
         while self.time.now_s() < end_s and not supervisor.at_rest():
@@ -218,6 +228,8 @@ class Instrument:
         for thread in self._threads:
             thread.stop()
         self.time.kill_process()
+        self._places = []
+        self.found_s.clear()
         self._end(_START_S)
 
     def _design(self, _rig: Rig, name: str, controller: str) -> Design:
@@ -230,6 +242,8 @@ class Instrument:
         self.invariants.record(record)
         if isinstance(record, ModeChange):
             self.modes[record.target] = self.modes.get(record.target, 0) + 1
+            if record.target == Mode.COARSE.name and record.loop in self.rig.stellar_loops:
+                self.found_s.setdefault(record.loop, record.time_s)
         self._on_record(record)
 
     # ------------------------------------------------------------ operators
@@ -260,7 +274,7 @@ class Instrument:
         """Give the command that leads every loop on towards its star; `from_zero`, sought about there."""
         for name, loop in self.supervisor.loops.items() if self.running else ():
             make = _LEADS_ON.get(loop.mode)
-            if make is Acquire and from_zero:
+            if make is Acquire and from_zero and name not in self.found_s:
                 expected = Acquire(
                     loop=name, expected_az_sky_arcsec=0.0, expected_el_sky_arcsec=0.0
                 )
@@ -364,7 +378,7 @@ def _recover(instrument: Instrument) -> None:
         target_px = loop.target_px
         instrument.give("ada", SetTarget(loop=name, az_px=target_px.az, el_px=target_px.el))
     end_s = time.now_s() + HEAL_S
-    # A supervisor that was killed during a search does not know where that began; its operator does.
+    # Where a star or a beam was never found, jogs and searches lead away; its operator knows where it is.
     from_zero_s = time.now_s() + HEAL_S / 3
     while time.now_s() < end_s:
         time.run_until(time.now_s() + 1.0)

@@ -70,6 +70,11 @@ class StarEstimator:
         """The stages' zeros have changed: nothing is known of the star any more."""
         self._expected, self._before_px = False, None
 
+    @property
+    def origin_px(self) -> AzEl | None:
+        """Where the star falls with both stages at zero; None where nothing is known of it."""
+        return (self._before_px or self._origin_px) if self._expected else None
+
     def predict_px(self, stages_px: AzEl) -> AzEl:
         """Where the star falls with the stages as given."""
         return self._origin_px[0] + stages_px[0], self._origin_px[1] + stages_px[1]

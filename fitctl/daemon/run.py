@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -36,6 +36,7 @@ from fitctl.daemon.service_manager import (
     status_line,
     tell_service_manager,
 )
+from fitctl.daemon.star_places import StarPlaces
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.messages.endpoints import (
@@ -126,11 +127,11 @@ def run_supervisor(
         stack.enter_context(only_supervisor(folder))
         stack.enter_context(only_master(rig))
         check_keyed_door(rig)  # what the gateway will need
-        for name in _LEFT:
-            stack.callback((folder / name).unlink, missing_ok=True)
+        stack.callback(_remove_left, folder)
         clock = MonotonicClock()
-        queue = RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records)
-        stack.callback(queue.close)  # in case what follows fails
+        queue = stack.enter_context(  # closed where what follows fails
+            closing(RecordQueue(f"ipc://{folder / RECORDS_SOCKET}", rig.logging.queue_records))
+        )
         buffer = TelemetryBuffer()
 
         def record(record: AnyRecord) -> None:
@@ -148,10 +149,8 @@ def run_supervisor(
             design_executor=stack.enter_context(_designer()),
         )
         children = _children(
-            rig, rig_arguments(rig_file, settings), folder, supervisor.report_event
+            stack, rig, rig_arguments(rig_file, settings), folder, supervisor.report_event
         )
-        for child in children:
-            stack.callback(child.end)
         machine = Machine(
             log_folder,
             lambda: queue.waiting / rig.logging.queue_records,
@@ -178,8 +177,11 @@ def run_supervisor(
             rig, queue, folder, partial(write_running, folder, rig.name, rig_file, settings)
         )
 
+        places = stack.enter_context(_star_places(folder, supervisor))
+
         def housekeep() -> None:
             keep_bound()
+            places.write(supervisor.star_places)
             queue.pump()
             record(buffer.losses(state, clock.now_s()))
             collector.collect(pointing=supervisor.pointing)
@@ -204,6 +206,7 @@ def run_supervisor(
 
 
 def _children(
+    ends: ExitStack,
     rig: Rig,
     same_rig: Sequence[str],
     folder: Path,
@@ -228,11 +231,26 @@ def _children(
             PATIENCE_S,
         ),
     )
-    return [
+    children = [
         Child(name, [command, *same_rig], folder / f"{command}.err", again, note, patience_s)
         for wanted, name, command, again, patience_s in beside
         if wanted
     ]
+    for child in children:
+        ends.callback(child.end)
+    return children
+
+
+def _remove_left(folder: Path) -> None:
+    for name in _LEFT:
+        (folder / name).unlink(missing_ok=True)
+
+
+def _star_places(folder: Path, supervisor: Supervisor) -> StarPlaces:
+    """The file of the stars' places; the supervisor knows what is in it."""
+    places = StarPlaces(folder)
+    supervisor.recall(places.read())
+    return places
 
 
 def _modes(supervisor: Supervisor) -> str:

@@ -220,6 +220,16 @@ class OutputsFound(Record, frozen=True, kw_only=True):
     stack3_v: float
 
 
+class StarPlace(Record, frozen=True, kw_only=True):
+    """Where the star of a supervisor that was killed is: on the camera, with the loop's own stages at zero."""
+
+    loop: str
+    az_px: float
+    el_px: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+
+
 class DeviceFailure(Record, frozen=True, kw_only=True):
     """A device failed while it was used; told once, however long it lasts. The kind is the error's class."""
 
@@ -381,6 +391,7 @@ AnyRecord = (
     | ModeChange
     | DevicesOpened
     | OutputsFound
+    | StarPlace
     | DeviceFailure
     | ControllerChange
     | QuantityReading

@@ -44,6 +44,7 @@ from fitctl.logging.records import (
     RunInfo,
     SequenceAttempt,
     Snapshot,
+    StarPlace,
     Tick,
 )
 
@@ -56,6 +57,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     ControllerChange: "/fit/{loop}/controller",
     DevicesOpened: "/fit/{loop}/opened",
     OutputsFound: "/fit/{loop}/outputs_found",
+    StarPlace: "/fit/{loop}/star_place",
     DeviceFailure: "/fit/{loop}/failure",
     QuantityReading: "/fit/quantities",
     ExperimentStart: "/fit/{loop}/experiment",

@@ -295,6 +295,7 @@ class MetrologyLoop(Loop):
         super().begin(stack_v)
         self._photodiode_error = None
         self.zeros_lost += self.servo.encoders_jumped
+        self.servo.encoders_jumped = False
         self._sampled_s, self._ticked_s = self._clock.now_s(), math.nan
         self._ready = True
 

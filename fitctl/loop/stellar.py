@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ from fitctl.controllers.design.document import design_json
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
 from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
-from fitctl.logging.records import ControllerChange, OutputsFound, Tick
+from fitctl.logging.records import ControllerChange, OutputsFound, StarPlace, Tick
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
 from fitctl.loop.learning import Learning
@@ -103,6 +104,8 @@ class StellarLoop(Loop):
         self._flattened = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
         self._has_held = False  # since the devices were opened
+        self._recalled: StarPlace | None = None
+        self._is_recalled = False  # what the star finder expects, and no search has begun there yet
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
@@ -374,7 +377,9 @@ class StellarLoop(Loop):
         if self.link is not None and not self._has_held:
             # What the link's siderostat turned before, to find its beam, moved no star that was known.
             self.link.set_origin()
-            self.star_finder.estimator.forget()
+            if not self._is_recalled:
+                self.star_finder.estimator.forget()
+        self._is_recalled = False
         self.star_finder.estimator.expect(self.target_px, self._beam_rad(motor_rad), np.zeros(2))
         self.search.start_where_expected(again=again)
 
@@ -619,7 +624,9 @@ class StellarLoop(Loop):
         if stack_v is not None:
             self.mirror.start_from(stack_v)
         super().begin(stack_v)
-        if self.servo.encoders_jumped:
+        jumped, self.servo.encoders_jumped = self.servo.encoders_jumped, False
+        recalled, self._recalled = self._recalled, None
+        if jumped:
             self._has_held = False
             self.star_finder.estimator.forget()
             self._report_event(
@@ -632,6 +639,41 @@ class StellarLoop(Loop):
                 f"the siderostat turned on by {turned_arcsec:.0f} arcsec on the sky while its amplifiers did "
                 "not answer; the star's place is kept, and acquire goes back there",
             )
+        if recalled is not None and not jumped:
+            self._go_back_to(recalled)
+
+    @property
+    def star_place(self) -> StarPlace | None:
+        """Where its star is, for a supervisor after this one; None where nothing is known of it."""
+        estimator = self.star_finder.estimator
+        if estimator.origin_px is None:
+            return None
+        az_rad, el_rad = self.servo.position_rad.tolist()
+        link_rad = np.zeros(2) if self.link is None else self.link.turned_rad
+        link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))
+        return StarPlace(
+            time_s=self._clock.now_s(),
+            loop=self.name,
+            az_px=estimator.origin_px[0] + link_az_px,
+            el_px=estimator.origin_px[1] + link_el_px,
+            siderostat_az_rad=az_rad,
+            siderostat_el_rad=el_rad,
+        )
+
+    def recall(self, place: StarPlace) -> None:
+        """Once its devices are open, expect the star where a supervisor that was killed had it."""
+        self._recalled = place
+        self.servo.recall((place.siderostat_az_rad, place.siderostat_el_rad))
+
+    def _go_back_to(self, place: StarPlace) -> None:
+        # The first search counts from here what the link's siderostat turns.
+        self.star_finder.estimator.observe((place.az_px, place.el_px), (0.0, 0.0))
+        self._is_recalled = True
+        self._journal.record(msgspec.structs.replace(place, time_s=self._clock.now_s()))
+        self._report_event(
+            "info",
+            "the star's place is known from before the supervisor was killed; acquire goes back there",
+        )
 
     def release(self) -> None:
         """Send the D/A nothing more."""

@@ -317,7 +317,7 @@ class LoggedMirror(MirrorStage):
         failed = failures(step, self._name)
         found = step.of(OutputsFound, self._name)
         self._logged_dac.load_tick(
-            self._tick, failed.get("D/A"), _stacks(found[0]) if found else self._mirror.stack_v
+            self._tick, failed.get("D/A"), _stacks(found[0]) if found else None
         )
         self._logged_injector.load_step(step, self._name)
         self.injector.fault = failed.get("injector", self.injector.fault)
@@ -349,18 +349,20 @@ class LoggedDac(NoDevice):
         self._clock = clock
         self._written_s = math.nan
         self._error: DeviceError | None = None
-        self._outputs_v = np.full(3, math.nan)
+        self._found_v: Floats | None = None
 
-    def load_tick(self, tick: Any, error: DeviceError | None, outputs_v: Floats) -> None:
-        """How the next write ends, and what the outputs are found to be; not a number where that failed."""
+    def load_tick(self, tick: Any, error: DeviceError | None, found_v: Floats | None) -> None:
+        """How the next write ends, and what the outputs are found to be, if that was news."""
         self._written_s = math.nan if tick is None else tick.fsm_written_s
-        self._error, self._outputs_v = error, outputs_v
+        self._error, self._found_v = error, found_v
 
     def read_v(self) -> Floats:
-        """As found then."""
-        if self._error is not None and np.isnan(self._outputs_v).any():
+        """As found then; not a number where that was no news."""
+        if self._found_v is None:
+            return super().read_v()
+        if self._error is not None and np.isnan(self._found_v).any():
             raise self._error
-        return self._outputs_v
+        return self._found_v
 
     def confirm(self) -> None:
         """At the time of the log."""

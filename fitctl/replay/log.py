@@ -34,6 +34,7 @@ from fitctl.logging.records import (
     PiezoReading,
     QuantityReading,
     RecorderStatus,
+    StarPlace,
     Tick,
 )
 from fitctl.logging.schemas import TOPICS
@@ -49,6 +50,7 @@ _BEFORE_TICK = {
     InjectionRecord,
     ModeChange,
     OutputsFound,
+    StarPlace,
 }
 _AT_THE_END = {DeviceHealth, LoopTiming, Overlap, RecorderStatus}
 _TICKS = {Tick, MetrologyTick}

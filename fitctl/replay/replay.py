@@ -31,6 +31,7 @@ from fitctl.logging.records import (
     Overlap,
     PiezoReading,
     QuantityReading,
+    StarPlace,
     Tick,
 )
 from fitctl.loop.loop import Loop
@@ -150,8 +151,11 @@ class Replay:
             for failure in step.of(DeviceFailure, name):
                 if failure.device == "piezo":
                     supervisor.piezos[name].evaluate(_piezo_answer(failure))
-        for mirror in self._mirrors.values():
+        for name, mirror in self._mirrors.items():
             mirror.load_step(step)
+            for place in step.of(StarPlace, name):
+                given = {field: getattr(place, field) for field in StarPlace.__struct_fields__}
+                supervisor.stellar_loops[name].recall(StarPlace(**given))
         for photodiodes in self._photodiodes.values():
             photodiodes.load_step(step)
         for reading in step.of(PiezoReading):

@@ -36,6 +36,9 @@ _REQUEST_TIMEOUT_S = 15.0
 _STILL = (0.0, 0.0)
 FOLLOWING_S = 0.05
 _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
+_ON_ITS_OWN_S = (
+    3.0  # motors may have turned for so long after a supervisor last wrote where they were
+)
 _SPEED_MARGIN = 1.2  # of a motor that turns on, over its last velocity command
 
 
@@ -118,9 +121,11 @@ class SiderostatServo:
         self._missed_readings = 0
         self._drained = (0, 0)  # missed and skipped, as last asked
         self._followed_s = 0.0
-        self.encoders_jumped = False
+        self.encoders_jumped = False  # until the loop has concluded from it
         self.turned_on_rad = 0.0
         self._last_rad_s = _STILL
+        self._recalled_rad: AzEl | None = None
+        self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         self._disabling = False
         self._staged: tuple[float, AzEl] | None = None
         self.late_s: deque[float] = deque(maxlen=4096)
@@ -145,6 +150,10 @@ class SiderostatServo:
         self.setpoint_rad = setpoint_rad
         az_rad, el_rad = setpoint_rad.tolist()
         self._wanted_rad = (az_rad, el_rad)
+
+    def recall(self, position_rad: AzEl) -> None:
+        """Compare the encoders, once they are read, with where they were when another supervisor was killed."""
+        self._recalled_rad = position_rad
 
     def stop(self) -> None:
         """Velocity zero from the next period on, until :meth:`hold`."""
@@ -371,6 +380,7 @@ class SiderostatServo:
         same zero. Any other difference means that they count from elsewhere now.
         """
         knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
+        recalled_rad, self._recalled_rad = self._recalled_rad, None
         self._history.clear()
         deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
         while (reading := self._amplifiers.exchange(_STILL)) is None:
@@ -378,20 +388,22 @@ class SiderostatServo:
                 raise self._no_reading()
         self._accept_reading(reading, self._clock.now_s())
         self._servo.reset(reading.position_rad)
+        most_rad = [_SPEED_MARGIN * rad_s * (reading.time_s - last_s) for rad_s in self._last_rad_s]
+        least_rad = [0.0, 0.0]
+        if recalled_rad is not None:
+            knew, last_rad = True, recalled_rad
+            most_rad = [self._velocity_limit_rad_s * _ON_ITS_OWN_S] * 2
+            least_rad = [-rad for rad in most_rad]
         turned_rad = [now - last for now, last in zip(reading.position_rad, last_rad, strict=True)]
         far = knew and max(map(abs, turned_rad)) > _ENCODER_JUMP_RAD
         # After a loss of power they begin at zero, and no motor turns.
         at_zero = max(map(abs, reading.position_rad)) < _ENCODER_JUMP_RAD
         turned_on = not at_zero and all(
-            min(0.0, most_rad) - _ENCODER_JUMP_RAD <= rad <= max(0.0, most_rad) + _ENCODER_JUMP_RAD
-            for rad, most_rad in zip(
-                turned_rad,
-                [_SPEED_MARGIN * rad_s * (reading.time_s - last_s) for rad_s in self._last_rad_s],
-                strict=True,
-            )
+            min(least, most) - _ENCODER_JUMP_RAD <= rad <= max(least, most) + _ENCODER_JUMP_RAD
+            for rad, least, most in zip(turned_rad, least_rad, most_rad, strict=True)
         )
         self._last_rad_s = _STILL
-        self.encoders_jumped = far and not turned_on
+        self.encoders_jumped = self.encoders_jumped or (far and not turned_on)
         self.turned_on_rad = max(map(abs, turned_rad)) if far and turned_on else 0.0
 
     def _disable(self) -> None:

@@ -8,7 +8,7 @@ may take longer than a tick (opening, closing and polling devices) is handed to 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future
 from functools import partial
 from typing import NamedTuple
@@ -25,6 +25,7 @@ from fitctl.logging.records import (
     LoopTiming,
     QuantityReading,
     Severity,
+    StarPlace,
 )
 from fitctl.loop.learning import refused_report
 from fitctl.loop.loop import Loop
@@ -224,6 +225,19 @@ class Supervisor:
         grouped = [servo for group in self._servo_groups for servo in group.servos]
         each = [work for loop in self.loops.values() for work in loop.periodic]
         return [*self._servo_groups, *(work for work in each if work not in grouped), *drives]
+
+    @property
+    def star_places(self) -> list[StarPlace]:
+        """Where the stars are that the loops know of; for :meth:`recall` of a supervisor after this one."""
+        places = (loop.star_place for loop in self.stellar_loops.values())
+        return [place for place in places if place is not None]
+
+    def recall(self, places: Iterable[StarPlace]) -> None:
+        """Know where a supervisor that was killed had its stars; called before the first step."""
+        loops, now_s = self.stellar_loops, self._clock.now_s()
+        for place in places:
+            if place.loop in loops and place.time_s <= now_s:  # else the computer has restarted since
+                loops[place.loop].recall(place)
 
     # ------------------------------------------------------------ once a frame
 

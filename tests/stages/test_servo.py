@@ -278,6 +278,19 @@ def test_encoders_that_jumped_while_nobody_looked_are_noticed(servo, amplifiers)
     assert servo.encoders_jumped
 
 
+def test_encoders_that_jumped_are_noticed_though_opening_fails_after_that(servo, amplifiers):
+    run(servo, 5)
+    servo.close()
+    amplifiers.position_rad = (40.0, 0.0)
+    enable, amplifiers.enable = amplifiers.enable, lambda: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        servo.open()
+    amplifiers.enable = enable
+    servo.open()
+
+    assert servo.encoders_jumped
+
+
 @pytest.mark.parametrize(
     ("found_rad", "jumped"),
     [
