@@ -3,7 +3,7 @@
 For each night and seed, two simulations of the whole instrument on the virtual clock: with the rig's
 minimum-variance design throughout, and with `learn = "on"`. Both see the same air and the same lines. True
 residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them the bound of
-the night, which knows everything about it.
+the night, which knows everything about it. With `--random`, nights are drawn: see :func:`random_night`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as fitctl itself has it
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -169,6 +170,60 @@ def outcome(night: Night, seed: int) -> Outcome:
     return Outcome(fixed_px, learnt_px, changes, back)
 
 
+def random_night(number: int) -> Night:
+    """A night that no rig file has; the number says which.
+
+    Drawn are the sensor, air path, hysteresis, pixel noise, up to three lines from 1 to 60 Hz, of which some
+    drift, and in three of ten nights another air from some time on.
+    """
+    random = np.random.default_rng([18, number])
+
+    def between(low: float, high: float) -> float:
+        return float(np.exp(random.uniform(math.log(low), math.log(high))))
+
+    known = FIT if random.random() < 0.5 else ()
+    gain_px, b1_s2 = between(0.2, 0.9), between(0.1, 1.0)
+    width, noise_dn = random.uniform(0.05, 0.3), between(10.0, 60.0)
+    unknown = [
+        f"{AIR}.gain_px={gain_px:.4f}",
+        f"{AIR}.b1_s2={b1_s2:.4f}",
+        f"plant.loops.{LOOP}.hysteresis.loop_width_fraction={width:.4f}",
+    ]
+    changes = [f"{{at_s=0.5,pixel_noise_dn={noise_dn:.2f}}}"]
+    told = [f"{gain_px:.2f} px {b1_s2:.2f} s² {width:.0%} {noise_dn:.0f} DN"]
+    rows, own = [], []
+    drifts = False
+    for _ in range(random.integers(0, 4)):
+        hz, rms_px, damping = between(1.0, 60.0), between(0.005, 0.08), between(0.0005, 0.02)
+        drift = random.uniform(-0.05, 0.05) if random.random() < 0.2 else 0.0
+        drifts = drifts or drift != 0.0
+        rows.append(
+            f"{{frequency_hz={hz:.4f},rms_px={math.sqrt(2) * rms_px:.6f},direction_deg=45.0,"
+            f"damping={damping:.6f},drift_hz_per_min={drift:.4f}}}"
+        )
+        own.append(Line(hz, damping, rms_px))
+        told.append(f"{hz:.1f} Hz {rms_px:.3f} px")
+    unknown.append(f"plant.loops.{LOOP}.lines=[{','.join(rows)}]")
+    changing = random.random() < 0.3
+    at_s, later_px = random.uniform(60.0, 250.0), between(0.2, 0.9)
+    if changing:
+        told.append(f"{later_px:.2f} px from {at_s:.0f} s on")
+        changes.append(
+            f"{{at_s={at_s:.1f},loops={{{LOOP}={{air_path={{gain_px={later_px:.4f},b1_s2={b1_s2:.4f},"
+            f"b2_s=2.5}}}}}}}}"
+        )
+    unknown.append(f"plant.timeline=[{','.join(changes)}]")
+    return Night(
+        f"{number}: {'fit' if known else 'centroid'}; {'; '.join(told)}",
+        "2 % above fixed",
+        known,
+        tuple(unknown),
+        tuple(own),
+        (f"camera.pixel_noise_dn={noise_dn:.2f}",),
+        bounded=not (changing or drifts),
+    )
+
+
 def bound_px(night: Night) -> float:
     """Of one who knows the night."""
     rig = load_rig(default_rig_path(), [*night.known, *night.unknown, *night.for_bound])
@@ -179,33 +234,76 @@ def bound_px(night: Night) -> float:
     return bound(dataclasses.replace(own, air_path=true_air, lines=night.lines)).residual_px
 
 
-def main() -> None:
-    """Print a row of a Markdown table for each night."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--nights", default="", help="only those whose name holds this")
-    parser.add_argument("--processes", type=int, default=2)
-    arguments = parser.parse_args()
+def print_nights(nights: Sequence[Night], seeds: int, pool: ProcessPoolExecutor) -> None:
+    """A row of a Markdown table for each night."""
     print(
         "| night | seeds | fixed px | learning px | bound px | learning over bound | over fixed, worst seed "
         "| goal | changes, of them back |"
     )
     print("| --- " * 9 + "|")
+    for night in nights:
+        found = list(pool.map(partial(outcome, night), range(seeds)))
+        fixed_px, learnt_px = np.mean([one[:2] for one in found], axis=0)
+        worst = max(one.learnt_px / one.fixed_px for one in found)
+        least_px = bound_px(night)
+        beside = f"{least_px:.4f} | {learnt_px / least_px:.3f}" if night.bounded else "- | -"
+        print(
+            f"| {night.name} | {len(found)} | {fixed_px:.4f} | {learnt_px:.4f} | {beside} "
+            f"| {worst:.3f} | {night.goal} "
+            f"| {sum(one.changes for one in found)}, {sum(one.ways_back for one in found)} |",
+            flush=True,
+        )
+
+
+def random_outcome(number: int) -> tuple[Night, Outcome, float]:
+    """One random night: what came of it, and its bound, NaN for one that changes."""
+    night = random_night(number)
+    return night, outcome(night, number), bound_px(night) if night.bounded else math.nan
+
+
+def print_random_nights(numbers: Sequence[int], pool: ProcessPoolExecutor) -> None:
+    """A line for each night, then the distributions."""
+    over_fixed, over_bound, fixed_over_bound = [], [], []
+    for night, made, least_px in pool.map(random_outcome, numbers):
+        over_fixed.append(made.learnt_px / made.fixed_px)
+        if not math.isnan(least_px):
+            over_bound.append(made.learnt_px / least_px)
+            fixed_over_bound.append(made.fixed_px / least_px)
+        print(
+            f"{over_fixed[-1]:.3f} of fixed {made.fixed_px:.4f} px, bound {least_px:.4f}, "
+            f"{made.changes} changes, {made.ways_back} back; {night.name}",
+            flush=True,
+        )
+    worse = sum(ratio > 1.02 for ratio in over_fixed)
+    print(f"\n{len(over_fixed)} nights; worse than the fixed design by more than 2 %: {worse}\n")
+    print("| | nights | least | 5 % | median | 95 % | most |")
+    print("| --- " * 7 + "|")
+    for name, ratios in (
+        ("learning over fixed", over_fixed),
+        ("learning over bound", over_bound),
+        ("fixed over bound", fixed_over_bound),
+    ):
+        if ratios:
+            five = np.percentile(ratios, [0, 5, 50, 95, 100])
+            print(f"| {name} | {len(ratios)} | {' | '.join(f'{one:.3f}' for one in five)} |")
+
+
+def main() -> None:
+    """Print what the nights that were asked for leave."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--nights", default="", help="only those whose name holds this")
+    parser.add_argument("--random", type=int, default=0, help="so many random nights instead")
+    parser.add_argument("--seed", type=int, default=0, help="the number of the first random night")
+    parser.add_argument("--processes", type=int, default=2)
+    arguments = parser.parse_args()
     with ProcessPoolExecutor(arguments.processes) as pool:
-        for night in NIGHTS:
-            if arguments.nights not in night.name:
-                continue
-            found = list(pool.map(partial(outcome, night), range(arguments.seeds)))
-            fixed_px, learnt_px = np.mean([one[:2] for one in found], axis=0)
-            worst = max(one.learnt_px / one.fixed_px for one in found)
-            least_px = bound_px(night)
-            beside = f"{least_px:.4f} | {learnt_px / least_px:.3f}" if night.bounded else "- | -"
-            print(
-                f"| {night.name} | {len(found)} | {fixed_px:.4f} | {learnt_px:.4f} | {beside} "
-                f"| {worst:.3f} | {night.goal} "
-                f"| {sum(one.changes for one in found)}, {sum(one.ways_back for one in found)} |",
-                flush=True,
-            )
+        if arguments.random:
+            first = arguments.seed
+            print_random_nights(range(first, first + arguments.random), pool)
+        else:
+            chosen = [night for night in NIGHTS if arguments.nights in night.name]
+            print_nights(chosen, arguments.seeds, pool)
 
 
 if __name__ == "__main__":

@@ -152,7 +152,8 @@ class Loop(Settings):
     how the star is measured: by Eq. 7's centre of gravity, or by a fit of a spot of that diameter.
     ``star_rate_sky_arcsec_s`` is how fast the star is known to move along the axes of the siderostat, with the
     stages at rest; the siderostat follows it. ``learn`` says what the loop does with a design
-    that was learnt from its own frames: nothing, advise the operator, or use it.
+    that was learnt from its own frames: nothing, advise the operator, or use it. ``fastest_line_hz`` is the
+    highest frequency of the rig's vibrations, if it is known. Without it, any line may be an alias.
     """
 
     kind: Literal["stellar"] = "stellar"
@@ -173,6 +174,7 @@ class Loop(Settings):
     vernier: Vernier
     prefilter: Prefilter
     learn: Literal["off", "advise", "on"] = "advise"
+    fastest_line_hz: Positive | None = None
 
     @property
     def flux_range_dn(self) -> tuple[float, float]:

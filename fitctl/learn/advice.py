@@ -13,6 +13,7 @@ from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import LEAST_GAIN, Basis, Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
+from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, left_on_paper
 from fitctl.controllers.design.margins import (
     Margins,
     Required,
@@ -35,6 +36,12 @@ from fitctl.learn.spectrum import (
 Floats = NDArray[np.float64]
 WORTH_IT = 0.98
 """A design that leaves more than this part of what the present one leaves is not worth the change."""
+BETTER_LATELY = 0.995
+"""On the last frames it must leave at most this part: what is only true of the mean of minutes is past."""
+LATELY_S = 60.0
+MOST_IF_ALIAS = 1.02
+"""If lines are aliases of faster ones, a design may leave so much of what it would leave without them, or of
+what the present design leaves: on frames both cases look the same."""
 TOLERATED_GAIN = 0.15
 """A mirror's gain so far from 1 is left to the margins."""
 _AXES = ("az", "el")
@@ -48,12 +55,15 @@ class LineAdvice(NamedTuple):
     found : LearntLine
     counteracted : bool
         The learnt design knows it.
+    can_be_alias : bool
+        The rig may have vibrations as fast as its aliases.
     present_px, learnt_px : float
         Residual of both designs if the line is one of its aliases.
     """
 
     found: LearntLine
     counteracted: bool
+    can_be_alias: bool
     present_px: float
     learnt_px: float
 
@@ -90,6 +100,10 @@ class Advice(NamedTuple):
     lines : tuple of LineAdvice
     design : Design
         The learnt one.
+    lately_px : tuple of float
+        RMS on frames that present and learnt design would leave of the last minute as it was, worst axis.
+    if_aliases_px : tuple of float
+        Residual of both if all lines that can be aliases are.
     """
 
     night: Night
@@ -99,13 +113,28 @@ class Advice(NamedTuple):
     bound_px: float
     lines: tuple[LineAdvice, ...]
     design: Design
+    lately_px: tuple[float, float]
+    if_aliases_px: tuple[float, float]
 
     @property
     def worth_it(self) -> bool:
-        """The model fits, and the learnt design leaves clearly less."""
-        return self.night.test.fits and (
-            self.learnt.residual_px <= WORTH_IT * self.present.residual_px
+        """The model fits, and the learnt design leaves clearly less, also lately."""
+        return (
+            self.night.test.fits
+            and self.learnt.residual_px <= WORTH_IT * self.present.residual_px
+            and self._better_lately
+            and self._safe_if_aliases
         )
+
+    @property
+    def _better_lately(self) -> bool:
+        present_px, learnt_px = self.lately_px
+        return learnt_px <= BETTER_LATELY * present_px
+
+    @property
+    def _safe_if_aliases(self) -> bool:
+        present_px, learnt_px = self.if_aliases_px
+        return learnt_px <= MOST_IF_ALIAS * present_px
 
     def lines_of_text(self) -> list[str]:
         """For an operator."""
@@ -126,6 +155,9 @@ class Advice(NamedTuple):
             _standing_text("present", self.present, self.bound_px),
             _standing_text("learnt", self.learnt, self.bound_px),
             f"bound        {self.bound_px:.4f}",
+            "last minute  present {:.4f}, learnt {:.4f} px on frames, computed".format(
+                *self.lately_px
+            ),
         ]
         if not night.test.fits:
             text.append("The model does not explain this night: do not use the learnt design.")
@@ -134,6 +166,15 @@ class Advice(NamedTuple):
             text.append(
                 f"The present design leaves less, with a peak sensitivity of {peak:.2f}; the learnt one keeps "
                 "its margins."
+            )
+        elif not self._better_lately:
+            text.append("Keep the present design: in the last minute it would have left as little.")
+        elif not self._safe_if_aliases:
+            text.append(
+                "Keep the present design: if the lines are faster than they look, the learnt one would leave "
+                "{1:.4f} px instead of {0:.4f}. If you know that they are not, set fastest_line_hz.".format(
+                    *self.if_aliases_px
+                )
             )
         elif not self.worth_it:
             text.append("Keep the present design: the learnt one would leave hardly less.")
@@ -165,6 +206,7 @@ class Advice(NamedTuple):
             "present": _standing_numbers(self.present),
             "learnt": _standing_numbers(self.learnt),
             "bound_px": self.bound_px,
+            "lately_px": {"present": self.lately_px[0], "learnt": self.lately_px[1]},
             "worth_it": self.worth_it,
         }
 
@@ -212,8 +254,11 @@ def advise(
         lines=tuple(line.for_design for line in night.lines),
         mirror_gain=_gain_for_design(night),
     )
+    suspects = tuple(line for line in truth.lines if _can_be_alias(line, truth))
     wanted = tuple(line for line in truth.lines if _worth_counteracting(line, truth))
     design = design_with_margins(dataclasses.replace(truth, lines=wanted), required)
+    both = present, design
+    present_px, learnt_px = (_if_aliases(one, truth, suspects) for one in both)
     return Advice(
         night=night,
         measured_px=measured_px,
@@ -222,12 +267,33 @@ def advise(
         bound_px=bound(truth).residual_px,
         lines=tuple(
             LineAdvice(
-                found, line in wanted, *(_if_alias(one, truth, line) for one in (present, design))
+                found,
+                line in wanted,
+                line in suspects,
+                *(_if_aliases(one, truth, (line,)) for one in both),
             )
             for found, line in zip(night.lines, truth.lines, strict=True)
         ),
         design=design,
+        lately_px=_lately_px(series, truth, present, design),
+        if_aliases_px=(present_px, learnt_px),
     )
+
+
+def _lately_px(
+    series: list[Series], truth: Basis, present: Design, learnt: Design
+) -> tuple[float, float]:
+    """What two designs would leave on the last frames without a gap, worst axis."""
+    frames = round((LATELY_S + SETTLE_S) / truth.period_s)
+    last = next(
+        one for one in reversed(series) if len(one.disturbance_px) * truth.period_s >= LEAST_S
+    )
+    disturbance_px = last.disturbance_px + (1 - truth.mirror_gain) * last.mirror_px
+    present_px, learnt_px = (
+        math.sqrt(left_on_paper(design, truth, disturbance_px[-frames:]).max())
+        for design in (present, learnt)
+    )
+    return present_px, learnt_px
 
 
 def _gain_for_design(night: Night) -> float:
@@ -276,29 +342,41 @@ def _camera_px(design: Design, truth: Basis) -> float:
     return math.sqrt(float(np.trapezoid(sensitivity**2 * density, hz)))
 
 
-def _without(line: Line, truth: Basis) -> Basis:
-    return dataclasses.replace(truth, lines=tuple(one for one in truth.lines if one != line))
+def _can_be_alias(line: Line, truth: Basis) -> bool:
+    """Whether the rig may have a vibration as fast as the slowest that looks like this line."""
+    return 1 / truth.period_s - line.frequency_hz <= truth.fastest_line_hz
+
+
+def _without(lines: tuple[Line, ...], truth: Basis) -> Basis:
+    return dataclasses.replace(
+        truth, lines=tuple(line for line in truth.lines if line not in lines)
+    )
 
 
 def _worth_counteracting(line: Line, truth: Basis) -> bool:
-    """Whether a line is better counteracted, while nobody knows if it is one of its aliases.
+    """Whether a line is better counteracted, also while nobody knows if it is one of its aliases.
 
-    On frames an alias looks the same, but what the mirror does about it only adds to it. Both are weighed
-    alike: what is gained if the line is what it looks like, and what is lost if it is not.
+    On frames an alias looks the same, but what the mirror does about it only adds to it. Most designs answer to
+    a line in either case. One that counteracts it may answer more only as far as that does no harm.
     """
-    knows, does_not = design_minimum_variance(truth), design_minimum_variance(_without(line, truth))
-    gained = linear_residual(does_not, truth) ** 2 - linear_residual(knows, truth) ** 2
-    lost = _if_alias(knows, truth, line) ** 2 - _if_alias(does_not, truth, line) ** 2
-    return gained > max(lost, 0.0)
+    knows = design_minimum_variance(truth)
+    does_not = design_minimum_variance(_without((line,), truth))
+    if linear_residual(knows, truth) >= linear_residual(does_not, truth):
+        return False
+    if not _can_be_alias(line, truth):
+        return True
+    knows_px, does_not_px = (_if_aliases(one, truth, (line,)) for one in (knows, does_not))
+    return knows_px <= MOST_IF_ALIAS * does_not_px
 
 
-def _if_alias(design: Design, truth: Basis, line: Line) -> float:
-    """Residual if a line is truly one of its aliases: it stays, and the mirror's answer to it comes on top."""
-    omega_rad_s = np.array([2 * math.pi * line.frequency_hz])
-    loop = sampled_response(design, truth)(omega_rad_s)[0]
-    answer = abs(loop / (1 + loop))
-    others_px = linear_residual(design, _without(line, truth))
-    return math.sqrt(others_px**2 + line.rms_px**2 * (1 + answer**2))
+def _if_aliases(design: Design, truth: Basis, lines: tuple[Line, ...]) -> float:
+    """Residual if lines are truly their aliases: they stay, and the mirror's answer to them comes on top."""
+    power_px2 = linear_residual(design, _without(lines, truth)) ** 2
+    for line in lines:
+        omega_rad_s = np.array([2 * math.pi * line.frequency_hz])
+        loop = sampled_response(design, truth)(omega_rad_s)[0]
+        power_px2 += line.rms_px**2 * (1 + abs(loop / (1 + loop)) ** 2)
+    return math.sqrt(power_px2)
 
 
 def _line_text(line: LineAdvice) -> str:
@@ -306,11 +384,13 @@ def _line_text(line: LineAdvice) -> str:
     sizes = ", ".join(f"{axis} {rms}" for axis, rms in zip(_AXES, found.rms_px, strict=True))
     fast = " or ".join(f"{hz:.1f}" for hz in found.aliases_hz)
     done = "" if line.counteracted else "; left alone"
+    if_alias = (
+        f"\n             if it is at {fast} Hz instead: present {line.present_px:.4f}, "
+        f"learnt {line.learnt_px:.4f} px"
+    )
     return (
         f"line         {found.frequency_hz} Hz, half width {found.half_width_hz} Hz{done}\n"
-        f"             RMS {sizes} px\n"
-        f"             if it is at {fast} Hz instead: present {line.present_px:.4f}, "
-        f"learnt {line.learnt_px:.4f} px"
+        f"             RMS {sizes} px{if_alias if line.can_be_alias else ''}"
     )
 
 
@@ -336,5 +416,6 @@ def _line_numbers(line: LineAdvice) -> dict[str, Any]:
         "rms_px": {axis: size._asdict() for axis, size in sizes.items()},
         "aliases_hz": list(found.aliases_hz),
         "counteracted": line.counteracted,
+        "can_be_alias": line.can_be_alias,
         "residual_if_alias_px": {"present": line.present_px, "learnt": line.learnt_px},
     }

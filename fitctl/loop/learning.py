@@ -8,17 +8,23 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fitctl.config import Rig
 from fitctl.controllers.pair import Design
+from fitctl.loop.comparison import Comparison
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LearningState
 from fitctl.model.optics import AzEl
 
+Floats = NDArray[np.float64]
 CALM_S = 2.0
 """A design is changed only after so long in VERNIER without saturation, and with star and target at rest."""
 PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 """After a way back, no change of design by itself for so long; twice as long after each further one."""
-# The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS.
+# The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS. The
+# comparison finds later what is worse by less.
 _WATCHES = ((0.3, 2.0), (10.0, 1.25))
 _STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
 _NEWS = 0.1  # by which part a gain must differ from the one last reported to be reported again
@@ -42,7 +48,9 @@ class Learning:
         self.report: LearnerReport | None = None
         self.in_force: LearnerReport | None = None
         self.before: Design | None = None
+        self._rig = rig
         self._loop_name = loop_name
+        self._comparison: Comparison | None = None
         self._still_px = _STILL_PX_PER_S * rig.camera.period_s
         self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
         self._means_px2 = [[0.0, 0.0] for _ in _WATCHES]
@@ -98,9 +106,12 @@ class Learning:
 
     # ------------------------------------------------------------ changes
 
-    def changed(self, before: Design, report: LearnerReport | None, *, by_itself: bool) -> None:
+    def changed(
+        self, before: Design, now: Design, report: LearnerReport | None, *, by_itself: bool
+    ) -> None:
         """Another design is at work: a learnt one with its report, or another without."""
         self._told = 0.0
+        self._comparison = None
         if report is None:
             if not by_itself:
                 self._by_hand, self._fell_back = True, ""
@@ -110,6 +121,8 @@ class Learning:
         self.in_force = report
         if not before.learnt:
             self.before = before
+        if self.before is not None:
+            self._comparison = Comparison(self._rig, self._loop_name, now, self.before)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
         for means in self._means_px2:
             means[:] = [report.learnt_camera_px**2] * 2
@@ -125,6 +138,7 @@ class Learning:
         now_s: float,
         error_px: AzEl | None,
         target_px: AzEl,
+        stages_rad: tuple[Floats, Floats],
         *,
         saturated: bool,
         hindered: bool,
@@ -137,6 +151,8 @@ class Learning:
             None without a star.
         target_px : tuple of float
             As the prefilter has it.
+        stages_rad : tuple of array, shape (2,)
+            Where mirror and siderostat were at mid-exposure.
         saturated : bool
             The mirror is at the end of its range.
         hindered : bool
@@ -146,27 +162,44 @@ class Learning:
         self._last_target_px = target_px
         if hindered or error_px is None or moved:
             self._calm_since_s = None
+            self._restart_comparison()
             return ""
         if saturated:
             self._calm_since_s = None
+            self._restart_comparison()
         elif self._calm_since_s is None:
             self._calm_since_s = now_s
-        return "" if self.in_force is None else self._why_back(error_px)
+        if self.in_force is None:
+            return ""
+        if self._comparison is not None and not saturated:
+            self._comparison.observe(error_px, *stages_rad)
+        return self._why_back(error_px)
+
+    def _restart_comparison(self) -> None:
+        if self._comparison is not None:
+            self._comparison.restart()
 
     def _why_back(self, error_px: AzEl) -> str:
-        worse = ""
+        worse = "" if self._comparison is None else self._comparison.why_back
+        limit_px = self._limit_px
+        if not math.isnan(self._before_px):  # a louder night is louder for the design before, too
+            limit_px = max(limit_px, self._before_px)
         for (over_s, factor), keep, means in zip(
             _WATCHES, self._keep, self._means_px2, strict=True
         ):
             for axis in (0, 1):
                 means[axis] = keep * means[axis] + (1.0 - keep) * error_px[axis] ** 2
             rms_px = math.sqrt(max(means))
-            if rms_px > factor * self._limit_px:
+            if rms_px > factor * limit_px:
                 worse = (
                     f"the learnt design leaves {rms_px:.4f} px on frames over {over_s:g} s; the design before "
-                    f"left {self._limit_px:.4f}"
+                    f"left {limit_px:.4f}"
                 )
         return worse
+
+    @property
+    def _before_px(self) -> float:
+        return math.nan if self._comparison is None else self._comparison.before_px
 
     # ------------------------------------------------------------ for consoles
 
@@ -185,6 +218,7 @@ class Learning:
                 design_json=in_force.design_json,
                 expected_px=in_force.learnt_camera_px,
                 measured_px=measured_px,
+                before_px=self._before_px,
             )
         if self._fell_back:
             return LearningState(

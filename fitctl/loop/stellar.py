@@ -255,6 +255,7 @@ class StellarLoop(Loop):
             observation.now_s,
             None if star is None else error_from(target_px, star),
             target_px,
+            (observation.law_mirror_rad, observation.beam_rad),
             saturated=self.pointing.saturated,
             hindered=self.mode is not Mode.VERNIER
             or bool(self.waits_for)
@@ -536,7 +537,7 @@ class StellarLoop(Loop):
 
         A learnt design comes with its report; `by_itself` is without an operator's command.
         """
-        self.learning.changed(self.pointing.design, report, by_itself=by_itself)
+        self.learning.changed(self.pointing.design, design, report, by_itself=by_itself)
         now_s, before, motor_rad = self._clock.now_s(), self.controller, self.servo.position_rad
         link_rad = self._read_link(now_s)
         self.pointing.use(design)

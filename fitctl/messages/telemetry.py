@@ -130,6 +130,9 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
         Of the learnt design in force; empty without.
     expected_px, measured_px : float
         RMS of the error on frames with the learnt design in force; NaN without.
+    before_px : float
+        RMS on the same frames that the design before would have left, by computation; NaN where it is not
+        known.
     """
 
     setting: Literal["off", "advise", "on"]
@@ -139,6 +142,7 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
     design_json: str = ""
     expected_px: float = math.nan
     measured_px: float = math.nan
+    before_px: float = math.nan
 
 
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):

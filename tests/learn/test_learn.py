@@ -217,6 +217,42 @@ def test_a_line_is_marked_with_the_faster_lines_that_look_like_it(six_hz):
     assert "if it is at 44.0 or 56.0 Hz instead" in "\n".join(advice.lines_of_text())
 
 
+@pytest.mark.parametrize("fastest_line_hz", [math.inf, 30.0])
+def test_a_line_that_may_be_a_faster_one_is_counteracted_only_where_that_does_no_harm(
+    paper, fixed, fastest_line_hz
+):
+    """A design that knows no lines answers less to 14 Hz than one that knows them, and more to 4 Hz."""
+    truth = dataclasses.replace(paper, lines=(Line(14.0, 0.005, 0.03), Line(4.0, 0.005, 0.02)))
+    _, series = held(truth, fixed, TWO_MINUTES_S, seed=5)
+    known = dataclasses.replace(paper, fastest_line_hz=fastest_line_hz)
+    advice = advise([series], (0.1, 0.1), known, fixed)
+    done = {round(line.found.frequency_hz.value): line.counteracted for line in advice.lines}
+
+    assert done[4]
+    assert done[14] == (fastest_line_hz == 30.0)
+    assert all(line.can_be_alias == math.isinf(fastest_line_hz) for line in advice.lines)
+
+
+def test_a_design_that_would_do_harm_if_lines_are_aliases_is_not_worth_it(six_hz):
+    _, advice = six_hz
+    present_px, learnt_px = advice.if_aliases_px
+    harmful = advice._replace(if_aliases_px=(present_px, 1.03 * present_px))
+
+    assert learnt_px < present_px
+    assert not harmful.worth_it
+    assert "set fastest_line_hz" in harmful.lines_of_text()[-1]
+
+
+def test_a_design_that_would_not_have_been_better_lately_is_not_worth_it(six_hz):
+    _, advice = six_hz
+    present_px, learnt_px = advice.lately_px
+    past = advice._replace(lately_px=(present_px, present_px))
+
+    assert learnt_px < 0.5 * present_px
+    assert not past.worth_it
+    assert "in the last minute" in past.lines_of_text()[-1]
+
+
 def test_advice_is_the_same_for_people_and_for_programs(six_hz):
     _, advice = six_hz
     numbers = msgspec.json.decode(msgspec.json.encode(advice.numbers()))

@@ -9,6 +9,7 @@ from learner_reports import PAPER, SHAKEN, report
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.document import parameters_json
+from fitctl.controllers.design.margins import design_with_margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.logging.records import ControllerChange, Event
 from fitctl.loop.learning import CALM_S, PAUSE_S
@@ -20,6 +21,8 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
+
+TIMID = parameters_json(design_with_margins(dataclasses.replace(PAPER, noise_px=0.03)))
 
 
 class Night:
@@ -214,6 +217,35 @@ def test_a_design_that_does_worse_is_left_within_a_second():
     assert night.loop.state(0.0).learning.state == "fell back"
 
 
+def test_a_design_that_is_only_a_little_worse_is_left_too():
+    """It was made for three times the noise, so it leaves a sixth more, which no quick look at frames shows."""
+    night = Night("loops.right.vernier.controller=minimum-variance")
+    night.report(design_json=TIMID, measured_px=0.02, learnt_camera_px=0.02)
+    night.simulation.run(20.0)
+    assert night.loop.controller == "learnt"
+
+    night.simulation.run(40.0)
+    _, back = night.changes()
+    assert (back.source, back.target) == ("learnt", "minimum-variance")
+    assert "the design before would have left" in back.reason
+
+
+def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
+    """The design before would leave more, too."""
+    louder = (
+        "plant.timeline=[{at_s=40.0,loops={right={air_path={gain_px=1.2,b1_s2=0.517,b2_s=2.5}}}}]"
+    )
+    night = Night("loops.right.vernier.controller=minimum-variance", louder)
+    same = design_with_margins(PAPER)
+    night.report(design_json=parameters_json(same), measured_px=0.016, learnt_camera_px=0.016)
+    night.simulation.run(90.0 - night.simulation.clock.now_s())
+    state = night.loop.state(0.0).learning
+
+    assert state.state == "in force"
+    assert state.measured_px > 1.25 * 0.016
+    assert state.before_px == pytest.approx(state.measured_px, rel=0.05)
+
+
 def test_after_a_way_back_there_is_a_pause():
     night = Night(*SHAKEN)
     night.report(lines=(), measured_px=0.02, learnt_camera_px=0.02)
@@ -233,4 +265,5 @@ def test_a_design_that_does_as_expected_stays(shaken):
 
     assert state.state == "in force"
     assert state.measured_px == pytest.approx(state.expected_px, rel=0.2)
+    assert state.before_px > 3 * state.measured_px
     assert math.isclose(state.expected_px, 0.026)

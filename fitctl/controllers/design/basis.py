@@ -73,6 +73,8 @@ class Basis:
         margins (:mod:`fitctl.controllers.design.margins`).
     mirror_gain : float
         How far the mirror moves the star, in what the rig file says; `fitctl design learn` measures it.
+    fastest_line_hz : float
+        No vibration is faster.
     """
 
     period_s: float
@@ -85,6 +87,7 @@ class Basis:
     lines: tuple[Line, ...] = ()
     guard: Line | None = None
     mirror_gain: float = 1.0
+    fastest_line_hz: float = math.inf
 
 
 def basis(rig: Rig, loop_name: str) -> Basis:
@@ -111,6 +114,7 @@ def basis(rig: Rig, loop_name: str) -> Basis:
         coarse_per_s=loop.coarse.gain_rad_per_m * scale.pixel_size_m * scale.motor_px_per_rad,
         mirror_range_px=scale.mirror_px_per_rad * loop.fsm.range_rad,
         settings=loop.vernier,
+        fastest_line_hz=loop.fastest_line_hz or math.inf,
     )
 
 

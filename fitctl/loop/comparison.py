@@ -1,0 +1,96 @@
+"""A learnt design at work, beside what the design before it would have left of the same frames.
+
+Nights change, so what was measured before a change of designs says little about the design that was left.
+The disturbance of each frame is rebuilt from where the stages were, and both designs follow it on paper.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import Rig
+from fitctl.controllers.design.basis import basis, on_its_mirror
+from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, OnPaper
+from fitctl.controllers.pair import Design
+from fitctl.model.optics import AzEl, scales
+
+Floats = NDArray[np.float64]
+OVER_S = 30.0
+"""Time constant of the comparison."""
+MOST_ON_PAPER = 1.02
+"""The learnt design may leave so much of what the design before would have left, both on paper,"""
+MOST_MEASURED = 1.1
+"""and so much on frames, where hysteresis and backlash add to it."""
+_MEASURED, _BEFORE, _LEARNT = range(3)
+
+
+class Comparison:
+    """Two designs on one loop's frames.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    learnt, before : Design
+        The one at work, and the one before it.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str, learnt: Design, before: Design) -> None:
+        loop_basis = on_its_mirror(basis(rig, loop_name), learnt.parameters)
+        self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
+        self._scale = scales(rig, rig.stellar_loops[loop_name])
+        self._mirror_gain = loop_basis.mirror_gain
+        self._settle_frames = round(SETTLE_S / loop_basis.period_s)
+        self._over_frames = round(OVER_S / loop_basis.period_s)
+        self.restart()
+
+    def restart(self) -> None:
+        """Frames are missing, or say nothing of the designs: begin again."""
+        for paper in self._papers:
+            paper.restart()
+        self._frames = 0
+        self._first_px: Floats | None = None
+        self._means_px2 = np.zeros((3, 2))
+
+    def observe(self, error_px: AzEl, mirror_rad: Floats, motor_rad: Floats) -> None:
+        """One frame: the star's error, and where mirror and motors were, shapes (2,)."""
+        mirror_px = self._mirror_gain * self._scale.mirror_px(mirror_rad)
+        motor_px = self._scale.motor_px_per_rad * motor_rad.dot(self._scale.siderostat_turn.T)
+        disturbance_px = np.array(error_px) - mirror_px - motor_px
+        if self._first_px is None:
+            self._first_px = disturbance_px
+        before, learnt = (paper.step(disturbance_px - self._first_px) for paper in self._papers)
+        self._frames += 1
+        counted = self._frames - self._settle_frames
+        if counted > 0:
+            squares = np.square(np.array([error_px, before, learnt], dtype=float))
+            self._means_px2 += (squares - self._means_px2) / min(counted, self._over_frames)
+
+    @property
+    def before_px(self) -> float:
+        """RMS on frames that the design before would have left, worst axis; NaN until it has settled."""
+        settled = self._frames > 2 * self._settle_frames
+        return float(self._rms_px()[_BEFORE]) if settled else math.nan
+
+    @property
+    def why_back(self) -> str:
+        """Why the design before is the better one; empty as long as it is not known to be."""
+        if self._frames < self._settle_frames + self._over_frames:
+            return ""
+        measured_px, before_px, learnt_px = self._rms_px().tolist()
+        if learnt_px > MOST_ON_PAPER * before_px:
+            left = f"would leave {learnt_px:.4f}"
+        elif measured_px > MOST_MEASURED * before_px:
+            left = f"leaves {measured_px:.4f}"
+        else:
+            return ""
+        return (
+            f"the learnt design {left} px on frames over {OVER_S:g} s; the design before would have left "
+            f"{before_px:.4f} of the same disturbance"
+        )
+
+    def _rms_px(self) -> Floats:
+        return np.asarray(np.sqrt(self._means_px2.max(axis=1)))

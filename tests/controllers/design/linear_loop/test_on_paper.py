@@ -1,0 +1,62 @@
+"""A design followed on paper leaves what it leaves at work."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from benchmarks.linear_loop import course_px, held
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.basis import Line, basis
+from fitctl.controllers.design.eq20 import design_eq20
+from fitctl.controllers.design.linear_loop.on_paper import OnPaper, left_on_paper
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
+
+SECONDS = 60.0
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return basis(load_rig(default_rig_path()), "right")
+
+
+@pytest.fixture(scope="module")
+def night(paper):
+    return dataclasses.replace(paper, lines=(Line(6.0, 0.005, 0.05),))
+
+
+@pytest.mark.parametrize("mirror_gain", [1.0, 0.8])
+def test_a_design_on_the_disturbance_of_its_own_frames_makes_the_same_errors(paper, mirror_gain):
+    design = design_minimum_variance(paper)
+    error_px, series = held(paper, design, 10.0, seed=1, mirror_gain=mirror_gain)
+    truth = dataclasses.replace(paper, mirror_gain=mirror_gain)
+    on_paper = OnPaper(design, truth)
+    disturbance_px = series.disturbance_px + (1 - mirror_gain) * series.mirror_px
+    made_px = [on_paper.step(row) for row in disturbance_px]
+
+    np.testing.assert_allclose(made_px, error_px, atol=1e-12)
+
+
+def test_another_design_on_the_same_disturbance_leaves_what_it_would_have_left(paper, night):
+    """Although the frames were another design's."""
+    star_px = course_px(night, round(SECONDS / night.period_s), seed=3)
+    _, series = held(night, design_minimum_variance(paper), SECONDS, 3, star_px=star_px)
+    other = design_minimum_variance(night)
+    error_px, _ = held(night, other, SECONDS, 3, star_px=star_px)
+    settled_px = error_px[round(5.0 / night.period_s) :]
+
+    assert left_on_paper(other, night, series.disturbance_px) == pytest.approx(
+        np.mean(settled_px**2, axis=0), rel=0.02
+    )
+
+
+def test_where_the_star_is_at_first_does_not_matter(paper):
+    design = design_eq20(paper)
+    star_px = course_px(paper, 3000, seed=0)
+
+    near, far = (left_on_paper(design, paper, star_px + away_px) for away_px in (0.0, 50.0))
+    np.testing.assert_allclose(near, far)
+
+
+def test_too_few_frames_leave_nothing_known(paper):
+    assert np.isnan(left_on_paper(design_minimum_variance(paper), paper, np.zeros((100, 2)))).all()
