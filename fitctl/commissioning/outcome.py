@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from fitctl.clock import Clock, MonotonicClock
 from fitctl.config import Loop, Rig
 
-State = Literal["passed", "corrected", "failed", "skipped"]
-DONE: frozenset[str] = frozenset({"passed", "corrected", "skipped"})
+State = Literal["passed", "corrected", "measured", "failed", "skipped"]
+DONE: frozenset[str] = frozenset({"passed", "corrected", "measured", "skipped"})
 
 
 @dataclass(frozen=True)
@@ -28,19 +28,52 @@ class Outcome:
         What the rig file must say instead, as tables of the rig file; empty where it is right.
     trouble : str
         What is wrong that no rig file can put right; empty if nothing.
+    estimated : bool
+        What was found is an estimate with an interval of its own: the rig file takes it without a second
+        measurement.
     """
 
     lines: list[str] = field(default_factory=list)
     figures: dict[str, float] = field(default_factory=dict)
     found: dict[str, Any] = field(default_factory=dict)
     trouble: str = ""
+    estimated: bool = False
 
     @property
     def state(self) -> State:
         """How the step ended."""
         if self.trouble:
             return "failed"
-        return "corrected" if self.found else "passed"
+        if not self.found:
+            return "passed"
+        return "measured" if self.estimated else "corrected"
+
+
+class Cable(NamedTuple):
+    """A cable that a test takes off.
+
+    Attributes
+    ----------
+    name : str
+        What people call it.
+    mock : str
+        The mock device on its end, such as ``right.mdt693``.
+    """
+
+    name: str
+    mock: str
+
+
+def nobody_there(_cable: Cable, _on: bool) -> None:
+    """Nobody can take a cable off.
+
+    Raises
+    ------
+    StepError
+        Always.
+    """
+    msg = "nobody is there to take a cable off"
+    raise StepError(msg)
 
 
 class StepError(Exception):
@@ -77,6 +110,8 @@ class Site:
         What earlier steps have measured, by ``task.figure``.
     quick : bool
         A short acceptance.
+    cable : callable
+        Has somebody take a cable off, or put it on again: its device, and whether it is to be on.
     clock : Clock
     """
 
@@ -87,6 +122,7 @@ class Site:
     overrides: tuple[str, ...]
     figures: Mapping[str, float] = field(default_factory=dict)
     quick: bool = False
+    cable: Callable[[Cable, bool], None] = nobody_there
     clock: Clock = field(default_factory=MonotonicClock)
 
     @property

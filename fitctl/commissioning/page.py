@@ -13,7 +13,7 @@ body { font: 15px/1.4 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto
 table { border-collapse: collapse; width: 100%; margin: .5rem 0 1.5rem; }
 th, td { border-bottom: 1px solid #ccc; padding: .25rem .6rem .25rem 0; text-align: left; vertical-align: top; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; }
-.failed { color: #a00; font-weight: 600; } .corrected { color: #850; } .passed { color: #060; }
+.failed { color: #a00; font-weight: 600; } .corrected, .measured { color: #850; } .passed { color: #060; }
 @media print { body { margin: 0; font-size: 11px; } }
 """
 

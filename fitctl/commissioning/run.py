@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.commissioning.outcome import Outcome, Site, StepError
+from fitctl.commissioning.outcome import Cable, Outcome, Site, StepError, nobody_there
 from fitctl.commissioning.record import Commissioning, Entry, Files, save
 from fitctl.commissioning.steps import Task, tasks_of
 from fitctl.config import ConfigError, Rig, load_rig
@@ -32,6 +33,8 @@ class Course(NamedTuple):
         Prints a line.
     quick : bool
         A short acceptance.
+    cable : callable
+        As :attr:`fitctl.commissioning.outcome.Site.cable`.
     """
 
     rig_path: Path
@@ -40,6 +43,7 @@ class Course(NamedTuple):
     record: Commissioning
     report: Callable[[str], None]
     quick: bool = False
+    cable: Callable[[Cable, bool], None] = nobody_there
 
     def rig(self, before: str = "") -> Rig:
         """The rig file with what was found, or with what was found before a task."""
@@ -62,6 +66,7 @@ class Course(NamedTuple):
             self.overrides,
             self.record.figures(),
             quick=self.quick,
+            cable=self.cable,
         )
 
 
@@ -78,7 +83,7 @@ def do(course: Course, task: Task) -> Entry:
         if outcome.trouble or not outcome.found:
             break
         lay_over(found, outcome.found)
-        outcome = Outcome(outcome.lines, outcome.figures, found)
+        outcome = replace(outcome, found=found)
         try:
             rig = _corrected(course, task, found)
         except ConfigError as error:
@@ -88,10 +93,12 @@ def do(course: Course, task: Task) -> Entry:
             outcome = Outcome(outcome.lines, outcome.figures, {}, what)
             found = {}
             break
+        if outcome.estimated:
+            break
         if attempt + 1 == _TRIES:
             what = "what was corrected is still not as expected"
             outcome = Outcome(outcome.lines, outcome.figures, found, what)
-    whole = Outcome(lines, outcome.figures, found, outcome.trouble)
+    whole = replace(outcome, lines=lines, found=found)
     earlier = course.record.tasks.get(task.name)
     if earlier is not None and earlier.found != found:
         _forget_dependents(course, task)

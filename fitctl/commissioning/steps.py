@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
-from fitctl.commissioning import amplifiers, camera, closed, devices, plate, stacks
+from fitctl.commissioning import (
+    acceptance,
+    amplifiers,
+    camera,
+    closed,
+    devices,
+    identified,
+    plate,
+    stacks,
+    travel,
+)
 from fitctl.commissioning.outcome import Outcome, Site
 from fitctl.config import Rig
 
@@ -102,11 +112,19 @@ STEPS: dict[str, Step] = {
         20.0,
         plate.check_mirror,
     ),
+    "travel": Step(
+        "Each motor turns to both ends of its travel",
+        "siderostat",
+        travel.moves,
+        ("amplifiers",),
+        100.0,
+        travel.check_travel,
+    ),
     "gentle": Step(
         "The first closed loop: the siderostat at a tenth of its gain",
         "star",
         closed.gentle_moves,
-        ("siderostat", "mirror"),
+        ("siderostat", "mirror", "travel"),
         40.0,
         closed.check_gentle,
         supervised=True,
@@ -120,13 +138,47 @@ STEPS: dict[str, Step] = {
         closed.check_whole,
         supervised=True,
     ),
-    "acceptance": Step(
-        "Acceptance: acquisitions, STOP after each, and a long hold",
+    **{
+        name: Step(
+            title,
+            "star",
+            identified.identification_moves(name),
+            ("loop",),
+            takes_s,
+            identified.identification(name),
+            supervised=True,
+        )
+        for name, title, takes_s in (
+            ("airpath", "The air path, as the camera shows it", 100.0),
+            ("hysteresis", "Hysteresis and stroke of each stack", 160.0),
+            ("backlash", "The play between the siderostat's motors and the beam", 100.0),
+            ("delay", "The time from mid-exposure to the command, as the star shows it", 70.0),
+        )
+    },
+    "design": Step(
+        "The design of the loop, and its margins on what was identified",
         "star",
-        closed.accept_moves,
-        ("loop",),
-        600.0,
-        closed.check_acceptance,
+        _nothing,
+        ("airpath", "hysteresis", "backlash", "delay"),
+        5.0,
+        identified.check_design,
+    ),
+    "acceptance": Step(
+        "Acceptance: acquisitions, a long hold, steps, STOP from each mode",
+        "star",
+        acceptance.accept_moves,
+        ("design",),
+        900.0,
+        acceptance.check_acceptance,
+        supervised=True,
+    ),
+    "cables": Step(
+        "Each cable taken off while the star is held leads to SAFE",
+        "star",
+        acceptance.cables_moves,
+        ("acceptance",),
+        150.0,
+        acceptance.check_cables,
         supervised=True,
     ),
 }

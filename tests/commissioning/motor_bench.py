@@ -15,14 +15,24 @@ RIG = load_rig(default_rig_path())
 class BenchAmplifiers:
     """Two motors: what they are commanded goes through `gains`, what they turned is counted through `counts`.
 
-    `gains` and `counts` are matrices; `runs_away_rad_s` is a velocity that nobody commanded.
+    `gains` and `counts` are matrices; `runs_away_rad_s` is a velocity that nobody commanded;
+    `ends_rad` is how far both motors can turn.
     """
 
-    def __init__(self, clock, gains=((1, 0), (0, 1)), counts=((1, 0), (0, 1)), runs_away_rad_s=0.0):
+    def __init__(
+        self,
+        clock,
+        gains=((1, 0), (0, 1)),
+        counts=((1, 0), (0, 1)),
+        runs_away_rad_s=0.0,
+        ends_rad=(-1e9, 1e9),
+    ):
         self.clock = clock
         self.gains, self.counts = np.array(gains, float), np.array(counts, float)
         self.runs_away = np.array([runs_away_rad_s, 0.0])
+        self.ends_rad = ends_rad
         self.motor_rad = np.zeros(2)
+        self.fastest_rad_s = 0.0
         self.furthest_rad = 0.0
         self.powered = False
         self.fault = ""
@@ -46,6 +56,7 @@ class BenchAmplifiers:
     def exchange(self, velocity_rad_s):
         self._advance()
         self._velocity = self.gains @ velocity_rad_s
+        self.fastest_rad_s = max(self.fastest_rad_s, *np.abs(velocity_rad_s))
         counted = self.counts @ self.motor_rad
         return ServoReading(self._at_s, tuple(counted), self.powered, self.fault)
 
@@ -55,6 +66,7 @@ class BenchAmplifiers:
             self.motor_rad = self.motor_rad + (self._velocity + self.runs_away) * (
                 now_s - self._at_s
             )
+            self.motor_rad = np.clip(self.motor_rad, *self.ends_rad)
             self.furthest_rad = max(self.furthest_rad, *np.abs(self.motor_rad))
         self._at_s = now_s
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,17 +14,19 @@ from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig
 from fitctl.commands.shared.terminal import has_terminal
-from fitctl.commissioning.outcome import State
+from fitctl.commissioning.outcome import Cable, State, StepError
 from fitctl.commissioning.page import change_texts, changes, flat, page, verdict
 from fitctl.commissioning.record import Commissioning, Entry, Files, load, load_any, writable
 from fitctl.commissioning.run import Course, chosen, do, skip
 from fitctl.commissioning.steps import Task, tasks_of
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 from fitctl.config.simulated import places
+from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench
 
 _MARKS: dict[State, str] = {
     "passed": "passed",
     "corrected": "corrected",
+    "measured": "measured",
     "failed": "FAILED",
     "skipped": "skipped",
 }
@@ -47,7 +50,7 @@ def commission(
         ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="A short acceptance: 3 acquisitions and 20 s.")
+        bool, typer.Option("--quick", help="A short acceptance: 3 acquisitions, 20 s, one step.")
     ] = False,
     list_steps: Annotated[
         bool, typer.Option("--list", help="List the steps, what each moves, and what is done.")
@@ -79,6 +82,7 @@ def commission(
         load(files.record, settings.name),
         _reporter(silent=as_json),
         quick,
+        partial(_by_bench, settings) if yes else _by_hand,
     )
     earlier = None if compare is None else load_any(compare)
     tasks = tasks_of(settings)
@@ -95,6 +99,30 @@ def commission(
     _conclude(course, tasks, earlier, as_json=as_json)
     if not all(course.record.done(task.name) for task in wanted):
         raise typer.Exit(FAILED)
+
+
+def _by_hand(cable: Cable, on: bool) -> None:
+    typer.prompt(
+        f"{'Put' if on else 'Take off'} {cable.name}{' on again' if on else ''}, then press Enter",
+        default="",
+        show_default=False,
+    )
+
+
+def _by_bench(rig: Rig, cable: Cable, on: bool) -> None:
+    """Mocks have no cables: their bench cuts the device off."""
+    _, mocks = rig.mock_parts()
+    question = (
+        ClearFaults(device=cable.mock, kind="disconnect")
+        if on
+        else SetFault(device=cable.mock, kind="disconnect")
+    )
+    try:
+        now = ask_bench(mocks.bench_port, question, FaultsNow)
+    except ConnectionError as error:
+        raise StepError(str(error)) from None
+    if now.error:
+        raise StepError(now.error)
 
 
 def _require_permission(rig: Rig, *, yes: bool) -> None:
@@ -147,9 +175,14 @@ def _do_all(course: Course, wanted: list[Task], *, again: bool, yes: bool) -> No
             return
         course.report(f"{task.name}: {task.step.title}. About {task.step.takes_s:g} s.")
         course.report(f"Moves: {task.step.moves(course.site(task, course.rig(task.name)))}.")
-        if not yes and not typer.confirm("Go?", default=False):
-            course.report("stopped; the next call goes on here")
-            return
+        if not yes:
+            answer = typer.prompt("Go? (yes, no, skip)", default="no").strip().lower()
+            if answer in {"s", "skip"}:
+                skip(course, task, typer.prompt("Reason for the record"))
+                continue
+            if answer not in {"y", "yes"}:
+                course.report("stopped; the next call goes on here")
+                return
         entry = do(course, task)
         for line in _entry_lines(task.name, entry):
             course.report(line)
