@@ -10,13 +10,21 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fitctl.clock import Clock
 from fitctl.commissioning.outcome import Site, StepError
 from fitctl.daemon.devices import amplifiers_of
 from fitctl.drivers.amplifiers import AXES
 from fitctl.drivers.interface import AzEl, DeviceError, DeviceFault, ServoAmplifiers
 
+Floats = NDArray[np.float64]
 _STILL = (0.0, 0.0)
+MOST_RAD_S = 4.0
+_GAIN_PER_S = 15.0
+_THERE_RAD = 0.01
+_AWAY_RAD = 0.2
 _BLIND_S = 0.25  # without a reading for so long, nobody watches
 
 
@@ -93,6 +101,69 @@ class Motors:
                 break
         self.exchange(_STILL)
         return elapsed_s
+
+
+class Servo:
+    """Both motors held at angles of their encoders, by whoever calls :meth:`hold` often enough.
+
+    Parameters
+    ----------
+    site : Site
+    motors : Motors
+
+    Attributes
+    ----------
+    goal_rad : array, shape (2,)
+        Where they were last sent; at first where they are.
+    """
+
+    def __init__(self, site: Site, motors: Motors) -> None:
+        self._site, self._motors = site, motors
+        motors.exchange(_STILL)
+        self.goal_rad = np.array(motors.position_rad)
+
+    def hold(self) -> None:
+        """One period."""
+        apart = self.goal_rad - self._motors.position_rad
+        az, el = np.clip(_GAIN_PER_S * apart, -MOST_RAD_S, MOST_RAD_S).tolist()
+        self._motors.exchange((az, el))
+
+    def turn_to(self, goal_rad: Floats) -> None:
+        """Turn both motors to an angle of their encoders, slowly.
+
+        Raises
+        ------
+        StepError
+            If one does not get there, or goes the other way, or the angle is beyond the travel.
+        """
+        motors = self._motors
+        self.goal_rad = np.array(goal_rad, dtype=float)
+        travel_rad = self._site.rig.loops[self._site.name].siderostat.travel_rad
+        if np.max(np.abs(self.goal_rad)) > travel_rad:
+            msg = (
+                f"({goal_rad[0]:.1f}, {goal_rad[1]:.1f}) rad is beyond the travel of "
+                f"{travel_rad:.1f} rad from the "
+                "encoders' zero; bring the siderostat nearer to its middle"
+            )
+            raise StepError(msg)
+        began_rad = np.array(motors.position_rad)
+        way_rad = np.max(np.abs(self.goal_rad - began_rad))
+        until_s = self._site.clock.now_s() + 2 * way_rad / MOST_RAD_S + 2.0
+        while np.max(np.abs(self.goal_rad - motors.position_rad)) > _THERE_RAD:
+            self.hold()
+            apart_rad = np.max(np.abs(self.goal_rad - motors.position_rad))
+            if apart_rad > way_rad + _AWAY_RAD:
+                msg = "a motor goes away from where it is sent; repeat the step amplifiers"
+                raise StepError(msg)
+            if self._site.clock.now_s() > until_s:
+                at = ", ".join(f"{one:.2f}" for one in motors.position_rad)
+                msg = (
+                    f"the motors are at ({at}) rad and were sent to "
+                    f"({self.goal_rad[0]:.2f}, {self.goal_rad[1]:.2f}) rad: one does not "
+                    "follow; check for a stop or "
+                    "a limit of the amplifier"
+                )
+                raise StepError(msg)
 
 
 @contextmanager

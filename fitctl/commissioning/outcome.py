@@ -13,6 +13,9 @@ from fitctl.config import Loop, Rig
 State = Literal["passed", "corrected", "measured", "failed", "skipped"]
 DONE: frozenset[str] = frozenset({"passed", "corrected", "measured", "skipped"})
 
+BEFORE = " before correction"
+"""After the name of a figure that a step measured before it corrected the rig file."""
+
 
 @dataclass(frozen=True)
 class Outcome:

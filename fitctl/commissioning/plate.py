@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.commissioning import stacks
 from fitctl.commissioning.camera import streaming
 from fitctl.commissioning.motors import powered
 from fitctl.commissioning.outcome import Outcome, Site, StepError
-from fitctl.commissioning.sky import Watch, search
+from fitctl.commissioning.sky import Watch, displaced, search
 from fitctl.config.wiring import STRAIGHT
-from fitctl.controllers.mirror import Mirror
+from fitctl.controllers.centroid import Star
 from fitctl.model.optics import rotation, scales
 
 Floats = NDArray[np.float64]
 ROUGH_RAD = 0.35
 FINE_RAD = 1.0
-STACK_V = 2.5
-_SWINGS = 3
 _TAKE_UP = 0.5  # of a step, before it: backlash
-_LEAST_PX = 0.7  # by a rough step
+LEAST_PX = 0.7  # by a rough step
 _NEAR_PX = 3.0
-_SCALE_APART = 0.08
-_ROTATION_APART_DEG = 5.0
+SCALE_APART = 0.08
+ROTATION_APART_DEG = 5.0
 _EVEN = 1.15  # of the two singular values
 _TWIN = 0.8  # of the brightest spot's light
-_EDGE_PX = 4.0
 _FLIPS = {
     "azimuth reversed": np.diag([-1.0, 1.0]),
     "elevation reversed": np.diag([1.0, -1.0]),
@@ -74,13 +69,14 @@ def check_star(site: Site) -> Outcome:
     StepError
         If there is none, or more than one that could be it.
     """
+    stars = len(site.rig.stellar_loops)
     with streaming(site) as camera:
         spots = Watch(site, camera, None).spots()
         moved_rad, looks = 0.0, 0
-        if not spots:
+        if _bright(spots) < stars:
             with powered(site) as motors:
                 watch = Watch(site, camera, motors)
-                _, looks = search(site, watch)
+                _, looks = search(site, watch, spots)
                 spots = watch.spots()
                 moved_rad = motors.furthest_rad
     if not spots:
@@ -97,12 +93,10 @@ def check_star(site: Site) -> Outcome:
         f"spot at az {spot.az_px:.1f}, el {spot.el_px:.1f} px: {spot.flux_dn:.0f} DN"
         for spot in spots
     ]
-    if len(spots) > 1 and spots[1].flux_dn > _TWIN * spots[0].flux_dn:
-        msg = (
-            f"two spots could be the star, of {spots[0].flux_dn:.0f} and "
-            f"{spots[1].flux_dn:.0f} DN; cover the other "
-            "star or another loop's beam, and repeat the step"
-        )
+    if _bright(spots) > stars:
+        lights = " and ".join(f"{spot.flux_dn:.0f}" for spot in spots[: stars + 1])
+        number = {2: "two", 3: "three"}.get(stars + 1, str(stars + 1))
+        msg = f"{number} spots could be the star, of {lights} DN; cover the other star, and repeat the step"
         raise StepError(msg, figures)
     low_dn, high_dn = loop.flux_range_dn
     if low_dn <= spots[0].flux_dn <= high_dn:
@@ -117,6 +111,10 @@ def check_star(site: Site) -> Outcome:
     return Outcome(
         lines, figures, site.found(star_flux_dn=round(spots[0].flux_dn, 1), other_spots=other)
     )
+
+
+def _bright(spots: list[Star]) -> int:
+    return sum(spot.flux_dn > _TWIN * spots[0].flux_dn for spot in spots)
 
 
 # ---------------------------------------------------------------- the siderostat
@@ -143,7 +141,9 @@ def check_siderostat(site: Site) -> Outcome:
     target_px = np.array([site.loop.target_px.az, site.loop.target_px.el])
     with streaming(site) as camera, powered(site) as motors:
         watch = Watch(site, camera, motors)
-        rough = np.array([_rough(site, watch, axis) for axis in range(2)]).T
+        moves = [_rough(site, watch, axis) for axis in range(2)]
+        rough = np.array([one[0] for one in moves]).T
+        place_px = moves[1][1]
         if abs(np.linalg.det(rough)) < 0.05 * np.linalg.norm(rough) ** 2:
             msg = (
                 "both motors move the star along the same line; check the cables from the "
@@ -151,6 +151,7 @@ def check_siderostat(site: Site) -> Outcome:
                 "and the siderostat's mount"
             )
             raise StepError(msg, {"furthest_rad": motors.furthest_rad})
+        watch.follow(place_px, rough)
         for _ in range(3):
             off_px = target_px - watch.place_px()
             if np.max(np.abs(off_px)) < _NEAR_PX:
@@ -165,17 +166,19 @@ def check_siderostat(site: Site) -> Outcome:
     return _siderostat_outcome(site, fine / scale.motor_px_per_rad, furthest_rad)
 
 
-def _rough(site: Site, watch: Watch, axis: int) -> Floats:
-    """Pixels a radian of one motor, from a small step."""
+def _rough(site: Site, watch: Watch, axis: int) -> tuple[Floats, Floats]:
+    """Pixels a radian of one motor, from a small step; and where the star is that it moves."""
     site.report(f"{'azimuth' if axis == 0 else 'elevation'}: {ROUGH_RAD:g} rad and back")
     step = ROUGH_RAD * np.eye(2)[axis]
     start_rad = watch.goal_rad.copy()
     watch.turn_to(start_rad - step)
-    before_px = watch.place_px()
+    before = watch.places_px()
     watch.turn_to(start_rad + step)
-    moved_px = watch.place_px() - before_px
+    after = watch.places_px()
     watch.turn_to(start_rad)
-    if np.linalg.norm(moved_px) < _LEAST_PX:
+    was_px, is_px = displaced(before, after) or (before[0], before[0])
+    moved_px = is_px - was_px
+    if np.linalg.norm(moved_px) < LEAST_PX:
         name = "azimuth" if axis == 0 else "elevation"
         msg = (
             f"{name}: the motor turned by {2 * ROUGH_RAD:g} rad and the star moved by "
@@ -185,7 +188,7 @@ def _rough(site: Site, watch: Watch, axis: int) -> Floats:
         raise StepError(
             msg, {} if watch.motors is None else {"furthest_rad": watch.motors.furthest_rad}
         )
-    return np.asarray(moved_px / (2 * ROUGH_RAD))
+    return np.asarray(moved_px / (2 * ROUGH_RAD)), np.asarray((was_px + is_px) / 2)
 
 
 def _fine(site: Site, watch: Watch, axis: int, size_rad: float) -> Floats:
@@ -232,13 +235,13 @@ def _siderostat_outcome(site: Site, seen: Floats, furthest_rad: float) -> Outcom
     if flip_name:
         found["wiring"] = _flipped(site, flip)
     apart_deg = (now.rotation_deg - was.rotation_deg + 180) % 360 - 180
-    if abs(apart_deg) > _ROTATION_APART_DEG:
+    if abs(apart_deg) > ROTATION_APART_DEG:
         found["rotation_deg"] = round(now.rotation_deg, 1)
     turned = found.get("rotation_deg", loop.siderostat.rotation_deg)
     if now.uneven > _EVEN * was.uneven:
         gains = rotation(turned).T @ hand
         found["axis_gains"] = [[round(float(one), 3) for one in row] for row in gains]
-    elif abs(relative - 1) > _SCALE_APART:
+    elif abs(relative - 1) > SCALE_APART:
         found["spur_gear_ratio"] = round(loop.siderostat.spur_gear_ratio / relative, 2)
         if relative < 1:  # the motors' own travel stays as it was
             travel_arcsec = loop.siderostat.travel_sky_arcsec * relative
@@ -261,137 +264,3 @@ def _flipped(site: Site, flip: Floats) -> dict[str, Any]:
         "velocity_signs": [a * b for a, b in zip(old.velocity_signs, signs, strict=True)],
         "encoder_signs": [a * b for a, b in zip(old.encoder_signs, signs, strict=True)],
     }
-
-
-# ---------------------------------------------------------------- the mirror
-def mirror_moves(site: Site) -> str:
-    """What the step moves."""
-    gain = site.loop.fsm.piezo.gain
-    return (
-        f"each stack by {STACK_V:g} V at the D/A both ways, {gain * STACK_V:g} V at the stack, "
-        "one after the other"
-    )
-
-
-def check_mirror(site: Site) -> Outcome:
-    """How the star moves with each stack.
-
-    Raises
-    ------
-    StepError
-        If it does not.
-    """
-    with streaming(site) as camera, stacks.opened(site) as held:
-        watch = Watch(site, camera, None)
-        fsm = site.loop.fsm
-        model = Mirror(fsm)
-        held.slew(np.full(3, fsm.bias_v), fsm.slew_v_per_s)
-        seen, expected = [], []
-        for stack in range(3):
-            site.report(f"stack {stack + 1}: {STACK_V:g} V both ways")
-            moved_px, modelled_px = _swing(site, watch, held, model, stack)
-            seen.append(moved_px)
-            expected.append(modelled_px)
-        furthest_v = held.furthest_v
-    return _mirror_outcome(site, np.array(seen), np.array(expected), furthest_v)
-
-
-def _swing(
-    site: Site, watch: Watch, held: stacks.Stacks, model: Mirror, stack: int
-) -> tuple[Floats, Floats]:
-    """How far the star moved with one stack, and how far it should have.
-
-    The first swing wipes out what the stack remembers of earlier ones, and is not measured.
-    """
-    fsm = site.loop.fsm
-    bias_v = np.full(3, fsm.bias_v)
-    moved_px, turned_rad = [], []
-    for swing in range(_SWINGS + 1):
-        places, angles = [], []
-        for way in (-1.0, 1.0):
-            goal_v = bias_v + way * STACK_V * np.eye(3)[stack]
-            held.slew(goal_v, fsm.slew_v_per_s)
-            model.written(goal_v)
-            if swing:
-                places.append(_kept_place(watch, held))
-                angles.append(model.angles_rad.copy())
-        if swing:
-            moved_px.append(places[1] - places[0])
-            turned_rad.append(angles[1] - angles[0])
-    held.slew(bias_v, fsm.slew_v_per_s)
-    model.written(bias_v)
-    modelled_px = scales(site.rig, site.loop).mirror_px(np.mean(turned_rad, axis=0))
-    return np.asarray(np.mean(moved_px, axis=0)), np.asarray(modelled_px)
-
-
-def _kept_place(watch: Watch, held: stacks.Stacks) -> Floats:
-    """Where the star is; the D/A is written between looks, for its watchdog."""
-    looks = []
-    for _ in range(2):
-        held.set(held.volts)
-        looks.append(watch.place_px(12))
-    return np.asarray(np.mean(looks, axis=0))
-
-
-def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: float) -> Outcome:
-    """What measured responses of three stacks, rows in pixels, make of the rig file."""
-    fsm = site.loop.fsm
-    figures = {"furthest_v": furthest_v}
-    for stack in range(3):
-        if np.linalg.norm(seen[stack]) < _LEAST_PX * 0.5:
-            msg = (
-                f"stack {stack + 1}: the amplifier drives it and the star moved by "
-                f"{np.linalg.norm(seen[stack]):.2f} "
-                "px; check the cable from the amplifier to the stack, and the stack"
-            )
-            raise StepError(msg, figures)
-    order = min(
-        itertools.permutations(range(3)), key=lambda one: _unlike(seen, expected[list(one)])
-    )
-    matrix = _fit(seen, expected[list(order)])
-    if _unlike(seen, expected[list(order)]) > 0.5:
-        msg = (
-            "the stacks do not move the star as three corners of a square would; check "
-            "that all three carry the "
-            "mirror, and stack_radius_m"
-        )
-        raise StepError(msg, figures)
-    now = similar(matrix)
-    figures |= {
-        "scale_over_expected": now.scale,
-        "turned_deg": now.rotation_deg,
-        "uneven": now.uneven,
-    }
-    lines = [
-        f"the mirror moves the star by {now.scale:.3f} of what is expected, turned by "
-        f"{now.rotation_deg:+.1f} degrees"
-    ]
-    found: dict[str, Any] = {}
-    if order != (0, 1, 2):
-        lines.append(
-            "the amplifier's outputs 1, 2, 3 are on stacks "
-            + ", ".join(str(one + 1) for one in order)
-        )
-        for device in ("dac", "piezo"):
-            old = getattr(fsm, device).channels or [1, 2, 3]
-            found[device] = {"channels": [old[order.index(stack)] for stack in range(3)]}
-    if abs(now.rotation_deg) > _ROTATION_APART_DEG:
-        whole_deg = fsm.rotation_deg + now.rotation_deg
-        found["rotation_deg"] = round((whole_deg + 180) % 360 - 180, 1)
-    if abs(now.scale - 1) > 2 * _SCALE_APART:
-        gains = now.scale * (np.eye(2) if fsm.axis_gains is None else np.array(fsm.axis_gains))
-        found["axis_gains"] = [[round(float(one), 3) for one in row] for row in gains]
-    return Outcome(lines, figures, site.found(fsm=found) if found else {})
-
-
-def _fit(seen: Floats, expected: Floats) -> Floats:
-    """The matrix that takes expected motions, rows, to those that were seen."""
-    return np.asarray(np.linalg.lstsq(expected, seen, rcond=None)[0].T, dtype=float)
-
-
-def _unlike(seen: Floats, expected: Floats) -> float:
-    """How far that matrix is from a rotation with a scale; large where it is a mirror image."""
-    matrix = _fit(seen, expected)
-    (a, b), (c, d) = matrix
-    turned = np.array([[a + d, b - c], [c - b, a + d]]) / 2
-    return float(np.linalg.norm(matrix - turned) / max(float(np.linalg.norm(turned)), 1e-9))

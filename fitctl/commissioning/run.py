@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.commissioning.outcome import Cable, Outcome, Site, StepError, nobody_there
+from fitctl.commissioning.outcome import BEFORE, Cable, Outcome, Site, StepError, nobody_there
 from fitctl.commissioning.record import Commissioning, Entry, Files, save
 from fitctl.commissioning.steps import Task, tasks_of
 from fitctl.config import ConfigError, Rig, load_rig
@@ -75,6 +75,7 @@ def do(course: Course, task: Task) -> Entry:
     began_s = time.monotonic()
     found: dict[str, object] = {}
     lines: list[str] = []
+    first: dict[str, float] = {}
     rig = course.rig(task.name)
     course.files.write_rig(course.record.found(task.name, [t.name for t in tasks_of(rig)]))
     for attempt in range(_TRIES):
@@ -83,6 +84,7 @@ def do(course: Course, task: Task) -> Entry:
         if outcome.trouble or not outcome.found:
             break
         lay_over(found, outcome.found)
+        first = first or {f"{name}{BEFORE}": value for name, value in outcome.figures.items()}
         outcome = replace(outcome, found=found)
         try:
             rig = _corrected(course, task, found)
@@ -98,7 +100,8 @@ def do(course: Course, task: Task) -> Entry:
         if attempt + 1 == _TRIES:
             what = "what was corrected is still not as expected"
             outcome = Outcome(outcome.lines, outcome.figures, found, what)
-    whole = replace(outcome, lines=lines, found=found)
+    figures = outcome.figures if outcome.estimated else outcome.figures | first
+    whole = replace(outcome, lines=lines, figures=figures, found=found)
     earlier = course.record.tasks.get(task.name)
     if earlier is not None and earlier.found != found:
         _forget_dependents(course, task)

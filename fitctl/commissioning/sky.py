@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.commissioning.motors import Motors
+from fitctl.commissioning.motors import Motors, Servo
 from fitctl.commissioning.outcome import Site, StepError
 from fitctl.config import Range
 from fitctl.controllers.centroid import Star, StarSensor
@@ -16,12 +17,11 @@ from fitctl.model.optics import scales
 
 Floats = NDArray[np.float64]
 ANY_FLUX = Range(low=1e-6, high=1e9)
-MOST_RAD_S = 4.0
-_GAIN_PER_S = 15.0
-_THERE_RAD = 0.01
-_AWAY_RAD = 0.2
 _FRAMES = 40  # averages the air
 _LEAST_FRAMES = 0.6  # of these must show the star
+_A_STAR = 0.5  # of the brightest spot's light
+_STRAY_PX = 6.0  # from where the star is expected, another one's begins
+_STILL_PX = 0.7
 
 
 class Watch:
@@ -40,15 +40,46 @@ class Watch:
         self._site, self._camera, self.motors = site, camera, motors
         loop = site.loop
         self._sensor = StarSensor(site.rig.camera, loop.model_copy(update={"flux_range": ANY_FLUX}))
-        self.goal_rad = np.zeros(2)
-        if motors is not None:
-            motors.exchange((0.0, 0.0))
-            self.goal_rad = np.array(motors.position_rad)
-        self._sent_rad = self.goal_rad.copy()
+        self._servo = None if motors is None else Servo(site, motors)
+        self._several = len(site.rig.stellar_loops) > 1
+        self._expected_px: Floats | None = None
+        self._px_per_rad = np.zeros((2, 2))
 
-    def brightest(self, frames: int = 5) -> Star | None:
-        """The brightest spot of the next frames."""
-        found = [star for spots in self._spots(frames) for star in spots]
+    def follow(self, place_px: Floats, px_per_rad: Floats | None = None) -> None:
+        """Where the frame has several loops' stars: which is ours, and how it moves with the motors."""
+        if self._several:
+            self._expected_px = np.array(place_px, dtype=float)
+        if px_per_rad is not None:
+            self._px_per_rad = px_per_rad
+
+    def places_px(self, frames: int = _FRAMES) -> list[Floats]:
+        """Where all stars are on average, the brightest first; where there is one loop, its own alone."""
+        if not self._several:
+            return [self.place_px(frames)]
+        each = [
+            [spot for spot in spots if spot.flux_dn > _A_STAR * max(s.flux_dn for s in spots)]
+            for spots in self._spots(frames)
+        ]
+        first = max(each, key=len)
+        found = []
+        for star in sorted(first, key=lambda spot: -spot.flux_dn):
+            near = [
+                spot.position_px
+                for spots in each
+                for spot in spots
+                if _apart_px(spot.position_px, star.position_px) < _STRAY_PX / 2
+            ]
+            found.append(np.asarray(np.median(near, axis=0)))
+        return found
+
+    def brightest(self, frames: int = 5, still: Sequence[Star] = ()) -> Star | None:
+        """The brightest spot of the next frames that is none of those that stand still."""
+        found = [
+            star
+            for spots in self._spots(frames)
+            for star in spots
+            if not any(_apart_px(star.position_px, one.position_px) < _STRAY_PX for one in still)
+        ]
         return max(found, key=lambda star: star.flux_dn, default=None)
 
     def spots(self, frames: int = 10) -> list[Star]:
@@ -65,11 +96,8 @@ class Watch:
         StepError
             If it is not on most frames.
         """
-        places = [
-            max(spots, key=lambda star: star.flux_dn).position_px
-            for spots in self._spots(frames)
-            if spots
-        ]
+        chosen = [self._ours(spots) for spots in self._spots(frames)]
+        places = [star.position_px for star in chosen if star is not None]
         if len(places) < _LEAST_FRAMES * frames:
             msg = (
                 f"the star is on {len(places)} of {frames} frames: it has left the field; "
@@ -79,51 +107,37 @@ class Watch:
             raise StepError(msg)
         return np.asarray(np.median(places, axis=0))
 
+    def _ours(self, spots: list[Star]) -> Star | None:
+        if self._expected_px is None:
+            return max(spots, key=lambda star: star.flux_dn, default=None)
+        expected_px = self._expected_px
+        stars = [one for one in spots if one.flux_dn > _A_STAR * max(s.flux_dn for s in spots)]
+        near = [one for one in stars if _apart_px(one.position_px, expected_px) < _STRAY_PX]
+        return min(near, key=lambda one: _apart_px(one.position_px, expected_px), default=None)
+
     def turn_to(self, goal_rad: Floats) -> None:
         """Turn both motors to an angle of their encoders, slowly.
 
         Raises
         ------
         StepError
-            If one does not get there, or goes the other way, or the angle is beyond the travel.
+            As :meth:`fitctl.commissioning.motors.Servo.turn_to`; or the motors have no power.
         """
-        if self.motors is None:
+        if self._servo is None:
             msg = "the motors have no power"
             raise StepError(msg)
-        self.goal_rad = np.array(goal_rad, dtype=float)
-        travel_rad = self._site.loop.siderostat.travel_rad
-        if np.max(np.abs(self.goal_rad)) > travel_rad:
-            msg = (
-                f"({goal_rad[0]:.1f}, {goal_rad[1]:.1f}) rad is beyond the travel of "
-                f"{travel_rad:.1f} rad from the "
-                "encoders' zero; bring the siderostat nearer to its middle"
-            )
-            raise StepError(msg)
-        began_rad = np.array(self.motors.position_rad)
-        way_rad = np.max(np.abs(self.goal_rad - began_rad))
-        until_s = self._site.clock.now_s() + 2 * way_rad / MOST_RAD_S + 2.0
-        while np.max(np.abs(self.goal_rad - self.motors.position_rad)) > _THERE_RAD:
-            self._hold()
-            apart_rad = np.max(np.abs(self.goal_rad - self.motors.position_rad))
-            if apart_rad > way_rad + _AWAY_RAD:
-                msg = "a motor goes away from where it is sent; repeat the step amplifiers"
-                raise StepError(msg)
-            if self._site.clock.now_s() > until_s:
-                at = ", ".join(f"{one:.2f}" for one in self.motors.position_rad)
-                msg = (
-                    f"the motors are at ({at}) rad and were sent to "
-                    f"({self.goal_rad[0]:.2f}, {self.goal_rad[1]:.2f}) rad: one does not "
-                    "follow; check for a stop or "
-                    "a limit of the amplifier"
-                )
-                raise StepError(msg)
+        if self._expected_px is not None:
+            self._expected_px = self._expected_px + self._px_per_rad @ (goal_rad - self.goal_rad)
+        self._servo.turn_to(goal_rad)
+
+    @property
+    def goal_rad(self) -> Floats:
+        """Where the motors were last sent."""
+        return np.zeros(2) if self._servo is None else self._servo.goal_rad
 
     def _hold(self) -> None:
-        if self.motors is None:
-            return
-        apart = self.goal_rad - self.motors.position_rad
-        az, el = np.clip(_GAIN_PER_S * apart, -MOST_RAD_S, MOST_RAD_S).tolist()
-        self.motors.exchange((az, el))
+        if self._servo is not None:
+            self._servo.hold()
 
     def _spots(self, count: int) -> list[list[Star]]:
         """All spots of each of the next frames; the amplifiers hear from us also while frames are evaluated."""
@@ -150,18 +164,31 @@ class Watch:
         return frames
 
 
-def search(site: Site, watch: Watch) -> tuple[Star, int]:
+def _apart_px(one: Floats, other: Floats) -> float:
+    return float(np.linalg.norm(np.asarray(one) - other))
+
+
+def displaced(before: list[Floats], after: list[Floats]) -> tuple[Floats, Floats] | None:
+    """Where the one star was and is that has moved; None where none has, or not one alone."""
+    gone = [one for one in before if not any(_apart_px(one, b) < _STILL_PX for b in after)]
+    come = [one for one in after if not any(_apart_px(one, a) < _STILL_PX for a in before)]
+    return (gone[0], come[0]) if len(gone) == len(come) == 1 else None
+
+
+def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[Star, int]:
     """The brightest spot, on the frame or on a square spiral about it; and after how many looks.
 
     The spiral is in the motors' own angles, so that it needs neither rotation nor sign of the siderostat.
+    A spot that was among `others` and has not moved is not taken: it is another loop's star.
 
     Raises
     ------
     StepError
         If there is none.
     """
+    still = others or []
     star = watch.brightest()
-    if star is not None:
+    if star is not None and not still:
         return star, 0
     scale = scales(site.rig, site.loop)
     camera = site.rig.camera
@@ -172,7 +199,7 @@ def search(site: Site, watch: Watch) -> tuple[Star, int]:
     for looks, (right, up) in enumerate(square_spiral(turns), start=1):
         site.report(f"look {looks}: az {right * step_rad:+.1f}, el {up * step_rad:+.1f} rad")
         watch.turn_to(centre_rad + step_rad * np.array([right, up]))
-        star = watch.brightest(3)
+        star = watch.brightest(3, still)
         if star is not None:
             return star, looks
     watch.turn_to(centre_rad)

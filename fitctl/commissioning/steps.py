@@ -8,10 +8,12 @@ from typing import Literal, NamedTuple
 from fitctl.commissioning import (
     acceptance,
     amplifiers,
+    beam,
     camera,
     closed,
     devices,
     identified,
+    mirror,
     plate,
     stacks,
     travel,
@@ -31,6 +33,7 @@ class Step(NamedTuple):
         What it does, for people.
     of : str
         ``rig``: done once. ``siderostat``: once for each loop. ``star``: once for each stellar loop.
+        ``beam``: once for each metrology loop; ``collector``: likewise, if the rig has a collector.
     moves : callable
         What it moves and by how much.
     needs : tuple of str
@@ -43,7 +46,7 @@ class Step(NamedTuple):
     """
 
     title: str
-    of: Literal["rig", "siderostat", "star"]
+    of: Literal["rig", "siderostat", "star", "beam", "collector"]
     moves: Callable[[Site], str]
     needs: tuple[str, ...]
     takes_s: float
@@ -107,10 +110,10 @@ STEPS: dict[str, Step] = {
     "mirror": Step(
         "How the star moves with each stack: order, scale, rotation",
         "star",
-        plate.mirror_moves,
+        mirror.moves,
         ("star", "stacks"),
         20.0,
-        plate.check_mirror,
+        mirror.check_mirror,
     ),
     "travel": Step(
         "Each motor turns to both ends of its travel",
@@ -119,6 +122,22 @@ STEPS: dict[str, Step] = {
         ("amplifiers",),
         100.0,
         travel.check_travel,
+    ),
+    "photodiodes": Step(
+        "Which photodiode is where, as the beam moves over them",
+        "beam",
+        beam.photodiodes_moves,
+        ("amplifiers",),
+        40.0,
+        beam.check_photodiodes,
+    ),
+    "collector": Step(
+        "Which way the hexapod moves the photodiodes under the beam",
+        "collector",
+        beam.collector_moves,
+        ("photodiodes",),
+        60.0,
+        beam.check_collector,
     ),
     "gentle": Step(
         "The first closed loop: the siderostat at a tenth of its gain",
@@ -209,7 +228,14 @@ class Task(NamedTuple):
 
 def tasks_of(rig: Rig) -> list[Task]:
     """All tasks of a rig, in their order."""
-    loops = {"rig": [""], "siderostat": list(rig.loops), "star": list(rig.stellar_loops)}
+    beams = list(rig.metrology_loops)
+    loops = {
+        "rig": [""],
+        "siderostat": list(rig.loops),
+        "star": list(rig.stellar_loops),
+        "beam": beams,
+        "collector": beams if rig.collector else [],
+    }
     return [
         Task(f"{loop}.{name}" if loop else name, loop, step)
         for name, step in STEPS.items()

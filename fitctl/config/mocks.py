@@ -103,6 +103,10 @@ class GigeMock(Settings):
         By how many right angles its picture is turned, azimuth towards elevation; for a square sensor.
     mirrored : bool
         Its picture is mirrored along azimuth, before it is turned.
+    mono8_only : bool
+        It has no other pixel format.
+    offset_at_start_px : int
+        Along both axes, of the region that the last program left it with, which ends at the sensor's edges.
     """
 
     description: Literal["xml", "zip"]
@@ -111,6 +115,8 @@ class GigeMock(Settings):
     true_frame_rate_hz: Positive | None = None
     quarter_turns: Annotated[int, Field(ge=0, le=3)] = 0
     mirrored: bool = False
+    mono8_only: bool = False
+    offset_at_start_px: Annotated[int, Field(ge=0, le=16)] = 0
 
 
 class EnsembleMock(Settings):
@@ -236,11 +242,14 @@ class SiderostatMocks(Settings):
     ----------
     velocity_gains : list of float, optional
         How many times faster than commanded each axis of the amplifiers turns its motor.
+    motor_ends_rad : list of float, optional
+        How far each axis's motor turns, either way from where it was at power-up, before something stops it.
     """
 
     slcan_port: Port
     drive_command_timeout_s: Positive
     velocity_gains: Annotated[list[Finite], Field(min_length=2, max_length=2)] | None = None
+    motor_ends_rad: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
     ensemble: EnsembleMock | None = None  # where siderostat.device is one
     bal_analog: BalAnalogMock | None = None  # likewise
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 from fitctl.config import Siderostat, SiderostatMocks
@@ -38,9 +39,11 @@ def amplifier_mock(
 
     A drive whose CAN bus has others too is on `adapter`.
     """
-    wiring, gains = siderostat.wiring, mocks.velocity_gains
-    if wiring is not None or gains is not None:
-        motors = WiredMotors(motors, wiring or STRAIGHT, gains or [1.0, 1.0])
+    wiring, gains, ends_rad = siderostat.wiring, mocks.velocity_gains, mocks.motor_ends_rad
+    if (wiring, gains, ends_rad) != (None, None, None):
+        motors = WiredMotors(
+            motors, wiring or STRAIGHT, gains or [1.0, 1.0], ends_rad or [math.inf, math.inf]
+        )
     match siderostat.device.driver:
         case "ensemble" if mocks.ensemble is not None:
             return EnsembleControllerMock(siderostat, mocks.ensemble, motors)

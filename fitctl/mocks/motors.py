@@ -45,12 +45,20 @@ class WiredMotors:
     wiring : AmplifierWiring
     velocity_gains : sequence of float
         How many times faster than commanded axis 0 and 1 turn their motors.
+    ends_rad : sequence of float
+        Where azimuth and elevation meet an end, either way from zero. They stop there at the next command,
+        a little beyond it.
     """
 
     def __init__(
-        self, motors: Motors, wiring: AmplifierWiring, velocity_gains: Sequence[float]
+        self,
+        motors: Motors,
+        wiring: AmplifierWiring,
+        velocity_gains: Sequence[float],
+        ends_rad: Sequence[float] = (math.inf, math.inf),
     ) -> None:
         self._motors = motors
+        self._ends_rad = ends_rad
         self._velocity_gains = velocity_gains
         self._axes = wiring.axes
         self._velocity_signs, self._encoder_signs = wiring.velocity_signs, wiring.encoder_signs
@@ -66,9 +74,15 @@ class WiredMotors:
     def command_velocity_rad_s(self, first: float, second: float) -> None:
         """Drive the motors on axis 0 and 1."""
         commanded = (first * self._velocity_gains[0], second * self._velocity_gains[1])
-        az, el = (
+        turned = (
             sign * commanded[axis]
             for sign, axis in zip(self._velocity_signs, self._axes, strict=True)
+        )
+        az, el = (
+            0.0 if abs(at) >= end and at * velocity > 0 else velocity
+            for velocity, at, end in zip(
+                turned, self._motors.position_rad(), self._ends_rad, strict=True
+            )
         )
         self._motors.command_velocity_rad_s(az, el)
 

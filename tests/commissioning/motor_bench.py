@@ -71,7 +71,5 @@ class BenchAmplifiers:
         self._at_s = now_s
 
 
-def site_of(rig=RIG, clock=None):
-    return Site(
-        rig, "right", lambda _line: None, Path("rig.toml"), (), clock=clock or VirtualClock()
-    )
+def site_of(rig=RIG, clock=None, name="right"):
+    return Site(rig, name, lambda _line: None, Path("rig.toml"), (), clock=clock or VirtualClock())

@@ -8,10 +8,10 @@ from commissioning.motor_bench import RIG, site_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from fitctl.commissioning.mirror import _mirror_outcome
 from fitctl.commissioning.outcome import StepError
 from fitctl.commissioning.plate import (
     _flipped,
-    _mirror_outcome,
     _siderostat_outcome,
     similar,
 )

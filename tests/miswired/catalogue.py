@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 SIDEROSTAT = "loops.right.siderostat"
 WIRING = f"{SIDEROSTAT}.wiring"
 MOCKS = "mocks.loops.right"
+TESTBED = "fit-testbed.toml"
 ENSEMBLE, BAL = "ensemble.toml", "fit-bal-analog.toml"
 CIA402 = "fit-mock.toml"
 
@@ -31,6 +32,12 @@ class Entry(NamedTuple):
     most_v : float
         How far a stack may go from where it was, at the D/A.
     rig : str
+    only : tuple of str
+        In place of everything up to `step`, these steps.
+    loop : str
+        Whose motions are watched.
+    exchanged : tuple of str
+        Two keys of the rig file that have each other's address.
     """
 
     name: str
@@ -42,6 +49,9 @@ class Entry(NamedTuple):
     most_rad: float = 0.05
     most_v: float = 0.35
     rig: str = CIA402
+    only: tuple[str, ...] = ()
+    loop: str = "right"
+    exchanged: tuple[str, ...] = ()
 
 
 def wired(axes=(0, 1), velocity=(1, 1), encoder=(1, 1)):
@@ -51,27 +61,41 @@ def wired(axes=(0, 1), velocity=(1, 1), encoder=(1, 1)):
     return (f"{WIRING}={{ {inside} }}",)
 
 
+RUNS_AWAY = 5.0
+"""Where a controller closes a loop of its own about the encoder: it runs away inside, up to its error limit."""
+COMMON = {
+    "azimuth motor reversed": wired(velocity=(-1, 1)),
+    "elevation motor reversed": wired(velocity=(1, -1)),
+    "both motors reversed": wired(velocity=(-1, -1)),
+    "azimuth encoder reversed": wired(encoder=(-1, 1)),
+    "both encoders reversed": wired(encoder=(-1, -1)),
+}
+SIGNS = {
+    "azimuth motor reversed": (-1, 1),
+    "elevation motor reversed": (1, -1),
+    "both motors reversed": (-1, -1),
+    "azimuth encoder reversed": (-1, 1),
+    "both encoders reversed": (-1, -1),
+}
+
+
 def _amplifiers(rig, back_end):
     def entry(name, wrong, **expected):
         return Entry(f"{name} ({back_end})", "amplifiers", wrong, "amplifiers", rig=rig, **expected)
 
     def signs(az, el):
+        if rig == BAL:
+            key = f"{SIDEROSTAT}.device.velocity_rad_s_per_v"
+            scales = {f"{key}.az": 6.0 * az, f"{key}.el": 6.0 * el}
+            return {key: scale for key, scale in scales.items() if scale < 0}
         return {f"{WIRING}.velocity_signs": [az, el]}
 
     yield entry("nothing", ())
-    if rig == BAL:
-        key = f"{SIDEROSTAT}.device.velocity_rad_s_per_v"
-        yield entry("azimuth motor reversed", wired(velocity=(-1, 1)), found={f"{key}.az": -6.0})
-    elif rig == ENSEMBLE:
-        # The controller closes a loop of its own about the encoder: it runs away inside, up to its error limit.
-        yield entry(
-            "azimuth motor reversed",
-            wired(velocity=(-1, 1)),
-            named="counts against it",
-            most_rad=5.0,
-        )
-    else:
-        yield entry("azimuth motor reversed", wired(velocity=(-1, 1)), found=signs(-1, 1))
+    for name, wrong in COMMON.items():
+        if rig == ENSEMBLE:
+            yield entry(name, wrong, named="counts against it", most_rad=RUNS_AWAY)
+        else:
+            yield entry(name, wrong, found=signs(*SIGNS[name]))
     yield entry(
         "elevation axis dead",
         (f"{MOCKS}.velocity_gains=[1.0, 0.0]",),
@@ -82,47 +106,29 @@ def _amplifiers(rig, back_end):
         ("mocks.faults=[{ device = 'right.drive', kind = 'stuck_axis', part = 'az' }]",),
         named="azimuth",
     )
-
-
-AMPLIFIERS = [
-    *_amplifiers(CIA402, "CiA 402"),
-]
-
-
-def _cia402(name, wrong, **expected):
-    return Entry(f"{name} (CiA 402)", "amplifiers", wrong, "amplifiers", **expected)
-
-
-def _signs(az, el):
-    return {f"{WIRING}.velocity_signs": [az, el]}
-
-
-AMPLIFIERS += [
-    _cia402("elevation motor reversed", wired(velocity=(1, -1)), found=_signs(1, -1)),
-    _cia402("both motors reversed", wired(velocity=(-1, -1)), found=_signs(-1, -1)),
-    _cia402("azimuth encoder reversed", wired(encoder=(-1, 1)), found=_signs(-1, 1)),
-    _cia402("both encoders reversed", wired(encoder=(-1, -1)), found=_signs(-1, -1)),
-    _cia402(
-        "encoders of 1000 counts for 4000",
-        (f"{SIDEROSTAT}.encoder_counts_per_rev=1000",),
-        named="encoder_counts_per_rev",
-    ),
-    _cia402(
-        "encoders of 16000 counts for 4000",
-        (f"{SIDEROSTAT}.encoder_counts_per_rev=16000",),
-        named="encoder_counts_per_rev",
-    ),
-    _cia402(
+    if rig == ENSEMBLE:  # it counts in its own units, and follows itself
+        return
+    for counts in (1000, 16000):
+        yield entry(
+            f"encoders of {counts} counts for 4000",
+            (f"{SIDEROSTAT}.encoder_counts_per_rev={counts}",),
+            named="encoder_counts_per_rev",
+        )
+    yield entry(
         "velocity scale 10 times",
         (f"{MOCKS}.velocity_gains=[10.0, 10.0]",),
         named="times as fast as commanded",
         most_rad=0.1,  # until the first reading beyond the bound, and one period more
-    ),
-    _cia402(
+    )
+    yield entry(
         "velocity scale a tenth",
         (f"{MOCKS}.velocity_gains=[0.1, 0.1]",),
         named="no encoder counted its pulse",
-    ),
+    )
+
+
+AMPLIFIERS = [
+    *_amplifiers(CIA402, "CiA 402"),
     *_amplifiers(ENSEMBLE, "Ensemble"),
     *_amplifiers(BAL, "analogue"),
 ]
@@ -271,6 +277,8 @@ CAMERA = [
         "star",
         most_rad=20.0,
     ),
+    _camera("only Mono8 where Mono16 is said", "mocks.camera.mono8_only=true", named="PixelFormat"),
+    _camera("region offset by the last program", "mocks.camera.offset_at_start_px=8"),
 ]
 
 
@@ -280,32 +288,58 @@ def _optics(name, *wrong, step="siderostat", **expected):
     )
 
 
-OPTICS = [
-    _optics("nothing", step="mirror"),
-    _optics(
-        "siderostat axes exchanged",
-        *wired(axes=(1, 0)),
-        found={f"{WIRING}.axes": [1, 0]},
-    ),
-    _optics(
+def _siderostat(rig, back_end):
+    def entry(name, *wrong, **expected):
+        return _optics(f"{name} ({back_end})", *wrong, rig=rig, **expected)
+
+    yield entry("siderostat axes exchanged", *wired(axes=(1, 0)), found={f"{WIRING}.axes": [1, 0]})
+    yield entry(
         "azimuth motor and its encoder reversed",
         *wired(velocity=(-1, 1), encoder=(-1, 1)),
         found={f"{WIRING}.velocity_signs": [-1, 1], f"{WIRING}.encoder_signs": [-1, 1]},
-    ),
-    _optics(
+    )
+    yield entry(
         "elevation motor and its encoder reversed",
         *wired(velocity=(1, -1), encoder=(1, -1)),
         found={f"{WIRING}.velocity_signs": [1, -1], f"{WIRING}.encoder_signs": [1, -1]},
-    ),
+    )
+    yield entry(
+        "both motors and encoders reversed",
+        *wired(velocity=(-1, -1), encoder=(-1, -1)),
+        found={SIDEROSTAT_DEG: 180.0},
+    )
+    yield entry(
+        "azimuth stuck after 1 rad",
+        f"{MOCKS}.motor_ends_rad=[1.0, 1000.0]",
+        named=STOPS[rig],
+    )
+    yield entry(
+        "an end nearer than the travel",
+        f"{MOCKS}.motor_ends_rad=[1000.0, 30.0]",
+        step="travel",
+        named="elevation",
+        most_rad=81.0,
+    )
+
+
+STOPS = {CIA402: "does not follow", BAL: "does not follow", ENSEMBLE: "fault"}
+OPTICS = [
+    _optics("nothing", step="mirror"),
+    *_siderostat(CIA402, "CiA 402"),
+    *_siderostat(ENSEMBLE, "Ensemble"),
+    *_siderostat(BAL, "analogue"),
     _optics(
         "elevation encoder alone reversed",
         *wired(encoder=(1, -1)),
         found={f"{WIRING}.velocity_signs": [1, 1], f"{WIRING}.encoder_signs": [1, -1]},
     ),
     _optics(
-        "both motors and encoders reversed",
-        *wired(velocity=(-1, -1), encoder=(-1, -1)),
-        found={SIDEROSTAT_DEG: 180.0},
+        "software limits nearer than the travel (Ensemble)",
+        f"{MOCKS}.ensemble.software_limit_units=5.0",
+        rig=ENSEMBLE,
+        step="travel",
+        named="31.",
+        most_rad=33.0,
     ),
     _optics(
         "spur gear 20 % off",
@@ -317,6 +351,23 @@ OPTICS = [
         "siderostat turned by 30 degrees",
         f"{SIDEROSTAT}.rotation_deg=30.0",
         found={SIDEROSTAT_DEG: 30.0},
+    ),
+    _optics(
+        "focal length 20 % off",
+        "optics.focal_length_m=0.5484",
+        step="mirror",
+        found={"optics.focal_length_m": 0.5484},
+    ),
+    _optics("D/A at 0 V at the start", f"{DAC}.safe_v=0.0", step="mirror", most_v=7.6),
+    _optics(
+        "mirror mounted mirrored",
+        "plant.loops.right.fsm_axis_gains=[[-1.0, 0.0], [0.0, 1.0]]",
+        step="mirror",
+        found={
+            f"{FSM}.dac.channels": [3, 2, 1],
+            f"{FSM}.piezo.channels": [3, 2, 1],
+            MIRROR_DEG: -90.0,
+        },
     ),
     _optics("backlash 5 times", "plant.loops.right.backlash_sky_arcsec=5.0"),
     _optics(
@@ -336,7 +387,58 @@ OPTICS = [
         for order in ((2, 1, 3), (1, 3, 2), (2, 3, 1), (3, 1, 2))
     ),
 ]
+STARS_NEAR = tuple(
+    f"plant.loops.{loop}.star_offset_sky_arcsec_max=10.0" for loop in ("left", "right")
+)
+CHANNEL = "loops.{}.siderostat.device.channel"
+INPUTS = "loops.metrology.sensor.device.inputs"
+AZIMUTH = "collector.geometry.link_azimuth"
+OF_RIGHT = ("devices", "camera", "stacks", "amplifiers", "star", "siderostat", "mirror")
+OF_BEAM = ("devices", "metrology.amplifiers", "metrology.photodiodes")
+
+
+def _testbed(name, *wrong, only=OF_BEAM, **expected):
+    most = {"most_rad": 90.0, "loop": "metrology"} | expected
+    return Entry(name, "testbed", (*STARS_NEAR, *wrong), only[-1], rig=TESTBED, only=only, **most)
+
+
+def _of_right(other):
+    return _testbed(
+        f"amplifiers of right and {other} exchanged",
+        only=tuple(name if name in OF_RIGHT[:2] else f"right.{name}" for name in OF_RIGHT),
+        exchanged=(CHANNEL.format("right"), CHANNEL.format(other)),
+        named={"left": "another star", "metrology": "whether this siderostat"}[other],
+        most_rad=7.0,
+        most_v=2.6,
+        loop=other,
+    )
+
+
+TESTBED_ENTRIES = [
+    _testbed("nothing", only=(*OF_RIGHT, "photodiodes", "collector"), most_v=2.6),
+    _of_right("left"),
+    _of_right("metrology"),
+    *(
+        _testbed(
+            f"photodiodes az+, az-, el+, el- on inputs {', '.join(map(str, inputs))}",
+            f"{INPUTS}={list(inputs)}",
+            found={INPUTS: list(inputs)},
+        )
+        for inputs in ((1, 0, 2, 3), (2, 1, 0, 3), (2, 3, 0, 1))
+    ),
+    _testbed(
+        "photodiode el- unplugged",
+        "mocks.faults=[{ device = 'metrology.labjack', kind = 'unplugged', part = 'AIN3' }]",
+        named="photodiodes",
+    ),
+    _testbed(
+        "hexapod turned by 90 degrees about the link",
+        f"{AZIMUTH}=[0.0, 0.0, 1.0]",
+        only=(*OF_BEAM, "metrology.collector"),
+        found={AZIMUTH: [0.0, 0.0, 1.0]},
+    ),
+]
 CATALOGUE = [
     entry._replace(name=f"{entry.name} ({entry.group})" if entry.name == "nothing" else entry.name)
-    for entry in (*AMPLIFIERS, *STACKS, *CAMERA, *OPTICS)
+    for entry in (*AMPLIFIERS, *STACKS, *CAMERA, *OPTICS, *TESTBED_ENTRIES)
 ]

@@ -11,7 +11,7 @@ from fitctl.commissioning.outcome import Site
 from fitctl.commissioning.steps import STEPS
 from fitctl.config import default_rig_path, load_rig
 
-from .catalogue import CATALOGUE
+from .catalogue import CATALOGUE, TESTBED
 
 PAGE = ROOT / "docs" / "commissioning.md"
 HEADER = ["what is wrong", "must be", "result", "largest motion of a motor", "of a stack", "took"]
@@ -37,10 +37,21 @@ def outcome(result):
     return f"corrected: {keys}" if keys else "passed"
 
 
-def rows(results):
-    """A row for each entry."""
+def kept_rows(page):
+    """The rows that the page has, by what is wrong: a run may have been of some entries only."""
+    within = re.search(r"<!-- results: begin -->\n(.*?)<!-- results: end -->", page, re.DOTALL)
+    lines = within[1].splitlines()[2:]
+    cells = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines]
+    return {row[0]: row for row in cells if len(row) == len(HEADER)}
+
+
+def rows(results, kept):
+    """A row for each entry: of this run or, where it did not have the entry, of an earlier one."""
     for entry in CATALOGUE:
         result = results.get(entry.name)
+        if result is None and entry.name in kept:
+            yield kept[entry.name]
+            continue
         measured = ["", "", ""]
         if result is not None:
             measured = [
@@ -52,11 +63,13 @@ def rows(results):
 
 
 def steps_table():
-    """A row for each step, as it is on the default rig."""
-    rig = load_rig(default_rig_path())
+    """A row for each step, as it is on the default rig; of a metrology loop, on the testbed."""
+    one, whole = load_rig(default_rig_path()), load_rig(default_rig_path().with_name(TESTBED))
+    loops = {"rig": "", "siderostat": "right", "star": "right"}
     rows = []
     for name, step in STEPS.items():
-        site = Site(rig, "" if step.of == "rig" else "right", print, default_rig_path(), ())
+        rig = one if step.of in loops else whole
+        site = Site(rig, loops.get(step.of, "metrology"), print, default_rig_path(), ())
         needs = ", ".join(f"`{one}`" for one in step.needs)
         rows.append([f"`{name}`", step.title, step.moves(site), needs, f"{step.takes_s:g} s"])
     return table(STEPS_HEADER, rows)
@@ -72,7 +85,7 @@ def main(path):
     """Write both tables."""
     results = json.loads(Path(path).read_text())
     page = marked(PAGE.read_text(), "steps", steps_table())
-    PAGE.write_text(marked(page, "results", table(HEADER, rows(results))))
+    PAGE.write_text(marked(page, "results", table(HEADER, rows(results, kept_rows(page)))))
 
 
 if __name__ == "__main__":

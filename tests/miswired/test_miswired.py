@@ -23,16 +23,17 @@ LOOK_S = 0.02
 class Watched(threading.Thread):
     """Asks the bench where the stages truly are, whatever commissioning believes."""
 
-    def __init__(self, port):
+    def __init__(self, port, loop):
         super().__init__(daemon=True)
         self.ending = threading.Event()
         self.port = port
-        self.first = ask_bench(port, StagesQuestion(loop="right"), StagesNow)
+        self.question = StagesQuestion(loop=loop)
+        self.first = ask_bench(port, self.question, StagesNow)
         self.most_rad = self.most_v = 0.0
 
     def run(self):
         while not self.ending.wait(LOOK_S):
-            now = ask_bench(self.port, StagesQuestion(loop="right"), StagesNow)
+            now = ask_bench(self.port, self.question, StagesNow)
             self.most_rad = max(self.most_rad, largest(now.motor_rad, self.first.motor_rad))
             self.most_v = max(self.most_v, largest(now.stack_v, self.first.stack_v))
 
@@ -42,7 +43,7 @@ class Watched(threading.Thread):
 
 
 def largest(now, first):
-    return max(abs(a - b) for a, b in zip(now, first, strict=True))
+    return max((abs(a - b) for a, b in zip(now, first, strict=True)), default=0.0)
 
 
 def settings(pairs):
@@ -50,7 +51,7 @@ def settings(pairs):
 
 
 @contextmanager
-def mocks_of(rig, wrong, seed=0):
+def mocks_of(rig, wrong, exchanged=(), seed=0):
     """Mocks wired as the entry says; their endpoints, and the bench's port."""
     arguments = ["mocks", "--rig", str(rig), "--free-ports", "--json", "--seed", str(seed)]
     process = subprocess.Popen(
@@ -60,6 +61,9 @@ def mocks_of(rig, wrong, seed=0):
     )
     try:
         endpoints = json.loads(process.stdout.readline())
+        if exchanged:
+            one, other = exchanged
+            endpoints[one], endpoints[other] = endpoints[other], endpoints[one]
         devices = [f"{key}={value}" for key, value in endpoints.items() if key[:6] != "mocks."]
         yield devices, int(endpoints["mocks.bench_port"])
     finally:
@@ -68,17 +72,19 @@ def mocks_of(rig, wrong, seed=0):
 
 
 ALONG = {  # keys that change with another one
-    "siderostat.travel_sky_arcsec": "siderostat.spur_gear_ratio",
-    "other_spots": "star_flux_dn",
-    "fsm.piezo.channels": "fsm.dac.channels",
+    "siderostat.travel_sky_arcsec": ("siderostat.spur_gear_ratio", "focal_length_m"),
+    "siderostat.spur_gear_ratio": ("focal_length_m",),
+    "other_spots": ("star_flux_dn",),
+    "fsm.piezo.channels": ("fsm.dac.channels",),
 }
 
 
 def expected(key, found):
     """Whether a key may change where the catalogue's keys must."""
     within = [one.rpartition(".")[0] for one in found if "wiring" in one or "per_v" in one]
-    along = next((by for end, by in ALONG.items() if key.endswith(end)), "none")
-    return key in found or key.rpartition(".")[0] in within or any(along in one for one in found)
+    along = next((by for end, by in ALONG.items() if key.endswith(end)), ())
+    beside = any(by in one for by in along for one in found)
+    return key in found or key.rpartition(".")[0] in within or beside
 
 
 def values(table, under=""):
@@ -89,11 +95,15 @@ def values(table, under=""):
             yield f"{under}{key}", value
 
 
+def steps_of(entry):
+    return [part for name in entry.only for part in ("--only", name)] or ["--until", entry.step]
+
+
 def commissioned(folder, entry):
     """What commissioning makes of an entry, and how far the stages truly moved."""
     rig = default_rig_path().with_name(entry.rig)
-    with mocks_of(rig, entry.wrong) as (devices, bench_port):
-        watched = Watched(bench_port)
+    with mocks_of(rig, entry.wrong, entry.exchanged) as (devices, bench_port):
+        watched = Watched(bench_port, entry.loop)
         watched.start()
         # The sockets in the test's folder: several entries run beside each other.
         own = [*devices, f"service.folder={folder}/sockets", f"logging.folder={folder}"]
@@ -110,7 +120,7 @@ def commissioned(folder, entry):
                     "--yes",
                     "--json",
                 ),
-                *("--folder", str(folder), "--until", entry.step, *settings(own)),
+                *("--folder", str(folder), *steps_of(entry), *settings(own)),
             ],
             capture_output=True,
             text=True,

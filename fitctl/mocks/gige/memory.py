@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zipfile
 from enum import IntEnum
@@ -133,7 +134,7 @@ class Memory:
 
     def __init__(self, settings: GigeMock) -> None:
         self._bytes = bytearray(_SPACE_BYTES)
-        name, self._xml = _description(settings.description)
+        name, self._xml = _description(settings)
         location = protocol.XmlLocation(name, XML_ADDRESS, len(self._xml))
         self._xml += b"\0" * (-len(self._xml) % 4)
         self._exists: set[int] = {int(address) for address in (*Register, *Feature)}
@@ -146,6 +147,8 @@ class Memory:
         self._writable |= set(range(user_name.address, user_name.address + user_name.length, 4))
         for word, value in _WORDS_AT_START.items():
             self.set_word(word, value)
+        if settings.mono8_only:
+            self.set_word(Feature.PIXEL_FORMAT, PIXEL_FORMATS["Mono8"].code)
         for double, number in _DOUBLES_AT_START.items():
             self.set_double(double, number)
         for register, text in _TEXTS_AT_START.items():
@@ -204,10 +207,12 @@ class Memory:
             raise RegisterError(Status.BAD_ALIGNMENT)
 
 
-def _description(kept: str) -> tuple[str, bytes]:
+def _description(settings: GigeMock) -> tuple[str, bytes]:
     """The GenICam description as the camera keeps it: a file's name, and what is in it."""
     xml = Path(__file__).with_name("fit_camera.xml").read_bytes()
-    if kept == "xml":
+    if settings.mono8_only:
+        xml = re.sub(rb'\s*<EnumEntry Name="Mono1[26]".*?</EnumEntry>', b"", xml)
+    if settings.description == "xml":
         return "fit_camera.xml", xml
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as writer:

@@ -78,6 +78,11 @@ class Registers(Memory):
         self._clock = clock
         self._acquisition = acquisition
         self._stream = stream
+        self._formats = {
+            code: one
+            for code, one in _FORMAT_OF_CODE.items()
+            if one is protocol.PIXEL_FORMATS["Mono8"] or not settings.mono8_only
+        }
         self._width_max_px = camera.width_px
         self._height_max_px = camera.height_px
         self._actions: dict[int, Callable[[int], None]] = {
@@ -100,6 +105,13 @@ class Registers(Memory):
             self.set_word(feature, camera.width_px)
         for feature in (Feature.HEIGHT, Feature.HEIGHT_MAX):
             self.set_word(feature, camera.height_px)
+        left_px = settings.offset_at_start_px
+        for size, offset in (
+            (Feature.WIDTH, Feature.OFFSET_X),
+            (Feature.HEIGHT, Feature.OFFSET_Y),
+        ):
+            self.set_word(offset, left_px)
+            self.set_word(size, self.word(size) - left_px)
         self.set_word(Register.STREAM_SOURCE_PORT, stream.source_port)
         self._set_size()
 
@@ -180,7 +192,7 @@ class Registers(Memory):
             self.word(feature)
             for feature in (Feature.WIDTH, Feature.HEIGHT, Feature.OFFSET_X, Feature.OFFSET_Y)
         )
-        pixel_format = _FORMAT_OF_CODE.get(self.word(Feature.PIXEL_FORMAT))
+        pixel_format = self._formats.get(self.word(Feature.PIXEL_FORMAT))
         fits = width + offset_x <= self._width_max_px
         fits &= height + offset_y <= self._height_max_px
         if not fits or min(width, height) < SIZE_MIN_PX or pixel_format is None:

@@ -1,0 +1,64 @@
+"""What motions of the metrology beam make of the rig file: photodiodes' order, the hexapod's direction."""
+
+import itertools
+
+import numpy as np
+import pytest
+from commissioning.motor_bench import site_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fitctl.commissioning.beam import _collector_outcome, _photodiodes_outcome
+from fitctl.commissioning.outcome import StepError
+from fitctl.config import default_rig_path, load_rig
+from fitctl.model.metrology.geometry import transverse_axes
+from fitctl.model.optics import rotation
+
+RIG = load_rig(default_rig_path().with_name("fit-testbed.toml"))
+OFFSET_M = RIG.metrology_loops["metrology"].sensor.diode_offset_m
+CORNERS_M = OFFSET_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+LIGHTS_V = np.full(4, 5.0)
+SITE = site_of(RIG, name="metrology")
+
+
+@given(
+    st.sampled_from(list(itertools.permutations(range(4)))),
+    st.lists(st.floats(-0.2, 0.2), min_size=8, max_size=8),
+)
+def test_photodiodes_on_other_inputs_get_theirs_in_the_rig_file(order, noise):
+    """`order[n]` is the input that has the n-th photodiode."""
+    places_m = np.empty((4, 2))
+    places_m[list(order)] = CORNERS_M
+    outcome = _photodiodes_outcome(SITE, places_m + OFFSET_M * np.reshape(noise, (4, 2)), LIGHTS_V)
+    if order == (0, 1, 2, 3):
+        assert outcome.state == "passed"
+    else:
+        device = outcome.found["loops"]["metrology"]["sensor"]["device"]
+        assert device["inputs"] == list(order)
+
+
+def test_photodiodes_that_are_no_four_corners_are_named():
+    places_m = CORNERS_M.copy()
+    places_m[2] = places_m[0]
+    with pytest.raises(StepError, match="check that all four"):
+        _photodiodes_outcome(SITE, places_m, LIGHTS_V)
+
+
+@given(st.floats(-170.0, 170.0), st.floats(0.85, 1.15))
+def test_a_turned_hexapod_gets_its_link_azimuth(turned_deg, scale):
+    """With the azimuth that was found, a motion along it is one along the photodiodes' azimuth."""
+    seen = scale * rotation(turned_deg)
+    outcome = _collector_outcome(RIG.collector, seen)
+    if abs(turned_deg) <= 4.9:
+        assert outcome.state == "passed"
+    if abs(turned_deg) <= 5.1:
+        return
+    azimuth = outcome.found["collector"]["geometry"]["link_azimuth"]
+    along = transverse_axes(RIG.collector.geometry) @ azimuth
+    assert seen @ along == pytest.approx([scale, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("seen", [np.diag([1.0, -1.0]), np.zeros((2, 2)), 3.0 * np.eye(2)])
+def test_a_hexapod_that_moves_the_beam_otherwise_is_named(seen):
+    with pytest.raises(StepError, match="hexapod"):
+        _collector_outcome(RIG.collector, seen)
