@@ -63,6 +63,25 @@ def test_a_correction_is_proved_by_a_second_measurement_and_kept(course, table):
     assert "# The default rig" in course.files.rig.read_text()
 
 
+def test_a_corrected_step_keeps_what_it_measured_before(course, table):
+    table(gear=step(corrects_the_gear))
+    assert do(course, task(course, "gear")).figures == {
+        "gear": 26.0,
+        "gear before correction": 25.0,
+    }
+
+
+def test_an_estimate_is_taken_without_a_second_measurement(course, table):
+    done = []
+    table(
+        gear=step(lambda site: done.append(site) or Outcome(found=GEAR, estimated=True)),
+        later=step(lambda site: Outcome(figures={"gear": gear_of(site)}), "gear"),
+    )
+    assert do(course, task(course, "gear")).state == "measured"
+    assert len(done) == 1
+    assert do(course, task(course, "later")).figures == {"gear": 26.0}
+
+
 def test_a_correction_that_helps_nothing_fails(course, table):
     table(gear=step(lambda _site: Outcome(found=GEAR)))
     entry = do(course, task(course, "gear"))

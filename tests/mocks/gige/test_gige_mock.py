@@ -247,3 +247,23 @@ def test_a_taken_port_is_an_error_and_nothing_stays_open() -> None:
         await second.stop()
 
     scenario(check)
+
+
+def test_a_camera_with_mono8_only_has_no_other_format_and_describes_none() -> None:
+    def check(mock: GigeCameraMock) -> None:
+        assert write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL) == p.Status.SUCCESS
+        assert read(mock, Feature.PIXEL_FORMAT) == p.PIXEL_FORMATS["Mono8"].code
+        mono16 = p.PIXEL_FORMATS["Mono16"].code
+        assert write(mock, Feature.PIXEL_FORMAT, mono16) == p.Status.INVALID_PARAMETER
+
+    scenario(check, mono8_only=True)
+
+
+def test_the_last_programs_region_can_be_made_the_whole_sensor() -> None:
+    def check(mock: GigeCameraMock) -> None:
+        assert write(mock, p.Register.CONTROL_PRIVILEGE, p.CONTROL) == p.Status.SUCCESS
+        assert (read(mock, Feature.WIDTH), read(mock, Feature.OFFSET_X)) == (32, 8)
+        assert write(mock, Feature.OFFSET_X, 0) == p.Status.SUCCESS
+        assert write(mock, Feature.WIDTH, 40) == p.Status.SUCCESS
+
+    scenario(check, offset_at_start_px=8)
