@@ -219,6 +219,7 @@ CONTRADICTIONS = [
     # pointing
     ({f"{SEARCH}.confirm_timeout_s": 0.08}, f"{SEARCH}.found_frames"),
     ({f"{SEARCH}.found_frames": 100}, f"{SEARCH}.confirm_timeout_s"),
+    ({"camera.frame_delay_s": 3.3}, f"{SEARCH}.confirm_timeout_s"),
     ({"loops.right.coarse.gain_rad_per_m": 500_000.0}, "camera.frame_delay_s"),
     ({"loops.right.vernier.fslq.crossover_hz": 40.0}, "camera.frame_rate_hz"),
     # interlocks

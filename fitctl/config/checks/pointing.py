@@ -33,6 +33,7 @@ def _confirmation(rig: Rig, key: str, loop: Loop | MetrologyLoop) -> Iterator[Co
     if acquisition.confirm_timeout_s < needed_s:
         frames_s = acquisition.confirm_timeout_s - camera.frame_delay_s
         frames = math.floor(frames_s / camera.period_s)
+        delay_s = acquisition.confirm_timeout_s - acquisition.found_frames * camera.period_s
         yield Conflict(
             f"found_frames frames and the camera's delay take {needed_s:.4g} s",
             (
@@ -41,6 +42,11 @@ def _confirmation(rig: Rig, key: str, loop: Loop | MetrologyLoop) -> Iterator[Co
                     f"{key}.found_frames",
                     acquisition.found_frames,
                     f"at most {frames}" if frames > 0 else "",
+                ),
+                Part(
+                    "camera.frame_delay_s",
+                    camera.frame_delay_s,
+                    at_most("", 0, delay_s).must_be if delay_s > 0 else "",
                 ),
                 Part(
                     "camera.frame_rate_hz",
