@@ -8,6 +8,7 @@ from fitctl.cli import main
 from fitctl.commissioning import steps
 from fitctl.commissioning.outcome import Outcome
 from fitctl.commissioning.steps import STEPS, Step
+from fitctl.config import default_rig_path
 
 REAL = "loops.right.siderostat.device.channel=/dev/ttyACM0"
 
@@ -53,8 +54,9 @@ def test_without_a_terminal_it_asks_nobody(commission):
     assert "needs a terminal" in text
 
 
-def test_the_list_has_every_step_and_what_it_moves(commission):
-    status, text = commission("--list", "--yes")
+def test_the_list_has_every_step_and_what_it_moves(commission, tmp_path):
+    testbed = default_rig_path().with_name("fit-testbed.toml")
+    status, text = commission("--list", "--rig", str(testbed), "--folder", str(tmp_path))
     assert status == 0
     for name in STEPS:
         assert name in text

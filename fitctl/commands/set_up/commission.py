@@ -73,7 +73,8 @@ def commission(
     """
     path = named_rig(rig) or default_rig_path()
     settings = load_rig(path, overrides or ())
-    _require_permission(settings, yes=yes)
+    if not list_steps:
+        _require_permission(settings, yes=yes)
     files = Files(path, _folder(path, folder))
     course = Course(
         path,

@@ -1,0 +1,154 @@
+"""`fitctl commission` on a terminal: it asks before each step; yes, no, skip, and what the next call does."""
+
+import json
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
+
+import pytest
+
+STEPS = """
+import sys
+from fitctl.cli import main
+from fitctl.commissioning import steps
+from fitctl.commissioning.outcome import Outcome, StepError
+
+def step(name, *needs, fails=False):
+    def run(site):
+        print("DONE", name, flush=True)
+        if fails:
+            raise StepError("the cable is off")
+        return Outcome(["seen"])
+    return steps.Step(f"step {name}", "star", lambda _site: f"the {name} motor", needs, 1.0, run)
+
+steps.STEPS = {"one": step("one"), "two": step("two", "one"), "three": step("three", "two", fails=True)}
+main(["commission", *sys.argv[1:]])
+"""
+ASKS = "Go? (yes, no, skip)"
+_TIMEOUT_S = 30.0
+
+
+class Terminal:
+    """A person at a terminal: waits for a text, types an answer."""
+
+    def __init__(self, folder, *arguments):
+        self.ours, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", STEPS, *arguments],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            cwd=folder,
+            env=os.environ | {"COLUMNS": "200"},
+        )
+        os.close(theirs)
+        self.text = ""
+        self.read = 0
+
+    def wait_for(self, text):
+        end_s = time.monotonic() + _TIMEOUT_S
+        while text not in self.text[self.read :]:
+            assert time.monotonic() < end_s, self.text
+            if not select.select([self.ours], [], [], 0.1)[0]:
+                continue
+            try:
+                self.text += os.read(self.ours, 65536).decode()
+            except OSError:  # the other side has ended
+                pytest.fail(f"ended without {text!r}: {self.text}")
+        self.read = self.text.index(text, self.read) + len(text)
+
+    def answer(self, text, question=ASKS):
+        self.wait_for(question)
+        os.write(self.ours, f"{text}\n".encode())
+
+    def end(self):
+        while True:
+            try:
+                more = os.read(self.ours, 65536).decode()
+            except OSError:
+                break
+            if not more:
+                break
+            self.text += more
+        return self.process.wait(_TIMEOUT_S)
+
+    def close(self):
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        os.close(self.ours)
+
+
+@pytest.fixture
+def at_terminal(tmp_path):
+    opened = []
+
+    def run(*arguments):
+        opened.append(Terminal(tmp_path, *arguments))
+        return opened[-1]
+
+    yield run
+    for terminal in opened:
+        terminal.close()
+
+
+def tasks(folder):
+    record = json.loads((folder / "fit-mock.commissioning.json").read_text())
+    return {name: task["state"] for name, task in record["tasks"].items()}
+
+
+def test_each_step_says_what_moves_and_asks_once_and_no_ends_it_there(at_terminal, tmp_path):
+    first = at_terminal()
+    first.wait_for("Moves: the one motor.")
+    first.answer("yes")
+    first.wait_for("DONE one")
+    first.wait_for("Moves: the two motor.")
+    first.answer("no")
+    assert first.end() == 1
+    assert "the next call goes on here" in first.text
+    assert first.text.count(ASKS) == 2
+    assert "DONE two" not in first.text
+    assert tasks(tmp_path) == {"right.one": "passed"}
+
+    again = at_terminal()
+    again.answer("y")
+    again.wait_for("DONE two")
+    again.answer("", ASKS)  # the answer that is offered is no
+    assert again.end() == 1
+    assert "DONE one" not in again.text
+    assert tasks(tmp_path) == {"right.one": "passed", "right.two": "passed"}
+
+
+def test_a_step_is_skipped_with_a_reason_and_what_needs_it_may_be_done(at_terminal, tmp_path):
+    terminal = at_terminal("--until", "two")
+    terminal.answer("skip")
+    terminal.answer("no lamp tonight", "Reason")
+    terminal.answer("yes")
+    assert terminal.end() == 0
+    assert tasks(tmp_path) == {"right.one": "skipped", "right.two": "passed"}
+    record = json.loads((tmp_path / "fit-mock.commissioning.json").read_text())
+    assert record["tasks"]["right.one"]["trouble"] == "no lamp tonight"
+
+
+def test_a_failed_step_is_repeated_by_the_next_call_and_another_one_by_its_name(
+    at_terminal, tmp_path
+):
+    first = at_terminal("--skip", "one=done by hand", "--skip", "two=done by hand")
+    first.answer("yes")
+    assert first.end() == 1
+    assert "the cable is off" in first.text
+    again = at_terminal()
+    again.answer("yes")
+    assert again.end() == 1
+    assert "DONE three" in again.text
+    by_name = at_terminal("--only", "one")
+    by_name.answer("yes")
+    assert by_name.end() == 0
+    assert tasks(tmp_path) == {
+        "right.one": "passed",
+        "right.two": "skipped",
+        "right.three": "failed",
+    }
