@@ -177,6 +177,9 @@ docs: $(READY)  ## The documentation as a site, dist/docs/index.html (needs npm)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "dist/docs/index.html"
 
+pictures: $(READY)  ## Draw the schematics of the documents anew, docs/pictures/*.svg
+	@$(BIN)/python docs/pictures/draw.py
+
 dist: $(READY)  ## Wheel and sdist, into dist/
 	$(BIN)/python -m hatchling build -d dist
 
