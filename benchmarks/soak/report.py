@@ -68,7 +68,7 @@ def sound(found: dict[str, Any]) -> bool:
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """A section for docs/reliability.md: tables, then what went wrong."""
+    """A section for docs/soak.md: tables, then what went wrong."""
     wrong = [found["ended"]] if found["ended"] else []
     wrong += [
         f"{s['name']}: {s['back_s']:.0f} s; {'; '.join(s['told'][-_TOLD:])}"
