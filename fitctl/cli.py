@@ -52,6 +52,7 @@ COMMANDS = {
     "fault": Command("try_out", "Inject faults into running mocks"),
     "init": Command("set_up", "Write a rig file for your hardware"),
     "check": Command("set_up", "Validate a rig file"),
+    "rig": Command("set_up", "Upgrade rig files of older versions"),
     "discover": Command("set_up", "List cameras, serial ports and CAN interfaces"),
     "doctor": Command("set_up", "Check that the devices of a rig answer"),
     "commission": Command("set_up", "Prove a rig step by step, from wiring to star"),

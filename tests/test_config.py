@@ -63,7 +63,6 @@ FLOATS = [path for path in KEYS if isinstance(value_at(DOCUMENT, path), float)]
 NUMBERS = [path for path in KEYS if type(value_at(DOCUMENT, path)) in {float, int}]
 # An interlock needs one of its limits only.
 REQUIRED = [p for p in KEYS if p[0] != "interlocks" or p[-1] not in {"low", "high", "stale_s"}]
-NUMBERS.remove(("schema_version",))  # a literal 1, and in Python True == 1
 
 
 # ---------------------------------------------------------------- rig files that load
@@ -134,7 +133,7 @@ def test_a_number_in_quotes_or_a_truth_value_is_not_a_number(path):
         ("plant.loops.right.structure.mode_hz", [330.0], "should have at least 2 items"),
         ("plant.loops.right.hysteresis.breakpoints_v", [0.0, 2.0, 1.0], "must start at 0 and ascend"),
         ("plant.loops.right.hysteresis.breakpoints_v", [0.1, 2.0], "must start at 0 and ascend"),
-        ("schema_version", 2, "must be 1 (is 2)"),
+        ("schema_version", 3, "must be 2 (is 3)"),
         ("name", "no spaces", "pattern"),
     ],
 )  # fmt: skip

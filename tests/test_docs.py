@@ -66,6 +66,7 @@ NOT_RUN = {
     "fitctl plot *--window": "opens a window: tests/commands/test_cli_report.py without a display",
     "fitctl rehearse *": "needs an instrument that runs: tests/commands/test_rehearse.py",
     "fitctl report *--open": "opens a browser: tests/commands/test_cli_report.py with another in its place",
+    "fitctl rig upgrade *": "needs a file of an older version: tests/test_config_upgrade.py",
     "fitctl run*": "a server: tests/system/test_first_light.py",
     "fitctl send *": "needs a running supervisor: tests/system/test_tutorial.py, and below",
     "fitctl sequence pause*": "needs a running supervisor: tests/system/test_sequences.py",

@@ -12,15 +12,13 @@ import tomlkit
 
 from fitctl.config.addresses import SOCKET_URL, is_host, is_socket_url
 from fitctl.config.base import ConfigError
+from fitctl.config.commented import dump_commented, parse_commented, set_value
 from fitctl.config.origins import default_rig_path
 from fitctl.config.reading import lay_over
 
 MOCK = "mock"
 ONE_STAR, TESTBED = "fit-mock", "fit-testbed"
 """The shipped rigs that a new one can begin with."""
-_RULE = "# -----"
-_OF_TABLE = "#< "
-"""Marks a comment that stands before a table while it is parsed as part of it."""
 _CAN_DRIVER = "cia402"
 _MOCKS_OF = {"ensemble": "tcp_port", "bal_analog": "modbus_port"}
 _HEAD = """written by `fitctl init` from the shipped rig.
@@ -316,7 +314,7 @@ def new_rig_text(rig: str, name: str, devices: Mapping[str, Chosen]) -> str:
         del document["plant"], document["mocks"]
     else:
         _move_mocks_apart(document)
-    return f"# {name}: {_HEAD}{_dumped(document)}"
+    return f"# {name}: {_HEAD}{dump_commented(document)}"
 
 
 def _put(
@@ -334,7 +332,7 @@ def _put(
         table: Any = document
         for part in tables:
             table = table[part]
-        _set_value(table, last, value)
+        set_value(table, last, value)
 
 
 def _parsed(path: Path, changed: Callable[[str], str] = str) -> tomlkit.TOMLDocument:
@@ -345,32 +343,7 @@ def _parsed(path: Path, changed: Callable[[str], str] = str) -> tomlkit.TOMLDocu
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     first = next(n for n, line in enumerate(lines) if not line.startswith("#"))
     text = changed("".join(lines[first:]))
-    return tomlkit.parse(re.sub(r"((?:^#.*\n)+)(^\[.*\n)", _into_table, text, flags=re.M))
-
-
-def _into_table(match: re.Match[str]) -> str:
-    comments, table = match.groups()
-    return table + "".join(_OF_TABLE + line for line in comments.splitlines(keepends=True))
-
-
-def _dumped(document: tomlkit.TOMLDocument) -> str:
-    """The text, with comments before their tables again; a heading that files laid over repeat stands once."""
-    text = re.sub(
-        rf"(^\[.*\n)((?:^{_OF_TABLE}.*\n)+)", _before_table, tomlkit.dumps(document), flags=re.M
-    )
-    headings: set[str] = set()
-    lines = []
-    for line in text.rstrip().splitlines():
-        if line.startswith(_RULE) and line in headings:
-            continue
-        headings.add(line)
-        lines.append(line)
-    return "\n".join(lines) + "\n"
-
-
-def _before_table(match: re.Match[str]) -> str:
-    table, comments = match.groups()
-    return comments.replace(_OF_TABLE, "") + table
+    return parse_commented(text)
 
 
 def _lay_file_over(
@@ -390,7 +363,7 @@ def _number_nodes(document: tomlkit.TOMLDocument) -> None:
         if device["driver"] == _CAN_DRIVER:
             bus = device["interface"], device["channel"]
             nodes[bus] += 1
-            _set_value(device, "node_id", nodes[bus])
+            set_value(device, "node_id", nodes[bus])
 
 
 def _keep_searches_within_travel(document: tomlkit.TOMLDocument) -> None:
@@ -398,7 +371,7 @@ def _keep_searches_within_travel(document: tomlkit.TOMLDocument) -> None:
     for loop in document["loops"].values():
         travel_arcsec = loop["siderostat"]["travel_sky_arcsec"]
         if loop["acquisition"]["search_radius_sky_arcsec"] > travel_arcsec:
-            _set_value(loop["acquisition"], "search_radius_sky_arcsec", float(travel_arcsec))
+            set_value(loop["acquisition"], "search_radius_sky_arcsec", float(travel_arcsec))
 
 
 def _move_mocks_apart(document: tomlkit.TOMLDocument) -> None:
@@ -406,15 +379,4 @@ def _move_mocks_apart(document: tomlkit.TOMLDocument) -> None:
     loops = document["mocks"]["loops"].values()
     for kind, key in _MOCKS_OF.items():
         for number, mocks in enumerate([loop[kind] for loop in loops if kind in loop]):
-            _set_value(mocks, key, mocks[key] + 1000 * number)
-
-
-def _set_value(table: Any, key: str, value: Any) -> None:
-    """Put a value in the place of another; the comment behind it stays in its column."""
-    before = table.item(key)
-    table[key] = value
-    after = table.item(key)
-    if not after.trivia.comment:
-        return
-    column = len(before.as_string()) + len(before.trivia.comment_ws)
-    after.trivia.comment_ws = " " * max(1, column - len(after.as_string()))
+            set_value(mocks, key, mocks[key] + 1000 * number)

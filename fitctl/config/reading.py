@@ -16,7 +16,7 @@ from fitctl.config.checks import rig_conflicts
 from fitctl.config.conflict import Conflict, Conflicts
 from fitctl.config.devices import DEVICE_BY_TAG
 from fitctl.config.origins import Layer, Marks, changed_by, layer_of, lies_on, mark_layer
-from fitctl.config.rig import Rig
+from fitctl.config.rig import SCHEMA_VERSION, Rig
 from fitctl.text import plain
 
 _EXAMPLE = "camera.frame_rate_hz=50.0"
@@ -60,9 +60,19 @@ def read_parts(path: Path, overrides: Sequence[str] = ()) -> LaidOver:
     ConfigError
         If a file is missing or is not TOML, or an override has no value's key.
     """
-    document = _read_part(
-        path, "no such rig file; copy rigs/fit-mock.toml or name another with --rig"
-    )
+    missing = "no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+    return lay_parts(path, read_toml(path, missing), overrides)
+
+
+def lay_parts(path: Path, document: dict[str, Any], overrides: Sequence[str] = ()) -> LaidOver:
+    """As :func:`read_parts`, for a document in the place of the file's content; it is changed.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`read_parts`.
+    """
+    _place_files(document, path)
     base = document.pop("base", None)
     layers: list[tuple[str, str, dict[str, Any]]] = []
     if base is not None:
@@ -93,10 +103,14 @@ def read_parts(path: Path, overrides: Sequence[str] = ()) -> LaidOver:
 def _read_part(path: Path, missing: str) -> dict[str, Any]:
     """A rig file, its base or a fragment; a file that it names is beside it."""
     document = read_toml(path, missing)
+    _place_files(document, path)
+    return document
+
+
+def _place_files(document: dict[str, Any], path: Path) -> None:
     camera = document.get("camera")
     if isinstance(camera, dict) and isinstance(camera.get("dark_file"), str):
         camera["dark_file"] = str(path.parent / camera["dark_file"])
-    return document
 
 
 def read_toml(path: Path, missing: str) -> dict[str, Any]:
@@ -177,6 +191,15 @@ def rig_from_parts(laid: LaidOver, origin: str) -> Rig:
 
 
 def _valid(laid: LaidOver, origin: str) -> Rig:
+    version = laid.document.get("schema_version")
+    if isinstance(version, int) and version < SCHEMA_VERSION:
+        # One line: most keys of the newer version are missing, too.
+        place = _place(laid, origin, ["schema_version"])
+        msg = (
+            f"{place}: schema_version: must be {SCHEMA_VERSION} (is {version}); an older fitctl wrote this "
+            f"file. To write it for this one: fitctl rig upgrade {place}"
+        )
+        raise ConfigError(plain(msg))
     try:
         return Rig.model_validate(laid.document)
     except ValidationError as error:
@@ -204,8 +227,21 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
     Raises
     ------
     ConfigError
-        As :func:`load_rig`.
+        In one line, if the rig cannot be used.
     """
+    try:
+        return _rig_in_log(text, origin, overrides)
+    except ConfigError as error:
+        first, *more = str(error).splitlines()
+        also = f" ({len(more)} more)" if more else ""
+        msg = (
+            f"{first}{also}; give a rig file of this fitctl with --rig ('fitctl rig upgrade' makes one of an "
+            "older file)"
+        )
+        raise ConfigError(msg) from None
+
+
+def _rig_in_log(text: str, origin: str, overrides: Sequence[str]) -> Rig:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -216,6 +252,9 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
         raise ConfigError(msg)
     for table, key in _files_of(document):
         del table[key]
+    if document.get("schema_version") in range(1, SCHEMA_VERSION):
+        # No file that could be upgraded: it is read as it is, and refused by the keys that it lacks.
+        document["schema_version"] = SCHEMA_VERSION
     laid = _marked(document, origin)
     for depth, override in enumerate(overrides, start=1):
         _override(laid, override, depth)
@@ -277,7 +316,7 @@ def parse_override(text: str, example: str) -> tuple[list[str], Any]:
 
 def _explain(laid: LaidOver, origin: str, problem: Any) -> list[str]:
     """What is wrong: a line, or one for each key that is to blame for a contradiction."""
-    location = _without_tags([str(part) for part in problem["loc"]])
+    location = without_tags([str(part) for part in problem["loc"]])
     error = problem.get("ctx", {}).get("error")
     if isinstance(error, Conflicts):
         return _blamed(laid, origin, error.found, ".".join(location))
@@ -325,7 +364,7 @@ def _place(laid: LaidOver, origin: str, path: Sequence[str], *, missing: bool = 
     return origin if layer is None else layer.origin
 
 
-def _without_tags(location: Sequence[str]) -> list[str]:
+def without_tags(location: Sequence[str]) -> list[str]:
     """A place in the rig file without what pydantic adds: kinds of devices and loops, a wrong key's mark."""
     return [
         part

@@ -28,6 +28,9 @@ from fitctl.config.metrology import MetrologyLoop
 from fitctl.config.mocks import Mocks
 from fitctl.config.plant import PlantTruth
 
+SCHEMA_VERSION = 2
+"""Of rig files that this fitctl reads; raise it when a key is removed, renamed or newly required."""
+
 AnyLoop = Annotated[
     Annotated[Loop, Tag(STELLAR)] | Annotated[MetrologyLoop, Tag(METROLOGY)], BY_KIND
 ]
@@ -36,7 +39,7 @@ AnyLoop = Annotated[
 class Rig(Settings):
     """A whole rig file. ``plant`` and ``mocks`` are for mock rigs; a rig of real hardware leaves them out."""
 
-    schema_version: Literal[1]
+    schema_version: Literal[2]  # SCHEMA_VERSION
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,40}$")]
     description: str
     optics: Optics

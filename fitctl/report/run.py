@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.config import CONTROLLERS, ConfigError, Rig, is_name, rig_from_log
+from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
@@ -123,8 +123,3 @@ def _rig_of(log: LogInfo) -> Rig:
     except KeyError:
         msg = f"{log.path}: has no rig file in it; give one with --rig"
         raise LogError(msg) from None
-    except ConfigError as error:
-        first, *more = str(error).splitlines()
-        also = f" ({len(more)} more)" if more else ""
-        msg = f"{first}{also}; give a rig file that this fitctl knows with --rig"
-        raise ConfigError(msg) from None

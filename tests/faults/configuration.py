@@ -59,17 +59,17 @@ WRONG = (
         "mocks.faults=[{ device = 'camera' }]",)),
     Wrong("a plant of another loop", "must name the same loops", change=(
         "plant.loops.right", "plant.loops.left")),
-    Wrong("a file of another version", "schema_version: must be 1", change=(
-        "schema_version = 1", "schema_version = 2")),
+    Wrong("a file of another version", "schema_version: must be 2", change=(
+        "schema_version = 2", "schema_version = 1")),
     Wrong("a value that was forgotten", "time_constant_s: is missing", change=(
         "time_constant_s = 1.0", "")),
     Wrong("a bracket too few", "not TOML", change=("[camera]", "[camera")),
     Wrong("the same key twice", "not TOML", change=(
-        "schema_version = 1", "schema_version = 1\nschema_version = 1")),
+        "schema_version = 2", "schema_version = 2\nschema_version = 2")),
     Wrong("an include that is not there", "gone.toml", change=(
-        "schema_version = 1", 'include = ["gone.toml"]\nschema_version = 1')),
+        "schema_version = 2", 'include = ["gone.toml"]\nschema_version = 2')),
     Wrong("a base that is not there", "gone.toml", change=(
-        "schema_version = 1", 'base = "gone.toml"\nschema_version = 1')),
+        "schema_version = 2", 'base = "gone.toml"\nschema_version = 2')),
     Wrong("a socket folder too long for a socket", "service.folder", (
         "service.folder=/tmp/" + "x" * 120,)),
     Wrong("a log folder where nothing can be", "logging.folder", ("logging.folder=/dev/null/x",)),

@@ -18,6 +18,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "fitctl check my-rig.toml",
         "fitctl check my-rig.toml --show",
     ),
+    "rig": ("fitctl rig upgrade my-rig.toml",),
+    "rig upgrade": (
+        "fitctl rig upgrade my-rig.toml",
+        "fitctl rig upgrade my-rig.toml --out my-new-rig.toml",
+    ),
     "discover": ("fitctl discover", "fitctl discover --broadcast 192.168.1.255"),
     "commission": (
         "fitctl commission --rig my-rig.toml",

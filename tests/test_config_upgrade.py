@@ -1,0 +1,169 @@
+"""Rig files of older versions: what is said of them, and how they become files of this one."""
+
+import copy
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from fitctl.cli import main
+from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_log
+from fitctl.config.rig import SCHEMA_VERSION, Rig
+from fitctl.config.upgrade import upgrade
+
+FIRST = Path(__file__).parent / "old_rigs" / "0.1.0.toml"  # the shipped rig of fitctl 0.1.0
+TEXT = FIRST.read_text(encoding="utf-8")
+SHIPPED = default_rig_path()
+
+
+@pytest.fixture
+def old(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(TEXT.replace("gain_per_s = 135.0 ", "gain_per_s = 120.0 "))
+    return path
+
+
+def values(table, place=()):
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from values(value, (*place, key))
+        else:
+            yield (*place, key), value
+
+
+def run(*words):
+    with pytest.raises(SystemExit) as end:
+        main(["rig", "upgrade", *map(str, words)])
+    return end.value.code
+
+
+def test_an_older_file_is_refused_with_the_command_that_upgrades_it(old):
+    with pytest.raises(ConfigError) as caught:
+        load_rig(old)
+
+    assert str(caught.value) == (
+        f"{old}: schema_version: must be {SCHEMA_VERSION} (is 1); an older fitctl wrote this file. "
+        f"To write it for this one: fitctl rig upgrade {old}"
+    )
+
+
+def test_a_file_of_a_newer_version_is_not_upgraded(old):
+    old.write_text(TEXT.replace("schema_version = 1", f"schema_version = {SCHEMA_VERSION + 1}"))
+
+    with pytest.raises(ConfigError, match=f"must be {SCHEMA_VERSION}"):
+        load_rig(old)
+    with pytest.raises(ConfigError, match=f"expected 1 to {SCHEMA_VERSION}"):
+        upgrade(old)
+
+
+def test_every_value_of_the_old_file_stays_and_the_new_one_is_valid(old, tmp_path):
+    done = upgrade(old)
+    new = tmp_path / "new.toml"
+    new.write_text(done.text)
+    before, after = (dict(values(tomllib.loads(text))) for text in (old.read_text(), done.text))
+
+    assert not done.problems
+    assert load_rig(new).loops["right"].siderostat.servo.gain_per_s == 120.0
+    moved = {("schema_version",), ("supervisor", "frame_timeout_s")}
+    assert {key: after[key] for key in before.keys() - moved} == {
+        key: value for key, value in before.items() if key not in moved
+    }
+    assert after["interlocks", "frame_missing", "stale_s"] == 0.25
+
+
+def test_each_new_value_is_among_the_changes(old):
+    done = upgrade(old)
+    named = tuple(change.key for change in done.changes)
+    before, after = (dict(values(tomllib.loads(text))) for text in (old.read_text(), done.text))
+
+    for key in after.keys() - before.keys():
+        assert ".".join(key).startswith(named), key
+
+
+def test_comments_stay_and_new_keys_bring_theirs(old):
+    text = upgrade(old).text
+
+    for line in TEXT.splitlines():
+        if line.startswith("#"):
+            assert line in text
+    assert 'compression = "zstd"\n' in text
+    assert "retain_days = 365.0               # since the last write" in text
+    assert "# ---------------------------------------------------------------- what must be" in text
+
+
+def test_an_upgraded_rig_moves_and_waits_as_before(old, tmp_path):
+    new = tmp_path / "new.toml"
+    new.write_text(upgrade(old).text)
+    loop = load_rig(new).loops["right"]
+
+    assert loop.siderostat.device.position_limit_rad == 0.0  # no limit in the drive, as in 0.1.0
+    assert not loop.other_spots
+
+
+def test_what_cannot_be_known_is_left_to_correct_by_hand(old):
+    old.write_text(old.read_text() + "\n[mirror]\nwobble = 1\n")
+    done = upgrade(old)
+
+    assert done.problems == [
+        f"{old}: mirror: unknown key (allowed here: {', '.join(sorted(Rig.model_fields))})"
+    ]
+
+
+def test_a_file_over_a_base_waits_for_the_base(old, tmp_path):
+    over = tmp_path / "over.toml"
+    over.write_text('base = "mine.toml"\nname = "over"\n[supervisor]\nframe_timeout_s = 0.5\n')
+
+    with pytest.raises(ConfigError, match="upgrade that file first"):
+        upgrade(over)
+
+    old.write_text(upgrade(old).text)
+    done = upgrade(over)
+    assert not done.problems
+    assert tomllib.loads(done.text)["interlocks"] == {"frame_missing": {"stale_s": 0.5}}
+    assert "schema_version" not in done.text
+
+
+def test_the_command_writes_a_file_beside_the_old_one_and_overwrites_none(old, capsys):
+    new = old.with_name(f"mine.v{SCHEMA_VERSION}.toml")
+    before = old.read_text()
+
+    assert not run(old)
+    assert "interlocks.frame_missing.stale_s = 0.25  # was supervisor.frame_timeout_s" in (
+        capsys.readouterr().out
+    )
+    assert load_rig(new).name == "fit-mock"
+    assert old.read_text() == before
+    assert run(old) == 2
+    assert "name another file with --out" in capsys.readouterr().err
+
+
+def test_the_command_prints_json_and_what_is_left_to_correct(old, capsys):
+    old.write_text(old.read_text() + "\n[mirror]\nwobble = 1\n")
+
+    assert run(old, "--json") == 1
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["new"].endswith(f"mine.v{SCHEMA_VERSION}.toml")
+    assert {"key": "schema_version", "value": "2", "was": "1"} in printed["changes"]
+    assert len(printed["problems"]) == 1
+
+
+def test_a_file_of_this_version_needs_no_upgrade(capsys):
+    assert run(SHIPPED) == 2
+    assert "needs no upgrade" in capsys.readouterr().err
+
+
+def test_a_log_of_an_older_version_with_all_keys_is_read():
+    document = tomllib.loads(SHIPPED.read_text())
+    older = copy.deepcopy(document) | {"schema_version": 1}
+
+    assert rig_from_log(json.dumps(older), "a log") == rig_from_log(json.dumps(document), "a log")
+
+
+def test_a_log_of_an_older_version_is_refused_in_one_line():
+    with pytest.raises(ConfigError) as caught:
+        rig_from_log(json.dumps(tomllib.loads(TEXT)), "a log")
+
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("a log: camera.device.pixel_format: is missing")
+    assert "more); give a rig file of this fitctl with --rig" in str(caught.value)
