@@ -183,7 +183,7 @@ pictures: $(READY)  ## Draw the schematics of the documents anew, docs/pictures/
 dist: $(READY)  ## Wheel and sdist, into dist/
 	$(BIN)/python -m hatchling build -d dist
 
-dist-test: $(READY)  ## Wheel and sdist, installed into a fresh environment and run there
+release-check: $(READY)  ## Wheel and sdist, installed on every Python from 3.11 on: demo and tutorial (RELEASING.md)
 	$(BIN)/pytest -m dist tests/dist $(ARGS)
 
 LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \

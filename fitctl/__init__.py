@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from fitctl.sequences.instrument import AsyncInstrument, Instrument
 
 __all__ = ["AsyncInstrument", "Instrument"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:

@@ -16,6 +16,8 @@ from fitctl.config import default_rig_path
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.commands import AnyCommand
 
+OUTSIDE = {"CHANGELOG.md", "CONTRIBUTING.md", "RELEASING.md"}  # of docs/
+
 
 @pytest.fixture(scope="module")
 def reference():
@@ -118,7 +120,7 @@ def test_every_page_has_its_place_in_the_site_and_every_place_a_page(reference):
     pages = {page for page in pages if not page.startswith("decisions/0")}
 
     assert len(placed) == len(set(placed))
-    assert set(placed) == pages | set(reference.PAGES) | {"CHANGELOG.md", "CONTRIBUTING.md"}
+    assert set(placed) == pages | set(reference.PAGES) | OUTSIDE
 
 
 @pytest.mark.parametrize("block", blocks("yaml"), ids=str)
@@ -130,6 +132,7 @@ def test_the_citation_is_of_this_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
-    assert citation["version"] == project["version"] == fitctl.__version__
+    assert "version" not in project  # it is in fitctl/__init__.py alone
+    assert citation["version"] == fitctl.__version__
     assert citation["license"] == project["license"]
     assert citation["authors"] == project["authors"]

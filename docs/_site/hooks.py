@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import reference
 
 ROOT = Path(__file__).parents[2]
-OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")
+OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "RELEASING.md")
 MODULES = ROOT / "requirements" / "site" / "node_modules"
 MERMAID = "assets/mermaid.js"
 SCRIPTS = {  # which the theme would have from elsewhere

@@ -1,125 +1,20 @@
-"""docs/tutorial.md, typed as it stands: the demo on a terminal, everything else in a shell beside it."""
+"""docs/tutorial.md, typed as it stands, with the fitctl of this checkout."""
 
-import contextlib
-import os
-import subprocess
 import sys
-import threading
-import time
 
 import pytest
-from documents import blocks, commands
+from tutorial import walk_through
 
-from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.client import Client
-from fitctl.messages.endpoints import service_folder
-
-from .conftest import end
+from fitctl.config import default_rig_path
 
 pytestmark = [pytest.mark.terminal, pytest.mark.timeout(600)]
-PATIENCE_S = 180.0
-# What a reader is told to wait for before he types on.
-AWAITED = {
-    ("send", "stop"): "VERNIER",
-    ("send", "acquire"): "STANDBY",
-    ("sequence", "check"): "VERNIER",
-}
 
 
-def of_tutorial(found):
-    return [each for each in found if each.document.name == "tutorial.md"]
-
-
-@pytest.fixture
-def place(tmp_path):
-    """An empty folder, and an environment that names the rig: other tests' supervisors run, too."""
+def test_every_command_of_the_tutorial_does_what_it_says(tmp_path):
     program = tmp_path / "bin" / "fitctl"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fitctl "$@"\n')
     program.chmod(0o755)
     (tmp_path / "work").mkdir()
-    environment = os.environ | {
-        "PATH": f"{program.parent}:{os.environ['PATH']}",
-        "FITCTL_RIG": str(default_rig_path()),
-        "TERM": "xterm-256color",
-        "COLUMNS": "120",
-        "LINES": "40",
-    }
-    return tmp_path / "work", environment
 
-
-class Demo:
-    """`fitctl demo` on a terminal of its own; the last of its output is kept."""
-
-    def __init__(self, folder, environment):
-        self.terminal, theirs = os.openpty()
-        self.process = subprocess.Popen(
-            ["fitctl", "demo"],
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            cwd=folder,
-            env=environment,
-            start_new_session=True,
-        )
-        os.close(theirs)
-        self.seen = b""
-        threading.Thread(target=self.read, daemon=True).start()
-
-    def read(self):
-        with contextlib.suppress(OSError):
-            while piece := os.read(self.terminal, 65536):
-                self.seen = piece
-
-    def press(self, key):
-        os.write(self.terminal, key)
-
-    def close(self):
-        end(self.process)
-        os.close(self.terminal)
-
-
-def wait_for(mode, demo):
-    client = Client(service_folder(load_rig(default_rig_path())))
-    try:
-        end_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end_s:
-            telemetry = client.receive(0.5)
-            if telemetry is not None and telemetry.loops[0].mode == mode:
-                return
-    finally:
-        client.close()
-    raise AssertionError(f"no {mode} within {PATIENCE_S} s: {demo.seen!r}")
-
-
-def test_every_command_of_the_tutorial_does_what_it_says(place):
-    folder, environment = place
-    (sequence,) = of_tutorial(blocks("TOML"))
-    (folder / "first.toml").write_text(sequence.text)
-    typed = [each for each in of_tutorial(commands()) if each.words[0] == "fitctl"]
-    assert typed.pop(0).words == ("fitctl", "demo")
-    demo = Demo(folder, environment)
-    try:
-        wait_for("VERNIER", demo)
-        for command in typed:
-            arguments = command.words[1:]
-            if arguments[0] == "log" and demo.process.poll() is None:
-                demo.press(b"q")
-                assert demo.process.wait(PATIENCE_S) == 0
-            if arguments[:2] in AWAITED:
-                wait_for(AWAITED[arguments[:2]], demo)
-            done = subprocess.run(
-                ["bash", "-c", " ".join(command.words)],
-                cwd=folder,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=180,
-                check=False,
-            )
-            not_well = any("not well" in line for line in command.output)
-            assert done.returncode == int(not_well), (command, done.stdout, done.stderr)
-            for line in command.output:
-                assert line in done.stdout
-    finally:
-        demo.close()
+    walk_through(tmp_path / "work", program.parent, default_rig_path())
