@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import shutil
 from collections import defaultdict
@@ -14,13 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import HEADER, column_blocks, log_info
+from fitctl.logging.reading import HEADER, LogInfo, column_blocks, log_info
+from fitctl.messages.modes import Mode
 from fitctl.report.drawing import SERIES, TimeAxis, envelope, panels, styled, time_axis, trace
 
 Floats = NDArray[np.floating]
+Limits = tuple[float, float]
 MOST_FIELDS = 12
 _ROWS = 20_000
 _TERMINAL_BINS = 400
+_COLOURS = ("blue", "orange", "green", "magenta", "cyan", "red")
 _LEAST_LINES = 12  # of a panel
 UNITS = ("px", "v", "s", "rad", "arcsec", "dn", "fraction", "progress", "ns")
 
@@ -46,7 +50,11 @@ class Series(NamedTuple):
 
 
 def read_series(
-    path: Path, wanted: Sequence[str], from_ns: int = 0, to_ns: int = 2**63 - 1
+    path: Path,
+    wanted: Sequence[str],
+    from_ns: int = 0,
+    to_ns: int = 2**63 - 1,
+    mode: Mode | None = None,
 ) -> list[Series]:
     """Fields of a log.
 
@@ -56,6 +64,8 @@ def read_series(
         ``TOPIC.FIELD``, ``TOPIC`` for all its fields, or ``FIELD`` of any topic; ``*`` stands for anything.
     from_ns, to_ns : int
         UTC, nanoseconds since 1970; the second is not included.
+    mode : Mode, optional
+        Only while the topic's loop is in this mode; for a topic of no loop, while any loop is.
 
     Raises
     ------
@@ -78,17 +88,59 @@ def read_series(
         raise LogError(msg)
     parts: dict[tuple[str, str], list[Floats]] = defaultdict(list)
     start_ns = round(info.start_s * 1e9)
+    modes = None if mode is None else _modes(path, info)
     for topic, columns in column_blocks(path, list(chosen), _ROWS, chosen):
         utc_ns = columns["publish_time_ns"]
         inside = (utc_ns >= from_ns) & (utc_ns < to_ns)
         parts[topic, ""].append((utc_ns[inside] - start_ns) / 1e9)
+        in_mode = np.array(True)
+        if modes is not None and mode is not None:
+            in_mode = _in_mode(modes, topic, utc_ns[inside], mode)
         for field in chosen[topic]:
-            parts[topic, field].append(columns[field][inside].astype(np.float32))
-    return [
+            values = columns[field][inside].astype(np.float32)
+            parts[topic, field].append(np.where(in_mode, values, np.float32(np.nan)))
+    found = [
         Series(topic, field, np.concatenate(parts[topic, ""]), np.concatenate(parts[topic, field]))
         for topic, its in chosen.items()
         for field in its
     ]
+    return found if mode is None else list(map(_without_ends, found))
+
+
+def _without_ends(series: Series) -> Series:
+    """A series from its first number to its last."""
+    there = np.flatnonzero(~np.isnan(series.values))
+    inside = slice(there[0], there[-1] + 1) if len(there) else slice(0)
+    return series._replace(time_s=series.time_s[inside], values=series.values[inside])
+
+
+_Modes = dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]
+
+
+def _modes(path: Path, info: LogInfo) -> _Modes:
+    """Of each loop, as its ticks say: times in UTC, nanoseconds since 1970, and modes by number."""
+    topics = [topic for topic in info.counts if topic.endswith("/tick")]
+    parts: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
+    for topic, columns in column_blocks(
+        path, topics, _ROWS, {topic: ["mode_number"] for topic in topics}
+    ):
+        loop = topic.removesuffix("/tick")
+        parts[loop].append((columns["publish_time_ns"], columns["mode_number"]))
+    return {
+        loop: (np.concatenate([each[0] for each in its]), np.concatenate([each[1] for each in its]))
+        for loop, its in parts.items()
+    }
+
+
+def _in_mode(modes: _Modes, topic: str, utc_ns: Any, mode: Mode) -> NDArray[np.bool_]:
+    """Which times of a topic lie in a mode: that of its loop, or of any loop."""
+    of_loop = [loop for loop in modes if topic.startswith(f"{loop}/")]
+    found = np.zeros(len(utc_ns), dtype=bool)
+    for loop in of_loop or modes:
+        at_ns, numbers = modes[loop]
+        index = np.searchsorted(at_ns, utc_ns, side="right") - 1
+        found |= (index >= 0) & (numbers[index] == mode)
+    return found
 
 
 def _fields(path: Path, topic: str) -> list[str]:
@@ -114,14 +166,25 @@ def _matching(path: Path, text: str, fields: dict[str, list[str]]) -> list[tuple
         if fnmatchcase(field, field_part)
     ]
     if not found:
-        there = (
-            f"{', '.join(topics)} has {', '.join(name for topic in topics for name in fields[topic])}"
-            if topics and topic_part != "*"
-            else f"its topics are {', '.join(fields) or 'none'}"
-        )
-        msg = f"{path}: has no {text}; {there}"
+        msg = f"{path}: has no {text}; {_suggestion(topic_part, field_part, topics, fields)}"
         raise LogError(msg)
     return found
+
+
+def _suggestion(topic: str, field: str, topics: Sequence[str], fields: dict[str, list[str]]) -> str:
+    """What may have been meant by a topic and a field that match nothing, or else what there is."""
+    if not topics:
+        near = difflib.get_close_matches(topic, fields, 3, 0.8)
+        return f"did you mean {' or '.join(near)}?" if near else f"topics: {', '.join(fields)}"
+    known = list(dict.fromkeys(name for each in topics for name in fields[each]))
+    near = difflib.get_close_matches(field, known, 3, 0.7) or [
+        name for name in known if field in name
+    ]
+    if near:
+        return f"did you mean {' or '.join(near[:3])}?"
+    if topic == "*":
+        return f"fields have names such as error_az_px; topics: {', '.join(fields)}"
+    return f"{', '.join(topics)} has {', '.join(known)}"
 
 
 def _layout(
@@ -137,8 +200,10 @@ def _layout(
     return by_unit, labels, time_axis(last_s, path.name)
 
 
-def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
-    """One panel for each unit, as wide and high as the terminal."""
+def as_text(
+    path: Path, series: Sequence[Series], ylim: Limits | None = None, *, colours: bool
+) -> str:
+    """One panel for each unit, as wide and high as the terminal; its fields stand above it."""
     import plotext
 
     columns, lines = shutil.get_terminal_size()
@@ -151,21 +216,39 @@ def as_text(path: Path, series: Sequence[Series], *, colours: bool) -> str:
     for row, (unit, its) in enumerate(grouped.items(), start=1):
         panel = figure.subplot(row, 1) if len(grouped) > 1 else figure
         panel.theme("simple" if colours else "colorless")
-        for one in its:
+        _label_above(panel, [labels[one.label] for one in its], colours=colours)
+        for one, colour in zip(its, itertools.cycle(_COLOURS), strict=False):
             at_s, low, high = envelope(one.time_s, one.values, _TERMINAL_BINS)
             both_s, both = np.repeat(at_s, 2), np.column_stack([low, high]).ravel()
             there = ~np.isnan(both)
             if there.any():
+                marker = plotext.marker("hd", colour) if colours else "hd"
                 points = panel.signal(
-                    (both_s[there] / time.s_per_unit).tolist(), both[there].tolist()
+                    (both_s[there] / time.s_per_unit).tolist(), both[there].tolist(), marker=marker
                 )
-                panel.draw(points.lines().label(labels[one.label]))
+                panel.draw(points.lines())
+        if ylim is not None:
+            panel.ruler("y").lim(*ylim)
         panel.label(unit, "y")
     panel.label(time.label, "x")
     return str(figure.build().string(colorless=not colours))
 
 
-def as_figure(path: Path, series: Sequence[Series]) -> Any:
+def _label_above(panel: Any, labels: Sequence[str], *, colours: bool) -> None:
+    """Put the names of the fields above a panel, in their colours: a legend would cover data."""
+    import plotext
+
+    if not colours:
+        panel.title(", ".join(labels))
+        return
+    parts = [
+        plotext.colorize(f"  {label}  ", colour)
+        for label, colour in zip(labels, itertools.cycle(_COLOURS), strict=False)
+    ]
+    panel.title(sum(parts[1:], start=parts[0]))
+
+
+def as_figure(path: Path, series: Sequence[Series], ylim: Limits | None = None) -> Any:
     """One panel for each unit, as a matplotlib figure."""
     grouped, labels, time = _layout(path, series)
     with styled():
@@ -174,6 +257,11 @@ def as_figure(path: Path, series: Sequence[Series]) -> Any:
             for one, color in zip(its, itertools.cycle(SERIES), strict=False):
                 trace(panel, time, one.time_s, one.values, color, labels[one.label])
             panel.set_ylabel(unit)
-            panel.legend(loc="best")
+            if panel.lines or panel.collections:
+                panel.legend(
+                    ncols=3, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2
+                )  # above the data, not on them
+            if ylim is not None:
+                panel.set_ylim(*ylim)
         axes[-1].set_xlabel(time.label)
     return figure

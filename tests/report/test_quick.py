@@ -3,6 +3,7 @@ import pytest
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
+from fitctl.messages.modes import Mode
 from fitctl.report.quick import MOST_FIELDS, as_figure, as_text, read_series
 
 
@@ -50,8 +51,14 @@ def test_a_span_of_time_is_all_that_is_read(held):
     [
         ("/fit/right/tick", f"fields are too many to look at, at most {MOST_FIELDS}; choose of"),
         ("/fit/right/tick.colour", "has no /fit/right/tick.colour; /fit/right/tick has number"),
-        ("colour", "has no colour; its topics are /fit/"),
-        ("/fit/left/tick", "its topics are /fit/"),
+        (
+            "/fit/right/tick.error_a_px",
+            "has no /fit/right/tick.error_a_px; did you mean error_az_px or",
+        ),
+        ("star_flux", "has no star_flux; did you mean star_flux_dn"),
+        ("colour", "has no colour; fields have names such as error_az_px; topics: /fit/"),
+        ("/fit/right/tik", "did you mean /fit/right/tick"),
+        ("/fit/elsewhere", "topics: /fit/"),
     ],
 )
 def test_what_is_not_there_is_answered_with_what_is(held, wanted, told):
@@ -74,6 +81,52 @@ def test_the_terminal_gets_a_panel_for_each_unit_within_its_width(held, monkeypa
         assert word in text
     assert "\x1b" not in text
     assert "\x1b" in as_text(held[1], series, colours=True)
+
+
+def test_a_mode_is_all_that_is_read(held):
+    ticks = tick_arrays(held[1], "right")
+    held_ticks = ticks["error_az_px"][ticks["mode_number"] == Mode.VERNIER]
+    (series,) = read_series(held[1], ["error_az_px"], mode=Mode.VERNIER)
+
+    there = series.values[~np.isnan(series.values)]
+    np.testing.assert_array_equal(there, held_ticks.astype(np.float32))
+    assert not np.isnan(series.values[[0, -1]]).any()
+    assert len(there) < len(ticks["error_az_px"])
+
+
+def test_a_topic_of_the_rig_is_read_while_any_loop_is_in_the_mode(held):
+    whole, vernier = (
+        read_series(held[1], ["/fit/right/piezo.stack1_v"], mode=mode)[0]
+        for mode in (None, Mode.VERNIER)
+    )
+    assert 0 < len(vernier.values) < len(whole.values)
+
+
+def test_a_mode_that_never_was_leaves_nothing(held):
+    (series,) = read_series(held[1], ["error_az_px"], mode=Mode.LOCKED)
+
+    assert len(series.time_s) == len(series.values) == 0
+
+
+def test_the_vertical_range_is_as_wanted(held):
+    series = read_series(held[1], ["error_az_px"])
+
+    (axes,) = as_figure(held[1], series, (-0.25, 0.125)).axes
+    assert axes.get_ylim() == (-0.25, 0.125)
+    text = as_text(held[1], series, (-0.25, 0.125), colours=False)
+    assert "-0.25" in text
+    assert "0.12" in text
+
+
+def test_no_legend_lies_on_the_data(held):
+    series = read_series(held[1], ["error_*_px", "fsm_range_fraction"])
+    figure = as_figure(held[1], series)
+    figure.draw_without_rendering()
+
+    for axes in figure.axes:
+        assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1 - 1
+    lines = as_text(held[1], series, colours=False).splitlines()
+    assert "error_az_px, error_el_px" in lines[0]
 
 
 def test_a_field_without_a_value_leaves_an_empty_panel(held):

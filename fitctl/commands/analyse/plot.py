@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,7 +15,8 @@ from fitctl.commands.shared.options import RigOption
 from fitctl.commands.shared.printing import say
 from fitctl.config import ConfigError
 from fitctl.logging.reading import log_info
-from fitctl.report.quick import Series, as_figure, as_text, read_series
+from fitctl.messages.modes import Mode
+from fitctl.report.quick import as_figure, as_text, read_series
 
 _PICTURES = {".png", ".svg", ".pdf"}
 
@@ -35,6 +35,14 @@ def plot(
     ] = "0",
     to: Annotated[
         str | None, typer.Option("--to", metavar="TIME", help="End of the plot, in the same form.")
+    ] = None,
+    mode: Annotated[
+        str | None,
+        typer.Option(metavar="MODE", help="Only while the loop is in this mode, such as VERNIER."),
+    ] = None,
+    ylim: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Range of the vertical axis."),
     ] = None,
     window: Annotated[bool, typer.Option("--window", help="Open a window instead.")] = False,
     out: Annotated[
@@ -58,28 +66,43 @@ def plot(
     found = log_info(log)
     from_ns = time_ns("--from", from_, found) if found.counts else 0
     to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
-    series = read_series(log, what, from_ns, to_ns)
+    series = read_series(log, what, from_ns, to_ns, None if mode is None else _mode(mode))
     if not any(len(one.time_s) for one in series):
-        msg = f"plot: {log} has nothing of that between --from {from_} and --to {to or 'its end'}"
+        in_mode = "" if mode is None else f" in mode {mode.upper()}"
+        msg = (
+            f"plot: {log} has no values of {', '.join(what)}{in_mode} between --from {from_} and "
+            f"--to {to or 'its end'}"
+        )
+        raise ConfigError(msg)
+    if ylim is not None and not ylim[0] < ylim[1]:
+        msg = f"plot: --ylim {ylim[0]:g} {ylim[1]:g}: the first must be below the second"
         raise ConfigError(msg)
     if out is not None:
-        _save(log, series, out)
+        _save(as_figure(log, series, ylim), out)
     elif window:
-        _show(log, series)
+        _show(as_figure(log, series, ylim))
     else:
-        print(as_text(log, series, colours=sys.stdout.isatty()))
+        print(as_text(log, series, ylim, colours=sys.stdout.isatty()))
 
 
-def _save(log: Path, series: Sequence[Series], out: Path) -> None:
+def _mode(text: str) -> Mode:
     try:
-        as_figure(log, series).savefig(out)
+        return Mode[text.upper()]
+    except KeyError:
+        msg = f"plot: --mode {text}: unknown mode; available: {', '.join(Mode.__members__)}"
+        raise ConfigError(msg) from None
+
+
+def _save(figure: Any, out: Path) -> None:
+    try:
+        figure.savefig(out)
     except OSError as error:
         msg = f"plot: --out {out}: cannot be written: {error.strerror or error}; name another file"
         raise ConfigError(msg) from None
     say(f"written: {out}")
 
 
-def _show(log: Path, series: Sequence[Series]) -> None:
+def _show(figure: Any) -> None:
     from matplotlib import pyplot
 
     manager = pyplot.figure().canvas.manager
@@ -90,7 +113,6 @@ def _show(log: Path, series: Sequence[Series]) -> None:
             err=True,
         )
         raise typer.Exit(FAILED)
-    figure = as_figure(log, series)
     manager.canvas.figure = figure
     figure.set_canvas(manager.canvas)
     pyplot.show()

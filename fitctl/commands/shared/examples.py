@@ -56,7 +56,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "report": ("fitctl report --latest", "fitctl report --compare monday.mcap tuesday.mcap"),
     "plot": (
         "fitctl plot --latest error_az_px error_el_px",
-        "fitctl plot night.mcap /fit/right/tick.error_az_px --from 60 --to 90",
+        "fitctl plot night.mcap 'error_*_px' --mode VERNIER --ylim -0.1 0.1",
     ),
     "log": ("fitctl log list", "fitctl log export night.mcap --format csv"),
     "log list": ("fitctl log list", "fitctl log list --rig my-rig.toml --json"),
