@@ -94,7 +94,6 @@ ALSO_SAID = {
 # Where an answer other than "well" is what the document tells of.
 STATUSES = {
     "fitctl doctor": {0, 1},  # no device is there, unless somebody's mocks are
-    "fitctl replay * --controller *": {1},  # another controller commands otherwise
     "* --set camera.frame_rate=50": {2},  # the document shows the mistake
     "* --set camera.frame_delay_s=0.2": {2},  # likewise
 }

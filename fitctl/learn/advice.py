@@ -238,6 +238,43 @@ def advise(
     ConfigError
         If there is too little of it, or no design has the margins.
     """
+    night, truth = estimated(series, rig_basis)
+    suspects = tuple(line for line in truth.lines if _can_be_alias(line, truth))
+    wanted = tuple(line for line in truth.lines if _worth_counteracting(line, truth))
+    design = design_with_margins(dataclasses.replace(truth, lines=wanted), required)
+    both = present, design
+    present_px, learnt_px = (_if_aliases(one, truth, suspects) for one in both)
+    return Advice(
+        night=night,
+        measured_px=measured_px,
+        present=standing(present, truth),
+        learnt=standing(design, truth),
+        bound_px=bound(truth).residual_px,
+        lines=tuple(
+            LineAdvice(
+                found,
+                line in wanted,
+                line in suspects,
+                *(_if_aliases(one, truth, (line,)) for one in both),
+            )
+            for found, line in zip(night.lines, truth.lines, strict=True)
+        ),
+        design=design,
+        lately_px=_lately_px(series, truth, present, design),
+        if_aliases_px=(present_px, learnt_px),
+    )
+
+
+def estimated(series: list[Series], rig_basis: Basis) -> tuple[Night, Basis]:
+    """Estimate a night, and what designs count with if that is what it was like.
+
+    Arguments as of :func:`advise`.
+
+    Raises
+    ------
+    ConfigError
+        If there is too little of it, or the mirror hardly moves.
+    """
     opened = periodograms(series, rig_basis.period_s)
     if opened is None:
         longest_s = max((len(one.disturbance_px) for one in series), default=0) * rig_basis.period_s
@@ -254,30 +291,7 @@ def advise(
         lines=tuple(line.for_design for line in night.lines),
         mirror_gain=_gain_for_design(night),
     )
-    suspects = tuple(line for line in truth.lines if _can_be_alias(line, truth))
-    wanted = tuple(line for line in truth.lines if _worth_counteracting(line, truth))
-    design = design_with_margins(dataclasses.replace(truth, lines=wanted), required)
-    both = present, design
-    present_px, learnt_px = (_if_aliases(one, truth, suspects) for one in both)
-    return Advice(
-        night=night,
-        measured_px=measured_px,
-        present=_standing(present, truth),
-        learnt=_standing(design, truth),
-        bound_px=bound(truth).residual_px,
-        lines=tuple(
-            LineAdvice(
-                found,
-                line in wanted,
-                line in suspects,
-                *(_if_aliases(one, truth, (line,)) for one in both),
-            )
-            for found, line in zip(night.lines, truth.lines, strict=True)
-        ),
-        design=design,
-        lately_px=_lately_px(series, truth, present, design),
-        if_aliases_px=(present_px, learnt_px),
-    )
+    return night, truth
 
 
 def _lately_px(
@@ -319,7 +333,8 @@ def _gain_for_design(night: Night) -> float:
     return found.value
 
 
-def _standing(design: Design, truth: Basis) -> Standing:
+def standing(design: Design, truth: Basis) -> Standing:
+    """What a design leaves of a night."""
     return Standing(
         design.name,
         linear_residual(design, truth),

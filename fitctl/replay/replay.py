@@ -66,6 +66,7 @@ from fitctl.supervisor.supervisor import Supervisor
 # Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well. What a
 # collector that moves does to the stars and the beam is in what was measured.
 _NOT_REPLAYED = {"SequenceControl", "TakeOver", "MoveCollector"}
+_OF_CONTROLLERS = {"SetController", "LearnerReport"}
 
 
 class Replay:
@@ -75,9 +76,12 @@ class Replay:
     ----------
     rig : Rig
         With the log's loops.
+    keep_controllers : bool
+        The controllers that the rig begins with stay, whatever the log's commands and learner changed.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, *, keep_controllers: bool = False) -> None:
+        self._left_out = _NOT_REPLAYED | (_OF_CONTROLLERS if keep_controllers else set())
         self._compared = {
             name: METROLOGY_COMPARED if name in rig.metrology_loops else STELLAR_COMPARED
             for name in rig.loops
@@ -162,10 +166,12 @@ class Replay:
             supervisor.piezos[reading.loop].evaluate(_piezo_answer(reading))
         for command in step.of(CommandRecord):
             # A refused Off takes the mirror to its bias.
-            if command.command not in _NOT_REPLAYED and (
-                command.accepted or command.command == "Off"
-            ):
+            if not command.accepted and command.command != "Off":
+                continue
+            if command.command not in self._left_out:
                 self._post(command)
+            elif command.command == "SetController":
+                self.result.controllers_left_out += 1
 
     def _post(self, message: Any) -> None:
         try:
@@ -243,10 +249,14 @@ class Replay:
 
 
 def replay(
-    rig: Rig, steps: Iterator[LoggedStep], on_tick: Callable[[float], None] = lambda _: None
+    rig: Rig,
+    steps: Iterator[LoggedStep],
+    on_tick: Callable[[float], None] = lambda _: None,
+    *,
+    keep_controllers: bool = False,
 ) -> ReplayResult:
     """Replay a log's steps; `on_tick` is called now and then with how far that is, in seconds of the log."""
-    running = Replay(rig)
+    running = Replay(rig, keep_controllers=keep_controllers)
     started = shown = time.perf_counter()
     for step in steps:
         running.play(step)

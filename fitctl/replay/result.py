@@ -128,6 +128,8 @@ class ReplayResult:
     loops : dict of str to LoopReplay
     refused : list of str
         Commands that were accepted then, and what is said to them today.
+    controllers_left_out : int
+        Commands of the log that would have changed a controller which was to stay.
     records_lost : int
         On the way to the log, as the recorder counted.
     start_s, end_s : float
@@ -138,6 +140,7 @@ class ReplayResult:
 
     loops: dict[str, LoopReplay]
     refused: list[str] = field(default_factory=list)
+    controllers_left_out: int = 0
     records_lost: int = 0
     start_s: float = math.nan
     end_s: float = math.nan

@@ -16,7 +16,7 @@ from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.report.fringes import FringeFindings, find_fringes
 from fitctl.report.gather import Gathered, gather
-from fitctl.report.rejection import Rejection, rejections
+from fitctl.report.rejection import Held, Rejection, held_by_controller, rejections
 from fitctl.report.residual import Estimate, Verdict, Word, night_verdict, rms_estimate, verdict
 from fitctl.report.run import Run
 from fitctl.report.selection import Selection, select_frames, select_samples
@@ -117,12 +117,14 @@ class StarFindings(LoopFindings):
     Attributes
     ----------
     sky_arcsec_per_px : float
+    held_by_controller : list of Held
     rejections : list of Rejection
     stacks : Stacks or None
     stages : Stages
     """
 
     sky_arcsec_per_px: float
+    held_by_controller: list[Held]
     rejections: list[Rejection]
     stacks: Stacks | None
     stages: Stages
@@ -178,6 +180,7 @@ def _star(gathered: Gathered, name: str) -> LoopFindings:
     return StarFindings(
         **_of_any(gathered, name, STAR, settings.requirement_px, selection),
         sky_arcsec_per_px=scales(rig, settings).sky_arcsec_per_px,
+        held_by_controller=held_by_controller(gathered, name, selection),
         rejections=rejections(gathered, name, selection),
         stacks=found,
         stages=stages(rig, name, ticks, selection, found),

@@ -139,6 +139,14 @@ def _plain_star(loop: StarFindings) -> dict[str, Any]:
         "piston_rms_m": moved.piston_rms_m,
         "siderostat_moved_px": moved.motor_moved_px.tolist(),
         "command_gap_px": [gap.px for gap in moved.gaps],
+        "rms_by_controller": [
+            {
+                "name": held.controller,
+                "judged_s": held.evaluated_s,
+                **{f"rms_{axis}_px": found.rms for axis, found in held.residual.items()},
+            }
+            for held in loop.held_by_controller
+        ],
         "controllers": [
             {
                 "name": found.controller,

@@ -79,7 +79,12 @@ def _star(findings: Findings, loop: StarFindings, time: TimeAxis) -> Section:
             f"{link}'s siderostat turned, and the rejection what the feedforward undid of it."
         )
     measured = [tables.rejected(loop), tables.timings(loop)]
-    lead = [tables.residual(loop), tables.error_budget(loop), tables.key_figures(loop)]
+    lead = [
+        tables.residual(loop),
+        tables.by_controller(loop),
+        tables.error_budget(loop),
+        tables.key_figures(loop),
+    ]
     return Section(f"Loop {loop.name}", plots, measured, lead, " ".join(texts))
 
 

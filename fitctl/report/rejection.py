@@ -32,6 +32,7 @@ from fitctl.figures.attenuation import (
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
+from fitctl.report.residual import Estimate, rms_estimate
 from fitctl.report.selection import Selection
 
 Floats = NDArray[np.float64]
@@ -99,6 +100,47 @@ class Rejection(NamedTuple):
         ]
 
 
+class Held(NamedTuple):
+    """How well a loop held its star under one controller.
+
+    Attributes
+    ----------
+    controller : str
+    evaluated_s : float
+    residual : dict of str to Estimate
+        By axis, px.
+    """
+
+    controller: str
+    evaluated_s: float
+    residual: dict[str, Estimate]
+
+
+def held_by_controller(gathered: Gathered, loop_name: str, selection: Selection) -> list[Held]:
+    """One for each controller with frames that are evaluated, in the order of their first use."""
+    ticks = gathered.ticks[loop_name]
+    error_px = axis_pair(ticks, "error_{}_px")
+    found = []
+    for name, spans in _spans(gathered, loop_name).items():
+        pieces = _within(selection, ticks, spans)
+        if not pieces:
+            continue
+        rows = np.concatenate(pieces)
+        residual = {
+            axis: rms_estimate(error_px[rows, column]) for column, axis in enumerate(("az", "el"))
+        }
+        found.append(Held(name, len(rows) * gathered.run.rig.camera.period_s, residual))
+    return found
+
+
+def _spans(gathered: Gathered, loop_name: str) -> dict[str, list[tuple[float, float]]]:
+    """From when to when each controller was in force."""
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for begin_s, end_s, name in _controllers(gathered, loop_name):
+        spans.setdefault(name, []).append((begin_s, end_s))
+    return spans
+
+
 def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list[Rejection]:
     """One for each controller that was in force long enough, in the order of their first use."""
     rig, ticks = gathered.run.rig, gathered.ticks[loop_name]
@@ -109,10 +151,8 @@ def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list
     mirror_rad = mirror_at_exposure_rad(fsm, ticks)
     disturbance_px = error_px - stages_px(rig, loop_name, ticks)
     period_s = rig.camera.period_s
-    controllers = _controllers(gathered, loop_name)
     found = []
-    for name in dict.fromkeys(name for _, _, name in controllers):
-        spans = [(begin_s, end_s) for begin_s, end_s, its in controllers if its == name]
+    for name, spans in _spans(gathered, loop_name).items():
         its_spectra, segments, seconds = [], [], 0.0
         pieces = _within(selection, ticks, spans)
         for piece in pieces:

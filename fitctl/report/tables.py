@@ -83,6 +83,28 @@ def residual(loop: LoopFindings) -> Table:
     )
 
 
+def by_controller(loop: StarFindings) -> Table:
+    """How well the star was held under each of several controllers."""
+    rows = [
+        [
+            held.controller,
+            seconds(held.evaluated_s),
+            *(
+                text
+                for found in held.residual.values()
+                for text in (number(found.rms, ".4f", "px"), interval(found))
+            ),
+        ]
+        for held in loop.held_by_controller
+    ]
+    head = [
+        "controller",
+        "judged",
+        *(part for axis in AXES for part in (f"RMS {axis}", "interval")),
+    ]
+    return Table("RMS of the error under each controller", head, rows if len(rows) > 1 else [])
+
+
 def headline(loop: LoopFindings) -> str:
     """The one number of a loop: the RMS of its worse axis."""
     worse = max(

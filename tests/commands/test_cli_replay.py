@@ -7,6 +7,8 @@ import pytest
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.prefilter import Prefilter
+from fitctl.messages.commands import SetController
 from tests.logged_simulation import LoggedSimulation
 
 
@@ -17,6 +19,19 @@ def log(tmp_path_factory):
     simulation = LoggedSimulation(rig, path)
     simulation.acquire()
     simulation.run(3.0)
+    simulation.writer.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def changed_log(tmp_path_factory):
+    """A run in which somebody changed the controller after half a minute."""
+    path = tmp_path_factory.mktemp("log") / "changed.mcap"
+    simulation = LoggedSimulation(load_rig(default_rig_path()), path)
+    simulation.acquire()
+    simulation.run(30.0)
+    simulation.command(SetController(loop="right", name="minimum-variance"))
+    simulation.run(35.0)
     simulation.writer.close()
     return path
 
@@ -47,7 +62,7 @@ def test_another_controller_differs_and_the_table_says_where_and_that_it_is_open
     status, text, _ = replay(log, "--controller", "lqg-ltr")
 
     rows = {line[2:24].strip(): line[24:].split() for line in text.splitlines()}
-    assert status == 1
+    assert status == 0  # a change that was asked for
     assert rows["mode"] == rows["star's place"] == ["0"]
     ticks, first_s, *_, worst, unit, rms, _ = rows["D/A voltages"]
     assert (int(ticks) > 50, float(first_s) > 0.4, unit) == (True, True, "V")
@@ -56,13 +71,57 @@ def test_another_controller_differs_and_the_table_says_where_and_that_it_is_open
     assert "open loop: whatever today's code commands, the frames are the log's" in text
 
 
+def test_a_log_too_short_for_an_expected_rms_says_so(replay, log):
+    _, text, _ = replay(log, "--controller", "lqg-ltr")
+
+    assert "loop right: no RMS can be expected: learn: the longest piece in VERNIER is" in text
+
+
+def test_another_controller_stays_to_the_end_whatever_the_log_changed(replay, changed_log):
+    _, text, _ = replay(changed_log)
+    assert text.splitlines()[-1] == "the same, to the last bit"  # with the log's own change
+
+    status, text, _ = replay(changed_log, "--controller", "eq20", "--json")
+    result = json.loads(text)
+    assert status == 0
+    assert result["controllers_left_out"] == 1
+    # The log began with eq20: until its own command, nothing differs.
+    stacks = result["loops"]["right"]["differences"]["stacks_v"]
+    assert 30.0 < stacks["first_s"] < 32.0
+
+
+def test_the_rms_of_each_controller_and_of_the_wanted_one(replay, changed_log):
+    status, text, _ = replay(changed_log, "--controller", "lqg-ltr", "--json")
+    (loop,) = json.loads(text)["controllers"]
+
+    assert status == 0
+    assert list(loop["measured"]) == ["eq20", "minimum-variance"]
+    assert list(loop["expected"]) == ["minimum-variance", "lqg-ltr"]
+    for az_px, el_px in loop["measured"].values():
+        assert 0.01 < az_px < 0.03
+        assert 0.01 < el_px < 0.03
+    # What a design was expected to leave on frames is what it left.
+    left_px = max(loop["measured"]["minimum-variance"])
+    assert loop["expected"]["minimum-variance"] == pytest.approx(left_px, rel=0.2)
+    assert loop["true"]["minimum-variance"] < loop["true"]["lqg-ltr"] < loop["expected"]["lqg-ltr"]
+
+
+def test_a_run_that_differs_without_a_change_has_status_1(replay, log, monkeypatch):
+    real = Prefilter.step
+    monkeypatch.setattr(Prefilter, "step", lambda self, target: real(self, target + 0.01))
+
+    status, text, _ = replay(log)
+    assert status == 1
+    assert "the same" not in text
+
+
 def test_json_says_the_same_for_programs(replay, log):
     changed = "loops.right.coarse.reach_frames=40"
     status, text, _ = replay(log, "--json", "--set", changed)
     result = json.loads(text)
     loop = result["loops"]["right"]
 
-    assert status == 1
+    assert status == 0
     assert result["same"] is False
     assert (loop["mode"]["then"], loop["mode"]["now"]) == ("VERNIER", "COARSE")
     assert loop["mode"]["ticks"] == 30

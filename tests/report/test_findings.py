@@ -9,6 +9,7 @@ from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.figures.rigs import with_controller
 from fitctl.messages.commands import SetController
 from fitctl.model.hysteresis import half_widths_v, stack_gains
+from fitctl.report import tables
 from fitctl.report.findings import find
 from fitctl.report.run import find_run
 from fitctl.report.stages import stacks
@@ -23,6 +24,13 @@ def test_the_residual_is_that_of_the_ticks(held, findings):
     assert loop.verdict.word == "met"
     assert loop.residual["az"].rms == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-5)
     assert loop.residual["az"].low < loop.residual["az"].rms < loop.residual["az"].high
+
+
+def test_the_only_controller_of_a_run_needs_no_table(findings):
+    loop = findings.loops["right"]
+
+    assert len(loop.held_by_controller) == 1
+    assert tables.by_controller(loop).rows == []
 
 
 def test_the_rejection_is_measured_and_the_design_is_the_logged_one(rig, findings):
@@ -98,9 +106,18 @@ def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
     path = tmp_path / "two.mcap"
     record(with_controller(rig, "right", "eq20"), path, course)
 
-    found = find(find_run([path])).loops["right"].rejections
+    loop = find(find_run([path])).loops["right"]
+    found, held = loop.rejections, loop.held_by_controller
 
     assert [one.controller for one in found] == ["eq20", "minimum-variance"]
+    assert [one.controller for one in held] == ["eq20", "minimum-variance"]
+    assert sum(one.evaluated_s for one in held) == pytest.approx(
+        loop.selection.evaluated_s, abs=0.1
+    )
+    squares = sum(one.evaluated_s * one.residual["az"].rms ** 2 for one in held)
+    whole = loop.selection.evaluated_s * loop.residual["az"].rms ** 2
+    assert squares == pytest.approx(whole, rel=0.01)
+    assert tables.by_controller(loop).rows[1][0] == "minimum-variance"
     assert all(one.predicted is not None for one in found)
     assert found[1].evaluated_s == pytest.approx(12.0, abs=1.0)
 

@@ -6,23 +6,29 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.logs import LatestOption, chosen_logs
+from fitctl.commands.shared.opened import opened_loop
 from fitctl.commands.shared.options import ControllerOption, JsonOption, SetOption
 from fitctl.commands.shared.printing import progress_line, say, to_json
 from fitctl.commands.shared.rig import controller_overrides
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
+from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.document import design_json
+from fitctl.learn.advice import estimated, standing
 from fitctl.logging.reading import LogInfo
 from fitctl.replay.files import logged_files, missing_dark_file
 from fitctl.replay.log import read_steps, whole_run
 from fitctl.replay.replay import replay as replay_steps
 from fitctl.replay.result import LoopReplay, ReplayResult
+from fitctl.report.gather import Gathered, gather
+from fitctl.report.rejection import held_by_controller
+from fitctl.report.run import find_run
 
 _ROWS = {
     "star_px": ("star's place", "px"),
@@ -56,8 +62,10 @@ def replay(
 ) -> None:
     """Run the frames of a log through today's code, and show where it decides differently.
 
-    Exit status 0 if every mode and every command is the same to the last bit, 1 if not, 2 if the log
-    cannot be replayed. A changed command changes no frames.
+    A changed command changes no frames. With --controller, that controller stays in force to the end, and the
+    command estimates the RMS that it would leave. Exit status 0 if every mode and command is the same to the
+    last bit, or if you changed something with --controller, --set or --rig; 1 if they differ without; 2 if the
+    log cannot be replayed.
     """
     logs = chosen_logs("replay", logs, rig, latest=latest)
     with whole_run(logs) as info, logged_files(info) as files:
@@ -69,22 +77,95 @@ def replay(
                 "no file is read because a log names it: name the dark frame with --set camera.dark_file=FILE"
             )
             raise ConfigError(msg)
-        result = _replayed(info, settings)
+        result = _replayed(info, settings, keep_controllers=controller is not None)
+        left = [] if controller is None else _what_is_left(logs, rig, settings)
     named = ", ".join(map(str, logs))
     if as_json:
-        say(to_json(_document(named, info, settings, result)))
+        document = _document(named, info, settings, result)
+        document |= {"controllers": [each._asdict() for each in left]} if left else {}
+        say(to_json(document))
     else:
-        for line in _lines(named, info, settings, result):
+        lines = [
+            *_lines(named, info, settings, result),
+            *(x for each in left for x in each.lines()),
+        ]
+        for line in lines:
             say(line)
-    raise typer.Exit(0 if result.same else FAILED)
+    asked = bool(controller or overrides or rig)
+    raise typer.Exit(0 if result.same or asked else FAILED)
 
 
-def _replayed(info: LogInfo, rig: Rig) -> ReplayResult:
+def _replayed(info: LogInfo, rig: Rig, *, keep_controllers: bool) -> ReplayResult:
     """The replay, with its progress."""
     with progress_line("replaying", info.duration_s) as progress:
-        result = replay_steps(rig, read_steps(info, rig), on_tick=progress)
+        result = replay_steps(
+            rig, read_steps(info, rig), on_tick=progress, keep_controllers=keep_controllers
+        )
         progress(info.duration_s)
     return result
+
+
+class Left(NamedTuple):
+    """What controllers leave of a loop's error; RMS in px.
+
+    Attributes
+    ----------
+    loop : str
+    measured : dict of str to tuple of float
+        In the log, az and el, under each controller that it had.
+    expected : dict of str to float
+        On frames, of the worse axis, with the log's last controller and with the one that was asked for.
+    true : dict of str to float
+        Likewise, without the sensor's noise.
+    why_not : str
+        Why nothing is expected.
+    """
+
+    loop: str
+    measured: dict[str, tuple[float, float]]
+    expected: dict[str, float]
+    true: dict[str, float]
+    why_not: str = ""
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = [
+            f"loop {self.loop}, RMS of the error in the log with {name}: az {az:.4f} px, el {el:.4f} px"
+            for name, (az, el) in self.measured.items()
+        ]
+        lines += [
+            f"loop {self.loop}, RMS expected on the same night with {name}: {px:.4f} px as measured, "
+            f"{self.true[name]:.4f} px without the sensor's noise"
+            for name, px in self.expected.items()
+        ]
+        if self.why_not:
+            lines.append(f"loop {self.loop}: no RMS can be expected: {self.why_not}")
+        return lines
+
+
+def _what_is_left(logs: Sequence[Path], file: Path | None, asked: Rig) -> list[Left]:
+    """Of each stellar loop: its RMS in the log, and what designs leave of the night that the log shows."""
+    gathered = gather(find_run(logs, None if file is None else load_rig(file)))
+    return [_left(gathered, loop, asked) for loop in asked.stellar_loops]
+
+
+def _left(gathered: Gathered, name: str, asked: Rig) -> Left:
+    measured: dict[str, tuple[float, float]] = {}
+    try:
+        loop = opened_loop(gathered, name)
+        for held in held_by_controller(gathered, name, loop.selection):
+            measured[held.controller] = (held.residual["az"].rms, held.residual["el"].rms)
+        _, truth = estimated(loop.series, basis(gathered.run.rig, name))
+        designs = (loop.present, design_for(asked, name))
+        found = {design.name: standing(design, truth) for design in designs}
+    except ConfigError as error:
+        return Left(name, measured, {}, {}, str(error))
+    return Left(
+        name,
+        measured,
+        {title: stands.camera_px for title, stands in found.items()},
+        {title: stands.residual_px for title, stands in found.items()},
+    )
 
 
 def _rig(
@@ -140,6 +221,7 @@ def _document(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> dict
         "speed_x": span_s / result.wall_s,
         "records_lost": result.records_lost,
         "refused": result.refused,
+        "controllers_left_out": result.controllers_left_out,
         "loops": loops,
     }
 
@@ -150,6 +232,10 @@ def _lines(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> Iterato
     for name, loop in result.loops.items():
         yield from _loop_lines(info, name, loop)
     yield from (f"accepted then, refused today: {text}" for text in result.refused)
+    if result.controllers_left_out:
+        yield (
+            f"left out: {result.controllers_left_out} commands of the log that would change the controller"
+        )
     if result.records_lost:
         yield f"{result.records_lost} records were lost on the way to the log; what follows them may differ"
     if result.same:

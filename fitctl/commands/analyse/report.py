@@ -106,7 +106,16 @@ def _print_verdict(night: Findings) -> None:
             say(
                 f"  {axis} {number(found.rms, '.4f', f'{unit} RMS')}, 95 % interval {interval(found)}"
             )
-        for under in loop.rejections if isinstance(loop, StarFindings) else ():
+        if not isinstance(loop, StarFindings):
+            continue
+        several = len(loop.held_by_controller) > 1
+        for held in loop.held_by_controller if several else ():
+            rms = ", ".join(
+                f"{axis} {number(found.rms, '.4f', 'px RMS')}"
+                for axis, found in held.residual.items()
+            )
+            say(f"  {held.controller}, {seconds(held.evaluated_s)}: {rms}")
+        for under in loop.rejections:
             if under.budget is not None:
                 say(f"  {under.controller}: {under.budget.verdict}; from {under.budget.parts}")
     if night.fringes is not None:

@@ -4,23 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
+from fitctl.commands.shared.opened import opened_loop
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import solving
 from fitctl.controllers.design.files import save_design
-from fitctl.controllers.design.theory import loop_theory
-from fitctl.figures.attenuation import mirror_at_exposure_rad
-from fitctl.identify.record import axis_pair
 from fitctl.learn.advice import Advice, advise
-from fitctl.learn.opened import rebuild
 from fitctl.report.gather import gather
-from fitctl.report.rejection import last_design
 from fitctl.report.run import Run, find_run
-from fitctl.report.selection import select_frames
 
 
 def learn(
@@ -56,17 +49,5 @@ def learn(
 
 
 def _advice(run: Run, loop_name: str) -> Advice:
-    rig, gathered = run.rig, gather(run)
-    loop, ticks = rig.stellar_loops[loop_name], gathered.ticks[loop_name]
-    present = last_design(gathered, loop_name)
-    pieces = select_frames(ticks, rig.camera.period_s, loop.requirement_px).pieces
-    series = rebuild(
-        loop_theory(rig, loop_name, present),
-        ticks,
-        pieces,
-        mirror_at_exposure_rad(loop.fsm, ticks),
-    )
-    rows = np.concatenate([np.empty(0, np.intp), *pieces])
-    error_px = axis_pair(ticks, "error_{}_px")[rows]
-    az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(rows) else (0.0, 0.0)
-    return advise(series, (az_px, el_px), basis(rig, loop_name), present)
+    loop = opened_loop(gather(run), loop_name)
+    return advise(loop.series, loop.measured_px, basis(run.rig, loop_name), loop.present)

@@ -1,0 +1,59 @@
+"""A loop of a logged run, opened on paper: what would have moved its star with the stages at rest."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fitctl.controllers.design.theory import loop_theory
+from fitctl.controllers.pair import Design
+from fitctl.figures.attenuation import mirror_at_exposure_rad
+from fitctl.identify.record import axis_pair
+from fitctl.learn.opened import Series, rebuild
+from fitctl.report.gather import Gathered
+from fitctl.report.rejection import last_design
+from fitctl.report.selection import Selection, select_frames
+
+
+class OpenedLoop(NamedTuple):
+    """A loop, opened.
+
+    Attributes
+    ----------
+    series : list of Series
+    selection : Selection
+        The frames of it.
+    measured_px : tuple of float
+        RMS of the error on them, az and el.
+    present : Design
+        That was in force at the end.
+    """
+
+    series: list[Series]
+    selection: Selection
+    measured_px: tuple[float, float]
+    present: Design
+
+
+def opened_loop(gathered: Gathered, loop_name: str) -> OpenedLoop:
+    """Open a stellar loop of a run.
+
+    Raises
+    ------
+    ConfigError
+        If the loop's design is not known.
+    """
+    rig, ticks = gathered.run.rig, gathered.ticks[loop_name]
+    loop = rig.stellar_loops[loop_name]
+    present = last_design(gathered, loop_name)
+    selection = select_frames(ticks, rig.camera.period_s, loop.requirement_px)
+    series = rebuild(
+        loop_theory(rig, loop_name, present),
+        ticks,
+        selection.pieces,
+        mirror_at_exposure_rad(loop.fsm, ticks),
+    )
+    error_px = axis_pair(ticks, "error_{}_px")[selection.rows]
+    az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(error_px) else (0.0, 0.0)
+    return OpenedLoop(series, selection, (az_px, el_px), present)
