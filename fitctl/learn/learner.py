@@ -7,7 +7,6 @@ virtual clock. It decides nothing: what becomes of its reports, the loop does (:
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +61,9 @@ class Learner:
         self._loop_name = loop_name
         period_s = rig.camera.period_s
         self._period_s = period_s
-        self._ticks: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / period_s))
         self._columns = ("time_s", "mid_exposure_s", *_FIELDS)
+        self._ring = np.empty((round(WINDOW_S / period_s), len(self._columns)))
+        self._added = 0
         self._new = 0
         self._due_after = round(FIRST_S / period_s)
         self._unsettled_s = -math.inf
@@ -84,8 +84,15 @@ class Learner:
         if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or moved:
             self._unsettled_s = tick.time_s
         elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
-            self._ticks.append(tuple(getattr(tick, name) for name in self._columns))
+            row = self._added % len(self._ring)
+            self._ring[row] = [getattr(tick, name) for name in self._columns]
+            self._added += 1
             self._new += 1
+
+    @property
+    def frames(self) -> int:
+        """How many are kept: at most those of `WINDOW_S`."""
+        return min(self._added, len(self._ring))
 
     @property
     def due(self) -> bool:
@@ -103,11 +110,12 @@ class Learner:
                 loop=self._loop_name,
                 design_json="",
                 text=str(error),
-                evaluated_s=len(self._ticks) * self._period_s,
+                evaluated_s=self.frames * self._period_s,
             )
 
     def _advice(self, present: Design) -> Advice:
-        table = np.array(self._ticks)
+        oldest = self._added % len(self._ring) if self._added > len(self._ring) else 0
+        table = np.roll(self._ring[: self.frames], -oldest, axis=0)
         ticks = dict(zip(self._columns, table.T, strict=True))
         pieces = pieces_of(ticks["mid_exposure_s"], np.ones(len(table), bool))
         theory = loop_theory(self._rig, self._loop_name, present)

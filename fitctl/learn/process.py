@@ -6,6 +6,7 @@ It has no part in the loop. Without it nothing is learnt, and nothing else chang
 from __future__ import annotations
 
 import os
+import resource
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -18,6 +19,8 @@ from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LoopState, Telemetry
 
 NICENESS = 19
+MOST_BYTES = 1 << 30
+"""Of the process's own data. Beyond it, the process ends, and the supervisor starts a new one."""
 _POLL_S = 0.5
 
 
@@ -56,6 +59,7 @@ class LoopLearner:
 def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:
     """Learn from a supervisor's telemetry until `stop`."""
     os.nice(NICENESS)
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
     learners = {
         name: LoopLearner(rig, name)
         for name, loop in rig.stellar_loops.items()

@@ -20,6 +20,7 @@ BESIDE = {
     "recorder",
     "gateway",
     "metrics server",
+    "learner",
     "console",
     "command",
     "disk",
@@ -27,7 +28,15 @@ BESIDE = {
     "clock",
 }
 """What stands beside the tick, which goes on whatever becomes of them."""
-PROCESSES = {"mocks", "supervisor", "recorder", "gateway", "metrics server", "console"}
+PROCESSES = {
+    "mocks",
+    "supervisor",
+    "recorder",
+    "gateway",
+    "metrics server",
+    "learner",
+    "console",
+}
 REST = {"OFF", "STANDBY", "SAFE"}
 HELD_S = 1.0  # a loop must have held its star for so long before it is struck
 HOLDS_WITHIN_S = 20.0

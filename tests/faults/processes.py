@@ -52,6 +52,6 @@ ENTRIES = (
         for mode in MODES
         for how, says, within_s in (
             ("killed", "the {} was killed by signal 9", 3.0), ("stopped", "", 1.0), ("slowed", "", 1.0))
-        for beside in ("gateway", "metrics server")
+        for beside in ("gateway", "metrics server", "learner")
     ),
 )  # fmt: skip

@@ -69,7 +69,7 @@ def killed(rig, entry):
             rig.restart_mocks()
         if entry.struck == "supervisor":
             rig.start_supervisor()
-    if entry.struck in {"gateway", "metrics server"}:
+    if entry.struck in {"gateway", "metrics server", "learner"}:
         goes_on(rig, entry)
 
 
@@ -144,11 +144,13 @@ def repeated(action, every_s):
 
 
 def goes_on(rig, entry):
-    """A console draws again; who is elsewhere is answered again, and who asks for metrics gets them."""
+    """A console draws again; who is elsewhere is answered again, metrics come again; a learner runs."""
     if entry.struck == "gateway":
         rig.is_reached_from_elsewhere()
     if entry.struck == "metrics server":
         rig.is_measured()
+    if entry.struck == "learner":
+        rig.process("learner")
     if entry.struck == "console":
         drawn, end_s = rig.console.drawn, time.monotonic() + DRAWS_WITHIN_S
         while rig.console.drawn == drawn:

@@ -163,6 +163,8 @@ class WatchedRig(Rig):
             return self._open_console()
         if name == "recorder":
             return self.recorder()
+        if name == "learner":
+            return self.child("learner")
         if name == "gateway":
             self.is_reached_from_elsewhere()
             return self.child("gateway")

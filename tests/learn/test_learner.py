@@ -11,7 +11,7 @@ from learner_reports import SHAKEN, learnt_json
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
-from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, Learner
+from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, WINDOW_S, Learner
 from fitctl.learn.process import LoopLearner
 from fitctl.messages.commands import MAX_COMMAND_BYTES
 from fitctl.messages.telemetry import LearningState
@@ -68,15 +68,32 @@ def test_a_first_report_is_due_after_a_minute_of_frames(rig, vernier):
 def test_frames_of_a_disturbed_loop_are_left_out(rig, vernier, disturbed):
     learner = fed(rig, [msgspec.structs.replace(tick, **disturbed) for tick in vernier])
 
-    assert not learner._ticks
+    assert learner.frames == 0
 
 
 def test_after_a_step_of_the_target_frames_are_left_out(rig, vernier):
     before, after = vernier[:1000], vernier[1000:1500]
     stepped = [msgspec.structs.replace(tick, target_az_px=25.0) for tick in after]
-    kept = len(fed(rig, before)._ticks)
+    kept = fed(rig, before).frames
 
-    assert len(fed(rig, before + stepped)._ticks) == kept + 500 - round(SETTLE_S / PERIOD_S)
+    assert fed(rig, before + stepped).frames == kept + 500 - round(SETTLE_S / PERIOD_S)
+
+
+def test_a_long_night_is_learnt_from_its_last_minutes_in_as_much_memory(rig, vernier):
+    """A year of frames needs no more than four minutes of them, and what is older is forgotten."""
+    frames = round(WINDOW_S / PERIOD_S)
+    learner = fed(rig, vernier[:1])
+    before = learner._ring.nbytes
+    at_s = vernier[0].time_s
+    for number in range(frames + 1500):
+        at_s += PERIOD_S
+        tick = vernier[number % len(vernier)]
+        learner.add(msgspec.structs.replace(tick, time_s=at_s, mid_exposure_s=at_s))
+    report = learner.report(design_for(rig, "right"))
+
+    assert learner.frames == frames
+    assert learner._ring.nbytes == before
+    assert report.evaluated_s == pytest.approx(WINDOW_S, rel=0.01)
 
 
 def test_a_report_has_the_night_and_a_design_that_can_be_made_again(rig, ticks):
