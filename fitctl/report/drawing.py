@@ -171,7 +171,9 @@ def limit(axes: Axes, value: float, label: str | None = None) -> None:
 
 
 def legend_above(axes: Axes, columns: int) -> None:
-    """A legend beside the title, where it hides nothing."""
+    """A legend beside the title, where it hides nothing; none for an empty plot."""
+    if not axes.get_legend_handles_labels()[0]:
+        return
     axes.legend(ncols=columns, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
 
 
