@@ -78,7 +78,6 @@ def test_a_sequence_is_run_steered_edited_and_rehearsed_and_its_log_reported_and
     sequences.press("Tab", "PageDown", "PageDown")  # to the last parameter, how long is waited
     sequences.press("Enter")
     sequences.until("duration_s (is 600.0)")
-    sequences.press("C-u")
     sequences.type("1.0")
     sequences.press("Enter")
     sequences.until("well; 3 steps")
