@@ -3,6 +3,9 @@
 A device acts by itself whatever becomes of its line: a drive turns on at its last velocity until it misses its
 master, and a D/A that is not written to goes to its safe voltages.
 
+A CANopen drive stops with a fault when it misses its master; the station of analogue amplifiers takes the
+enable lines away until the next write; an Ensemble watches nobody, and turns until its own limits.
+
 Known limitations: a drive without its master stops at once, without a ramp; a reset takes no time.
 """
 
@@ -12,6 +15,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from random import Random
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +52,8 @@ _MASTER_LOST = "heartbeat of the master lost"
 _REFERENCE_S = 5.0
 _SILENCE = frozenset({"deaf", "mute", "refuses", "garbled"})
 _MOST_LATE_FRAMES = 20
+_USUAL_S = {"cia402": 0.0004, "bal_analog": 0.0006, "ensemble": 0.005}
+_LOOK_S = 0.1
 
 
 def _identity(model: str) -> DeviceIdentity:
@@ -78,14 +84,28 @@ class SwarmAmplifiers:
         commanded: Callable[[str, AzEl], None],
     ) -> None:
         siderostat = rig.loops[loop_name].siderostat
-        device = siderostat.device
+        device: Any = siderostat.device
         self.name = loop_name
+        self._driver = device.driver
+        self._enables_by_line = self._driver == "bal_analog"
+        usual_s = _USUAL_S[self._driver]
         self.line = Line(
-            "siderostat", device.endpoint, time, random, 0.0004, device.response_timeout_s
+            "siderostat", device.endpoint, time, random, usual_s, device.response_timeout_s
         )
         self.powered = False
         self.fault = ""
-        self.master_timeout_s = getattr(device, "master_heartbeat_timeout_s", 0.5)
+        _, mocks = rig.mock_parts()
+        mock = mocks.loops[loop_name]
+        self._enables = False  # the analogue amplifiers' enable lines, as last asked for
+        self._limit_rad = math.inf
+        self.master_timeout_s = _LOOK_S
+        if self._driver == "cia402":
+            self.master_timeout_s = device.master_heartbeat_timeout_s
+        elif self._driver == "bal_analog":
+            self.master_timeout_s = mock.bal_analog.watchdog_s  # type: ignore[union-attr]
+        else:
+            limit_units = mock.ensemble.software_limit_units  # type: ignore[union-attr]
+            self._limit_rad = math.tau * limit_units
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._alive_s = 3 * getattr(device, "drive_heartbeat_s", 0.1)
         self._time = time
@@ -103,6 +123,7 @@ class SwarmAmplifiers:
     def open(self) -> DeviceIdentity:
         """Connect and configure, which takes many exchanges."""
         self.line.open()
+        self._enables = False
         for _ in range(20):
             self.line.ask(self._nothing)
         self._heard_s = self._time.now_s()
@@ -114,18 +135,22 @@ class SwarmAmplifiers:
         """Power both axes."""
         for _ in range(4):
             self.line.ask(self._nothing)
+        self._enables = True
         self.line.ask(self._power_up)
         if not self.powered:
+            self._enables = False
             raise DeviceFault(
                 "siderostat", self.line.endpoint, "both axes enabled", self.fault, "recover"
             )
 
     def disable(self) -> None:
         """Take power from both axes."""
+        self._enables = False
         self.line.ask(self._power_down)
 
     def reset_fault(self) -> None:
         """Disable, and clear a latched fault."""
+        self._enables = False
         self.line.ask(self._power_down)
         self.line.ask(self._clear)
 
@@ -143,8 +168,7 @@ class SwarmAmplifiers:
             return
         reading = None
         if "deaf" not in self.line.faults:
-            self._hear(velocity_rad_s)
-            reading = self._read()
+            reading = self._hear(velocity_rad_s)
         self._sync = self._time.now_s(), self.line.delay_s(), reading
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
@@ -221,17 +245,28 @@ class SwarmAmplifiers:
         self.fault = ""
 
     def _read(self) -> ServoReading:
-        reading = self._inner.exchange(self._inner._commanded_rad_s)
-        return reading._replace(enabled=self.powered, fault=self.fault)
+        return self._as_driver_has_it(self._inner.exchange(self._inner._commanded_rad_s))
 
-    def _hear(self, velocity_rad_s: AzEl) -> None:
-        """Obey, and watch from now on whether more comes."""
+    def _as_driver_has_it(self, reading: ServoReading) -> ServoReading:
+        # No line of analogue amplifiers reports that an axis is enabled.
+        has_power = self._enables and not self.fault if self._enables_by_line else self.powered
+        return ServoReading(reading.time_s, reading.position_rad, has_power, self.fault)
+
+    def _hear(self, velocity_rad_s: AzEl) -> ServoReading:
+        """Obey, watch from now on whether more comes, and read the encoders."""
+        inner = self._inner
         self._last_master_s = self._time.now_s()
+        if self._enables_by_line and self._enables and not (self.powered or self.fault):
+            inner.enable()  # the station's watchdog took the lines away; a write is obeyed
+            self.powered = True
         if self.powered:
-            self._inner.exchange(velocity_rad_s)
+            reading = inner.exchange(velocity_rad_s)
             if not self._watched:
                 self._watched = True
                 self._time.call_at(self._last_master_s + self.master_timeout_s, self._watch)
+        else:
+            reading = inner.exchange(inner._commanded_rad_s)
+        return self._as_driver_has_it(reading)
 
     def _watch(self) -> None:
         due_s = self._last_master_s + self.master_timeout_s
@@ -241,9 +276,15 @@ class SwarmAmplifiers:
         if self._time.now_s() < due_s - 1e-9:
             self._time.call_at(due_s, self._watch)
             return
+        if self._driver == "ensemble":  # watches nobody; its own limits end a free run
+            if max(map(abs, self._read().position_rad)) > self._limit_rad:
+                self._inner.exchange(_STILL)
+            self._time.call_at(self._time.now_s() + _LOOK_S, self._watch)
+            return
         self._watched = False
         self._power_down()
-        self.fault = _MASTER_LOST
+        if self._driver == "cia402":
+            self.fault = _MASTER_LOST
 
 
 class SwarmDac:

@@ -17,6 +17,7 @@ from fitctl.drivers.interface import AzEl
 from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading
 from fitctl.messages.commands import AnyCommand, Recover, Reply, Standby, Stop
 from fitctl.messages.modes import Mode, Trigger
+from fitctl.service.admission import Sender
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
@@ -24,6 +25,9 @@ _SLACK = 1.0 + 1e-6
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
 _AT_REST = frozenset({Mode.OFF, Mode.SAFE})
 _SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
+_FOR_ALL = {"Status", "RecentEvents"}
+_OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
+_OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
 _MOST_STEP_S = 2.0
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
@@ -68,10 +72,12 @@ class Invariants:
         self._stop_answered_s: dict[str, float] = {}
         self._texts: Counter[str] = Counter()  # of errors, since devices were opened
         self._piezo_read_s: dict[str, float] = {}
+        self._lease = "", -math.inf
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
         self._supervisor = supervisor
+        self._lease = "", -math.inf
         self._stopped_s.clear()
         self._power_up_s.clear()
         self._stop_answered_s.clear()
@@ -96,6 +102,27 @@ class Invariants:
             self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
 
     # ------------------------------------------------------------ commands and records
+
+    def admitted(self, sender: Sender, command: AnyCommand, refusal: str) -> None:
+        """The service has let a command in, or refused it: nobody may do more or less than is theirs."""
+        name, now_s = type(command).__name__, self._clock.now_s()
+        holder, heard_s = self._lease
+        holder = holder if now_s - heard_s <= self._rig.service.lease_s else ""
+        if name in _FOR_ALL:
+            may = True
+        elif name in _OF_THIS_MACHINE:
+            may = sender.is_local
+        elif name in _OF_COMMANDERS:
+            may = sender.role == "commander"
+        else:
+            may = sender.role == "commander" and holder in {"", sender.name}
+        if may == bool(refusal):
+            self.violated(
+                "lease and rights are kept", f"{sender.name}, {name}, {holder!r} has it: {refusal}"
+            )
+        takes = name not in _FOR_ALL | _OF_THIS_MACHINE | _OF_COMMANDERS or name == "TakeOver"
+        if may and (takes or holder == sender.name):
+            self._lease = sender.name, now_s
 
     def posted(self, command: AnyCommand) -> None:
         """A command is on its way to the supervisor."""

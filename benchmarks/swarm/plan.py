@@ -14,9 +14,12 @@ from fitctl.messages.commands import (
     AnyCommand,
     Hold,
     Jog,
+    Look,
     MoveCollector,
     Off,
     Recover,
+    Reset,
+    SequenceControl,
     SetBiasOffset,
     SetController,
     SetTarget,
@@ -30,12 +33,33 @@ from fitctl.messages.commands import (
 RIGS: dict[str, tuple[str, ...]] = {
     "fit-mock.toml": ("right",),
     "fit-testbed.toml": ("right", "metrology", "left"),
+    "two-stars.toml": ("right", "left"),
+    "ensemble.toml": ("right",),
+    "fit-bal-analog.toml": ("right",),
 }
 """Files of ``rigs/``, each with its loops."""
+_RIG_WEIGHTS = (8, 3, 2, 3, 3)
+_SETTINGS = (
+    "service.lease_s=10.0",
+    "logging.queue_records=200",
+    "supervisor.telemetry_hz=20.0",
+    "loops.right.acquisition.search_again_s=10.0",
+)
+"""Texts of which some runs have some."""
+_SLOW_SERVO = (
+    "loops.right.siderostat.servo.rate_hz=50.0",
+    "loops.right.siderostat.servo.gain_per_s=15.0",
+    "loops.right.siderostat.servo.following_error_limit_rad=10.0",
+    "interlocks.following_error.high=8.0",
+)
+"""Of runs of the default rig whose servo runs at 50 Hz instead of 500."""
+_SETTING = 0.15  # so many runs have each
 DURATION_S = 120.0
-OPERATORS = ("ada", "ben", "cleo")
+OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # so many commands name one
 _WITHOUT_FAULTS = 0.15  # so many runs have none of a device
+_CONSOLE_SLOW = 0.2  # so many runs have a console that misses messages
+_STEPS = ("standby", "acquire", "acquire", "hold", "wait", "jog", "target", "off")
 _BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
 
 
@@ -104,7 +128,55 @@ class Cloud(msgspec.Struct, frozen=True, kw_only=True, tag="cloud"):
         return "cloud"
 
 
-Happening = Order | Strike | Stall | Kill | Cloud
+class RecorderDeath(msgspec.Struct, frozen=True, kw_only=True, tag="recorder"):
+    """The recorder is killed; a new one comes."""
+
+    at_s: float
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "recorder death"
+
+
+class FullDisk(msgspec.Struct, frozen=True, kw_only=True, tag="disk"):
+    """Nothing can be written to the log's disk for a while."""
+
+    at_s: float
+    lasts_s: float
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "full disk"
+
+
+class ClockStep(msgspec.Struct, frozen=True, kw_only=True, tag="clock"):
+    """The computer's wall clock is set."""
+
+    at_s: float
+    by_s: float
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "clock step"
+
+
+class Sequence(msgspec.Struct, frozen=True, kw_only=True, tag="sequence"):
+    """An operator starts a sequence, of steps of `benchmarks.swarm.clients.STEPS`."""
+
+    at_s: float
+    who: str
+    steps: list[str]
+
+    @property
+    def kind(self) -> str:
+        """For the statistics."""
+        return "sequence"
+
+
+Happening = Order | Strike | Stall | Kill | Cloud | RecorderDeath | FullDisk | ClockStep | Sequence
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,6 +194,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         Until everything is healed.
     happenings : list
         In the order of their times.
+    console_loss : float
+        Part of the messages that the console misses.
     """
 
     seed: int
@@ -129,6 +203,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     settings: list[str]
     duration_s: float
     happenings: list[Happening]
+    console_loss: float = 0.0
 
 
 _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
@@ -146,6 +221,11 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
         az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
     ),
     "controller": lambda random: SetController(name=random.choice(("eq20", "minimum-variance"))),
+    "sequence-control": lambda random: SequenceControl(
+        action=random.choice(("pause", "resume", "stop"))
+    ),
+    "reset": lambda _: Reset(name="dac_watchdog"),
+    "look": lambda random: Look(az_px=random.uniform(5, 35), el_px=random.uniform(5, 35)),
     "shutdown": lambda random: Shutdown() if random.random() < 0.2 else None,
     "collector": lambda random: MoveCollector(
         action=random.choice(("reference", "start", "start", "stop"))
@@ -169,7 +249,7 @@ def devices_of(rig: str) -> list[str]:
 def plan_of(seed: int) -> Plan:
     """The plan of a seed."""
     random = Random(seed)  # noqa: S311 - a repeatable draw
-    rig = random.choices(list(RIGS), [3, 1])[0]
+    rig = random.choices(list(RIGS), _RIG_WEIGHTS)[0]
     return drawn_plan(random, seed, rig)
 
 
@@ -184,7 +264,15 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     struck = random.sample(devices, random.randint(1, len(devices)))
     words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
     strikes: list[Callable[[Random, float], Happening]] = []
-    for make, part in ((_stall, 0.4), (_kill, 0.3), (_cloud, 0.3)):
+    for make, part in (
+        (_stall, 0.4),
+        (_kill, 0.3),
+        (_cloud, 0.3),
+        (_recorder_death, 0.2),
+        (_full_disk, 0.2),
+        (_clock_step, 0.2),
+        (_sequence, 0.3),
+    ):
         strikes += [make] * (random.random() < part)
     fault_free = random.random() < _WITHOUT_FAULTS
     if not fault_free:
@@ -213,7 +301,18 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
                 command = msgspec.structs.replace(command, loop=random.choice(loops))
             happenings.append(Order(at_s=at_s, who=random.choice(people), command=command))
     happenings.sort(key=lambda happening: happening.at_s)
-    return Plan(seed=seed, rig=rig, settings=[], duration_s=duration_s, happenings=happenings)
+    settings = ["supervisor.telemetry_hz=5.0"]  # as the rig has it, it takes a tenth of the time
+    settings += [text for text in _SETTINGS if random.random() < _SETTING]
+    if rig == "fit-mock.toml" and random.random() < _SETTING:
+        settings += _SLOW_SERVO
+    return Plan(
+        seed=seed,
+        rig=rig,
+        settings=settings,
+        duration_s=duration_s,
+        happenings=happenings,
+        console_loss=random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0,
+    )
 
 
 def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> Happening:
@@ -237,3 +336,20 @@ def _kill(random: Random, at_s: float) -> Happening:
 
 def _cloud(random: Random, at_s: float) -> Happening:
     return Cloud(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.2), part=random.random() ** 2)
+
+
+def _recorder_death(random: Random, at_s: float) -> Happening:
+    return RecorderDeath(at_s=at_s)
+
+
+def _full_disk(random: Random, at_s: float) -> Happening:
+    return FullDisk(at_s=at_s, lasts_s=10 ** random.uniform(0.0, 1.3))
+
+
+def _clock_step(random: Random, at_s: float) -> Happening:
+    return ClockStep(at_s=at_s, by_s=random.uniform(-2.0, 2.0))
+
+
+def _sequence(random: Random, at_s: float) -> Happening:
+    steps = [random.choice(_STEPS) for _ in range(random.randint(1, 4))]
+    return Sequence(at_s=at_s, who=random.choice(OPERATORS), steps=steps)

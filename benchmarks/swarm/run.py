@@ -10,9 +10,11 @@ from pathlib import Path
 from random import Random
 from time import process_time
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 
+from benchmarks.swarm.clients import SENDERS, Console, Link, RunningSequence, Service
 from benchmarks.swarm.devices import (
     SwarmAmplifiers,
     SwarmCamera,
@@ -23,12 +25,26 @@ from benchmarks.swarm.devices import (
 )
 from benchmarks.swarm.invariants import Invariants, Violation
 from benchmarks.swarm.lines import Bus, Line
-from benchmarks.swarm.plan import Cloud, Happening, Kill, Order, Plan, Stall, Strike
+from benchmarks.swarm.plan import (
+    ClockStep,
+    Cloud,
+    FullDisk,
+    Happening,
+    Kill,
+    Order,
+    Plan,
+    RecorderDeath,
+    Sequence,
+    Stall,
+    Strike,
+)
+from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.threads import VirtualExecutor, VirtualTime, installed
 from fitctl.config import Rig, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import Devices, LoopDevices
+from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, ModeChange, StarPlace
 from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import (
@@ -44,7 +60,6 @@ from fitctl.messages.commands import (
 from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.metrology.part import MetrologyPart
 from fitctl.model.plant import Plant
-from fitctl.service.admission import Admission, Sender
 from fitctl.simulation.devices import SimulatedMirror
 from fitctl.stages.periodic import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
@@ -55,6 +70,8 @@ _HISTORY_S = 5.0  # a frame may come so late
 _ANSWER_S = 5.0
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
+_LAST_RECORDS_S = 5.0
+_SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
 _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
@@ -127,6 +144,9 @@ class Instrument:
         self._unanswered: dict[int, tuple[float, str]] = {}
         self._posted = 0
         self._places: list[StarPlace] = []
+        self._lives = 0
+        self._disk_is_full = False
+        self._sequences: list[RunningSequence] = []
         self.found_s: dict[
             str, float
         ] = {}  # by loop: its star was found, and is not to be forgotten
@@ -134,6 +154,7 @@ class Instrument:
         self.invariants = Invariants(rig, time, self.amplifiers)
         if not any(isinstance(one, Strike | Stall) for one in plan.happenings):
             self.invariants.nothing_fails = True
+        self._console = Console(self.invariants, time, self._random("console"), plan.console_loss)
         self.camera = SwarmCamera(rig, time, self.plant, self._random("camera"))
         self._add("camera", self.camera)
         loops = {name: self._loop_devices(name) for name in rig.loops}
@@ -175,9 +196,14 @@ class Instrument:
     # ------------------------------------------------------------ the supervisor's process
 
     def start(self) -> None:
-        """Start a supervisor."""
+        """Start a supervisor, with its service and its recorder."""
         self.time.new_process()
         self._unanswered.clear()
+        self._lives += 1
+        size = self.rig.logging.queue_records
+        self._queue = RecordQueue("swarm", size)
+        self.recorder = SwarmRecorder(self.time, self._queue)
+        self.service: Service | None = None
         self.supervisor = Supervisor(
             self.rig,
             self.devices,
@@ -190,9 +216,18 @@ class Instrument:
         )
         self.supervisor.recall(self._places)
         self._designs_take_time = True
-        self.admission = Admission(self.rig.service.lease_s)
         self.invariants.watch(self.supervisor)
         self.running = True
+        queue = self._queue
+        self.service = Service(
+            self.supervisor,
+            self.time,
+            self.invariants,
+            self._lives,
+            lambda: queue.lost,
+            lambda: queue.offered,
+        )
+        self._console.connect(self.service, self.supervisor)
         self._threads = [PeriodicThread(work, self.time) for work in self.supervisor.periodic]
         for thread in self._threads:
             thread.start()
@@ -208,18 +243,22 @@ class Instrument:
 
     def _end(self, back_after_s: float) -> None:
         self.running = self._designs_take_time = False
+        self.service = None
+        self.recorder.end()
         self._unanswered.clear()
         self.invariants.watch(None)
         self.time.call_at(self.time.now_s() + back_after_s, self.start)
 
     def _main(self) -> None:
         """As :func:`fitctl.daemon.run.run_supervisor` does it."""
-        supervisor, tick, saved_s = self.supervisor, self.invariants.tick, 0.0
+        supervisor, tick = self.supervisor, self.invariants.tick
+        second_s = self.time.now_s()
         while not supervisor.shutdown_wanted:
             supervisor.step()
             tick()
-            if self.time.now_s() - saved_s > _SAVED_S:
-                saved_s, self._places = self.time.now_s(), supervisor.star_places
+            if self.time.now_s() - second_s >= 1.0:
+                second_s = self.time.now_s()
+                self._once_a_second()
         supervisor.stop("shutting down")
         end_s = self.time.now_s() + _WIND_DOWN_S
         while self.time.now_s() < end_s and not supervisor.at_rest():
@@ -227,10 +266,34 @@ class Instrument:
         supervisor.close()
         for thread in self._threads:
             thread.stop()
+        self._finish_log()
         self.time.kill_process()
         self._places = []
         self.found_s.clear()
         self._end(_START_S)
+
+    def _once_a_second(self) -> None:
+        queue, supervisor = self._queue, self.supervisor
+        queue.pump()
+        self._places = supervisor.star_places
+        taken = queue.waiting / self.rig.logging.queue_records
+        supervisor.report_quantity("recorder_backlog_fraction", taken)
+        supervisor.report_quantity("disk_free_bytes", 0.0 if self._disk_is_full else 1e12)
+        self.recorder.disk_is_full = self._disk_is_full
+
+    def _finish_log(self) -> None:
+        """As :func:`fitctl.daemon.last_records.finish_log`."""
+        end_s = self.time.now_s() + _LAST_RECORDS_S
+        while self._queue.waiting and self.time.now_s() < end_s:
+            self._queue.pump()
+            self.time.sleep(0.05)
+        self.account_for_records()
+
+    def account_for_records(self) -> None:
+        """Every record is written, or waits, or was counted."""
+        wrong = self.recorder.unaccounted()
+        if wrong:
+            self.invariants.violated("a record is written or counted", wrong)
 
     def _design(self, _rig: Rig, name: str, controller: str) -> Design:
         if self._designs_take_time:  # those of the start come before time goes on
@@ -239,6 +302,9 @@ class Instrument:
 
     def _record(self, record: AnyRecord) -> None:
         self._digest.update(self._encode(record))
+        self._queue.offer(record)
+        if self.service is not None:
+            self.service.take(record)
         self.invariants.record(record)
         if isinstance(record, ModeChange):
             self.modes[record.target] = self.modes.get(record.target, 0) + 1
@@ -252,23 +318,18 @@ class Instrument:
         """An operator gives a command, by the service's rules."""
         if not self.running:
             return
-        now_s = self.time.now_s()
-        sender = Sender(who, "swarm", "commander", is_local=True)
-        if self.admission.refusal(sender, command, now_s):
+        service = self.service
+        if service is None:
             return
-        if type(command).__name__ in {"Status", "RecentEvents", "TakeOver"}:
-            return  # answered by the service itself
         self._posted += 1
         number = self._posted
-        self._unanswered[number] = now_s, type(command).__name__
-        self.invariants.posted(command)
-        answered = partial(self._answered, number, command)
-        self.supervisor.post(command, answered, who, "swarm")
+        self._unanswered[number] = self.time.now_s(), type(command).__name__
+        service.send(SENDERS[who], command, partial(self._answered, number, command))
 
     def _answered(self, number: int, command: AnyCommand, reply: Reply) -> None:
         if self._unanswered.pop(number, None) is None:
-            self.invariants.violated("a command is answered once", f"{number} is answered twice")
-        self.invariants.answered(command, reply)
+            name = type(command).__name__
+            self.invariants.violated("a command is answered once", f"{name} {number}: twice")
 
     def lead_on(self, who: str, *, from_zero: bool = False) -> None:
         """Give the command that leads every loop on towards its star; `from_zero`, sought about there."""
@@ -305,6 +366,15 @@ class Instrument:
                 self.invariants.stalled(happening.lasts_s)
             case Kill():
                 self.kill(happening.back_after_s)
+            case RecorderDeath():
+                self.recorder.die()
+            case FullDisk():
+                self._disk_is_full = True
+                self.time.call_at(self.time.now_s() + happening.lasts_s, self._empty_disk)
+            case ClockStep():
+                self.supervisor.report_quantity("clock_step_s", happening.by_s)
+            case Sequence():
+                self._start_sequence(happening)
             case Cloud():
                 self._dim(happening.part)
                 self.time.call_at(self.time.now_s() + happening.lasts_s, partial(self._dim, 1.0))
@@ -318,6 +388,23 @@ class Instrument:
                     partial(faults.pop, happening.fault, None),  # type: ignore[arg-type]
                 )
 
+    def _empty_disk(self) -> None:
+        self._disk_is_full = False
+
+    def _start_sequence(self, happening: Sequence) -> None:
+        link = Link(self.time, lambda: self.service, SENDERS[happening.who])
+        sequence = RunningSequence(link, self.rig, happening.steps)
+        self._sequences.append(sequence)
+        self.time.spawn(sequence.run, f"sequence at {happening.at_s:.3f} s", apart=True)
+
+    def end_sequences(self) -> None:
+        """Somebody stops every sequence, and each ends soon."""
+        for sequence in self._sequences:
+            sequence.stop()
+        self.time.run_until(self.time.now_s() + _SEQUENCE_ENDS_S)
+        if not all(sequence.ended for sequence in self._sequences):
+            self.invariants.violated("a sequence that is stopped ends", "one did not")
+
     def _dim(self, part: float) -> None:
         self.camera.dim(part)
         for beam in self.plant.metrology_loops.values():
@@ -326,6 +413,7 @@ class Instrument:
     def heal(self) -> None:
         """End every fault."""
         self._dim(1.0)
+        self._empty_disk()
         for line in self.lines.values():
             line.faults.clear()
 
@@ -340,7 +428,7 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
     began_s = process_time()
     rig = load_rig(RIGS / plan.rig, plan.settings)
     time = VirtualTime()
-    with installed(time):
+    with installed(time), patch("fitctl.logging.queue.zmq", ZMQ):
         instrument = Instrument(rig, plan, time, on_record)
         for happening in plan.happenings:
             time.call_at(happening.at_s, partial(instrument.happen, happening))
@@ -350,6 +438,7 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
             time.run_until(end_s)
             instrument.answers_due()
         _recover(instrument)
+        instrument.account_for_records()
         time.end()
     violations = instrument.invariants.violations
     violations += [
@@ -369,6 +458,7 @@ def _recover(instrument: Instrument) -> None:
     time = instrument.time
     instrument.heal()
     time.run_until(time.now_s() + _BACK_S)
+    instrument.end_sequences()
     instrument.give("ada", TakeOver())
     instrument.give("ada", Stop())
     for (

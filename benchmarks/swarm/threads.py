@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack, contextmanager
+from itertools import count
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -97,8 +99,8 @@ class VirtualTime:
 
     # ------------------------------------------------------------ threads
 
-    def spawn(self, run: Callable[[], None], name: str) -> greenlet:
-        """Start a thread, at this time but not before this one waits."""
+    def spawn(self, run: Callable[[], None], name: str, *, apart: bool = False) -> greenlet:
+        """Start a thread, at this time but not before this one waits; `apart`, in another process."""
 
         def guarded() -> None:
             try:
@@ -108,7 +110,8 @@ class VirtualTime:
 
         thread = greenlet(guarded, self._hub)
         self._threads.append(thread)
-        self._process.append(thread)
+        if not apart:
+            self._process.append(thread)
         self._push(self._now_s, thread)
         return thread
 
@@ -350,6 +353,8 @@ def installed(time: VirtualTime) -> Iterator[None]:
         threading = VirtualThreading(time)
         for module in _WITH_THREADS:
             stack.enter_context(patch(f"{module}.threading", threading))
+        runs = (SimpleNamespace(hex=f"{number:032x}") for number in count())
+        stack.enter_context(patch("fitctl.sequences.contact.uuid.uuid4", lambda: next(runs)))
         stack.enter_context(patch("fitctl.stages.servo.Future", future_on(time)))
         stack.enter_context(patch("fitctl.stages.periodic.become_realtime", lambda **_: None))
         yield

@@ -1,0 +1,265 @@
+"""The service and its clients on virtual time: who may command, what a console shows, sequences that run.
+
+Known limitations: messages are passed as they are, without a socket, so that none is late or too long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from random import Random
+
+from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.threads import VirtualEvent, VirtualTime
+from fitctl.config import Rig
+from fitctl.logging.records import AnyRecord, Event
+from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.telemetry import Telemetry
+from fitctl.sequences import steps
+from fitctl.sequences.contact import Contact
+from fitctl.sequences.runner import Runner, run_steps
+from fitctl.sequences.view import SequenceError
+from fitctl.service.admission import Admission, Sender
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.supervisor.supervisor import Supervisor
+from fitctl.tui.state import ConsoleState
+
+SENDERS = {
+    "ada": Sender("ada", "here", "commander", is_local=True),
+    "ben": Sender("ben", "elsewhere", "commander", is_local=False),
+    "cleo": Sender("cleo", "here", "commander", is_local=True),
+    "dora": Sender("dora", "elsewhere", "viewer", is_local=False),
+}
+"""By name; the first three may command."""
+STEPS: dict[str, Callable[[], steps.Step]] = {
+    "standby": steps.Standby,
+    "acquire": steps.Acquire,
+    "hold": lambda: steps.Hold(duration_s=5.0, settle_s=1.0, attempts=2),
+    "wait": lambda: steps.Wait(duration_s=3.0),
+    "jog": lambda: steps.Jog(dwell_s=3.0, steady_after_s=1.0),
+    "target": lambda: steps.Target(
+        offset_az_px=0.5, offset_el_px=-0.5, dwell_s=3.0, steady_after_s=1.0
+    ),
+    "off": steps.Off,
+}
+"""What the sequences of operators are made of."""
+_ANSWERED_HERE = {"Status", "RecentEvents", "RecorderReport", "TakeOver"}
+_REPLY_S = 5.0
+
+
+class Service:
+    """Of one supervisor: admits commands, and publishes telemetry.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+    time : VirtualTime
+    invariants : Invariants
+    pid : int
+        Of the supervisor's process.
+    lost, offered : callable
+        Counts of the record queue.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        time: VirtualTime,
+        invariants: Invariants,
+        pid: int,
+        lost: Callable[[], int],
+        offered: Callable[[], int],
+    ) -> None:
+        self.buffer = TelemetryBuffer()
+        self.events = 0
+        self.subscribers: list[Callable[[Telemetry], None]] = []
+        self._supervisor = supervisor
+        self._time = time
+        self._invariants = invariants
+        self._admission = Admission(supervisor.rig.service.lease_s)
+        self._state = ServiceState(
+            pid=pid,
+            wall_minus_monotonic_s=0.0,
+            scheduling="virtual",
+            records_lost=lost,
+            records_offered=offered,
+        )
+        time.spawn(self._run, "service")
+
+    def take(self, record: AnyRecord) -> None:
+        """Leave a record for consoles."""
+        self.events += isinstance(record, Event)
+        self.buffer.add(record)
+
+    def send(self, sender: Sender, command: AnyCommand, reply: Callable[[Reply], None]) -> None:
+        """Give a command."""
+        refusal = self._admission.refusal(sender, command, self._time.now_s())
+        self._invariants.admitted(sender, command, refusal)
+        if refusal or type(command).__name__ in _ANSWERED_HERE:
+            reply(Reply(accepted=not refusal, text=refusal))
+            return
+        self._invariants.posted(command)
+
+        def answered(to_it: Reply) -> None:
+            self._invariants.answered(command, to_it)
+            reply(to_it)
+
+        self._supervisor.post(command, answered, sender.name, sender.address)
+
+    def _run(self) -> None:
+        period_s = 1.0 / self._supervisor.rig.supervisor.telemetry_hz
+        while True:
+            self._time.sleep(period_s)
+            now_s, state = self._time.now_s(), self._state
+            state.sequence += 1
+            state.commander = self._admission.commander(now_s)
+            telemetry = self.buffer.telemetry(self._supervisor, state, now_s)
+            for take in list(self.subscribers):
+                take(telemetry)
+
+
+class Console:
+    """A console that misses messages, and must know what it missed.
+
+    Parameters
+    ----------
+    loss : float
+        Part of the messages that do not come.
+    """
+
+    def __init__(
+        self, invariants: Invariants, time: VirtualTime, random: Random, loss: float
+    ) -> None:
+        self._state = ConsoleState(0.0)
+        self._invariants = invariants
+        self._time = time
+        self._random = random
+        self._loss = loss
+        self._missed = self._heard = 0
+        self._service: Service | None = None
+        self._supervisor: Supervisor | None = None
+
+    def connect(self, service: Service, supervisor: Supervisor) -> None:
+        """Hear this one from now on."""
+        self._service, self._supervisor = service, supervisor
+        self._missed = self._heard = 0
+        self._first = True
+        service.subscribers.append(self._take)
+
+    def _take(self, message: Telemetry) -> None:
+        if self._random.random() < self._loss:
+            self._missed += not self._first  # nobody knows of those before the first
+            return
+        self._first = False
+        self._heard += len(message.events)
+        state, supervisor, service = self._state, self._supervisor, self._service
+        state.accept(message, self._time.now_s())
+        if supervisor is None or service is None:
+            return
+        for name, loop in supervisor.loops.items():
+            shown = state.loops[name].state
+            if shown.mode != loop.mode.name or shown.since_s != loop.mode_since_s:
+                self._wrong(f"{name}: shows {shown.mode}, is {loop.mode.name}")
+        if state.missed != self._missed:
+            self._wrong(f"{self._missed} messages missed, {state.missed} counted")
+        losses = message.losses
+        if not (
+            self._missed or self._loss or losses.events_unsent or self._heard == service.events
+        ):
+            self._wrong(f"{service.events} events, {self._heard} heard, none missed")
+
+    def _wrong(self, detail: str) -> None:
+        self._invariants.violated("the console shows what is", detail)
+
+
+class Link:
+    """A sequence's connection, as :class:`fitctl.messages.client.Client`.
+
+    Parameters
+    ----------
+    service : callable
+        The service that there is now, None while there is none.
+    """
+
+    def __init__(
+        self, time: VirtualTime, service: Callable[[], Service | None], sender: Sender
+    ) -> None:
+        self._time = time
+        self._service = service
+        self._sender = sender
+        self._telemetry: list[Telemetry] = []
+        self._some = VirtualEvent(time)
+        self._heard: Service | None = None
+
+    def now_s(self) -> float:
+        """The virtual time."""
+        return self._time.now_s()
+
+    def send(self, command: AnyCommand) -> Reply:
+        """Give a command, and wait for its reply.
+
+        Raises
+        ------
+        ConnectionError
+            If none comes in time.
+        """
+        service, answered, replies = self._service(), VirtualEvent(self._time), []
+
+        def answer(reply: Reply) -> None:
+            replies.append(reply)
+            answered.set()
+
+        if service is not None:
+            service.send(self._sender, command, answer)
+        if not answered.wait(_REPLY_S):
+            msg = f"no reply within {_REPLY_S:g} s"
+            raise ConnectionError(msg)
+        return replies[0]
+
+    def receive(self, timeout_s: float) -> Telemetry | None:
+        """The next telemetry, None if none comes in time."""
+        service = self._service()
+        if service is not None and service is not self._heard:
+            self._heard = service
+            service.subscribers.append(self._take)
+        if not self._telemetry:
+            self._some.clear()
+            self._some.wait(timeout_s)
+        return self._telemetry.pop(0) if self._telemetry else None
+
+    def close(self) -> None:
+        """Hear no more."""
+        if self._heard is not None:
+            self._heard.subscribers.remove(self._take)
+
+    def _take(self, message: Telemetry) -> None:
+        self._telemetry.append(message)
+        self._some.set()
+
+
+class RunningSequence:
+    """A sequence of `STEPS` in a process of its own; however it ends is well, as long as it does.
+
+    Attributes
+    ----------
+    ended : bool
+    """
+
+    def __init__(self, link: Link, rig: Rig, words: Sequence[str]) -> None:
+        self.ended = False
+        self._link = link
+        self._steps = [STEPS[word]() for word in words]
+        self._contact = Contact(link, rig, "swarm", len(words))  # type: ignore[arg-type]
+
+    def run(self) -> None:
+        """Run it; this is its thread."""
+        try:
+            run_steps(Runner(self._contact), self._steps)
+        except (SequenceError, ConnectionError):
+            pass  # refused, failed or stopped
+        finally:
+            self.ended = True
+            self._link.close()
+
+    def stop(self) -> None:
+        """Somebody wants it to end."""
+        self._contact.stop_wanted.set()

@@ -1,0 +1,174 @@
+"""The recorder beside the supervisor on virtual time: it dies, and the queue before it is the real one.
+
+The wire stands in for ZeroMQ: it keeps what was sent to a recorder until that takes it, and loses it when the
+recorder dies. A recorder that dies loses what it has not flushed; a new one comes after a while.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from types import SimpleNamespace
+
+import msgspec
+
+from benchmarks.swarm.threads import VirtualTime
+from fitctl.logging.queue import RecordQueue
+
+_TAKE_S, _FLUSH_S = 0.05, 0.5
+_BACK_S = 1.0  # as fitctl.daemon.children looks once a second
+_encode = msgspec.msgpack.encode
+_sequence_of = msgspec.msgpack.Decoder(tuple[int, int, msgspec.Raw]).decode
+_UNREACHABLE, _AGAIN = 113, 11
+
+
+class WireError(Exception):
+    """As ``zmq.ZMQError``."""
+
+    def __init__(self, errno: int) -> None:
+        super().__init__(errno)
+        self.errno = errno
+
+
+class FullError(WireError):
+    """As ``zmq.Again``."""
+
+
+class Wire:
+    """As the queue's ROUTER, with the recorder's end of it.
+
+    Attributes
+    ----------
+    size : int
+        Messages on the way, at most.
+    recorder : bytes
+        Who is there; empty while nobody is.
+    """
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.recorder = b""
+        self.sent: deque[bytes] = deque()
+        self.closed = False
+        self._answers: deque[tuple[bytes, bytes]] = deque()
+
+    def answer(self, number: int) -> None:
+        """The recorder says something."""
+        self._answers.append((self.recorder, _encode(number)))
+
+    def poll(self, _timeout_ms: int) -> bool:
+        """Whether an answer is there."""
+        return bool(self._answers)
+
+    def recv_multipart(self, _flags: int) -> tuple[bytes, bytes]:
+        """The oldest answer."""
+        return self._answers.popleft()
+
+    def send_multipart(self, parts: list[bytes], _flags: int) -> None:
+        """Send, if there is a recorder and room on the way to it."""
+        if parts[0] != self.recorder:
+            raise WireError(_UNREACHABLE)
+        if len(self.sent) >= self.size:
+            raise FullError(_AGAIN)
+        self.sent.append(parts[1])
+
+    def setsockopt(self, option: int, value: int) -> None:
+        """How many messages may be on the way."""
+        if option == ZMQ.SNDHWM:
+            self.size = value
+
+    def bind(self, _endpoint: str) -> None:
+        """There is nobody else."""
+
+
+ZMQ = SimpleNamespace(
+    Context=lambda: SimpleNamespace(socket=lambda _kind: Wire(), destroy=lambda **_: None),
+    ZMQError=WireError,
+    Again=FullError,
+    EHOSTUNREACH=_UNREACHABLE,
+    ROUTER=0,
+    SNDHWM=1,
+    ROUTER_MANDATORY=2,
+    NOBLOCK=0,
+)
+"""As the module ``zmq``, as far as the queue uses it."""
+
+
+class SwarmRecorder:
+    """A recorder of one supervisor, started again as long as that one lives.
+
+    Parameters
+    ----------
+    time : VirtualTime
+    queue : RecordQueue
+        Its socket is a `Wire`.
+
+    Attributes
+    ----------
+    written : set of int
+        Sequences of the records in its files.
+    disk_is_full : bool
+        Whatever it flushes ends it.
+    """
+
+    def __init__(self, time: VirtualTime, queue: RecordQueue) -> None:
+        self.written: set[int] = set()
+        self.disk_is_full = False
+        self._time = time
+        self._queue = queue
+        self._wire: Wire = queue._socket  # type: ignore[assignment]
+        self._unflushed: list[int] = []
+        self._starts = 0
+        self._ended = False
+        self._start()
+
+    def end(self) -> None:
+        """Its supervisor is no more."""
+        self._ended = True
+
+    def die(self) -> None:
+        """It is killed."""
+        if self._ended or not self._wire.recorder:
+            return
+        self._wire.recorder = b""
+        self._wire.sent.clear()
+        self._unflushed.clear()
+        self._time.call_at(self._time.now_s() + _BACK_S, self._start)
+
+    def _start(self) -> None:
+        if self._ended:
+            return
+        self._starts += 1
+        self._wire.recorder = str(self._starts).encode()
+        self._wire.answer(-1)
+        self._flush_s = self._time.now_s() + _FLUSH_S
+        self._take(self._starts)
+
+    def _take(self, start: int) -> None:
+        """Take what is there; a start that is over does nothing."""
+        if self._ended or start != self._starts or not self._wire.recorder:
+            return
+        sent = self._wire.sent
+        while sent:
+            _version, sequence, _record = _sequence_of(sent.popleft())
+            self._unflushed.append(sequence)
+        now_s = self._time.now_s()
+        if now_s >= self._flush_s and self._unflushed:
+            if self.disk_is_full:
+                self.die()
+                return
+            self._flush_s = now_s + _FLUSH_S
+            self.written.update(self._unflushed)
+            self._wire.answer(self._unflushed[-1])
+            self._unflushed.clear()
+        self._time.call_at(now_s + _TAKE_S, lambda: self._take(start))
+
+    def unaccounted(self) -> str:
+        """Which records are neither written, nor waiting, nor counted; empty if all are."""
+        queue = self._queue
+        waiting = {sequence for sequence, _ in queue._kept}
+        missing = queue.offered - len(self.written | waiting)
+        if missing == queue.lost:
+            return ""
+        return (
+            f"{queue.offered} offered, {missing} neither written nor waiting, {queue.lost} counted"
+        )
