@@ -72,6 +72,8 @@ class SwarmAmplifiers:
     random : Random
     commanded : callable
         Hears the loop's name and each velocity that is sent.
+    powered_unread : callable
+        Hears the loop's name where motors are given power and no encoder was read since opening.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class SwarmAmplifiers:
         loop_name: str,
         random: Random,
         commanded: Callable[[str, AzEl], None],
+        powered_unread: Callable[[str], None],
     ) -> None:
         siderostat = rig.loops[loop_name].siderostat
         device: Any = siderostat.device
@@ -110,6 +113,8 @@ class SwarmAmplifiers:
         self._alive_s = 3 * getattr(device, "drive_heartbeat_s", 0.1)
         self._time = time
         self._commanded = commanded
+        self._powered_unread = powered_unread
+        self._was_read = False
         self._inner = SimulatedAmplifiers(plant, time, siderostat.encoder_counts_per_rev)  # type: ignore[arg-type]
         self._last_master_s = -math.inf
         self._heard_s = 0.0
@@ -123,7 +128,7 @@ class SwarmAmplifiers:
     def open(self) -> DeviceIdentity:
         """Connect and configure, which takes many exchanges."""
         self.line.open()
-        self._enables = False
+        self._enables = self._was_read = False
         for _ in range(20):
             self.line.ask(self._nothing)
         self._heard_s = self._time.now_s()
@@ -133,6 +138,8 @@ class SwarmAmplifiers:
 
     def enable(self) -> None:
         """Power both axes."""
+        if not self._was_read:
+            self._powered_unread(self.name)
         for _ in range(4):
             self.line.ask(self._nothing)
         self._enables = True
@@ -195,6 +202,7 @@ class SwarmAmplifiers:
         if not line.connected:
             raise line.broken()
         if reading is not None:
+            self._was_read = True
             self._heard_s = self._time.now_s()
         elif self._time.now_s() - self._heard_s > self._alive_s:
             raise line.timeout()

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.swarm.devices import SwarmAmplifiers
+from benchmarks.swarm.lines import Line
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.drivers.interface import AzEl
-from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading
+from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading, Tick
 from fitctl.messages.commands import AnyCommand, Recover, Reply, Standby, Stop
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.service.admission import Sender
@@ -29,6 +30,8 @@ _FOR_ALL = {"Status", "RecentEvents"}
 _OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
 _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
 _MOST_STEP_S = 2.0
+_MOST_PERIODS = 2.0  # a frame on which a tick acts is no older than that and its delay
+_WELL_S = 2.0
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
 _MOST_ALIKE = 3
@@ -52,13 +55,22 @@ class Invariants:
     clock : Clock
     amplifiers : mapping of str to SwarmAmplifiers
         By loop.
+    lines : mapping of str to Line
+        By device.
     """
 
-    def __init__(self, rig: Rig, clock: Clock, amplifiers: Mapping[str, SwarmAmplifiers]) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        clock: Clock,
+        amplifiers: Mapping[str, SwarmAmplifiers],
+        lines: Mapping[str, Line],
+    ) -> None:
         self.violations: list[Violation] = []
         self._rig = rig
         self._clock = clock
         self._amplifiers = amplifiers
+        self._lines = lines
         self._supervisor: Supervisor | None = None
         self._resting_since_s = dict.fromkeys(rig.loops, 0.0)
         self._slowly: dict[str, bool] = {}
@@ -155,6 +167,25 @@ class Invariants:
                 self._texts.clear()
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
+            case Tick(number=number) if number >= 0:
+                self._acted_on(record)
+
+    def _acted_on(self, tick: Tick) -> None:
+        camera = self._rig.camera
+        oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
+        if self._camera_well() and tick.frame_age_s > oldest_s:
+            self.violated(
+                "a tick acts on the newest frame",
+                f"{tick.loop}: one of {tick.frame_age_s:.3f} s, at most {oldest_s:.3f} s",
+            )
+
+    def _camera_well(self) -> bool:
+        """Nothing has been wrong with the camera's line for a while."""
+        return self._line_well("camera")
+
+    def _line_well(self, device: str) -> bool:
+        line = self._lines[device]
+        return not line.faults and self._clock.now_s() - line.healed_s > _WELL_S
 
     def _mode_changed(self, change: ModeChange) -> None:
         name = change.loop
@@ -163,6 +194,8 @@ class Invariants:
             stop_s = self._stop_answered_s.get(name, -math.inf)
             if self._power_up_s.get(name, math.inf) < stop_s:
                 self.violated("a stop has the last word", f"{name}: powered up after it")
+        if "following error below" in change.reason and self._line_well(f"{name} siderostat"):
+            self.violated("an axis that is not stuck is not called so", f"{name}: {change.reason}")
         if change.trigger == Trigger.FAULT.name and self.nothing_fails:
             self.violated("without a fault nothing fails", f"{name}: {change.reason}")
 
@@ -200,6 +233,10 @@ class Invariants:
                     "no stage moves in OFF or SAFE",
                     f"{name}: {velocity_rad_s} rad/s after {at_rest_s:.3f} s in {loop.mode.name}",
                 )
+
+    def powered_unread(self, name: str) -> None:
+        """Motors are given power, and nobody has read where they are."""
+        self.violated("encoders are read before motors have power", name)
 
     def volts(self, name: str, volts: Floats, before_v: Floats) -> None:
         """Voltages are sent to a loop's mirror, whose D/A has others until they arrive."""

@@ -63,6 +63,8 @@ class Line:
     ----------
     faults : dict of str to float
         Those in force, of `FAULTS`; of "slow", how much slower.
+    healed_s : float
+        When the last fault ended.
     connected : bool
         The driver has opened it, and it has not broken since.
     bus : Bus or None
@@ -81,12 +83,19 @@ class Line:
         self.device = device
         self.endpoint = endpoint
         self.faults: dict[str, float] = {}
+        self.healed_s = -math.inf
         self.connected = False
         self.bus: Bus | None = None
         self.timeout_s = timeout_s
         self._time = time
         self._random = random
         self._usual_s = usual_s
+
+    def heal(self, *faults: str) -> None:
+        """End faults; without a name, all."""
+        for fault in faults or list(self.faults):
+            self.faults.pop(fault, None)
+        self.healed_s = self._time.now_s()
 
     def open(self) -> None:
         """Connect.

@@ -16,6 +16,7 @@ from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.modes import Mode, Trigger
+from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.device_jobs import DeviceJobs
@@ -124,6 +125,10 @@ def _safe_and_go_on(self: Loop, source: Mode, motor_rad: Any) -> None:
         _ENTER(self, source, motor_rad)
 
 
+def _find_nothing(self: MirrorStage) -> None:
+    self._known_s = self._clock.now_s()
+
+
 _ASK = PiezoWatch.ask
 _SERVO_INIT = SiderostatServo.__init__
 _FIND_POSITION = SiderostatServo._find_position
@@ -191,6 +196,16 @@ DEFECTS = {
         "a0d343e",
         "after a stall the loop acts on the oldest frame, and stays behind",
         [(CameraWatch, "next_frame", _oldest_frame)],
+    ),
+    "watchdog-step": Defect(
+        "0e8a60f",
+        "a mirror that the D/A's own watchdog moved steps back to where it was",
+        [(MirrorStage, "find_after_pause", _find_nothing)],
+    ),
+    "killed-in-a-search": Defect(
+        "029a746",
+        "a supervisor that follows a killed one does not know where the star was",
+        [(Supervisor, "recall", lambda _self, _places: None)],
     ),
     "moves-in-a-fault": Defect(
         "bf6a8c0",

@@ -60,6 +60,7 @@ _OF_ONE_LOOP = 0.3  # so many commands name one
 _WITHOUT_FAULTS = 0.15  # so many runs have none of a device
 _CONSOLE_SLOW = 0.2  # so many runs have a console that misses messages
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "jog", "target", "off")
+_REPEATED, _REPEATED_S = 0.1, 0.02  # so many commands come again so soon: a key that is held
 _BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
 
 
@@ -299,7 +300,11 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
             command = _COMMANDS[random.choice(words)](random)
             if command is not None and random.random() < _OF_ONE_LOOP:
                 command = msgspec.structs.replace(command, loop=random.choice(loops))
-            happenings.append(Order(at_s=at_s, who=random.choice(people), command=command))
+            who, again_s = random.choice(people), at_s
+            happenings.append(Order(at_s=at_s, who=who, command=command))
+            while command is not None and random.random() < _REPEATED:
+                again_s += random.expovariate(1 / _REPEATED_S)
+                happenings.append(Order(at_s=again_s, who=who, command=command))
     happenings.sort(key=lambda happening: happening.at_s)
     settings = ["supervisor.telemetry_hz=5.0"]  # as the rig has it, it takes a tenth of the time
     settings += [text for text in _SETTINGS if random.random() < _SETTING]

@@ -151,7 +151,7 @@ class Instrument:
             str, float
         ] = {}  # by loop: its star was found, and is not to be forgotten
         self.amplifiers: dict[str, SwarmAmplifiers] = {}
-        self.invariants = Invariants(rig, time, self.amplifiers)
+        self.invariants = Invariants(rig, time, self.amplifiers, self.lines)
         if not any(isinstance(one, Strike | Stall) for one in plan.happenings):
             self.invariants.nothing_fails = True
         self._console = Console(self.invariants, time, self._random("console"), plan.console_loss)
@@ -175,7 +175,13 @@ class Instrument:
     def _loop_devices(self, name: str) -> LoopDevices:
         part, random, time, rig = self.plant.loops[name], self._random(name), self.time, self.rig
         self.amplifiers[name] = amplifiers = SwarmAmplifiers(
-            part, time, rig, name, random, self.invariants.velocity
+            part,
+            time,
+            rig,
+            name,
+            random,
+            self.invariants.velocity,
+            self.invariants.powered_unread,
         )
         self._add(f"{name} siderostat", amplifiers)
         bus = None
@@ -381,11 +387,10 @@ class Instrument:
             case Strike(fault="reset"):
                 self.resets[happening.device]()
             case Strike():
-                faults = self.lines[happening.device].faults
-                faults[happening.fault] = happening.size
+                line = self.lines[happening.device]
+                line.faults[happening.fault] = happening.size
                 self.time.call_at(
-                    self.time.now_s() + happening.lasts_s,
-                    partial(faults.pop, happening.fault, None),  # type: ignore[arg-type]
+                    self.time.now_s() + happening.lasts_s, partial(line.heal, happening.fault)
                 )
 
     def _empty_disk(self) -> None:
@@ -415,7 +420,7 @@ class Instrument:
         self._dim(1.0)
         self._empty_disk()
         for line in self.lines.values():
-            line.faults.clear()
+            line.heal()
 
     @property
     def digest(self) -> str:
