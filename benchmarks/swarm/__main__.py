@@ -15,9 +15,11 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from itertools import count, repeat
+from random import Random
 
 import msgspec
 
+from benchmarks.swarm.drivers import BENCHES, drawn_run, run_wire
 from benchmarks.swarm.past import DEFECTS, put_back
 from benchmarks.swarm.plan import Plan, plan_of
 from benchmarks.swarm.run import Result, run_plan
@@ -144,6 +146,23 @@ def replay(plan: Plan) -> int:
     return 1 if result.violations else 0
 
 
+def wires(seed: int, runs: int) -> dict[str, dict[str, object]]:
+    """Each driver against its mock over a bad wire, so many nights of sixty calls each."""
+    found: dict[str, dict[str, object]] = {}
+    for name in BENCHES:
+        ended: Counter[str] = Counter()
+        mistaken = []
+        for number in range(runs):
+            random = Random(f"{seed} {number} {name}")  # noqa: S311 - a repeatable draw
+            try:
+                ended.update(run_wire(name, *drawn_run(random)))
+            except Exception as error:  # whatever it is, it is none that a driver may raise
+                mistaken.append(f"{seed} {number} {name}: {error!r}")
+        found[name] = {"calls_ended_in": dict(ended.most_common()), "mistaken": mistaken[:_SHOWN]}
+        print(f"{name}: {json.dumps(found[name])}", file=sys.stderr, flush=True)
+    return found
+
+
 def past(names: list[str], seed: int, hours: float, jobs: int) -> int:
     """Put defects back one after the other, and print how soon each is found."""
     found = {}
@@ -169,7 +188,14 @@ def main() -> int:
         help="put defects of the past back, by default each, and show how soon they are found: "
         + ", ".join(DEFECTS),
     )
+    parser.add_argument(
+        "--wires", type=int, metavar="NIGHTS", help="each driver over a bad wire, so often"
+    )
     options = parser.parse_args()
+    if options.wires is not None:
+        wired = wires(options.seed or 1, options.wires)
+        print(json.dumps(wired, indent=1))
+        return 1 if any(each["mistaken"] for each in wired.values()) else 0
     if options.past is not None:
         return past(options.past or list(DEFECTS), options.seed or 1, options.hours, options.jobs)
     if options.replay is not None:

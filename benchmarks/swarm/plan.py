@@ -332,7 +332,7 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
 
 
 def _stall(random: Random, at_s: float) -> Happening:
-    return Stall(at_s=at_s, lasts_s=10 ** random.uniform(-2.5, 0.3))
+    return Stall(at_s=at_s, lasts_s=10 ** random.uniform(-2.5, 0.5))
 
 
 def _kill(random: Random, at_s: float) -> Happening:

@@ -1,0 +1,558 @@
+"""Each driver against its mock over a bad wire: no answer is ever taken for another's, and every call ends.
+
+A call ends in a value or in a `DeviceError`, within a time. A value is one that the device had between the
+call's beginning and its end; what was commanded without an error has happened by then.
+
+Known limitations: what a protocol cannot tell apart is not tried. Over Modbus RTU, RS-232 and the Ensemble's
+ASCII answers have no number: a second copy comes with the first there, and on a serial line no answer comes
+later than the driver waits for late ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from random import Random
+from types import MappingProxyType
+from typing import Any
+
+import can
+import numpy as np
+
+from benchmarks.swarm.wires import KINDS, Trouble, Wire, WireTime, virtual
+from fitctl.config import Rig, default_rig_path, load_rig
+from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
+from fitctl.drivers.cia402.driver import Cia402Amplifiers
+from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
+from fitctl.drivers.interface import DeviceError, ServoReading
+from fitctl.drivers.labjack_t7.driver import LabJackT7
+from fitctl.drivers.mdt693.driver import Mdt693
+from fitctl.drivers.modbus_dac.driver import ModbusDac
+from fitctl.mocks.bal_analog.station import BalAnalogMockStation
+from fitctl.mocks.cia402.drive import Cia402DriveMock
+from fitctl.mocks.cia402.slcan import CanFrame, decode_frame
+from fitctl.mocks.ensemble.controller import CYCLE_S, EnsembleControllerMock, LineSplitter
+from fitctl.mocks.labjack_t7.server import LabJackT7Mock
+from fitctl.mocks.mdt693.amplifier import Amplifier
+from fitctl.mocks.mdt693.controller import Controller
+from fitctl.mocks.modbus import pdu as modbus_pdu
+from fitctl.mocks.modbus.rtu import frame as rtu_frame
+from fitctl.mocks.modbus.rtu import parse_frame
+from fitctl.mocks.modbus.tcp import ModbusTcpServer, pop_message
+from fitctl.mocks.modbus_dac.server import ModbusDacMock
+
+RIGS = default_rig_path().parent
+_SLACK_S = 2e-3
+_MDT693_S = 0.02  # from a command to its answer
+_SPEED_RAD_S = 3.0
+_V_PER_S, _AROUND_S = 0.2, 40.0  # of photodiodes whose voltages tell the time
+_UNSURE_S = 0.015  # by which these know it
+_PAUSES_S = (0.0, 0.002, 0.02, 0.3)
+
+
+class Mistaken(AssertionError):
+    """A driver returned what its device did not have, or a call did not end."""
+
+
+class Motors:
+    """Two ideal motors, which begin far from each other."""
+
+    def __init__(self, time: WireTime) -> None:
+        self._time = time
+        self._angle_rad = [7.0, -11.0]
+        self._velocity_rad_s = (0.0, 0.0)
+        self._enabled = [False, False]
+        self._at_s = time.now_s
+
+    def position_rad(self) -> tuple[float, float]:
+        """Both angles."""
+        now_s = self._time.now_s
+        for axis, velocity in enumerate(self._velocity_rad_s):
+            self._angle_rad[axis] += velocity * (now_s - self._at_s) * self._enabled[axis]
+        self._at_s = now_s
+        az_rad, el_rad = self._angle_rad
+        return az_rad, el_rad
+
+    def command_velocity_rad_s(self, az: float, el: float) -> None:
+        """Turn at these velocities."""
+        self.position_rad()
+        self._velocity_rad_s = (az, el)
+
+    def set_enabled(self, axis: int, enabled: bool) -> None:
+        """Give current, or take it away."""
+        self.position_rad()
+        self._enabled[axis] = enabled
+
+
+class Course:
+    """What a device had, and since when."""
+
+    def __init__(self) -> None:
+        self._values: list[tuple[float, Any]] = []
+
+    def add(self, time_s: float, value: Any) -> None:
+        """From now on it has this."""
+        self._values.append((time_s, value))
+
+    def between(self, begin_s: float, end_s: float) -> list[Any]:
+        """All that it had then."""
+        values = self._values
+        nexts = [time_s for time_s, _ in values[1:]] + [math.inf]
+        return [
+            value
+            for (since_s, value), until_s in zip(values, nexts, strict=True)
+            if since_s <= end_s and until_s >= begin_s
+        ]
+
+
+class Bench:
+    """A driver, the mock behind the wire, and what may be asked of it.
+
+    Attributes
+    ----------
+    driver : driver
+    calls : list of callable
+        What is called, each of which checks what it gets.
+    most_s : float
+        No call takes longer.
+    """
+
+    driver: Any
+    calls: list[Callable[[], None]]
+    most_s: float
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None], **options: Any) -> None:
+        self.time = time
+        self.wire = Wire(time, troubles, self.hear, self.reboot, **options)
+
+    def hear(self, data: Any) -> None:
+        """The device hears something."""
+        raise NotImplementedError
+
+    def reboot(self) -> None:
+        """The device restarts."""
+        raise NotImplementedError
+
+
+def _rig(name: str = "fit-mock.toml", *settings: str) -> Rig:
+    return load_rig(RIGS / name, list(settings))
+
+
+class _Modbus:
+    """The requests in what comes over TCP, answered one by one."""
+
+    def __init__(self, server: ModbusTcpServer, wire: Callable[[bytes], None]) -> None:
+        self._server = server
+        self._answer = wire
+        self._pending = bytearray()
+
+    def hear(self, data: bytes) -> None:
+        self._pending += data
+        while (request := pop_message(self._pending)) is not None:
+            self._answer(self._server.respond(request))
+
+
+class DacBench(Bench):
+    """The D/A over Modbus/TCP."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        super().__init__(time, troubles)
+        self._set_up(_rig())
+        self._modbus = _Modbus(self._mock._tcp, self.wire.answer)
+        self.driver = ModbusDac(self._dac)
+
+    def _set_up(self, rig: Rig) -> None:
+        mocks: Any = rig.mock_parts()[1]
+        self._course = Course()
+        self._dac = rig.stellar_loops["right"].fsm.dac
+        settings = mocks.loops["right"].dac
+        self._mock = ModbusDacMock(self._dac, settings, self._changed, port=0)
+        self._changed(self._mock.outputs_v)
+        self._number = 0
+        self.calls = [self._write, self._write, self._read, self._send_only]
+        self.most_s = 16 * self._dac.response_timeout_s + 1.0
+
+    def _changed(self, volts: Sequence[float]) -> None:
+        self._course.add(self.time.now_s, tuple(volts))
+
+    def hear(self, data: bytes) -> None:
+        """Modbus requests."""
+        self._modbus.hear(data)
+
+    def reboot(self) -> None:
+        """Its outputs are safe."""
+        self._mock._fault_changed("reboot")
+
+    def _next_v(self) -> np.ndarray:
+        self._number += 1
+        return np.array([0.1, 0.2, 0.3]) + 0.01 * (self._number % 900)
+
+    def _send_only(self) -> None:
+        self.driver.send_v(self._next_v())
+
+    def _write(self) -> None:
+        volts, begin_s = self._next_v(), self.time.now_s
+        self.driver.send_v(volts)
+        self.driver.confirm()
+        self._check("confirmed", volts, begin_s)
+
+    def _read(self) -> None:
+        begin_s = self.time.now_s
+        self._check("read", self.driver.read_v(), begin_s)
+
+    def _check(self, what: str, volts: np.ndarray, begin_s: float) -> None:
+        had = self._course.between(begin_s, self.time.now_s)
+        if not any(np.abs(volts - one).max() <= self._dac.step_v for one in had):
+            msg = f"D/A {what} {volts}, had {had}"
+            raise Mistaken(msg)
+
+
+class RtuBench(DacBench):
+    """The D/A over Modbus RTU."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        rig = _rig(
+            "fit-mock.toml",
+            "loops.right.fsm.dac.transport=rtu",
+            "loops.right.fsm.dac.serial_port=/dev/ttyUSB7",
+        )
+        timeout_s = rig.stellar_loops["right"].fsm.dac.response_timeout_s
+        Bench.__init__(
+            self, time, troubles, has_numbers=False, is_serial=True, most_late_s=1.9 * timeout_s
+        )
+        self._set_up(rig)
+        self.driver = ModbusDac(self._dac)
+
+    def hear(self, data: bytes) -> None:
+        """One frame."""
+        request = parse_frame(data)
+        if request is None or request[0] != self._dac.device_id:
+            return
+        answer = modbus_pdu.answer(request[1], self._mock._rtu._model)
+        self.wire.answer(rtu_frame(request[0], answer))
+
+
+class Mdt693Bench(Bench):
+    """The piezo amplifier on RS-232."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        rig = _rig()
+        mocks: Any = rig.mock_parts()[1]
+        piezo = rig.stellar_loops["right"].fsm.piezo
+        super().__init__(
+            time,
+            troubles,
+            has_numbers=False,
+            is_serial=True,
+            most_late_s=0.9 * piezo.response_timeout_s,
+        )
+        settings = mocks.loops["right"].mdt693
+        self._amplifier = Amplifier(settings, piezo.gain, lambda _volts: None, time.time)
+        self._amplifier.set_external_input_v([1.0, 4.0, 6.0])
+        self._controller = Controller(settings, self._amplifier)
+        self._limit_v = piezo.limit_v
+        self._pending = b""
+        self.driver = Mdt693(piezo)
+        self.calls = [self._volts, self._limit]
+        self.most_s = 60 * piezo.response_timeout_s
+        time.sleep(60.0)  # what it measures has settled
+
+    def hear(self, data: bytes) -> None:
+        """Commands, each ended by a CR."""
+        *commands, self._pending = (self._pending + data).split(b"\r")
+        for command in commands:
+            answer = self._controller.answer(command.decode("ascii", "replace"))
+            self.time.call_later(_MDT693_S, self.wire.answer, answer.encode("ascii"))
+
+    def reboot(self) -> None:
+        """Everything as at power-up."""
+        self._controller.power_up()
+        self._pending = b""
+
+    def _volts(self) -> None:
+        volts = self.driver.stack_volts()
+        true_v = np.array(self._amplifier.outputs_v)
+        if not np.abs(volts - true_v).max() < 2.5:  # it measures with an offset and noise
+            msg = f"stacks read {volts}, have {true_v}"
+            raise Mistaken(msg)
+
+    def _limit(self) -> None:
+        if abs(self.driver.limit_v() - self._limit_v) > 1.0:
+            msg = f"limit is not {self._limit_v}"
+            raise Mistaken(msg)
+
+
+class AmplifierBench(Bench):
+    """The siderostat's amplifiers."""
+
+    rig = "fit-mock.toml"
+    options: Mapping[str, Any] = MappingProxyType({})
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        rig = _rig(self.rig, *self.settings())
+        self.siderostat: Any = rig.loops["right"].siderostat
+        self.mocks: Any = rig.mock_parts()[1].loops["right"]
+        super().__init__(time, troubles, **self.options)
+        self.motors = Motors(time)
+        self._velocity = 0
+        self.most_s = 60 * self.siderostat.device.response_timeout_s + 2.0
+        self.calls = [self._exchange] * 6 + [self._enable, self._disable, self._reset]
+        self._course = Course()
+        self._watch()
+
+    def settings(self) -> Sequence[str]:
+        """Texts that replace values of the rig file."""
+        return ()
+
+    def _watch(self) -> None:
+        self._course.add(self.time.now_s, self.motors.position_rad())
+        self.time.call_later(0.001, self._watch)
+
+    def _enable(self) -> None:
+        self.driver.enable()
+
+    def _disable(self) -> None:
+        self.driver.disable()
+
+    def _reset(self) -> None:
+        self.driver.reset_fault()
+
+    def _exchange(self) -> None:
+        self._velocity += 1
+        rad_s = _SPEED_RAD_S * math.sin(0.3 * self._velocity)
+        reading: ServoReading | None = self.driver.exchange((rad_s, -rad_s))
+        if reading is None:
+            return
+        if not self.time.now_s - 5.0 < reading.time_s <= self.time.now_s:
+            msg = f"a reading of {reading.time_s - self.time.now_s:.3f} s from now"
+            raise Mistaken(msg)
+        # An encoder counts down; positions are as of somewhen about the time that the reading says.
+        count_rad = 2 * math.tau / self.siderostat.encoder_counts_per_rev
+        uncertain_s = self.siderostat.device.response_timeout_s
+        near = self._course.between(
+            reading.time_s - uncertain_s - _SLACK_S, reading.time_s + uncertain_s + _SLACK_S
+        )
+        for axis, position_rad in enumerate(reading.position_rad):
+            angles_rad = [both[axis] for both in near] + [self.motors.position_rad()[axis]]
+            if not min(angles_rad) - count_rad <= position_rad <= max(angles_rad) + count_rad:
+                had = f"{min(angles_rad):.3f} to {max(angles_rad):.3f}"
+                msg = f"axis {axis} read at {position_rad:.3f} rad, was at {had}"
+                raise Mistaken(msg)
+
+
+class BalAnalogBench(AmplifierBench):
+    """Analogue amplifiers behind Modbus/TCP I/O."""
+
+    rig = "fit-bal-analog.toml"
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        super().__init__(time, troubles)
+        settings = self.mocks.bal_analog
+        self._mock = BalAnalogMockStation(self.siderostat, settings, self.motors)
+        self._modbus = _Modbus(self._mock._server, self.wire.answer)
+        self.driver = BalAnalogAmplifiers(self.siderostat)
+
+    def hear(self, data: bytes) -> None:
+        """Modbus requests."""
+        self._modbus.hear(data)
+
+    def reboot(self) -> None:
+        """Outputs are safe."""
+        self._mock._fault_changed("reboot")
+
+
+class EnsembleBench(AmplifierBench):
+    """An Ensemble by its ASCII interface."""
+
+    rig = "ensemble.toml"
+    options = MappingProxyType({"has_numbers": False})
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        super().__init__(time, troubles)
+        settings = self.mocks.ensemble
+        self._reply_s = settings.reply_s
+        self._mock = EnsembleControllerMock(self.siderostat, settings, self.motors)
+        self._mock._stepped_s = time.now_s
+        self._mock._run_cycle()
+        self._mock._cycle.set_period(CYCLE_S)
+        self._lines = LineSplitter()
+        self.driver = EnsembleAmplifiers(self.siderostat)
+
+    def hear(self, data: bytes) -> None:
+        """Commands, a line each."""
+        for line in self._lines.feed(data):
+            if line.strip():
+                answer = self._mock._answer(line.decode("ascii", "replace"))
+                self.time.call_later(self._reply_s, self.wire.answer, answer)
+
+    def reboot(self) -> None:
+        """No power; everything as at power-up."""
+        self._mock._fault_changed("reboot")
+        self._lines.clear()
+
+
+class Cia402Bench(AmplifierBench):
+    """A CANopen drive."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        super().__init__(time, troubles)
+        self._mock = Cia402DriveMock(self.siderostat, self.motors, port=0, adapter=self)  # type: ignore[arg-type]
+        self._mock._control.set_period(0.002)
+        self._mock._reset_communication()
+        self.driver = Cia402Amplifiers(self.siderostat)
+
+    def settings(self) -> Sequence[str]:
+        """Not SLCAN: the bus itself is the wire."""
+        return ("loops.right.siderostat.device.interface=virtual",)
+
+    def attach(self, received: Callable[[CanFrame], None]) -> None:
+        """As an adapter: a drive listens."""
+        self._received = received
+
+    def send_line(self, line: bytes) -> None:
+        """As an adapter: a drive sends a frame."""
+        frame = decode_frame(line.rstrip(b"\r"))
+        self.wire.answer(
+            can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
+        )
+
+    def hear(self, data: can.Message) -> None:
+        """One frame."""
+        self._received(CanFrame(data.arbitration_id, bytes(data.data)))
+
+    def reboot(self) -> None:
+        """No power; everything as at power-up."""
+        self._mock._power_off()
+        self._mock._reset_communication()
+
+
+class LabJackBench(Bench):
+    """The converter of the photodiodes."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        super().__init__(time, troubles)
+        rig = _rig("fit-testbed.toml")
+        mocks: Any = rig.mock_parts()[1]
+        device = rig.metrology_loops["metrology"].sensor.device
+        settings = mocks.loops["metrology"].labjack
+        self._mock = LabJackT7Mock(device, settings, self._true_v)
+        self._modbus = _Modbus(self._mock._server, self.wire.answer)
+        self.driver = LabJackT7(device)
+        self.calls = [self._sample] * 4 + [self._receive]
+        self._asked_s: list[float] = []
+        self.most_s = 20 * device.response_timeout_s + 1.0
+
+    def hear(self, data: bytes) -> None:
+        """Modbus requests."""
+        self._modbus.hear(data)
+
+    def reboot(self) -> None:
+        """Its inputs' settings are those of power-up."""
+        for setting, values in self._mock._values.items():
+            values[:] = [setting.default] * len(values)
+
+    def _true_v(self, time_s: float) -> Sequence[float]:
+        """Each photodiode's voltage tells the time."""
+        return [0.2 * place + _V_PER_S * (time_s % _AROUND_S) for place in range(4)]
+
+    def _sample(self) -> None:
+        self._asked_s.append(self.time.now_s)
+        self.driver.send_request()
+        self._receive()
+
+    def _receive(self) -> None:
+        reading = self.driver.receive()
+        if reading is None:
+            return
+        sampled_s = [
+            reading.time_s
+            + ((volts - 0.2 * place) / _V_PER_S - reading.time_s + _AROUND_S / 2) % _AROUND_S
+            - _AROUND_S / 2
+            for place, volts in enumerate(reading.volts)
+        ]
+        if max(sampled_s) - min(sampled_s) > _UNSURE_S:
+            msg = f"photodiodes of different times: {reading.volts}"
+            raise Mistaken(msg)
+        # Its time is midway between request and answer; the request is the last one before the sample.
+        asked_s = [one for one in self._asked_s if one <= sampled_s[0] + _UNSURE_S]
+        if not asked_s or not asked_s[-1] - _UNSURE_S <= reading.time_s <= self.time.now_s:
+            msg = f"a sample of {sampled_s[0]:.4f} s is dated {reading.time_s:.4f} s"
+            raise Mistaken(msg)
+
+
+BENCHES: dict[str, Callable[[WireTime, Iterator[Trouble | None]], Bench]] = {
+    "D/A over Modbus/TCP": DacBench,
+    "D/A over Modbus RTU": RtuBench,
+    "MDT693": Mdt693Bench,
+    "analogue amplifiers": BalAnalogBench,
+    "Ensemble": EnsembleBench,
+    "CiA 402": Cia402Bench,
+    "LabJack T7": LabJackBench,
+}
+"""By the driver's name."""
+
+
+def run_wire(
+    name: str, troubles: Sequence[Trouble | None], calls: Sequence[tuple[int, float]]
+) -> dict[str, int]:
+    """Make calls, each after a pause, over a wire with these troubles; how each ended, by its error's name.
+
+    Raises
+    ------
+    Mistaken
+        If an answer was taken for another's, or a call took too long.
+    Exception
+        What a call ended in that is no `DeviceError`.
+    """
+    time, ended = WireTime(), dict[str, int]()
+    coming: Iterator[Trouble | None] = iter(troubles)
+    holder: list[Bench] = []
+
+    def troubles_once_open() -> Iterator[Trouble | None]:
+        yield from coming
+
+    # The mock's timers need the loop of the wire's time; the wire comes with the bench.
+    wire = _Deferred(lambda: holder[0].wire)
+    with virtual(time, wire):  # type: ignore[arg-type]
+        bench = BENCHES[name](time, troubles_once_open())
+        holder.append(bench)
+        is_open = False
+        for number, pause_s in calls:
+            time.sleep(pause_s)
+            call = bench.calls[number % len(bench.calls)] if is_open else bench.driver.open
+            began_s, outcome = time.now_s, "value"
+            try:
+                call()
+                is_open = True
+            except DeviceError as error:
+                outcome, is_open = type(error).__name__, False
+            took_s = time.now_s - began_s
+            if took_s > bench.most_s:
+                msg = f"a call took {took_s:.2f} s, at most {bench.most_s:.2f} s"
+                raise Mistaken(msg)
+            ended[outcome] = ended.get(outcome, 0) + 1
+        bench.driver.close()
+    return ended
+
+
+class _Deferred:
+    """The wire of a bench that is still being made."""
+
+    def __init__(self, wire: Callable[[], Wire]) -> None:
+        self._wire = wire
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._wire(), name)
+
+
+def drawn_run(random: Random) -> tuple[list[Trouble | None], list[tuple[int, float]]]:
+    """Troubles and calls at random."""
+    part = random.choice((0.02, 0.1, 0.3))
+    kinds = random.sample(KINDS, random.randint(1, len(KINDS)))
+    troubles = [
+        Trouble(random.choice(kinds), 10 ** random.uniform(-3.5, 0.3))
+        if random.random() < part
+        else None
+        for _ in range(2000)
+    ]
+    return troubles, [(random.randrange(100), random.choice(_PAUSES_S)) for _ in range(60)]
