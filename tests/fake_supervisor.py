@@ -162,6 +162,7 @@ class FakeSupervisor:
         self.waits_for: dict[str, str] = {}
         self.learning: LearningState | None = None
         self.bias_offset_urad = (0.0, 0.0)
+        self.controller = "minimum-variance"
         self.controller_file = ""
         self.search_again: SearchAgain | None = None
         self.last_failure: LoopFailure | None = None
@@ -259,7 +260,7 @@ class FakeSupervisor:
             requirement_px=1.0 / 2.708 if is_beam else 0.1,
             usable_commands=["Stop", *USABLE[mode]],
             sky_arcsec_per_px=2.708,
-            controller="" if is_beam else "minimum-variance",
+            controller="" if is_beam else self.controller,
             last_change=self._change(loop),
             interlocks=self.interlocks,
             limits=LIMITS,

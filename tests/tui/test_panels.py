@@ -412,6 +412,16 @@ def learnt(state, **values):
             learnt("in force", design_json="{}", expected_px=0.026, measured_px=0.027),
             ["on frames 0.0270 px, expected 0.0260"],
         ),
+        (
+            learnt(
+                "in force",
+                design_json="{}",
+                expected_px=0.026,
+                measured_px=0.027,
+                before_px=0.098,
+            ),
+            ["before        0.0980 px on the same frames"],
+        ),
         (learnt("fell back"), ["fell back to the design before"]),
     ],
     ids=lambda value: getattr(value, "state", ""),

@@ -8,8 +8,10 @@ import asyncio
 import pytest
 from pytest_textual_snapshot import SVGImageExtension
 
+from fitctl.messages.telemetry import LearningState
 from fitctl.tui.commands import VIEWS
 from tests.fake_supervisor import MODE_NUMBERS, TESTBED, FakeSupervisor
+from tests.learner_reports import LINE, learnt_json, report
 from tests.tui.fixed import FixedApp, make_logs, settle
 from tests.tui.wrong import (
     ALARMS,
@@ -98,6 +100,34 @@ def test_without_colour(changed, monkeypatch, state):
     monkeypatch.setenv("NO_COLOR", "1")
     states = {"VERNIER": FakeSupervisor, "fault": drive_fault, "stopped": stopped_testbed}
     assert changed(FixedApp(states[state]())) == []
+
+
+LEARNT = {
+    "advice": {"setting": "advise", "state": "advice"},
+    "in_force": {
+        "setting": "on",
+        "state": "in force",
+        "design_json": learnt_json(LINE),
+        "expected_px": 0.0262,
+        "measured_px": 0.0271,
+        "before_px": 0.0978,
+    },
+}
+
+
+@pytest.mark.parametrize("learnt", LEARNT)
+def test_what_was_learnt(changed, learnt):
+    supervisor = FakeSupervisor()
+    supervisor.learning = LearningState(
+        text="air k/b1 0.87 px/s², b2/b1 4.8 1/s; noise 0.0100 px; lines 6.00 Hz 0.050 px; the model fits "
+        "(p = 0.43)",
+        report=report(),
+        **LEARNT[learnt],
+    )
+    if learnt == "in_force":
+        supervisor.controller = "learnt"
+    views = [view for view in VIEWS if view.name == "loop"]
+    assert changed(FixedApp(supervisor), views=views) == []
 
 
 def test_three_loops(changed):

@@ -153,6 +153,9 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
     elif learning.state == "fell back":
         gain, colour = "fell back to the design before", ORANGE
     lines = [[text("learning".ljust(_NAME_COLUMNS), DIM), text(gain, colour)]]
+    if not math.isnan(learning.before_px):
+        before = f"{learning.before_px:.4f} px on the same frames, computed"
+        lines.append([text("before".ljust(_NAME_COLUMNS), DIM), text(before, INK)])
     if learning.state == "advice":
         command = f"fitctl send controller learnt --loop {loop.name}"
         lines.append([text("to apply".ljust(_NAME_COLUMNS), DIM), text(command, INK)])
