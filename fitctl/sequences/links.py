@@ -21,16 +21,23 @@ class SimulatedLink:
     """The instrument on the virtual clock: waiting for telemetry is what moves the time on.
 
     As with a running rig, telemetry is received on one thread, and commands may be sent from any. `prepare`
-    may change the simulation before it begins.
+    may change the simulation before it begins; `advises` is for a sequence that uses what was learnt.
     """
 
     def __init__(
-        self, rig: Rig, seed: int, prepare: Callable[[Simulation], object] = lambda _: None
+        self,
+        rig: Rig,
+        seed: int,
+        prepare: Callable[[Simulation], object] = lambda _: None,
+        *,
+        advises: bool = False,
     ) -> None:
         self._stepping = threading.Lock()
         self._buffer = TelemetryBuffer()
         self._period_s = 1.0 / rig.supervisor.telemetry_hz
-        self._simulation = Simulation(rig, seed, record=self._buffer.add, history_s=1.0)
+        self._simulation = Simulation(
+            rig, seed, record=self._buffer.add, history_s=1.0, advises=advises
+        )
         prepare(self._simulation)
         self._state = ServiceState(
             pid=os.getpid(),

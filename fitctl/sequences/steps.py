@@ -202,10 +202,12 @@ class Raster(Visiting):
 
 
 class Controller(Step):
-    """Switch to another design."""
+    """Switch to another design. With `learnt`, wait for the learner's, and switch if it would leave less."""
 
     step: Literal["controller"] = "controller"
-    name: Annotated[ControllerName, Field(description="as in `fitctl send controller`")]
+    name: Annotated[
+        Literal[ControllerName, "learnt"], Field(description="as in `fitctl send controller`")
+    ]
     timeout_s: TimeoutS = 60.0
 
 
@@ -415,3 +417,8 @@ class Sequence(Settings):
     steps: Annotated[
         list[Annotated[AnyStep, Field(discriminator="step")]], Field(min_length=1, max_length=500)
     ]
+
+    @property
+    def uses_what_is_learnt(self) -> bool:
+        """A step switches to a learnt design."""
+        return any(isinstance(step, Controller) and step.name == "learnt" for step in self.steps)

@@ -64,6 +64,8 @@ class Simulation:
         Takes every record, as the recorder would.
     history_s : float, optional
         How long true positions are kept, by default as the rig says.
+    advises : bool
+        Loops with ``learn = "advise"`` have a learner, too. Advice is for people, and most runs have none.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class Simulation:
         star_offset_px: Floats | None = None,
         record: Callable[[AnyRecord], None] | None = None,
         history_s: float | None = None,
+        advises: bool = False,
     ) -> None:
         self.rig = rig
         self.clock = VirtualClock()
@@ -87,7 +90,7 @@ class Simulation:
         self.learners = {
             name: Learner(rig, name)
             for name, loop in rig.stellar_loops.items()
-            if loop.learn == "on"  # advice is for people, and a run has none
+            if loop.learn == "on" or (advises and loop.learn == "advise")
         }
         self.samples = dict.fromkeys(rig.metrology_loops, 0)
         self._on_record = record

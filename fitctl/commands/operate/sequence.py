@@ -153,7 +153,7 @@ def dry_run(
     settings.mock_parts()
     begun = time.perf_counter()
     prepare = _placed(settings, remote) if present else lambda _: None
-    link = SimulatedLink(settings, seed, prepare)
+    link = SimulatedLink(settings, seed, prepare, advises=sequence.uses_what_is_learnt)
     status = _run(settings, sequence, link, out, as_json=as_json)
     if not as_json:
         say(f"{link.now_s():.1f} s of virtual time, in {time.perf_counter() - begun:.1f} s")

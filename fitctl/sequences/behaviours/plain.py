@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fitctl.config import Rig
+from fitctl.controllers.pair import LEARNT
 from fitctl.messages.commands import Hold, Off, SetController, Standby
 from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
@@ -23,12 +24,34 @@ def _standby_done(_step: steps.Standby, view: View) -> Result | None:
 
 
 def _run_controller(step: steps.Controller, view: View) -> None:
-    view.command(SetController(loop=view.loop_name, name=step.name))
+    if step.name != LEARNT:
+        view.command(SetController(loop=view.loop_name, name=step.name))
 
 
 def _controller_done(step: steps.Controller, view: View) -> Result | None:
     view.require_no_failure()
-    return Result({}, step.name) if view.loop.controller == step.name else None
+    if view.loop.controller == step.name:
+        return Result({}, step.name)
+    return _learnt_done(view) if step.name == LEARNT else None
+
+
+def _learnt_done(view: View) -> Result | None:
+    """Use the learner's next design, or keep the present one if that leaves hardly more."""
+    learning, controller = view.loop.learning, view.loop.controller
+    report = None if learning is None else learning.report
+    if report is None or not report.design_json or view.marks:
+        return None
+    if not report.worth_it:
+        return Result({"learnt_px": report.learnt_px}, f"kept {controller}; {report.text}")
+    view.marks.append(view.now_s)
+    view.command(SetController(loop=view.loop_name, name=LEARNT))
+    return None
+
+
+def _check_controller(step: steps.Controller, rig: Rig, loop_name: str) -> list[str]:
+    if step.name == LEARNT and rig.stellar_loops[loop_name].learn == "off":
+        return [f'loops.{loop_name}.learn is "off", so nothing is learnt; set it to "advise"']
+    return []
 
 
 def _wait_done(step: steps.Wait, view: View) -> Result | None:
@@ -50,7 +73,9 @@ PLAIN = {
     "standby": Behaviour(
         POWERED | {Mode.OFF}, _standby_done, _run_standby, loops="links last", of_beams=True
     ),
-    "controller": Behaviour(POWERED | {Mode.OFF}, _controller_done, _run_controller),
+    "controller": Behaviour(
+        POWERED | {Mode.OFF}, _controller_done, _run_controller, check=_check_controller
+    ),
     "wait": Behaviour(
         POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True, loops="none", of_beams=True
     ),
