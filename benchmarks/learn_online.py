@@ -1,9 +1,9 @@
 """What a loop leaves that learns while it observes, on nights that its rig file does not know.
 
-For each night and seed, two simulations of the whole instrument on the virtual clock: with the rig's
-minimum-variance design throughout, and with `learn = "on"`. Both see the same air and the same lines. True
-residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them the bound of
-the night, which knows everything about it. With `--random`, nights are drawn: see :func:`random_night`.
+For each night and seed, two runs of the whole instrument on the virtual clock: with the rig's
+minimum-variance design throughout (compiled batch), and with `learn = "on"`. Both see the same air and the
+same lines. True residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them
+the bound of the night, which knows everything about it. With `--random`, nights are drawn: see :func:`random_night`.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line, basis
 from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.logging.records import AnyRecord, ControllerChange
+from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
@@ -33,6 +34,7 @@ LOOP = "right"
 BEGIN_S, END_S = 120.0, 300.0
 FIT = ("loops.right.sensor=fit",)
 CONTROLLER = f"loops.{LOOP}.vernier.controller=minimum-variance"
+_SUMS = ("true_sum2", "residual_steps")
 AIR = f"plant.loops.{LOOP}.air_path"
 
 
@@ -144,8 +146,16 @@ class Outcome(NamedTuple):
     ways_back: int
 
 
+def fixed_residual(settings: Sequence[str], seed: int) -> float:
+    """Of a run without learning, in the compiled batch, which does the same as a simulation."""
+    batch = Batch(load_rig(default_rig_path(), [CONTROLLER, *settings]))
+    states = [batch.run(seed, end_s).loops[LOOP].state for end_s in (BEGIN_S, END_S)]
+    sums, steps = (np.diff([state[name] for state in states], axis=0)[0] for name in _SUMS)
+    return float(np.sqrt(sums.max() / steps))
+
+
 def residual(settings: Sequence[str], seed: int) -> tuple[float, int, int]:
-    """Of one run, with its changes of design, and those back."""
+    """Of one simulation, with its changes of design, and those back."""
     changes: list[ControllerChange] = []
 
     def record(made: AnyRecord) -> None:
@@ -165,7 +175,7 @@ def residual(settings: Sequence[str], seed: int) -> tuple[float, int, int]:
 def outcome(night: Night, seed: int) -> Outcome:
     """Both runs of one seed."""
     settings = [*night.known, *night.unknown]
-    fixed_px, *_ = residual([*settings, f"loops.{LOOP}.learn=off"], seed)
+    fixed_px = fixed_residual(settings, seed)
     learnt_px, changes, back = residual([*settings, f"loops.{LOOP}.learn=on"], seed)
     return Outcome(fixed_px, learnt_px, changes, back)
 

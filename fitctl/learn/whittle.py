@@ -14,8 +14,10 @@ gain and overshoot are two more parameters, and need no experiment.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +65,8 @@ class Guess(NamedTuple):
     lines: tuple[LineGuess, ...] = ()
 
 
-class Likeliest(NamedTuple):
+@dataclass(frozen=True)
+class Likeliest:
     """The end of a search.
 
     Attributes
@@ -71,17 +74,23 @@ class Likeliest(NamedTuple):
     guess : Guess
     cost : float
         Negative logarithm of the likelihood.
-    covariance : array, shape (n, n)
-        Of the parameters: logarithms of strength, damping, stiffness, noise and gain; the overshoot; then for
-        each line its frequency in Hz, and logarithms of its half width and of its RMS by axis.
     density : array, shape (rows, axes)
         One-sided, px²/Hz.
+    find_covariance : callable
+        For :attr:`covariance`, shape (n, n), of the parameters: logarithms of strength, damping, stiffness,
+        noise and gain; the overshoot; then for each line its frequency in Hz, and logarithms of its half width
+        and of its RMS by axis.
     """
 
     guess: Guess
     cost: float
-    covariance: Floats
     density: Floats
+    find_covariance: Callable[[], Floats] = field(repr=False)
+
+    @functools.cached_property
+    def covariance(self) -> Floats:
+        """Only the last of many searches needs it, and it takes as long as the search."""
+        return self.find_covariance()
 
 
 def likeliest(opened: Opened, begin: Guess, *, free_mirror: bool = True) -> Likeliest:
@@ -89,7 +98,8 @@ def likeliest(opened: Opened, begin: Guess, *, free_mirror: bool = True) -> Like
     problem = _Problem(opened, begin, free_mirror=free_mirror)
     values, cost = _lowest(problem)
     guess = problem.guess(values)
-    return Likeliest(guess, cost, problem.covariance(values), problem.density(guess)[0])
+    density = problem.density(guess)[0]
+    return Likeliest(guess, cost, density, functools.partial(problem.covariance, values))
 
 
 def _lowest(problem: _Problem) -> tuple[Floats, float]:
