@@ -3,7 +3,8 @@
 For each night and seed, two runs of the whole instrument on the virtual clock: with the rig's
 minimum-variance design throughout (compiled batch), and with `learn = "on"`. Both see the same air and the
 same lines. True residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them
-the bound of the night, which knows everything about it. With `--random`, nights are drawn: see :func:`random_night`.
+the bound of the night, which knows everything about it. With `--random`, nights are drawn: see
+:func:`random_night`.
 """
 
 from __future__ import annotations
