@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fitctl.config import Rig
-from fitctl.identify import airpath, backlash, delay, hysteresis, response
+from fitctl.identify import airpath, backlash, delay, hysteresis, response, spot
 from fitctl.identify.frames import TimedImage, frames_of_log, frames_of_records, track_spots
 from fitctl.identify.link import ambient, beam, feedforward
 from fitctl.identify.link.step_record import TickKind, gather_step_log
@@ -22,6 +22,7 @@ Finding = (
     | backlash.BacklashResult
     | delay.DelayResult
     | airpath.AirPathResult
+    | spot.SpotResult
     | response.ResponseResult
     | feedforward.FeedforwardResult
     | beam.PhotodiodesResult
@@ -106,6 +107,11 @@ EXPERIMENTS: dict[str, Identification] = {
         airpath.plan,
         lambda rig, loop, path: _air_path(rig, loop, frames_of_log(path, loop)),
         lambda rig, loop, records: _air_path(rig, loop, frames_of_records(records, loop)),
+    ),
+    "spot": Identification(
+        spot.plan,
+        lambda rig, loop, path: spot.analyse(rig, loop, frames_of_log(path, loop)),
+        lambda rig, loop, records: spot.analyse(rig, loop, frames_of_records(records, loop)),
     ),
     "response": Identification(None, _response_from_file, None),
     "feedforward": _of_step(feedforward.STEP, Tick, feedforward.analyse),

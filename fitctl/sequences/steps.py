@@ -216,7 +216,7 @@ class Experiment(Moving):
 
     step: Literal["experiment"] = "experiment"
     what: Annotated[
-        Literal["backlash", "delay", "hysteresis", "airpath"],
+        Literal["backlash", "delay", "hysteresis", "airpath", "spot"],
         Field(description="as in `fitctl identify`"),
     ]
 

@@ -1,0 +1,243 @@
+"""The width of a loop's spot, from frames: the template of ``sensor = "fit"``.
+
+Every frame gives the spot's light, place and background by least squares, and all frames together its width. A
+spot that a moving star smears has the width that the sensor will see.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import HALF_WINDOW_PX, Camera, Loop, Rig
+from fitctl.controllers.centroid import StarSensor
+from fitctl.controllers.dark import Dark
+from fitctl.controllers.spot_fit import gaussian_shape
+from fitctl.identify.drawing import BLACK, BLUE, new_figure
+from fitctl.identify.errors import IdentifyError
+from fitctl.identify.frames import TimedImage
+from fitctl.model.drives import Drive
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+RECOMMENDED_S = 10.0
+LEAST_FRAMES = 100
+MOST_FRAMES = 3000
+NOT_ROUND = 2.0
+"""A round Gaussian leaves the pixels' noise; more than so many times that is another shape."""
+_SIDE = 2 * HALF_WINDOW_PX + 1
+_NARROWEST_PX, _WIDEST_PX = 1.0, 8.0
+_STEPS, _ENOUGH_PX = 30, 1e-5
+_SLOPE_PX = 1e-3  # for derivatives
+
+
+@dataclass(frozen=True)
+class SpotResult:
+    """A spot's width.
+
+    Attributes
+    ----------
+    loop : str
+    diameter_px, diameter_sd_px : float
+        1/e^2, and one standard deviation.
+    rig_diameter_px : float
+        As the rig file has it.
+    frames : int
+    flux_dn : float
+        Median.
+    excess : float
+        RMS of what the fit leaves, over the pixels' noise.
+    distance_px, light : arrays, shape (pixels,)
+        Of pixels from the spot's centre, and their light as a part of the spot's.
+    """
+
+    loop: str
+    diameter_px: float
+    diameter_sd_px: float
+    rig_diameter_px: float
+    frames: int
+    flux_dn: float
+    excess: float
+    distance_px: Floats
+    light: Floats
+
+    def fragment(self) -> dict[str, Any]:
+        """What to lay over the rig file."""
+        return {"loops": {self.loop: {"spot_diameter_px": round(self.diameter_px, 4)}}}
+
+    def lines(self) -> list[str]:
+        """For an operator."""
+        lines = [
+            f"spot diameter (1/e^2): {self.diameter_px:.4f} +- {self.diameter_sd_px:.4f} px, rig file "
+            f"{self.rig_diameter_px:g}",
+            f"{self.frames} frames of {self.flux_dn:.0f} DN; unexplained {self.excess:.2f} times the pixels' "
+            "noise",
+        ]
+        if self.excess > NOT_ROUND:
+            lines.append(
+                'The spot is not a round Gaussian: sensor = "fit" still finds it, but with more noise than '
+                "designs assume. Look at the plot, at focus and at neighbours"
+            )
+        return lines
+
+    def plot(self, path: Path) -> None:
+        """Write :meth:`draw` to a file."""
+        self.draw().savefig(path)
+
+    def draw(self) -> Figure:
+        """Light of the pixels over their distance, and the Gaussian."""
+        figure = new_figure()
+        axes = figure.add_subplot()
+        axes.plot(self.distance_px, self.light, ".", markersize=2, color=BLUE, label="pixels")
+        farthest_px = float(self.distance_px.max())
+        at_px = np.linspace(0.0, farthest_px, 200)
+        shape = [
+            gaussian_shape(self.diameter_px, np.array(one), np.array(0.0)).reshape(_SIDE, _SIDE)[
+                HALF_WINDOW_PX, HALF_WINDOW_PX
+            ]
+            for one in at_px
+        ]
+        axes.plot(at_px, shape, color=BLACK, label=f"Gaussian, {self.diameter_px:.3f} px")
+        axes.set(
+            xlabel="distance from the spot's centre (px)", ylabel="part of the light on a pixel"
+        )
+        axes.legend()
+        return figure
+
+
+def plan(_rig: Rig, _loop_name: str) -> list[Drive]:
+    """Nothing moves, for a little longer than is needed: a motion of no amplitude."""
+    return [
+        Drive(
+            channel="fsm_az",
+            shape="sine",
+            amplitude=0.0,
+            frequency_hz=1.0,
+            duration_s=RECOMMENDED_S + 2.0,
+        )
+    ]
+
+
+def analyse(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> SpotResult:
+    """The spot's width from the frames that show it.
+
+    Raises
+    ------
+    IdentifyError
+        If there are too few of them, or it is as narrow as a pixel or as wide as the window.
+    """
+    camera, loop = rig.camera, rig.stellar_loops[loop_name]
+    light_dn = _windows(frames, camera, loop)
+    diameter_px, each_px, places, left_dn = _fit(light_dn, loop.spot_diameter_px)
+    if not _NARROWEST_PX < diameter_px < _WIDEST_PX:
+        msg = (
+            f"the spot's diameter comes out at {diameter_px:.2f} px; expected {_NARROWEST_PX:g} to "
+            f"{_WIDEST_PX:g} px; look at focus and exposure, and record again"
+        )
+        raise IdentifyError(msg)
+    flux_dn, az_px, el_px, background_dn = places.T
+    shape = gaussian_shape(diameter_px, az_px, el_px)
+    photon_dn = 1 / (camera.electrons_per_dn or math.inf)
+    light = np.maximum(flux_dn[:, None] * shape, 0.0)
+    expected_dn2 = camera.pixel_noise_dn**2 + photon_dn * light
+    centres = np.arange(_SIDE) - HALF_WINDOW_PX
+    el_at, az_at = np.meshgrid(centres, centres, indexing="ij")
+    few = slice(None, None, max(1, len(light_dn) // 100))
+    distance_px = np.hypot(az_at.ravel() - az_px[few, None], el_at.ravel() - el_px[few, None])
+    return SpotResult(
+        loop=loop_name,
+        diameter_px=diameter_px,
+        diameter_sd_px=float(each_px.std(ddof=1)) / math.sqrt(len(each_px)),
+        rig_diameter_px=loop.spot_diameter_px,
+        frames=len(light_dn),
+        flux_dn=float(np.median(flux_dn)),
+        excess=float(np.sqrt(np.mean(left_dn**2 / expected_dn2) * _SIDE**2 / (_SIDE**2 - 5))),
+        distance_px=distance_px.ravel(),
+        light=((light_dn[few] - background_dn[few, None]) / flux_dn[few, None]).ravel(),
+    )
+
+
+def _windows(frames: Iterable[TimedImage], camera: Camera, loop: Loop) -> Floats:
+    """Light about the loop's star, shape (frames, 49), less what pixels read without any."""
+    sensor, dark = StarSensor(camera, loop), Dark(camera)
+    kept: list[Floats] = []
+    for _, image in frames:
+        star = sensor.find(image)
+        if star is None:
+            continue
+        el, az = star.window_el_px - HALF_WINDOW_PX, star.window_az_px - HALF_WINDOW_PX
+        kept.append(dark.light(image, el, az, _SIDE, _SIDE).ravel().copy())
+        if len(kept) == MOST_FRAMES:
+            break
+    if len(kept) < LEAST_FRAMES:
+        msg = (
+            f"{len(kept)} frames show the star; expected at least {LEAST_FRAMES}; hold the star and record "
+            "again"
+        )
+        raise IdentifyError(msg)
+    return np.array(kept)
+
+
+def _fit(light_dn: Floats, diameter_px: float) -> tuple[float, Floats, Floats, Floats]:
+    """The width that suits all frames, by Gauss and Newton.
+
+    Returns
+    -------
+    diameter_px : float
+    each_px : array, shape (frames,)
+        Of each frame by itself.
+    places : array, shape (frames, 4)
+        Flux, place on both axes, background.
+    left_dn : array, shape (frames, 49)
+        What the fit leaves.
+    """
+    # From a centre of gravity.
+    centres = np.arange(_SIDE) - float(HALF_WINDOW_PX)
+    el_at, az_at = (one.ravel() for one in np.meshgrid(centres, centres, indexing="ij"))
+    flux_dn = light_dn.sum(axis=1)
+    values = np.column_stack(
+        [flux_dn, light_dn @ az_at / flux_dn, light_dn @ el_at / flux_dn, np.zeros(len(flux_dn))]
+    )
+    for _ in range(_STEPS):
+        flux_dn, az_px, el_px, background_dn = values.T
+        shape = gaussian_shape(diameter_px, az_px, el_px)
+
+        terms = np.stack(
+            [
+                shape,
+                *(flux_dn[:, None] * slope for slope in _slopes(diameter_px, az_px, el_px)),
+                np.ones_like(shape),
+            ],
+            axis=-1,
+        )
+        left_dn = light_dn - flux_dn[:, None] * shape - background_dn[:, None]
+        turned = terms.swapaxes(1, 2)
+        steps = np.linalg.solve(turned @ terms, turned @ left_dn[..., None])[..., 0]
+        each_px = diameter_px + steps[:, 3]
+        wider_px = float(np.median(steps[:, 3]))
+        values = values + steps[:, [0, 1, 2, 4]]
+        diameter_px = float(np.clip(diameter_px + wider_px, 0.5, 2 * _SIDE))
+        if abs(wider_px) < _ENOUGH_PX:
+            break
+    return float(np.mean(each_px)), each_px, values, left_dn
+
+
+def _slopes(diameter_px: float, az_px: Floats, el_px: Floats) -> list[Floats]:
+    """Of a spot's shape by its place on both axes and by its width, each shape (frames, 49)."""
+    at = np.array([np.full_like(az_px, diameter_px), az_px, el_px])
+    slopes = []
+    for by in (1, 2, 0):
+        step = _SLOPE_PX * np.eye(3)[by][:, None]
+        ahead, behind = (
+            gaussian_shape(one[0, 0], one[1], one[2]) for one in (at + step, at - step)
+        )
+        slopes.append((ahead - behind) / (2 * _SLOPE_PX))
+    return slopes
