@@ -3,6 +3,8 @@
 import pytest
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.config.devices import DEVICE_TABLES
+from fitctl.config.reading import _is_tag
 
 # ---------------------------------------------------------------- files that are not rig files
 
@@ -148,3 +150,11 @@ def test_a_base_must_be_a_name(tmp_path):
     path.write_text("base = 3\n")
     with pytest.raises(ConfigError, match=r"mine\.toml: base: must be a file name \(is 3\)"):
         load_rig(path)
+
+
+@pytest.mark.parametrize("table", sorted(DEVICE_TABLES))
+def test_the_driver_of_a_device_is_no_part_of_its_keys(table):
+    """pydantic puts it into the place of an error where a table may be of several devices."""
+    assert _is_tag(["loops", "right", table], "ensemble")
+    assert not _is_tag(["loops", "right", table], "port")
+    assert not _is_tag(["loops"], "ensemble")

@@ -243,6 +243,8 @@ class BalAnalogDevice(Settings):
 SiderostatDevice = Annotated[
     Cia402Device | EnsembleDevice | BalAnalogDevice, Field(discriminator="driver")
 ]
+DEVICE_TABLES = frozenset({"device", "dac", "piezo", "hexapod"})
+"""Tables of the rig file whose `driver` says which device they are of."""
 DEVICE_BY_TAG: dict[str, type[Settings]] = {
     "cia402": Cia402Device,
     "ensemble": EnsembleDevice,

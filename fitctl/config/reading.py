@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings
 from fitctl.config.checks import rig_conflicts
 from fitctl.config.conflict import Conflict, Conflicts
-from fitctl.config.devices import DEVICE_BY_TAG
+from fitctl.config.devices import DEVICE_BY_TAG, DEVICE_TABLES
 from fitctl.config.origins import Layer, Marks, changed_by, layer_of, lies_on, mark_layer
 from fitctl.config.rig import SCHEMA_VERSION, Rig
 from fitctl.text import plain
@@ -375,7 +375,7 @@ def without_tags(location: Sequence[str]) -> list[str]:
 
 def _is_tag(before: Sequence[str], part: str) -> bool:
     """Whether this part of a place is the kind of the device or loop that is named before it."""
-    if before[-1:] == ["device"]:
+    if before and before[-1] in DEVICE_TABLES:
         return part in DEVICE_BY_TAG
     return before[-2:-1] == ["loops"] and len(before) <= 3 and part in {STELLAR, METROLOGY}
 
