@@ -20,6 +20,7 @@ from fitctl.commissioning.record import Commissioning, Entry, Files, load, load_
 from fitctl.commissioning.run import Course, chosen, do, skip
 from fitctl.commissioning.steps import Task, tasks_of
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
+from fitctl.config.reading import read_parts
 from fitctl.config.simulated import places
 from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench
 
@@ -211,7 +212,8 @@ def _conclude(
 ) -> None:
     record, files = course.record, course.files
     titles = {task.name: task.step.title for task in tasks}
-    files.write_page(page(record, titles, earlier))
+    said = flat(read_parts(course.rig_path, course.overrides).document)
+    files.write_page(page(record, titles, earlier, said))
     if as_json:
         document = {
             "rig": record.rig,
