@@ -190,7 +190,7 @@ def test_the_page_has_every_step_and_compares_figures(course, table):
     assert "&lt;i&gt;" in text
     assert "<i>" not in text
     assert "+100.0%" in text
-    assert "not done" in text
+    assert "to do" in text
 
 
 def test_the_shipped_table_needs_only_steps_that_come_before(rig):
