@@ -409,6 +409,11 @@ class ConsoleApp(App[None]):
         words = self.view.to_rehearse() if self.view else ""
         self.push_screen(Ask("Rehearse", prompt, words, refused), rehearse)
 
+    def _show_commissioning(self) -> None:
+        """Show what the commissioning of the rig has done, by a process of its own."""
+        job = self.start_job(["commission", "--list", *(self.rig_arguments or ())])
+        self.push_screen(Running("Commissioning", job))
+
     def action_alarms(self) -> None:
         """Open the alarms in full."""
         self.push_screen(Alarms(self.state, self.alarms), self._show_alarm)
@@ -442,6 +447,9 @@ class ConsoleApp(App[None]):
             if key.action and key.label not in {"Palette", "Help"}:
                 run = partial(self._run, key.action)
                 yield SystemCommand(key.label, f"{key.help} ({key.shown})", run)
+        if self.rig_arguments is not None and not self.playback.log_name:
+            steps = "The steps of the rig's commissioning: done, failed, to do"
+            yield SystemCommand("Commissioning", steps, self._show_commissioning)
         yield SystemCommand(
             "Shut down the supervisor",
             "SAFE, OFF, then end the supervisor process",

@@ -76,7 +76,7 @@ def commission(
     settings = load_rig(path, overrides or ())
     if not list_steps:
         _require_permission(settings, yes=yes)
-    files = Files(path, _folder(path, folder))
+    files = Files(path, _folder(path, folder, reads_only=list_steps))
     course = Course(
         path,
         tuple(overrides or ()),
@@ -137,9 +137,9 @@ def _require_permission(rig: Rig, *, yes: bool) -> None:
         raise ConfigError(msg)
 
 
-def _folder(path: Path, folder: Path | None) -> Path:
+def _folder(path: Path, folder: Path | None, *, reads_only: bool) -> Path:
     wanted = folder or (Path.cwd() if path == default_rig_path() else path.parent)
-    if not wanted.is_dir() or not writable(wanted):
+    if not wanted.is_dir() or not (reads_only or writable(wanted)):
         msg = f"commission: {wanted}: nothing can be written there; choose another with --folder"
         raise ConfigError(msg)
     return wanted
@@ -193,9 +193,12 @@ def _do_all(course: Course, wanted: list[Task], *, again: bool, yes: bool) -> No
 
 
 def _entry_lines(name: str, entry: Entry) -> list[str]:
-    lines = [f"{_MARKS[entry.state]}: {name}, {entry.took_s:.1f} s", *entry.lines]
-    lines += [f"rig file: {key} = {value}" for key, value in flat(entry.found).items()]
-    return [*lines, *([entry.trouble] if entry.trouble else [])]
+    return [f"{_MARKS[entry.state]}: {name}, {entry.took_s:.1f} s", *_seen_lines(entry)]
+
+
+def _seen_lines(entry: Entry) -> list[str]:
+    found = [f"rig file: {key} = {value}" for key, value in flat(entry.found).items()]
+    return [*entry.lines, *found, *([entry.trouble] if entry.trouble else [])]
 
 
 def _list(course: Course, tasks: list[Task]) -> None:
@@ -205,6 +208,9 @@ def _list(course: Course, tasks: list[Task]) -> None:
         state = "to do" if entry is None else f"{_MARKS[entry.state]} {entry.at}"
         say(f"{task.name:<24} {state:<32} {task.step.title}")
         say(f"{'':<24} moves: {task.step.moves(course.site(task, rig))}")
+        for line in () if entry is None else _seen_lines(entry):
+            say(f"{'':<24} {line}")
+    say(f"{course.record.rig}: {verdict(course.record, [task.name for task in tasks])}")
 
 
 def _conclude(
