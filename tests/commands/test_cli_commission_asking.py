@@ -14,7 +14,7 @@ STEPS = """
 import sys
 from fitctl.cli import main
 from fitctl.commissioning import steps
-from fitctl.commissioning.outcome import Outcome, StepError
+from fitctl.commissioning.outcome import Cable, Outcome, StepError
 
 def step(name, *needs, fails=False):
     def run(site):
@@ -25,6 +25,13 @@ def step(name, *needs, fails=False):
     return steps.Step(f"step {name}", "star", lambda _site: f"the {name} motor", needs, 1.0, run)
 
 steps.STEPS = {"one": step("one"), "two": step("two", "one"), "three": step("three", "two", fails=True)}
+def cable(site):
+    for on in (False, True):
+        site.cable(Cable("the camera's cable", "camera"), on)
+    return Outcome(["it came back"])
+
+nothing = lambda _site: "nothing"
+steps.STEPS["cable"] = steps.Step("cables", "star", nothing, (), 1.0, cable)
 main(["commission", *sys.argv[1:]])
 """
 ASKS = "Go? (yes, no, skip)"
@@ -152,3 +159,13 @@ def test_a_failed_step_is_repeated_by_the_next_call_and_another_one_by_its_name(
         "right.two": "skipped",
         "right.three": "failed",
     }
+
+
+def test_a_cable_is_taken_off_and_put_on_again_by_a_person(at_terminal, tmp_path):
+    terminal = at_terminal("--only", "cable")
+    terminal.answer("yes")
+    terminal.answer("", "Take off the camera's cable, then press Enter")
+    terminal.answer("", "Put the camera's cable on again, then press Enter")
+    assert terminal.end() == 0
+    assert "it came back" in terminal.text
+    assert tasks(tmp_path) == {"right.cable": "passed"}
