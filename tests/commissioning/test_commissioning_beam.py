@@ -4,15 +4,18 @@ import itertools
 
 import numpy as np
 import pytest
-from commissioning.motor_bench import site_of
+from commissioning.motor_bench import BenchAmplifiers, site_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.commissioning.beam import _collector_outcome, _photodiodes_outcome
+from fitctl.clock import VirtualClock
+from fitctl.commissioning import beam, motors
+from fitctl.commissioning.beam import _collector_outcome, _photodiodes_outcome, check_photodiodes
 from fitctl.commissioning.outcome import StepError
 from fitctl.config import default_rig_path, load_rig
+from fitctl.drivers.interface import DiodeReading
 from fitctl.model.metrology.geometry import transverse_axes
-from fitctl.model.optics import rotation
+from fitctl.model.optics import motor_sky_rad_per_rad, rotation
 
 RIG = load_rig(default_rig_path().with_name("fit-testbed.toml"))
 OFFSET_M = RIG.metrology_loops["metrology"].sensor.diode_offset_m
@@ -62,3 +65,61 @@ def test_a_turned_hexapod_gets_its_link_azimuth(turned_deg, scale):
 def test_a_hexapod_that_moves_the_beam_otherwise_is_named(seen):
     with pytest.raises(StepError, match="hexapod"):
         _collector_outcome(RIG.collector, seen)
+
+
+class BeamDiodes:
+    """A Gaussian beam on four photodiodes, moved by a bench's motors; `order` is how they are connected."""
+
+    def __init__(self, bench, start_m, order, light=1.0):
+        self.bench, self.start_m, self.order, self.light = bench, np.array(start_m), order, light
+        self.sensor = RIG.metrology_loops["metrology"].sensor
+        self.m_per_rad = self.sensor.link_length_m * motor_sky_rad_per_rad(
+            RIG.loops["metrology"].siderostat
+        )
+
+    def open(self):
+        pass
+
+    def close(self):
+        pass
+
+    def send_request(self):
+        pass
+
+    def receive(self):
+        self.bench.clock.sleep_until(self.bench.clock.now_s() + 1e-3)
+        at_m = self.start_m + self.m_per_rad * self.bench.motor_rad
+        apart_m = np.linalg.norm(CORNERS_M - at_m, axis=1)
+        on_a_diode = self.sensor.on_axis_v * np.exp(2 * (OFFSET_M / self.sensor.beam_radius_m) ** 2)
+        lights = self.light * on_a_diode * np.exp(-2 * (apart_m / self.sensor.beam_radius_m) ** 2)
+        volts = np.empty(4)
+        volts[list(self.order)] = lights
+        return DiodeReading(self.bench.clock.now_s(), tuple(volts + self.sensor.ambient_v))
+
+
+@pytest.fixture
+def step(monkeypatch):
+    def run(start_m, order=(0, 1, 2, 3), light=1.0):
+        clock = VirtualClock()
+        bench = BenchAmplifiers(clock)
+        monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
+        diodes = BeamDiodes(bench, start_m, order, light)
+        monkeypatch.setattr(beam, "PHOTODIODES", {"labjack_t7": lambda _device: diodes})
+        return bench, check_photodiodes(site_of(RIG, clock, "metrology"))
+
+    return run
+
+
+@pytest.mark.parametrize("start_m", [(0.0, 0.0), (0.03, -0.02), (-0.03, 0.03)])
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 3, 0, 1), (1, 2, 3, 0)])
+def test_the_beam_is_brought_to_the_middle_and_each_photodiode_is_found(step, start_m, order):
+    bench, outcome = step(start_m, order)
+    device = outcome.found.get("loops", {}).get("metrology", {}).get("sensor", {}).get("device", {})
+    assert device.get("inputs", [0, 1, 2, 3]) == list(order)
+    assert outcome.figures["offset_over_expected"] == pytest.approx(1.0, abs=0.02)
+    assert not bench.powered
+
+
+def test_without_light_the_step_ends(step):
+    with pytest.raises(StepError, match="no photodiode has light"):
+        step((0.0, 0.0), light=0.0)
