@@ -290,7 +290,7 @@ def _optics(name, *wrong, step="siderostat", **expected):
 
 def _siderostat(rig, back_end):
     def entry(name, *wrong, **expected):
-        return _optics(f"{name} ({back_end})", *wrong, rig=rig, **expected)
+        return _optics(f"{name}{back_end}", *wrong, rig=rig, **expected)
 
     yield entry("siderostat axes exchanged", *wired(axes=(1, 0)), found={f"{WIRING}.axes": [1, 0]})
     yield entry(
@@ -325,9 +325,9 @@ def _siderostat(rig, back_end):
 STOPS = {CIA402: "does not follow", BAL: "does not follow", ENSEMBLE: "fault"}
 OPTICS = [
     _optics("nothing", step="mirror"),
-    *_siderostat(CIA402, "CiA 402"),
-    *_siderostat(ENSEMBLE, "Ensemble"),
-    *_siderostat(BAL, "analogue"),
+    *_siderostat(CIA402, ""),
+    *_siderostat(ENSEMBLE, " (Ensemble)"),
+    *_siderostat(BAL, " (analogue)"),
     _optics(
         "elevation encoder alone reversed",
         *wired(encoder=(1, -1)),
