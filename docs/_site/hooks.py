@@ -20,9 +20,16 @@ ROOT = Path(__file__).parents[2]
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "RELEASING.md")
 MODULES = ROOT / "requirements" / "site" / "node_modules"
 MERMAID = "assets/mermaid.js"
-SCRIPTS = {  # which the theme would have from elsewhere
+STIX = "stix-two-math"
+ASSETS = {  # which the theme would have from elsewhere, or does not have
     MERMAID: MODULES / "@mermaid-js" / "tiny" / "dist" / "mermaid.tiny.js",
     "assets/iframe-worker.js": MODULES / "iframe-worker" / "shim" / "index.js",
+    "assets/site.css": Path(__file__).with_name("site.css"),
+    f"assets/{STIX}.woff2": MODULES
+    / "@fontsource"
+    / STIX
+    / "files"
+    / f"{STIX}-latin-400-normal.woff2",
 }
 
 
@@ -33,7 +40,7 @@ def on_files(files: Files, config: Any) -> Files:
         files.append(File.generated(config, name, content=text.replace("](docs/", "](")))
     for name, make in reference.PAGES.items():
         files.append(File.generated(config, name, content=make()))
-    for name, path in SCRIPTS.items():
+    for name, path in ASSETS.items():
         if not path.exists():
             msg = f"{path} is missing: build the site by `make docs`, which has npm get it"
             raise PluginError(msg)
@@ -72,4 +79,4 @@ def _inline(found: re.Match[str]) -> str:
 
 
 def _block(found: re.Match[str]) -> str:
-    return convert(html.unescape(found[1]), display="block")
+    return f'<div class="formula">{convert(html.unescape(found[1]), display="block")}</div>'
