@@ -35,6 +35,15 @@ def test_the_command_line_has_every_command_and_no_hidden_one(reference):
     assert titles == {name for name, command in COMMANDS.items() if command.summary}
 
 
+def test_examples_of_commands_are_blocks_a_line_each(reference):
+    page = reference.command_line()
+
+    assert "\b" not in page
+    for examples in re.findall(r"\*\*Examples\*\*:\n\n```console\n(.+?)```", page, re.DOTALL):
+        assert all(line.startswith("fitctl ") for line in examples.splitlines()), examples
+    assert "**Examples**:\n\n```console\nfitctl demo\n" in page
+
+
 def test_every_key_of_the_shipped_rig_has_a_row_with_what_is_allowed(reference):
     page = reference.rig_keys()
     sections = re.split(r"^## (\S+).*\n", page, flags=re.MULTILINE)[1:]

@@ -57,7 +57,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Set formulas as MathML, which browsers draw by themselves."""
+    """Set formulas as MathML, which browsers draw by themselves; take the roles of docstrings away."""
+    content = re.sub(r":(?:meth|class|func|attr|data|mod|exc):(?=<code>)", "", content)
     content = re.sub(
         r'<span class="arithmatex">\\\((.*?)\\\)</span>', _inline, content, flags=re.DOTALL
     )

@@ -37,7 +37,13 @@ def command_line() -> str:
     group.commands = {name: load_command(name) for name, each in COMMANDS.items() if each.summary}
     _not_cut_short(group)
     text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="fitctl")
+    text = re.sub(r"\x08\nExamples:\n((?:  .+\n)+)", _as_block, text)
     return text.replace("# `fitctl`\n", "# Command line\n", 1)
+
+
+def _as_block(found: re.Match[str]) -> str:
+    """Examples, which a terminal shows as they stand, as a block of commands."""
+    return f"**Examples**:\n\n```console\n{inspect.cleandoc('  ' + found[1].strip())}\n```\n"
 
 
 def _not_cut_short(group: Any) -> None:
