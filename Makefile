@@ -180,6 +180,9 @@ docs: $(READY)  ## The documentation as a site, dist/docs/index.html (needs npm)
 pictures: $(READY)  ## Draw the schematics of the documents anew, docs/pictures/*.svg
 	@$(BIN)/python docs/pictures/draw.py
 
+moving-picture: $(READY)  ## Record the console for the README, docs/pictures/console-moving.gif (needs Chromium)
+	@$(BIN)/python docs/pictures/take_moving.py
+
 dist: $(READY)  ## Wheel and sdist, into dist/
 	$(BIN)/python -m hatchling build -d dist
 

@@ -1,4 +1,4 @@
-"""Take the README's picture: the real console on the real mock instrument, half a minute after the start."""
+"""Take the picture of the console: the real one on the real mock instrument, half a minute after the start."""
 
 import asyncio
 import time
