@@ -63,10 +63,10 @@ def rig_keys() -> str:
     document = tomlkit.parse(default_rig_path().read_text(encoding="utf-8"))
     parts = [
         "# Rig keys",
-        "Every key of a rig file, with its value in the shipped `fit-mock.toml` and what is allowed. A table "
-        "that is named optional may be left out; `plant` and `mocks` are for mocks and simulation alone. What "
-        "only `fit-testbed.toml` has, with several loops and a collector, follows at the end. The "
-        "other siderostats have keys of their own: [Ensemble](../devices/ensemble.md), [analogue "
+        "This page lists every key of a rig file, with its value in the shipped `fit-mock.toml` and the "
+        "allowed values. You can omit a table that is marked optional. Only mocks and simulation use `plant` "
+        "and `mocks`. The keys that only `fit-testbed.toml` has, with several loops and a collector, are at "
+        "the end. Other amplifiers have keys of their own: [Ensemble](../devices/ensemble.md), [analogue "
         "amplifiers](../devices/bal-analog.md).",
     ]
     head = ["key", "shipped", "allowed", "what it is"]
@@ -180,9 +180,9 @@ def commands() -> str:
     """Every command of the service's schema, with its fields."""
     parts = [
         "# Commands of the service",
-        "What a client may send to a supervisor: msgpack, made by `msgspec` from the structs of "
-        "`fitctl.messages.commands`. Each has `version` and `loop` (empty for all loops). Unknown fields are "
-        "refused. `fitctl send` and the console give those that people need.",
+        "A client sends these commands to a supervisor as msgpack, encoded by `msgspec` from the structs of "
+        "`fitctl.messages.commands`. Each has `version` and `loop` (empty for all loops). The supervisor "
+        "rejects unknown fields. `fitctl send` and the console offer the commands that people need.",
     ]
     for kind in sorted(get_args(AnyCommand), key=lambda kind: kind.__name__):
         parts += [f"## {kind.__name__}", _plain(kind)]
@@ -239,8 +239,8 @@ def _first_paragraph(text: str | None) -> str:
 
 PYTHON = """# Python
 
-What scripts import. [Sequences](../sequences.md) shows how they are used, and [logs](../logs.md) how logs
-are read.
+This page lists what scripts import. [Sequences](../sequences.md#from-python) has examples, and [logs](../logs.md) explains how to read
+logs.
 
 ## Instrument
 
