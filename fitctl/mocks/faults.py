@@ -36,13 +36,15 @@ class FaultKind(NamedTuple):
 
 WIRE_FAULTS = {
     "drop": FaultKind("what the device sends is lost"),
-    "delay": FaultKind("what the device sends comes later", "s", 0.1),
-    "corrupt": FaultKind("one bit of what the device sends is turned"),
-    "duplicate": FaultKind("what the device sends comes twice"),
-    "reorder": FaultKind("what the device sends comes after what it sends next"),
+    "delay": FaultKind("what the device sends arrives later", "s", 0.1),
+    "corrupt": FaultKind("one bit of what the device sends is flipped"),
+    "duplicate": FaultKind("what the device sends arrives twice"),
+    "reorder": FaultKind("what the device sends arrives after its next message"),
     "disconnect": FaultKind("connections are cut and none is accepted"),
-    "freeze": FaultKind("connections stay, but nothing that comes is taken and nothing is sent"),
-    "reboot": FaultKind("power is cycled: away for that long, then as at power-up", "s", 2.0),
+    "freeze": FaultKind("connections stay open, but the device reads and sends nothing"),
+    "reboot": FaultKind(
+        "power is cycled: the device is off for this long, then as at power-up", "s", 2.0
+    ),
 }
 """Every device has these; each takes effect message by message with the fault's probability."""
 

@@ -13,9 +13,9 @@ AXES = ("az", "el")
 
 AXIS_FAULTS = {
     "amplifier_fault": FaultKind(
-        "an amplifier is in fault; when this has ended, until it is reset", parts=AXES
+        "an amplifier is in fault, after the end of the fault until it is reset", parts=AXES
     ),
-    "encoder_jump": FaultKind("an encoder counts that much more", "counts", 1000, AXES),
+    "encoder_jump": FaultKind("an encoder counts this much more", "counts", 1000, AXES),
     "stuck_axis": FaultKind("a motor does not turn, whatever its amplifier does", parts=AXES),
 }
 

@@ -23,7 +23,7 @@ FAULTS = (
     | AXIS_FAULTS
     | {
         "command_offset": FaultKind(
-            "an amplifier sees this much more than it is given", "V", 0.05, AXES
+            "an amplifier receives this much more than its command", "V", 0.05, AXES
         ),
     }
 )

@@ -16,7 +16,7 @@ from fitctl.mocks.tcp import Link, TcpServer
 from fitctl.model.hexapod_motion import Floats
 
 FAULTS = WIRE_FAULTS | {
-    "silent": FaultKind("commands are obeyed and not answered: the line back is broken"),
+    "silent": FaultKind("commands are carried out and not answered: the line back is broken"),
     "moves_stopped": FaultKind("every move is stopped at once, as by another client's STP"),
     "servo_off": FaultKind("the servos are off, and cannot be switched on"),
     "motion_error": FaultKind(
@@ -24,9 +24,9 @@ FAULTS = WIRE_FAULTS | {
     ),
     "stuck": FaultKind("moves are accepted and the platform does not move"),
     "wrong_axis": FaultKind("X and Y are exchanged in every move"),
-    "position_offset": FaultKind("X is reported too large by this", "mm", 1.0),
-    "false_error": FaultKind("ERR? answers this, whatever happened", "error number", 1024.0),
-    "reference_lost": FaultKind("no axis is referenced any more"),
+    "position_offset": FaultKind("the reported X is too large by this", "mm", 1.0),
+    "false_error": FaultKind("ERR? answers this number, whatever happened", "error number", 1024.0),
+    "reference_lost": FaultKind("all axes lose their reference"),
     "emergency_stop": FaultKind(
         "the emergency stop is pressed: motions end, the servos are off until it is released and they"
         " are switched on"

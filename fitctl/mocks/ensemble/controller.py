@@ -28,7 +28,7 @@ FAULTS = (
     | AXIS_FAULTS
     | {
         "following_error": FaultKind(
-            "an axis is in position error; when this has ended, until it is acknowledged",
+            "an axis is in position error, after the end of the fault until it is acknowledged",
             parts=AXES,
         )
     }

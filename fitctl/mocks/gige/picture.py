@@ -17,14 +17,14 @@ _HALVING_MIN_S = 1e-3
 HOT_PIXEL = (0.25, 0.75)  # its place on the sensor, across and down, in parts of its size
 
 PICTURE_FAULTS = {
-    "star_fading": FaultKind("starlight halves, again and again, each time within this", "s", 1.0),
-    "star_dim": FaultKind("this part of the starlight is left", "of its light", 0.7),
-    "dark_half": FaultKind("no light comes to one half of the sensor", parts=("left", "right")),
-    "star_jump": FaultKind("the whole picture is displaced by this, along both axes", "px", 4.0),
-    "star_double": FaultKind("all light is there once more, this far off along az", "px", 8.0),
-    "background_jump": FaultKind("every pixel reads more by this", "DN", 2000.0),
-    "hot_pixel": FaultKind("one pixel reads more by this", "DN", 20000.0),
-    "saturation": FaultKind("no pixel reads more than this", "DN", 3000.0),
+    "star_fading": FaultKind("starlight halves again and again, with this half-life", "s", 1.0),
+    "star_dim": FaultKind("only this part of the starlight remains", "of its light", 0.7),
+    "dark_half": FaultKind("one half of the sensor gets no light", parts=("left", "right")),
+    "star_jump": FaultKind("the whole picture moves by this along both axes", "px", 4.0),
+    "star_double": FaultKind("all light appears a second time, this far away along az", "px", 8.0),
+    "background_jump": FaultKind("every pixel reads this much more", "DN", 2000.0),
+    "hot_pixel": FaultKind("one pixel reads this much more", "DN", 20000.0),
+    "saturation": FaultKind("no pixel exceeds this value", "DN", 3000.0),
 }
 
 

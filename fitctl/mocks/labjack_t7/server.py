@@ -22,14 +22,16 @@ _PAIRS = {"az": (0, 1), "el": (2, 3)}  # of the photodiodes az+, az-, el+, el-
 FAULTS = WIRE_FAULTS | {
     "exception": FaultKind("every request is refused with this exception", "exception code", 4.0),
     "not_a_number": FaultKind("an input reads NaN", parts=_PARTS),
-    "wrong_value": FaultKind("an input reads this, whatever its voltage", "V", -9999.0, _PARTS),
+    "wrong_value": FaultKind(
+        "an input reads this value, whatever its voltage", "V", -9999.0, _PARTS
+    ),
     "stuck_input": FaultKind("an input keeps the reading that it has", parts=_PARTS),
     "offset_drift": FaultKind("an input's offset grows", "V/s", 0.01, _PARTS),
-    "noise": FaultKind("an input has this noise more, RMS", "V", 0.05, _PARTS),
+    "noise": FaultKind("an input has this much additional noise, RMS", "V", 0.05, _PARTS),
     "unplugged": FaultKind("nothing is connected to an input: it reads about 0 V", parts=_PARTS),
     "swapped": FaultKind("the two photodiodes of an axis are exchanged", parts=tuple(_PAIRS)),
     "range_changed": FaultKind("another client sets this range of all inputs", "V", 1.0),
-    "laser_dim": FaultKind("this part of the laser's light is left", "of its light", 0.0),
+    "laser_dim": FaultKind("only this part of the laser's light remains", "of its light", 0.0),
 }
 _READING = {protocol.READ_HOLDING_REGISTERS, protocol.READ_INPUT_REGISTERS}
 _ADDRESS_AND_COUNT = struct.Struct(">HH")

@@ -16,10 +16,10 @@ from fitctl.mocks.mdt693.line import CommandSplitter, Sender, write_to
 from fitctl.mocks.pty import Endpoints, Pty
 
 FAULTS = WIRE_FAULTS | {
-    "silent": FaultKind("commands are obeyed and not answered: the line back is broken"),
+    "silent": FaultKind("commands are carried out and not answered: the line back is broken"),
     "limit_switch": FaultKind("the voltage-limit switch is moved", "V", 75.0),
     "saturated_stack": FaultKind(
-        "an output stays at its highest voltage, whatever it is told", parts=tuple(CHANNELS)
+        "an output stays at its highest voltage, whatever the command", parts=tuple(CHANNELS)
     ),
 }
 
