@@ -102,12 +102,12 @@ WATCHED = (
 USABLE = {
     "OFF": ["Standby"],
     "STANDBY": ["Acquire", "Off"],
-    "ACQUISITION": ["Acquire", "Hold"],
-    "COARSE": ["Hold"],
-    "VERNIER": ["Hold"],
+    "ACQUISITION": ["Acquire", "Release"],
+    "COARSE": ["Release"],
+    "VERNIER": ["Release"],
     "SAFE": ["Recover", "Off"],
-    "EXPERIMENT": ["Hold"],
-    "LOCKED": ["Hold"],
+    "EXPERIMENT": ["Release"],
+    "LOCKED": ["Release"],
 }
 
 

@@ -11,10 +11,10 @@ from fitctl.logging.records import StarPlace
 from fitctl.messages.commands import (
     Acquire,
     Experiment,
-    Hold,
     Look,
     Off,
     Recover,
+    Release,
     Reset,
     SetBiasOffset,
     SetController,
@@ -60,7 +60,7 @@ def every_command(simulation):
     simulation.run(1.0)
     simulation.command(SetController(name="minimum-variance"))
     simulation.run(1.0)
-    for command in (Hold(), Acquire(), Stop(), Recover(), Acquire(), Stop()):
+    for command in (Release(), Acquire(), Stop(), Recover(), Acquire(), Stop()):
         simulation.command(command)
         simulation.run(0.7)
     simulation.command(Off())
@@ -252,7 +252,7 @@ def two_loops():
 INTERLOCKS = [
     "interlocks.disk_space.action=flatten",
     "interlocks.recorder_behind={ quantity = 'recorder_backlog_fraction', high = 0.5, for_s = 0.0, "
-    "modes = ['VERNIER'], action = 'hold', reset = 'hand' }",
+    "modes = ['VERNIER'], action = 'freeze', reset = 'hand' }",
     "interlocks.clock={ quantity = 'clock_step_s', high = 1.0, for_s = 0.1, modes = ['VERNIER'], "
     "action = 'safe', reset = 'hand' }",
 ]
@@ -263,8 +263,8 @@ MOVING = [
     "plant.loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}",
 ]
 COURSES = {
-    "every command": (every_command, [], {"HOLD", "STOP", "RECOVER", "OFF", "IN_REACH"}),
-    "a star that moves": (every_command, MOVING, {"HOLD", "STOP", "RECOVER", "IN_REACH"}),
+    "every command": (every_command, [], {"RELEASE", "STOP", "RECOVER", "OFF", "IN_REACH"}),
+    "a star that moves": (every_command, MOVING, {"RELEASE", "STOP", "RECOVER", "IN_REACH"}),
     "experiments on a star that moves": (an_experiment, MOVING, {"EXPERIMENT", "EXPERIMENT_DONE"}),
     "another star": (another_star, [TWO_STARS], {"IN_REACH"}),
     "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),

@@ -148,6 +148,29 @@ def test_the_command_prints_json_and_what_is_left_to_correct(old, capsys):
     assert len(printed["problems"]) == 1
 
 
+def test_an_action_of_another_name_is_refused_with_the_new_one_and_upgraded(tmp_path):
+    mine = tmp_path / "mine.toml"
+    text = SHIPPED.read_text().replace('action = "freeze"', 'action = "hold"  # until it comes')
+    mine.write_text(text)
+
+    with pytest.raises(ConfigError, match=r"interlocks\.frame_age\.action: .*; hold is now freeze"):
+        load_rig(mine)
+    done = upgrade(mine)
+    assert [change.key for change in done.changes if "action" in change.key] == [
+        "interlocks.frame_age.action"
+    ]
+    assert 'action = "freeze"' in done.text
+    assert "# until it comes" in done.text
+    assert not done.problems
+
+
+def test_a_log_of_an_older_version_has_its_actions_by_their_old_names():
+    document = json.loads(load_rig(SHIPPED).model_dump_json()) | {"schema_version": 1}
+    document["interlocks"]["frame_age"]["action"] = "hold"
+
+    assert rig_from_log(json.dumps(document), "a log").interlocks["frame_age"].action == "freeze"
+
+
 def test_a_file_of_this_version_needs_no_upgrade(capsys):
     assert run(SHIPPED) == 2
     assert "needs no upgrade" in capsys.readouterr().err

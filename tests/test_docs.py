@@ -179,6 +179,9 @@ def supply(folder, words):
             shutil.copy(folder / "rigs" / "fit-mock.toml", path)
         elif word == "first.toml":
             path.write_text(sequence.text)
+        elif word == "my_integrator.py":
+            (code,) = (each.text for each in blocks("python") if "def design" in each.text)
+            path.write_text(code)
 
 
 # ---------------------------------------------------------------- commands

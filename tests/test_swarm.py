@@ -20,7 +20,7 @@ from benchmarks.swarm.threads import (
     VirtualThreading,
     VirtualTime,
 )
-from fitctl.messages.commands import Hold, Recover, Stop
+from fitctl.messages.commands import Recover, Release, Stop
 
 DIGEST = """
 import msgspec
@@ -75,7 +75,7 @@ def test_a_defect_of_the_past_that_is_put_back_is_found():
 
 @pytest.mark.long
 def test_a_plan_is_shrunk_to_what_violates():
-    idle = [Order(at_s=0.01 * number, who="ada", command=Hold()) for number in range(6, 9)]
+    idle = [Order(at_s=0.01 * number, who="ada", command=Release()) for number in range(6, 9)]
     plan = msgspec.structs.replace(OVERTAKEN, happenings=[*idle, *OVERTAKEN.happenings])
 
     with put_back("stop-while-opening"):
@@ -201,11 +201,11 @@ def test_the_command_prints_one_object_and_ends_well_where_nothing_is_violated()
 def test_happenings_within_a_second_have_met():
     orders = [
         Order(at_s=at_s, who="ada", command=command)
-        for at_s, command in ((1.0, Stop()), (1.9, Hold()), (2.5, Recover()))
+        for at_s, command in ((1.0, Stop()), (1.9, Release()), (2.5, Recover()))
     ]
     plan = msgspec.structs.replace(OVERTAKEN, happenings=orders)
 
-    assert list(met(plan)) == [("Hold", "Stop"), ("Hold", "Recover")]
+    assert list(met(plan)) == [("Release", "Stop"), ("Release", "Recover")]
 
 
 def test_a_machine_that_stands_still_holds_every_thread_and_no_device(time):

@@ -35,8 +35,8 @@ STEPS: dict[str, Callable[[], steps.Step]] = {
     "acquire": steps.Acquire,
     "hold": lambda: steps.Hold(duration_s=5.0, settle_s=1.0, attempts=2),
     "wait": lambda: steps.Wait(duration_s=3.0),
-    "jog": lambda: steps.Jog(dwell_s=3.0, steady_after_s=1.0),
-    "target": lambda: steps.Target(
+    "dither": lambda: steps.Dither(dwell_s=3.0, steady_after_s=1.0),
+    "offset": lambda: steps.Offset(
         offset_az_px=0.5, offset_el_px=-0.5, dwell_s=3.0, steady_after_s=1.0
     ),
     "off": steps.Off,

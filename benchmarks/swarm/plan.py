@@ -12,12 +12,12 @@ from benchmarks.swarm.lines import FAULTS, drawn_slowness
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
-    Hold,
     Jog,
     Look,
     MoveCollector,
     Off,
     Recover,
+    Release,
     Reset,
     SequenceControl,
     SetBiasOffset,
@@ -59,7 +59,7 @@ OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # so many commands name one
 _WITHOUT_FAULTS = 0.15  # so many runs have none of a device
 _CONSOLE_SLOW = 0.2  # so many runs have a console that misses messages
-_STEPS = ("standby", "acquire", "acquire", "hold", "wait", "jog", "target", "off")
+_STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
 _REPEATED, _REPEATED_S = 0.1, 0.02  # so many commands come again so soon: a key that is held
 _BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
 
@@ -214,7 +214,7 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "recover": lambda _: Recover(),
     "standby": lambda _: Standby(),
     "acquire": lambda _: Acquire(),
-    "hold": lambda _: Hold(),
+    "release": lambda _: Release(),
     "status": lambda _: Status(),
     "take-over": lambda _: TakeOver(),
     "target": lambda random: SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30)),
@@ -223,7 +223,7 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     ),
     "controller": lambda random: SetController(name=random.choice(("eq20", "minimum-variance"))),
     "sequence-control": lambda random: SequenceControl(
-        action=random.choice(("pause", "resume", "stop"))
+        action=random.choice(("pause", "resume", "end"))
     ),
     "reset": lambda _: Reset(name="dac_watchdog"),
     "look": lambda random: Look(az_px=random.uniform(5, 35), el_px=random.uniform(5, 35)),

@@ -239,8 +239,8 @@ def _first_paragraph(text: str | None) -> str:
 
 PYTHON = """# Python
 
-This page lists what scripts import. [Sequences](../sequences.md#from-python) has examples, and [logs](../logs.md) explains how to read
-logs.
+This page lists what scripts import. [Sequences](../sequences.md#from-python) has examples, and
+[logs](../logs.md) explains how to read logs.
 
 ## Instrument
 

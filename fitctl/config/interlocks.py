@@ -11,7 +11,9 @@ from fitctl.config.base import Finite, NonNegative, Positive, Settings, require_
 ModeName = Literal[
     "OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE", "EXPERIMENT", "LOCKED"
 ]
-Action = Literal["warn", "hold", "flatten", "safe"]
+RENAMED_ACTIONS = {"hold": "freeze"}
+"""Actions of an older fitctl, which are refused with the name of today."""
+Action = Literal["warn", "freeze", "flatten", "safe"]
 ResetBy = Literal["hand", "itself"]
 
 
@@ -175,7 +177,7 @@ class Interlock(Settings):
     @classmethod
     def _measured(cls, name: str) -> str:
         if name not in QUANTITIES:
-            msg = f"nobody measures that; there are {', '.join(QUANTITIES)}"
+            msg = f"unknown quantity; available: {', '.join(QUANTITIES)}"
             raise ValueError(msg)
         return name
 

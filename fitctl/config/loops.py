@@ -101,8 +101,11 @@ class Vernier(Settings):
     @field_validator("controller")
     @classmethod
     def _known(cls, name: str) -> str:
-        if name not in CONTROLLERS and not name.endswith(".json"):
-            msg = f"must be one of {', '.join(CONTROLLERS)}, or a file *.json that `fitctl design` saved"
+        if name not in CONTROLLERS and not name.endswith((".json", ".py")):
+            msg = (
+                f"must be one of {', '.join(CONTROLLERS)}, a file *.json that `fitctl design` saved, or a "
+                "Python file *.py of your own"
+            )
             raise ValueError(msg)
         return name
 

@@ -15,6 +15,8 @@ from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings
 from fitctl.config.checks import rig_conflicts
 from fitctl.config.conflict import Conflict, Conflicts
 from fitctl.config.devices import DEVICE_BY_TAG, DEVICE_TABLES
+from fitctl.config.interlocks import RENAMED_ACTIONS
+from fitctl.config.loops import CONTROLLERS
 from fitctl.config.origins import Layer, Marks, changed_by, layer_of, lies_on, mark_layer
 from fitctl.config.rig import SCHEMA_VERSION, Rig
 from fitctl.text import plain
@@ -212,8 +214,9 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
 
     Contradictions between its tables do not count: the rig has run, and its devices are not opened again.
 
-    Anyone may have written the log, so no text in it becomes a path: the dark frame's file is left out, and a
-    controller from a file is missing unless an override names one.
+    Anyone may have written the log, so no text in it becomes a path, above all not one of Python to run: the
+    dark frame's file is left out, and so is a controller that is none of `CONTROLLERS`, unless an override
+    names one.
 
     Parameters
     ----------
@@ -255,10 +258,22 @@ def _rig_in_log(text: str, origin: str, overrides: Sequence[str]) -> Rig:
     if document.get("schema_version") in range(1, SCHEMA_VERSION):
         # No file that could be upgraded: it is read as it is, and refused by the keys that it lacks.
         document["schema_version"] = SCHEMA_VERSION
+        for _, row in old_actions(document):
+            row["action"] = RENAMED_ACTIONS[row["action"]]
     laid = _marked(document, origin)
     for depth, override in enumerate(overrides, start=1):
         _override(laid, override, depth)
     return _valid(laid, origin)
+
+
+def old_actions(document: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """The interlocks of a rig whose action has another name today, by name."""
+    rows = document.get("interlocks")
+    return [
+        (name, row)
+        for name, row in (rows.items() if isinstance(rows, dict) else ())
+        if isinstance(row, dict) and row.get("action") in RENAMED_ACTIONS
+    ]
 
 
 def _files_of(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
@@ -270,7 +285,7 @@ def _files_of(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
     loops = document.get("loops")
     for loop in loops.values() if isinstance(loops, dict) else ():
         vernier = loop.get("vernier") if isinstance(loop, dict) else None
-        if isinstance(vernier, dict) and str(vernier.get("controller", "")).endswith(".json"):
+        if isinstance(vernier, dict) and vernier.get("controller", "") not in (*CONTROLLERS, ""):
             found.append((vernier, "controller"))
     return found
 
@@ -345,7 +360,9 @@ def _said(problem: Any, location: list[str], *, missing: bool) -> str:
     message = message.removeprefix("Value error, ").replace("Input should be", "must be")
     given = problem.get("input")
     is_value = isinstance(given, str | int | float | list)
-    return f"{message} (is {given!r})" if is_value else message
+    now = RENAMED_ACTIONS.get(str(given)) if location[-1:] == ["action"] else None
+    hint = f"; {given} is now {now}" if now else ""
+    return f"{message} (is {given!r}){hint}" if is_value else message
 
 
 def _blamed(laid: LaidOver, origin: str, conflicts: Sequence[Conflict], under: str) -> list[str]:

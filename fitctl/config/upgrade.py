@@ -12,11 +12,13 @@ from pydantic import ValidationError
 from tomlkit.exceptions import ParseError
 
 from fitctl.config.base import ConfigError
-from fitctl.config.commented import dump_commented, parse_commented
+from fitctl.config.commented import dump_commented, parse_commented, set_value
+from fitctl.config.interlocks import RENAMED_ACTIONS
 from fitctl.config.origins import default_rig_path, layer_of
 from fitctl.config.reading import (
     LaidOver,
     lay_parts,
+    old_actions,
     read_text,
     rig_from_parts,
     without_tags,
@@ -96,6 +98,10 @@ def upgrade(path: Path) -> Upgrade:
     moved = {new: _taken(document, old) for old, new in _MOVED.items() if _holds(document, old)}
     if _VERSION in document:
         document[_VERSION] = SCHEMA_VERSION
+    for name, row in old_actions(document):
+        was = str(row["action"])
+        set_value(row, "action", RENAMED_ACTIONS[was])
+        changes.append(Change(f"interlocks.{name}.action", _shown(row["action"]), f'"{was}"'))
     shipped = parse_commented(default_rig_path().read_text(encoding="utf-8"))
     for _ in range(_MOST_ROUNDS):
         added = [_add(document, shipped, key) for key in _missing(_laid(path, document))]
@@ -113,7 +119,8 @@ def _insist_on_old(path: Path, document: tomlkit.TOMLDocument) -> None:
     laid = _laid(path, document)
     version = laid.document.get(_VERSION)
     layer = layer_of(laid.marks, [_VERSION])
-    if version == SCHEMA_VERSION and not any(_holds(document, old) for old in _MOVED):
+    has_old = any(_holds(document, old) for old in _MOVED) or old_actions(document)
+    if version == SCHEMA_VERSION and not has_old:
         msg = f"{path}: has {_VERSION} {SCHEMA_VERSION} and needs no upgrade"
         raise ConfigError(msg)
     if version not in range(1, SCHEMA_VERSION + 1):

@@ -47,7 +47,7 @@ class Design:
     Attributes
     ----------
     name : str
-        eq20, lqg-ltr, minimum-variance or fslq.
+        eq20, lqg-ltr, minimum-variance, fslq, or that of a file of the user's.
     period_s, delay_s : float
         Of the loop that it was made for: frame period, and mid-exposure to command.
     a, b, c, d : arrays, shapes (n, n), (n, 5), (2, n), (2, 5)
@@ -59,6 +59,9 @@ class Design:
         The file that it was read from, absolute; empty when it was made from the rig's values.
     learnt : bool
         Made for a night that was learnt from a loop's own frames.
+    own : bool
+        Made by a Python file of the user's (:mod:`fitctl.controllers.design.own`): its matrices are all that
+        there is to it.
     """
 
     name: str
@@ -72,6 +75,7 @@ class Design:
     parameters: dict[str, Any] = field(repr=False)
     file: str = ""
     learnt: bool = False
+    own: bool = False
 
     @property
     def title(self) -> str:

@@ -66,7 +66,7 @@ _LEFT = (COMMAND_SOCKET, TELEMETRY_SOCKET, RECORDS_SOCKET, GATEWAY_SOCKET, RUNNI
 _GATEWAY_PATIENCE_S = 2.0  # without it nobody elsewhere can give a stop
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
-_DEAF = "the service thread has died, nobody could stop us any more; see the traceback above"
+_DEAF = "the service thread has died, so no command could stop the rig any more; see the traceback above"
 _VERSIONED = (
     "fitctl",
     "numpy",

@@ -13,7 +13,7 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.logging.folder import log_name
 from fitctl.logging.records import AnyRecord
 from fitctl.messages.client import Client
-from fitctl.messages.commands import AnyCommand, Experiment, Hold, Status
+from fitctl.messages.commands import AnyCommand, Experiment, Release, Status
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.model.drives import Drive, experiment_s
@@ -92,7 +92,7 @@ def on_rig(
     try:
         telemetry = _followed(client, loop_name, experiment_s(drives), on_progress, paths)
     except KeyboardInterrupt:
-        client.send(Hold(loop=loop_name))  # nobody waits for it any more
+        client.send(Release(loop=loop_name))  # nobody waits for it any more
         raise
     change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
     _require_end(_mode(telemetry, loop_name), change.reason if change else "")

@@ -13,7 +13,7 @@ from fitctl.messages.telemetry import TrippedInterlock, Watched
 Reading = tuple[float, float, str]
 """A value, when it was measured, in s, and what there is to say about it, if it is an error's."""
 
-_STRENGTH: dict[Action, int] = {"warn": 0, "hold": 1, "flatten": 2, "safe": 3}
+_STRENGTH: dict[Action, int] = {"warn": 0, "freeze": 1, "flatten": 2, "safe": 3}
 _ROUNDING_S = 1e-9
 
 

@@ -186,7 +186,7 @@ class Loop(ABC):
         reason = next(trip.reason for trip in self.interlocks.tripped if trip.action == action)
         if action == "safe" and self.mode is not Mode.SAFE:
             self.fire(Trigger.FAULT, reason)
-        elif action in {"hold", "flatten"} and self.mode is Mode.EXPERIMENT:
+        elif action in {"freeze", "flatten"} and self.mode is Mode.EXPERIMENT:
             self.fire(Trigger.EXPERIMENT_DONE, reason)
 
     def reset_interlock(self, name: str) -> str:
@@ -235,7 +235,9 @@ class Loop(ABC):
             link_el_rad=link_el_rad,
         )
         if source is not self.mode or self.last_change is None:
-            self.last_change = change  # a STOP of a loop that is SAFE leaves the fault as its reason
+            self.last_change = (
+                change  # a STOP of a loop that is SAFE leaves the fault as its reason
+            )
         self._journal.record(change)
         self._report_event(
             _SEVERITY.get(trigger, "info"), f"{source.name} -> {row.target.name}: {reason}"

@@ -181,7 +181,7 @@ class SpiralSearch:
             None,
             f"no {wanted.name} within {self._radius_sky_arcsec:g} arcsec of its last place; the search "
             f"repeats with pauses of {self._settings.search_again_pause_s:g} s until the {wanted.name} is "
-            f"back; check {wanted.check_long}, or end the search with hold, stop or another acquire",
+            f"back; check {wanted.check_long}, or end the search with release, stop or another acquire",
         )
 
     def state_again(self, since_s: float) -> SearchAgain | None:

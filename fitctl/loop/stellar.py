@@ -231,9 +231,9 @@ class StellarLoop(Loop):
     def _move(self, observation: Observation) -> None:
         """Follow the link and the mode's law, unless an interlock holds or flattens."""
         action = self.interlocks.action if self.mode in TRACKING else None
-        if self.link is not None and action not in {"hold", "flatten"}:
+        if self.link is not None and action not in {"freeze", "flatten"}:
             self._follow_link(self.link)
-        if self.sky is not None and action not in {"hold", "flatten"}:
+        if self.sky is not None and action not in {"freeze", "flatten"}:
             self._follow_sky(self.sky, observation.now_s)
         if action == "flatten":
             self.mirror.step_to_bias()
@@ -242,7 +242,7 @@ class StellarLoop(Loop):
         self._flattened = action == "flatten"
         # Without a frame to track by, the stages wait where they are.
         waits = self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
-        if action not in {"hold", "flatten"} and not waits:
+        if action not in {"freeze", "flatten"} and not waits:
             self._laws[self.mode](observation)
 
     def _evaluate_learning(self, observation: Observation) -> None:

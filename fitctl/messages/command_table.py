@@ -91,7 +91,7 @@ COMMANDS = (
     CommandRow(commands.Stop, "a commander's key", "stop", "s", "STOP"),
     CommandRow(commands.Standby, "the instrument", "standby", "b", "Standby", wait_s=60.0),
     CommandRow(commands.Acquire, "the instrument", "acquire", "a", "Acquire", wait_s=600.0),
-    CommandRow(commands.Hold, "the instrument", "hold", "h", "Hold"),
+    CommandRow(commands.Release, "the instrument", "release", "h", "Release"),
     CommandRow(commands.Recover, "the instrument", "recover", "r", "Recover", wait_s=60.0),
     CommandRow(
         commands.Off,
@@ -121,6 +121,8 @@ COMMANDS = (
 )
 _LOGGED_OF_REFUSED = 100  # characters of its loop, of its values and of the answer
 ROWS = {row.make: row for row in COMMANDS}
+RENAMED = {"hold": "release"}
+"""Words of an older fitctl, which are refused with the word of today."""
 WORDS = {row.word: row for row in COMMANDS if row.word}
 
 
@@ -132,6 +134,9 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
     ConfigError
         If there is no such command, or its values are not what it needs.
     """
+    if word in RENAMED:
+        msg = f"send: {word} is now {RENAMED[word]}"
+        raise ConfigError(msg)
     if word not in WORDS:
         msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
         raise ConfigError(msg)
@@ -153,6 +158,28 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
     except msgspec.ValidationError as error:
         msg = f"send: {word} {' '.join(values)}: {error}"
         raise ConfigError(msg) from None
+
+
+def as_command(command: AnyCommand | str, loop: str = "") -> AnyCommand:
+    """A command from Python: a message as it is, or words as after ``fitctl send``.
+
+    Raises
+    ------
+    ConfigError
+        If words are no command, or its values are not what it needs.
+    TypeError
+        If it is neither, or a message with a loop beside it.
+    """
+    if isinstance(command, str):
+        word, *values = command.split() or [""]
+        return command_of(word, values, loop)
+    if type(command) not in ROWS or loop:
+        msg = (
+            "send: expected words such as 'target 24 19.5', with loop= if it is for one, or a message of "
+            f"fitctl.messages.commands; got {command!r}"
+        )
+        raise TypeError(msg)
+    return command
 
 
 def command_record(

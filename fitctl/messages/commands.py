@@ -53,8 +53,8 @@ class Acquire(Command, frozen=True, kw_only=True):
     star_flux_dn: float | None = None
 
 
-class Hold(Command, frozen=True, kw_only=True):
-    """Stop tracking, and hold the stages where they are."""
+class Release(Command, frozen=True, kw_only=True):
+    """Stop tracking the star; the stages stay where they are: STANDBY."""
 
 
 class Stop(Command, frozen=True, kw_only=True):
@@ -212,7 +212,7 @@ class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     attempt: int = 0
     message: str = ""
     last_attempt: SequenceAttempt | None = None
-    wanted: Literal["run", "pause", "stop"] = "run"
+    wanted: Literal["run", "pause", "end"] = "run"
 
 
 class SequenceReport(Command, frozen=True, kw_only=True):
@@ -222,15 +222,15 @@ class SequenceReport(Command, frozen=True, kw_only=True):
 
 
 class SequenceControl(Command, frozen=True, kw_only=True):
-    """Pause, resume or stop the sequence that is running, wherever it runs."""
+    """Pause, resume or end the sequence that is running, wherever it runs."""
 
-    action: Literal["pause", "resume", "stop"]
+    action: Literal["pause", "resume", "end"]
 
 
 AnyCommand = (
     Standby
     | Acquire
-    | Hold
+    | Release
     | Stop
     | Recover
     | Off

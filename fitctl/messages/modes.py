@@ -25,8 +25,8 @@ class Mode(IntEnum):
 
 
 MEANING = {
-    Mode.OFF: "devices let go, nothing powered",
-    Mode.STANDBY: "devices ready, siderostat held where it is, mirror at its bias",
+    Mode.OFF: "devices closed, nothing powered",
+    Mode.STANDBY: "devices ready, siderostat stands where it is, mirror at its bias",
     Mode.ACQUISITION: "the siderostat searches for the star along a spiral",
     Mode.COARSE: "star found; the siderostat pulls it in",
     Mode.VERNIER: "the fast steering mirror holds the star, the siderostat takes what lasts",
@@ -74,7 +74,7 @@ class Trigger(IntEnum):
 
     STANDBY = 0
     ACQUIRE = 1
-    HOLD = 2
+    RELEASE = 2
     STOP = 3
     RECOVER = 4
     OFF = 5
@@ -95,7 +95,7 @@ COMMANDS = frozenset(
     {
         Trigger.STANDBY,
         Trigger.ACQUIRE,
-        Trigger.HOLD,
+        Trigger.RELEASE,
         Trigger.STOP,
         Trigger.RECOVER,
         Trigger.OFF,
@@ -180,7 +180,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     *_from((Mode.EXPERIMENT,), Trigger.EXPERIMENT_DONE, Mode.COARSE, "all motions done"),
     *_from(
         (Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT),
-        Trigger.HOLD,
+        Trigger.RELEASE,
         Mode.STANDBY,
         "asked for",
     ),
@@ -219,7 +219,9 @@ METROLOGY_TRANSITIONS: tuple[Transition, ...] = (
     *_from(
         (Mode.COARSE, Mode.LOCKED), Trigger.BEAM_LOST, Mode.ACQUISITION, "no beam for lost_frames"
     ),
-    *_from((Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED), Trigger.HOLD, Mode.STANDBY, "asked for"),
+    *_from(
+        (Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED), Trigger.RELEASE, Mode.STANDBY, "asked for"
+    ),
     *_from(METROLOGY_MODES, Trigger.STOP, Mode.SAFE, "asked for, at once"),
     *_from(
         (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED),

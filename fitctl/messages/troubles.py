@@ -13,18 +13,18 @@ from fitctl.logging.records import DeviceHealth
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
-FIND_STAR = "check shutter and clouds; hold, stop or acquire ends the search"
+FIND_STAR = "check shutter and clouds; release, stop or acquire ends the search"
 RECORDER_SILENT_S = 10.0  # it reports about once a second
 
 _DID = {
     "warn": "nothing was changed",
-    "hold": "the stages wait where they are",
+    "freeze": "the stages wait where they are",
     "flatten": "the mirror goes to its bias, the siderostat waits",
     "safe": "the loop went to SAFE",
 }
 _AFTER_FAILURE = {
-    "standby": "all devices were let go again",
-    "recover": "all devices were let go again",
+    "standby": "all devices were closed again",
+    "recover": "all devices were closed again",
     "acquire": "the siderostat waits where it is",
     "search": "the siderostat waits where it is",
     "controller": "the design before it stays at work",

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fitctl.config import Rig, is_name
+from fitctl.config import CONTROLLERS, Rig, is_name
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo
 from fitctl.logging.schemas import dark_npy_of
@@ -40,7 +40,7 @@ def logged_files(info: LogInfo) -> Iterator[list[str]]:
             contents.append(("dark.npy", "camera.dark_file", dark_npy))
         for number, (loop, text) in enumerate(info.metadata.get("designs", {}).items()):
             # A loop of another name is refused with the rig, and is no key of an override.
-            if is_name(loop) and _controller(info, loop).endswith(".json"):
+            if is_name(loop) and _controller(info, loop) not in CONTROLLERS:
                 key = f"loops.{loop}.vernier.controller"
                 contents.append((f"design-{number}.json", key, text.encode()))
         for name, _, content in contents:

@@ -66,6 +66,7 @@ from fitctl.supervisor.supervisor import Supervisor
 # Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well. What a
 # collector that moves does to the stars and the beam is in what was measured.
 _NOT_REPLAYED = {"SequenceControl", "TakeOver", "MoveCollector"}
+_RENAMED = {"Hold": "Release"}  # commands of older logs
 _OF_CONTROLLERS = {"SetController", "LearnerReport"}
 
 
@@ -176,7 +177,10 @@ class Replay:
     def _post(self, message: Any) -> None:
         try:
             arguments = msgspec.json.decode(message.values_json)
-            given = arguments | {"type": message.command, "loop": message.loop}
+            given = arguments | {
+                "type": _RENAMED.get(message.command, message.command),
+                "loop": message.loop,
+            }
             command = msgspec.convert(given, AnyCommand)
         except msgspec.MsgspecError as error:
             self._answered(message, Reply(accepted=False, text=f"not a command: {error}"))

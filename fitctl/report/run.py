@@ -110,8 +110,10 @@ def _controllers_of(log: LogInfo) -> list[str]:
     for loop, text in log.metadata.get("designs", {}).items():
         with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
             name = json.loads(text)["name"]
-            if is_name(loop) and name in CONTROLLERS:
-                overrides.append(f"loops.{loop}.vernier.controller={name}")
+            if is_name(loop):
+                # A design of the user's own has a name that no rig file may have; the log has its matrices.
+                known = name if name in CONTROLLERS else CONTROLLERS[0]
+                overrides.append(f"loops.{loop}.vernier.controller={known}")
     return overrides
 
 

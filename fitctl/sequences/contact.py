@@ -24,11 +24,11 @@ _REPORT_S = 1.0
 
 
 class Stopped(Exception):
-    """Somebody wants the whole sequence to end; `hold` says whether its loops are to be held then."""
+    """Somebody wants the whole sequence to end; `release` says whether its loops then release their stars."""
 
-    def __init__(self, message: str, *, hold: bool) -> None:
+    def __init__(self, message: str, *, release: bool) -> None:
         super().__init__(message)
-        self.hold = hold
+        self.release = release
 
 
 class Contact:
@@ -123,7 +123,7 @@ class Contact:
                 return telemetry
             if self.stop_wanted.is_set():
                 msg = "stopped by its program"
-                raise Stopped(msg, hold=True)
+                raise Stopped(msg, release=True)
             if self.link.now_s() - begun_s > _SILENCE_S:
                 msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then begin again"
                 raise ConnectionError(msg)
@@ -132,16 +132,16 @@ class Contact:
         if view.mode is Mode.SAFE:
             # Nothing is commanded any more: SAFE has the last word.
             msg = f"loop {view.loop_name} is SAFE: {view.why}; see to it, then: fitctl send recover"
-            raise Stopped(msg, hold=False)
+            raise Stopped(msg, release=False)
         if self.stop_wanted.is_set():
             msg = "stopped by its program"
-            raise Stopped(msg, hold=True)
+            raise Stopped(msg, release=True)
         running = view.telemetry.running_sequence
         if running is not None and running.run == self.status.run:
             self._wanted = running.wanted
-        if self._wanted == "stop":
+        if self._wanted == "end":
             msg = "stopped by the operator"
-            raise Stopped(msg, hold=True)
+            raise Stopped(msg, release=True)
 
     # ------------------------------------------------------------ reports
 

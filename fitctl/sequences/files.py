@@ -9,6 +9,7 @@ from typing import Any
 from fitctl.config import ConfigError
 from fitctl.config.reading import read_text, read_toml
 
+_RENAMED = {"jog": "dither"}  # shipped sequences of an older fitctl
 YAML_SUFFIXES = (".yaml", ".yml")
 SUFFIXES = (".toml", *YAML_SUFFIXES)
 
@@ -21,9 +22,18 @@ def _shipped_folder() -> Path:
 
 
 def find_sequence(name: Path) -> Path:
-    """The file of a sequence: as given, or a shipped one by its bare name."""
+    """The file of a sequence: as given, or a shipped one by its bare name.
+
+    Raises
+    ------
+    ConfigError
+        If it is the old name of a shipped one.
+    """
     if name.exists() or name.parent != Path() or name.suffix:
         return name
+    if str(name) in _RENAMED:
+        msg = f"{name}: the shipped sequence {name} is now {_RENAMED[str(name)]}"
+        raise ConfigError(msg)
     return next((path for path in shipped_sequences() if path.stem == str(name)), name)
 
 

@@ -18,7 +18,7 @@ import msgspec
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.logging.records import SequenceAttempt
 from fitctl.messages.client import Client
-from fitctl.messages.command_table import ROWS
+from fitctl.messages.command_table import ROWS, as_command
 from fitctl.messages.commands import AnyCommand, Reply, Status, Stop
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import RemoteKey, read_key_of
@@ -174,26 +174,68 @@ class Instrument(StepMethods[Figures]):
         measured = [] if self._runner is None else self._runner.calibrations
         return [write_calibration(each, self.rig, Path(folder)) for each in measured]
 
-    def send(self, command: AnyCommand) -> Reply:
-        """Give one command of :mod:`fitctl.messages.commands`; from any thread."""
-        return self._link.send(command)
-
-    def send_and_wait(self, command: AnyCommand, timeout_s: float | None = None) -> None:
-        """Give a command, and wait until what it asks for has happened; not from the thread of a step.
+    def send(self, command: AnyCommand | str, loop: str = "") -> Reply:
+        """Send one command and return the reply; from any thread.
 
         Parameters
         ----------
-        command : AnyCommand
+        command : str or AnyCommand
+            The words that follow ``fitctl send`` in a shell, such as ``"stop"`` or ``"target 24 19.5"``, or a
+            message of :mod:`fitctl.messages.commands`.
+        loop : str, optional
+            With words: the loop that the command is for. All loops without it.
+
+        Returns
+        -------
+        Reply
+            ``accepted``, and ``text`` with the reason if the supervisor refused the command.
+
+        Raises
+        ------
+        ConfigError
+            If the words are no command, or its values are not what it needs.
+        TypeError
+            If `command` is neither words nor a message.
+        ConnectionError
+            If the supervisor does not answer.
+
+        Examples
+        --------
+        >>> with Instrument(simulate=True) as instrument:
+        ...     instrument.send("standby").accepted
+        True
+        """
+        return self._link.send(as_command(command, loop))
+
+    def send_and_wait(
+        self, command: AnyCommand | str, timeout_s: float | None = None, loop: str = ""
+    ) -> None:
+        """Send a command and wait until it is done; not from the thread of a step.
+
+        Parameters
+        ----------
+        command : str or AnyCommand
+            As :meth:`send`.
         timeout_s : float, optional
-            By default as long as ``fitctl send --wait``.
+            Longest wait. By default as long as ``fitctl send --wait``.
+        loop : str, optional
+            As :meth:`send`.
 
         Raises
         ------
         SequenceError
-            If it is refused, fails, is ended by another command or is still under way after `timeout_s`.
-        ConnectionError
-            If the supervisor does not answer.
+            If the command is refused, fails, is ended by another command or is not done after `timeout_s`.
+        ConfigError, TypeError, ConnectionError
+            As :meth:`send`.
+
+        Examples
+        --------
+        >>> with Instrument(simulate=True) as instrument:
+        ...     instrument.send_and_wait("standby")
+        ...     instrument.telemetry().loops[0].mode
+        'STANDBY'
         """
+        command = as_command(command, loop)
         row, reply = ROWS[type(command)], self.send(command)
         name = row.word or row.name
         if not reply.accepted:
@@ -202,10 +244,10 @@ class Instrument(StepMethods[Figures]):
         if not reply.number:
             return
         limit_s = timeout_s or row.wait_s
-        for loop, outcome in wait_for_outcomes(self._link, reply, limit_s).items():
+        for of_loop, outcome in wait_for_outcomes(self._link, reply, limit_s).items():
             if outcome.state != "done":
                 late = f" after {limit_s:g} s" if outcome.state == "under way" else ""
-                msg = f"loop {loop}: {name} {outcome.state}{late}: {outcome.text}".removesuffix(
+                msg = f"loop {of_loop}: {name} {outcome.state}{late}: {outcome.text}".removesuffix(
                     ": "
                 )
                 raise SequenceError(msg)
@@ -336,15 +378,17 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         """What the instrument is doing now; after the step that is running, if one is."""
         return await self._in_thread(self._instrument.telemetry)
 
-    async def send(self, command: AnyCommand) -> Reply:
-        """Give one command of :mod:`fitctl.messages.commands`, at once, also while a step runs."""
+    async def send(self, command: AnyCommand | str, loop: str = "") -> Reply:
+        """Send one command as :meth:`Instrument.send`, at once, also while a step runs."""
         instrument = self._instrument
-        return await self._at_once(lambda: instrument.send(command))
+        return await self._at_once(lambda: instrument.send(command, loop))
 
-    async def send_and_wait(self, command: AnyCommand, timeout_s: float | None = None) -> None:
-        """Give a command and wait, as :meth:`Instrument.send_and_wait`; after the step that is running."""
+    async def send_and_wait(
+        self, command: AnyCommand | str, timeout_s: float | None = None, loop: str = ""
+    ) -> None:
+        """Send a command and wait, as :meth:`Instrument.send_and_wait`; after the step that is running."""
         instrument = self._instrument
-        await self._in_thread(lambda: instrument.send_and_wait(command, timeout_s))
+        await self._in_thread(lambda: instrument.send_and_wait(command, timeout_s, loop))
 
     async def stop(self) -> None:
         """SAFE, at once, also while a step runs: every loop."""

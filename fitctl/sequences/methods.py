@@ -48,6 +48,13 @@ def _method(kind: type[steps.Step]) -> Callable[..., Any]:
 class StepMethods(ABC, Generic[R_co]):
     """The steps, each of which gives its figures, with units in their names."""
 
+    def __getattr__(self, name: str) -> Any:
+        """Refuse the names that steps had in an older fitctl."""
+        today = steps.RENAMED_STEPS.get(name)
+        now = f": the step {name} is now {today}" if today else ""
+        msg = f"{type(self).__name__!r} object has no attribute {name!r}{now}"
+        raise AttributeError(msg)
+
     @abstractmethod
     def run(self, step: steps.Step) -> R_co:
         """Run one step."""
@@ -56,8 +63,8 @@ class StepMethods(ABC, Generic[R_co]):
     acquire: Callable[..., R_co] = _method(steps.Acquire)
     hold: Callable[..., R_co] = _method(steps.Hold)
     stars: Callable[..., R_co] = _method(steps.Stars)
-    target: Callable[..., R_co] = _method(steps.Target)
-    jog: Callable[..., R_co] = _method(steps.Jog)
+    offset: Callable[..., R_co] = _method(steps.Offset)
+    dither: Callable[..., R_co] = _method(steps.Dither)
     raster: Callable[..., R_co] = _method(steps.Raster)
     controller: Callable[..., R_co] = _method(steps.Controller)
     experiment: Callable[..., R_co] = _method(steps.Experiment)

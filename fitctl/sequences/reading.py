@@ -14,7 +14,16 @@ from fitctl.config.base import Settings
 from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours.table import problems
 from fitctl.sequences.files import read_document, read_table, shipped_sequences
-from fitctl.sequences.steps import AnyStep, Sequence, Star, Stars, Step
+from fitctl.sequences.steps import (
+    RENAMED_KEYS,
+    RENAMED_STEPS,
+    RENAMED_VALUES,
+    AnyStep,
+    Sequence,
+    Star,
+    Stars,
+    Step,
+)
 
 STEPS: dict[str, type[Step]] = {
     kind.model_fields["step"].default: kind for kind in get_args(AnyStep)
@@ -160,11 +169,16 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
         case "union_tag_not_found":
             mistake = f"step is missing; there are {', '.join(STEPS)}"
         case "union_tag_invalid":
-            mistake = f"{problem['ctx']['tag']!r} is no step; there are {', '.join(STEPS)}"
+            tag = problem["ctx"]["tag"]
+            mistake = f"{tag!r} is no step; there are {', '.join(STEPS)}"
+            if tag in RENAMED_STEPS:
+                mistake = f"step {tag!r} is now {RENAMED_STEPS[tag]!r}"
         case "extra_forbidden":
             allowed = [name for name in kind.model_fields if name != "step"]
             near = difflib.get_close_matches(key, allowed, 1)
             hint = f"; did you mean {near[0]}?" if near else ""
+            if key in RENAMED_KEYS:
+                hint = f"; it is now {RENAMED_KEYS[key]}"
             mistake = f"{key}: unknown key{hint} (allowed here: {', '.join(allowed)})"
         case "missing":
             mistake = f"{key}: is missing"
@@ -173,4 +187,6 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
             shown = f" (is {given!r})" if isinstance(given, str | int | float) else ""
             message = problem["msg"].replace("Input should be", "must be") + shown
             mistake = f"{key}: {message}" if key else message
+            if isinstance(given, str) and (key, given) in RENAMED_VALUES:
+                mistake += f"; {given} is now {RENAMED_VALUES[key, given]}"
     return f"{where}: {mistake}".replace("\n", " ")

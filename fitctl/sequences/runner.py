@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 
 from fitctl.logging.records import SequenceAttempt
-from fitctl.messages.commands import Hold, MoveCollector
+from fitctl.messages.commands import MoveCollector, Release
 from fitctl.messages.modes import METROLOGY_MODES, STELLAR_MODES, Mode
 from fitctl.sequences.behaviours.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours.stars import evaluate, star_results, steps_of
@@ -54,7 +54,7 @@ class Runner:
         """Stop tracking with every loop that had a step; one that does not track refuses, and may."""
         with suppress(ConnectionError):
             for name in self._loops:
-                self._link.send(Hold(loop=name))
+                self._link.send(Release(loop=name))
 
     def stop_collector(self, *, done: bool) -> None:
         """Stop a motion of the collector that a step began."""
@@ -100,7 +100,7 @@ class Runner:
                 for each in steps_of(step, star):
                     self._try(each, loop_name, number, star.name)
             except SequenceError:
-                if step.on_failure == "stop":
+                if step.on_failure == "fail":
                     raise
         self._report(step.step, loop_name, number, 1, "")
         try:
@@ -147,9 +147,9 @@ class Runner:
             outcome: Outcome = "timed out" if isinstance(failure, TimedOut) else "failed"
             return self._record(outcome, str(failure), {}, began_s)
         except (Stopped, KeyboardInterrupt) as stopped:
-            hold = not isinstance(stopped, Stopped) or stopped.hold
+            release = not isinstance(stopped, Stopped) or stopped.release
             with suppress(ConnectionError):
-                if view is not None and hold:
+                if view is not None and release:
                     behaviour.stop(step, view)
                 self._record("stopped", str(stopped) or "interrupted", {}, began_s)
             raise
@@ -237,7 +237,7 @@ def _ending(runner: Runner) -> Iterator[None]:
     try:
         yield
     except Stopped as stopped:
-        if stopped.hold:
+        if stopped.release:
             runner.hold_stages()
             runner.stop_collector(done=False)
         runner.contact.end("stopped", str(stopped))

@@ -11,6 +11,10 @@ from fitctl.config.base import Count, Finite, NonNegative, Positive, Settings
 from fitctl.config.loops import ControllerName, FieldOverlap
 
 LONGEST_S = 86_400.0
+RENAMED_STEPS = {"target": "offset", "jog": "dither"}
+RENAMED_KEYS = {"jog_px": "dither_px"}
+RENAMED_VALUES = {("on_failure", "stop"): "fail"}
+"""Names of an older fitctl, which are refused with the name of today."""
 
 LoopName = Annotated[
     str,
@@ -70,7 +74,7 @@ class Step(Settings):
 
 
 class Standby(Step):
-    """Power up the devices, stop tracking, and hold the stages: STANDBY. Without a loop, all loops."""
+    """Power up the devices and release the star: STANDBY. Without a loop, all loops."""
 
     step: Literal["standby"] = "standby"
     timeout_s: TimeoutS = 60.0
@@ -148,7 +152,7 @@ class Stars(Step):
     radius_growth: RadiusGrowth = 1.5
     max_offset_sky_arcsec: LargestOffset = None
     on_failure: Annotated[
-        Literal["skip", "stop"],
+        Literal["skip", "fail"],
         Field(description="what to do after a star that is not found or not held well"),
     ] = "skip"
     least_held: Annotated[Count, Field(description="the step fails if fewer stars were held")] = 1
@@ -175,19 +179,19 @@ class Visiting(Moving):
     rms_limit_px: RmsLimitPx = None
 
 
-class Target(Visiting):
-    """Move the target in one step (Fig. 11); the star stays there."""
+class Offset(Visiting):
+    """Move the target by an offset in one step (Fig. 11); the star stays there."""
 
-    step: Literal["target"] = "target"
+    step: Literal["offset"] = "offset"
     offset_az_px: OffsetPx
     offset_el_px: OffsetPx
 
 
-class Jog(Visiting):
+class Dither(Visiting):
     """Move the target on both axes to one side, to the other side, and back (Fig. 12)."""
 
-    step: Literal["jog"] = "jog"
-    jog_px: Annotated[Positive, Field(description="on each axis, to either side")] = 1.0
+    step: Literal["dither"] = "dither"
+    dither_px: Annotated[Positive, Field(description="on each axis, to either side")] = 1.0
 
 
 class Raster(Visiting):
@@ -389,8 +393,8 @@ AnyStep = (
     | Acquire
     | Hold
     | Stars
-    | Target
-    | Jog
+    | Offset
+    | Dither
     | Raster
     | Controller
     | Experiment

@@ -55,7 +55,7 @@ OF_TALLY: list[tuple[str, str, Callable[[Tally], float]]] = [
     ("fitctl_star_ticks", "Ticks that saw the star.", lambda tally: tally.star_ticks),
     (
         "fitctl_frames_lost",
-        "Frames that the camera sent and nobody got, since it was opened.",
+        "Frames that the camera sent and the supervisor did not receive, since the camera was opened.",
         lambda tally: 0 if tally.newest is None else tally.newest.frames_lost,
     ),
 ]
@@ -253,7 +253,7 @@ def _of_instrument(newest: Telemetry) -> Iterator[Metric]:
     lost = newest.records_lost
     yield CounterMetricFamily("fitctl_records_lost", "Records missing from the log.", value=lost)
     unsent = [([queue], count) for queue, count in newest.losses.unsent.items()]
-    yield _counters("fitctl_unsent", "Telemetry and replies let go.", ["queue"], unsent)
+    yield _counters("fitctl_unsent", "Telemetry and replies dropped.", ["queue"], unsent)
     recorder = newest.recorder
     if recorder is not None:
         for name, text, value in (

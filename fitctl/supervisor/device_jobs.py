@@ -155,7 +155,9 @@ class DeviceJobs:
             self._close(names, with_camera, lambda _faults: ended(why, failed=True))
             return
         if abandoned:
-            self._journal.event("warning", _SOURCE, "stopped while opening; devices let go")
+            self._journal.event(
+                "warning", _SOURCE, "stopped while opening the devices; they are closed again"
+            )
             self._close(names, with_camera, lambda _faults: ended(_STOPPED, failed=True))
             return
         opened: Opened = future.result()

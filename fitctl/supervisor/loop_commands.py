@@ -51,7 +51,7 @@ def look(rig: Rig, loops: StellarLoops, command: Look) -> str:
         return f"one loop looks at a place; name it: {', '.join(loop.name for loop in loops)}"
     (loop,) = loops
     if loop.mode not in WITH_WINDOW:
-        return f"look means nothing in {loop.mode.name}; a star is followed in COARSE and VERNIER"
+        return f"look is not available in {loop.mode.name}; it needs COARSE or VERNIER"
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"look {rig.camera.window_range_text}"
     loop.star_finder.look_at_px = (command.az_px, command.el_px)
@@ -70,7 +70,7 @@ def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
         return f"an experiment is on one loop; name it: {', '.join(loop.name for loop in loops)}"
     (loop,) = loops
     if transition(loop.mode, Trigger.EXPERIMENT) is None:
-        return f"experiment means nothing in {loop.mode.name}; it needs a star in COARSE or VERNIER"
+        return f"experiment is not available in {loop.mode.name}; it needs COARSE or VERNIER"
     why_not = refused_drives(rig, loop.name, command.drives)
     if why_not:
         return f"experiment: {why_not}"

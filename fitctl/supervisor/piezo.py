@@ -149,7 +149,7 @@ def disagreement(
                 "piezo amplifier",
                 settings.port,
                 f"stack {stack + 1} within {tolerance_v:g} V of the {low_v:.1f} to {high_v:.1f} V "
-                "that the D/A was told",
+                "commanded to the D/A",
                 f"{volts:.1f} V",
                 "check the cable from D/A to amplifier, the amplifier's own set-point (it must be 0 V), "
                 "the stack, and piezo.gain in the rig file",

@@ -13,10 +13,10 @@ from fitctl.stages.journal import Journal
 SILENCE_S = 3.0
 _SOURCE = "sequence"  # of its events
 _UNDER_WAY = ("running", "paused")
-_WANTED: dict[str, Literal["run", "pause", "stop"]] = {
+_WANTED: dict[str, Literal["run", "pause", "end"]] = {
     "pause": "pause",
     "resume": "run",
-    "stop": "stop",
+    "end": "end",
 }
 
 
@@ -47,7 +47,7 @@ class SequenceBoard:
         if known is not None and known.run != status.run and known.state in _UNDER_WAY:
             text = (
                 f"sequence {known.name} is under way (step {known.step_number} of {known.steps}); wait for "
-                "its end, or: fitctl sequence stop"
+                "its end, or: fitctl sequence end"
             )
             return Reply(accepted=False, text=text)
         before = self._status
@@ -60,12 +60,12 @@ class SequenceBoard:
         self._report_change(before, status)
         return Reply(accepted=True)
 
-    def control(self, action: Literal["pause", "resume", "stop"]) -> Reply:
+    def control(self, action: Literal["pause", "resume", "end"]) -> Reply:
         """Leave an order, which the sequence reads in the telemetry."""
         known = self.status()
         if known is None or known.state not in _UNDER_WAY:
             return Reply(accepted=False, text=f"{action}: no sequence is under way")
-        if known.wanted == "stop":
+        if known.wanted == "end":
             return Reply(accepted=False, text=f"{action}: sequence {known.name} is being stopped")
         self._status = msgspec.structs.replace(known, wanted=_WANTED[action])
         self._journal.event("info", _SOURCE, f"{known.name}: {action}, asked for by the operator")

@@ -36,11 +36,11 @@ from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
-    Hold,
     LearnerReport,
     MoveCollector,
     Off,
     Recover,
+    Release,
     Reply,
     SequenceControl,
     SequenceReport,
@@ -72,7 +72,7 @@ from fitctl.supervisor.timing import TimingBook
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Standby: Trigger.STANDBY,
     Acquire: Trigger.ACQUIRE,
-    Hold: Trigger.HOLD,
+    Release: Trigger.RELEASE,
     Stop: Trigger.STOP,
     Recover: Trigger.RECOVER,
     Off: Trigger.OFF,
@@ -236,7 +236,9 @@ class Supervisor:
         """Know where a supervisor that was killed had its stars; called before the first step."""
         loops, now_s = self.stellar_loops, self._clock.now_s()
         for place in places:
-            if place.loop in loops and place.time_s <= now_s:  # else the computer has restarted since
+            if (
+                place.loop in loops and place.time_s <= now_s
+            ):  # else the computer has restarted since
                 loops[place.loop].recall(place)
 
     # ------------------------------------------------------------ once a frame
@@ -428,7 +430,7 @@ class Supervisor:
     def _why_not(self, trigger: Trigger, names: list[str]) -> str:
         loop = self.loops[names[0]]
         mode, can = loop.mode, ", ".join(t.name.lower() for t in loop.usable_commands)
-        return f"{trigger.name.lower()} means nothing in {mode.name}; from here: {can}"
+        return f"{trigger.name.lower()} is not available in {mode.name}. Available: {can}"
 
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
         names = [name for name in names if name in self.stellar_loops]

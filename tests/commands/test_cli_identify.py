@@ -14,7 +14,7 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import EXPERIMENTS
 from fitctl.identify.run import on_simulation
 from fitctl.logging.writer import LogWriter
-from fitctl.messages.commands import Experiment, Hold, Reply
+from fitctl.messages.commands import Experiment, Release, Reply
 from fitctl.model.drives import Drive
 
 WALL_S = 1_795_000_000.0
@@ -140,5 +140,5 @@ def test_ctrl_c_ends_the_experiment_on_the_rig(rig):
     drive = Drive(channel="fsm_az", shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=9.0)
     with pytest.raises(KeyboardInterrupt):
         runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
-    assert [type(command) for command in given] == [Experiment, Hold]
+    assert [type(command) for command in given] == [Experiment, Release]
     assert given[1].loop == "right"

@@ -92,7 +92,7 @@ def test_send_reaches_a_rig_by_its_key_file_alone(served, key_file, capsys):
     assert fitctl("send", "status", "--remote", key_file) == 0
     assert capsys.readouterr().out == f"{served.client.send(Status()).text}\n"
     served.client.send(TakeOver())
-    assert fitctl("send", "hold", "--remote", key_file) == 1
+    assert fitctl("send", "release", "--remote", key_file) == 1
     assert "has the instrument" in capsys.readouterr().err
     assert fitctl("send", "stop", "--remote", key_file) == 0
     assert served.client.send(Status()).text == "right SAFE"

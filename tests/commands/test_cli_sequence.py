@@ -43,9 +43,9 @@ def test_the_shipped_sequences_are_listed(sequence):
 def test_sequences_are_listed_with_every_key_for_programs(sequence, tmp_path):
     status, out, _ = sequence("list", "--json")
     assert status == 0
-    jog = next(each for each in json.loads(out) if each["name"] == "jog")
+    jog = next(each for each in json.loads(out) if each["name"] == "dither")
     assert Path(jog["file"]).is_file()
-    assert jog["steps"][2]["jog_px"] == 1.0
+    assert jog["steps"][2]["dither_px"] == 1.0
     assert jog["steps"][0]["attempts"] == 2  # not in the file
 
     path = written(tmp_path, WAIT)
@@ -58,7 +58,9 @@ def test_sequences_are_listed_with_every_key_for_programs(sequence, tmp_path):
 
 
 def test_check_says_every_mistake_on_a_line(sequence, tmp_path):
-    path = written(tmp_path, HEAD + 'steps = [{ step = "hold" }, { step = "jog", jog_px = 4.0 }]\n')
+    path = written(
+        tmp_path, HEAD + 'steps = [{ step = "hold" }, { step = "dither", dither_px = 4.0 }]\n'
+    )
     status, out, err = sequence("check", path)
 
     assert status == 2
@@ -73,7 +75,7 @@ def test_check_says_every_mistake_on_a_line(sequence, tmp_path):
 
 
 def test_check_tells_what_is_well(sequence):
-    status, out, _ = sequence("check", "jog")
+    status, out, _ = sequence("check", "dither")
 
     assert status == 0
     assert "well; 3 steps for rig fit-mock" in out
@@ -85,7 +87,7 @@ def test_a_file_that_is_not_there_is_told_with_those_that_are(sequence, command)
 
     assert status == 2
     assert "no such sequence file" in err
-    assert "jog" in err
+    assert "dither" in err
 
 
 def test_a_dry_run_prints_every_attempt_and_the_virtual_time(sequence, tmp_path):
@@ -122,7 +124,7 @@ def test_a_dry_run_that_fails_has_status_1_and_says_why(sequence, tmp_path):
     assert err.splitlines()[-1] == f"sequence tried: {told['failure']}"
 
 
-@pytest.mark.parametrize("command", [["run", "jog"], ["stop"]])
+@pytest.mark.parametrize("command", [["run", "dither"], ["end"]])
 def test_without_a_supervisor_there_is_one_line_and_status_1(sequence, tmp_path, command):
     status, _, err = sequence(*command, "--set", f"service.folder={tmp_path / 'none'}")
 

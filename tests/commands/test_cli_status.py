@@ -113,7 +113,7 @@ def test_a_failed_command_is_a_trouble_with_what_to_do():
 def test_an_interlock_on_the_lost_star_that_holds_the_stages_is_still_named():
     supervisor = FakeSupervisor("ACQUISITION")
     supervisor.search_again = STAR_LOST
-    supervisor.interlocks = [msgspec.structs.replace(TRIPPED, name="star_lost", action="hold")]
+    supervisor.interlocks = [msgspec.structs.replace(TRIPPED, name="star_lost", action="freeze")]
 
     assert "interlock flux_low: star of right: " in lines(told(supervisor))[1]
 

@@ -21,7 +21,8 @@ def found():
     def add(path, command):
         commands[path] = command
         for name, below in getattr(command, "commands", {}).items():
-            add(f"{path} {name}", below)
+            if not below.hidden:
+                add(f"{path} {name}", below)
 
     for name in FOR_PEOPLE:
         add(name, load_command(name))

@@ -136,7 +136,7 @@ def test_checks_and_faults_have_json_for_programs(fitctl, logs):
     checked = json.loads(fitctl("check", default_rig_path(), "--json")[1])
     kinds = json.loads(fitctl("fault", "kinds", "--json")[1])
     whole = json.loads(fitctl("log", "verify", "--latest", "--json")[1])
-    sequence = json.loads(fitctl("sequence", "check", "jog", "--json")[1])
+    sequence = json.loads(fitctl("sequence", "check", "dither", "--json")[1])
 
     assert checked["rig"] == RIG
     assert kinds["camera"]["freeze"]["text"]

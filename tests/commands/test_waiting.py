@@ -133,7 +133,7 @@ def test_a_stop_by_another_ends_the_waiting_as_a_failure(fitctl, served, meanwhi
 def test_what_is_refused_or_takes_no_time_is_not_waited_for(fitctl):
     status, _, err = fitctl("send", "acquire", "--wait")
     assert status == 1
-    assert "acquire means nothing in OFF" in err
+    assert "acquire is not available in OFF" in err
     assert fitctl("send", "stop", "--wait")[:2] == (0, "accepted\n")
 
 

@@ -35,11 +35,11 @@ SENT = {
     "JSON": ((b"tag", b'{"type": "Stop"}'), "not a command"),
     "of an unknown kind": ((b"tag", packed(type="Explode")), "not a command"),
     "without a kind": ((b"tag", packed(loop="right")), "not a command"),
-    "with an unknown field": ((b"tag", packed(type="Hold", force=True)), "not a command"),
+    "with an unknown field": ((b"tag", packed(type="Release", force=True)), "not a command"),
     "with a word for a number": (
         (b"tag", packed(type="SetTarget", az_px="left", el_px=1.0)), "not a command"),
     "nested a thousand deep": ((b"tag", b"\x91" * 1000 + b"\x01"), "not a command"),
-    "of another version": ((b"tag", packed(type="Hold", version=99)), "speaks version"),
+    "of another version": ((b"tag", packed(type="Release", version=99)), "speaks version"),
     "to a loop that is none": ((b"tag", encode(Acquire(loop="left"))), "no loop is named left"),
     "with a target that is no number": (
         (b"tag", encode(SetTarget(az_px=math.nan, el_px=19.5))), "target"),
@@ -47,7 +47,7 @@ SENT = {
         (b"tag", encode(SetTarget(az_px=1e9, el_px=19.5))), "target"),
     "with a motion that is no number": ((b"tag", encode(wild())), "experiment"),
     "that resets nothing": ((b"tag", encode(Reset(name="moon"))), "no interlock is named moon"),
-    "in the wrong mode": ((b"tag", encode(Standby())), "standby means nothing in VERNIER"),
+    "in the wrong mode": ((b"tag", encode(Standby())), "standby is not available in VERNIER"),
     "larger than any": ((b"tag", b"\x00" * 100_000), ""),
     "without a tag": ((b"",), ""),
     "in five frames": ((b"a", b"b", b"c", b"d", b"e"), ""),

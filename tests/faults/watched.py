@@ -10,7 +10,16 @@ from system.conftest import Rig
 
 from fitctl.config import load_rig
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Acquire, Experiment, Hold, Off, Recover, Standby, Status, Stop
+from fitctl.messages.commands import (
+    Acquire,
+    Experiment,
+    Off,
+    Recover,
+    Release,
+    Standby,
+    Status,
+    Stop,
+)
 from fitctl.messages.keys import new_key
 from fitctl.mocks.bench import (
     ClearFaults,
@@ -57,13 +66,13 @@ def experiment(loop):
 
 _UP = {"OFF": Standby, "SAFE": Recover, "STANDBY": Acquire}
 TOWARDS = {
-    "OFF": {"STANDBY": Off, "SAFE": Off} | dict.fromkeys(TRACKING, Hold),
+    "OFF": {"STANDBY": Off, "SAFE": Off} | dict.fromkeys(TRACKING, Release),
     "SAFE": dict.fromkeys(("OFF", "STANDBY", *TRACKING), Stop),
-    "STANDBY": {"OFF": Standby, "SAFE": Recover} | dict.fromkeys(TRACKING, Hold),
+    "STANDBY": {"OFF": Standby, "SAFE": Recover} | dict.fromkeys(TRACKING, Release),
     # By a first search, which moves at once; the one for a lost star begins with a pause.
-    "ACQUISITION": _UP | dict.fromkeys(("COARSE", "VERNIER", "LOCKED", "EXPERIMENT"), Hold),
-    "COARSE": _UP | {"EXPERIMENT": Hold},
-    "VERNIER": _UP | {"EXPERIMENT": Hold},
+    "ACQUISITION": _UP | dict.fromkeys(("COARSE", "VERNIER", "LOCKED", "EXPERIMENT"), Release),
+    "COARSE": _UP | {"EXPERIMENT": Release},
+    "VERNIER": _UP | {"EXPERIMENT": Release},
     "LOCKED": _UP,
     "EXPERIMENT": _UP | {"VERNIER": experiment},
 }
@@ -152,7 +161,7 @@ class WatchedRig(Rig):
     def turn_off(self, loop):
         """As an operator does: hold, then off, which the mirror's way to its bias delays."""
         end_s = time.monotonic() + ANSWER_S
-        assert self.client.send(Hold(loop=loop)).accepted
+        assert self.client.send(Release(loop=loop)).accepted
         while not self.client.send(Off(loop=loop)).accepted:
             assert time.monotonic() < end_s, f"{loop} is not turned off within {ANSWER_S:g} s"
             self.receive(LOOK_S)

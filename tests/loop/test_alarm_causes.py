@@ -12,9 +12,9 @@ from simulated import failing
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.messages.commands import (
     Acquire,
-    Hold,
     Off,
     Recover,
+    Release,
     Reset,
     SetController,
     Standby,
@@ -180,7 +180,7 @@ def test_a_recovery_that_fails_by_the_same_device_is_still_one_alarm():
 def test_a_fault_during_a_search_is_one_alarm():
     bench = Bench()
     light(0.0, bench)
-    bench.simulation.command(Hold())
+    bench.simulation.command(Release())
     bench.simulation.command(Acquire())
     bench.run(0.5)
     fail(bench, "camera")
@@ -220,7 +220,7 @@ def test_a_design_that_cannot_be_made_is_an_alarm_until_another_command():
     assert_alarms(
         alarms(bench), [("right: controller failed: no design eq20", "choose another design")]
     )
-    bench.simulation.command(Hold())
+    bench.simulation.command(Release())
     assert alarms(bench) == []
 
 

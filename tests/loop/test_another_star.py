@@ -61,12 +61,10 @@ def test_a_window_that_is_not_on_the_frame_is_refused(vernier, place, why_not):
 
 def test_where_no_star_is_followed_to_look_means_nothing(simulate_with):
     simulation = simulate_with(**NEAR)
-    assert "look means nothing in OFF" in simulation.command(Look(az_px=20.0, el_px=20.0)).text
+    assert "look is not available in OFF" in simulation.command(Look(az_px=20.0, el_px=20.0)).text
     simulation.acquire()
     until(simulation, Mode.ACQUISITION)
 
     reply = simulation.command(Look(az_px=20.0, el_px=20.0))
 
-    assert reply.text == (
-        "look means nothing in ACQUISITION; a star is followed in COARSE and VERNIER"
-    )
+    assert reply.text == ("look is not available in ACQUISITION; it needs COARSE or VERNIER")

@@ -9,7 +9,7 @@ import pytest
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.identify.record import gather
 from fitctl.logging.records import Event, ExperimentStart, InjectionRecord
-from fitctl.messages.commands import Acquire, Experiment, Hold, SetController, Standby, Stop
+from fitctl.messages.commands import Acquire, Experiment, Release, SetController, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import Drive, drive_value, experiment_s
 from fitctl.model.optics import scales
@@ -118,7 +118,7 @@ def test_hold_ends_an_experiment_in_standby(held):
     simulation, loop, _ = held()
     begin(simulation, SCAN)
     simulation.run(1.0)
-    assert simulation.command(Hold()).accepted
+    assert simulation.command(Release()).accepted
     assert loop.mode is Mode.STANDBY
 
 

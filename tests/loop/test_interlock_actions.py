@@ -10,7 +10,16 @@ from served import until
 
 from fitctl.config import QUANTITIES
 from fitctl.daemon.machine import Machine, wall_minus_monotonic_s
-from fitctl.messages.commands import Experiment, Hold, Off, Recover, Reset, SetTarget, Standby, Stop
+from fitctl.messages.commands import (
+    Experiment,
+    Off,
+    Recover,
+    Release,
+    Reset,
+    SetTarget,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import Drive
 
@@ -45,7 +54,7 @@ def test_flattened_the_mirror_is_at_its_bias_and_the_siderostat_held_until_it_is
     assert abs(np.mean(errors)) < 0.05
 
 
-@pytest.mark.parametrize("action", ["hold", "flatten"])
+@pytest.mark.parametrize("action", ["freeze", "flatten"])
 def test_an_experiment_ends_when_its_stages_are_held(action):
     bench = with_action(action, modes="['EXPERIMENT']")
     drive = Drive(channel="fsm_az", shape="sine", amplitude=0.1, frequency_hz=1.0, duration_s=60.0)
@@ -100,7 +109,7 @@ def test_recover_opens_a_silent_camera_anew_and_needs_no_reset():
 
 def test_encoders_that_count_anew_after_opening_are_no_runaway():
     bench = Bench()
-    for command in (Hold(), Off()):
+    for command in (Release(), Off()):
         assert bench.simulation.command(command).accepted
     bench.run(0.1)
     plant = bench.simulation.plants["right"].state
@@ -126,7 +135,7 @@ def test_a_reset_is_refused_by_name():
 
 def test_hold_by_command_is_no_interlock():
     bench = Bench()
-    bench.simulation.command(Hold())
+    bench.simulation.command(Release())
     bench.run(3.0)
 
     assert not bench.tripped

@@ -183,7 +183,7 @@ def test_an_error_of_a_device_is_told_in_its_own_words():
 
 
 def test_the_strongest_action_of_all_that_is_tripped_is_in_force():
-    actions = ["hold", "safe", "warn", "flatten"]
+    actions = ["freeze", "safe", "warn", "flatten"]
     rows = {action: row(action=action, for_s=0.0, reset="hand") for action in actions}
     interlocks = Interlocks(rows, {})
     interlocks.evaluate("VERNIER", 1.0, {FIRST: (2.0, 1.0, "")})
@@ -192,7 +192,7 @@ def test_the_strongest_action_of_all_that_is_tripped_is_in_force():
         in_force.append(interlocks.action)
         interlocks.reset(interlocks.action, 1.0, {})
 
-    assert in_force == ["safe", "flatten", "hold", "warn"]
+    assert in_force == ["safe", "flatten", "freeze", "warn"]
 
 
 values = st.one_of(st.none(), st.floats(-3, 3), st.just(float("nan")))
@@ -207,7 +207,7 @@ rows = st.builds(
     stale_s=st.one_of(st.none(), st.floats(0.03, 0.3)),
     for_s=st.floats(0, 0.2),
     modes=st.lists(st.sampled_from(["STANDBY", "COARSE", "VERNIER"]), min_size=1, unique=True),
-    action=st.sampled_from(["warn", "hold", "flatten", "safe"]),
+    action=st.sampled_from(["warn", "freeze", "flatten", "safe"]),
     reset=st.sampled_from(["hand", "itself"]),
 )
 

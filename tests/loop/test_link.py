@@ -7,9 +7,9 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import Event, ModeChange, Overlap, Tick
 from fitctl.messages.commands import (
     Acquire,
-    Hold,
     Off,
     Recover,
+    Release,
     SetController,
     SetTarget,
     Standby,
@@ -240,10 +240,10 @@ def test_a_metrology_loop_that_is_stopped_and_brought_back_finds_left_waiting(he
 
 
 def test_hold_ends_the_waiting(held):
-    held.command(Hold(loop=METROLOGY))
+    held.command(Release(loop=METROLOGY))
     held.run(0.1)
     assert held.loop(LEFT).waits_for
-    held.command(Hold(loop=LEFT))
+    held.command(Release(loop=LEFT))
     held.run(0.1)
     assert held.loop(LEFT).mode is Mode.STANDBY
     assert not held.loop(LEFT).waits_for

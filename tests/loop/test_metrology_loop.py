@@ -116,7 +116,7 @@ def test_a_beam_that_jumps_far_is_pulled_in_again():
 
 def test_hold_leaves_the_siderostat_where_it_is():
     one = bench(collector_m=drift).held().run(2.0)
-    one.loop.fire(Trigger.HOLD, "test")
+    one.loop.fire(Trigger.RELEASE, "test")
     before = one.motors.position_rad.copy()
     one.run(2.0)
     assert one.loop.mode is Mode.STANDBY

@@ -5,7 +5,7 @@ import pytest
 from simulated import darken, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Experiment, Hold
+from fitctl.messages.commands import Acquire, Experiment, Release
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import Drive
 from fitctl.simulation.simulation import Simulation, simulate
@@ -80,7 +80,7 @@ def test_a_rate_that_is_a_little_wrong_is_learned_as_drift():
 
 
 def test_the_siderostat_stands_in_standby_and_the_next_search_begins_where_the_star_has_gone(held):
-    held.command(Hold())
+    held.command(Release())
     held.run(0.5)
     stood_rad = held.ticks[-1].siderostat_az_rad, held.ticks[-1].siderostat_el_rad
     held.run(10.0)
@@ -111,7 +111,7 @@ def test_a_star_that_is_dark_for_a_while_is_found_where_it_has_gone(held):
 
 def test_a_star_is_searched_for_where_a_command_says_that_it_would_be_with_the_motors_at_zero(held):
     """The command's place is of this moment."""
-    held.command(Hold())
+    held.command(Release())
     held.run(1.0)
     now_s = held.clock.now_s()
     away_arcsec = np.array([10.0, -6.0]) * 2.708 + np.array(RATE_ARCSEC_S) * now_s

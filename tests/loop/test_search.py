@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Hold, Standby
+from fitctl.messages.commands import Acquire, Release, Standby
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.model.optics import scales
 from fitctl.simulation.simulation import Simulation
@@ -96,7 +96,7 @@ def test_a_flux_that_is_asked_for_holds_until_the_next_search_by_command():
     run_until(simulation, Mode.VERNIER, 30.0)  # found again, as the same star
 
     assert loop.quantities.readings["star_flux_fraction"][0] == pytest.approx(1 / 0.8, rel=0.05)
-    simulation.command(Hold())
+    simulation.command(Release())
     simulation.command(Acquire())
     run_until(simulation, Mode.VERNIER, 30.0)
     assert loop.quantities.readings["star_flux_fraction"][0] == pytest.approx(1.0, rel=0.05)
@@ -120,7 +120,7 @@ def test_a_radius_holds_for_one_search_only():
     simulation.command(Acquire(search_radius_sky_arcsec=10.0))
     run_until(simulation, Mode.COARSE, 10.0)
 
-    simulation.command(Hold())
+    simulation.command(Release())
     simulation.plants["right"].constants.spot_origin_px[:] += 2000.0
     simulation.command(Acquire())
     run_until(simulation, Mode.STANDBY, 60.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from simulated import darken, events_of, mode_of, until
 
-from fitctl.messages.commands import Acquire, Hold, Stop
+from fitctl.messages.commands import Acquire, Release, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 
@@ -132,7 +132,7 @@ def test_the_siderostat_stays_within_its_travel_however_long_it_searches(held):
 
 @pytest.mark.parametrize(
     ("command", "ends"),
-    [(Hold(), Mode.STANDBY), (Stop(), Mode.SAFE), (Acquire(), Mode.ACQUISITION)],
+    [(Release(), Mode.STANDBY), (Stop(), Mode.SAFE), (Acquire(), Mode.ACQUISITION)],
 )
 def test_hold_stop_and_another_acquire_end_it(held, command, ends):
     simulation = held()

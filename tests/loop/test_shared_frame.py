@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Hold, SetTarget, Standby
+from fitctl.messages.commands import Acquire, Release, SetTarget, Standby
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -106,7 +106,7 @@ def test_a_star_that_does_not_move_with_the_loops_stages_is_not_its_own():
 
 
 def test_a_star_that_vanishes_is_lost_though_another_is_on_the_frame(held):
-    held.command(Hold(loop=LEFT))  # no loop follows its star from now on
+    held.command(Release(loop=LEFT))  # no loop follows its star from now on
     held.light(right=0.0, left=1.0)
     held.run(0.5)
     assert held.loop(RIGHT).mode is Mode.ACQUISITION

@@ -23,7 +23,7 @@ def test_a_shipped_row_trips_and_acts(name):
     if trip.action == "safe":
         assert bench.loop.mode is Mode.SAFE
         assert bench.loop.last_change.reason == trip.reason
-    elif trip.action == "hold":
+    elif trip.action == "freeze":
         before = (*loop.mirror.stack_v, *loop.siderostat.setpoint_rad)
         bench.run(0.5)
         assert (*loop.mirror.stack_v, *loop.siderostat.setpoint_rad) == before

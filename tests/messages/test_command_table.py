@@ -6,8 +6,8 @@ import pytest
 
 from fitctl.cli import main
 from fitctl.config import ConfigError
-from fitctl.messages.command_table import COMMANDS, ROWS, WORDS, command_of
-from fitctl.messages.commands import Acquire, AnyCommand, Reset, SetTarget, Stop
+from fitctl.messages.command_table import COMMANDS, ROWS, WORDS, as_command, command_of
+from fitctl.messages.commands import Acquire, AnyCommand, Reply, Reset, SetTarget, Stop
 
 
 def test_every_command_is_in_the_table_once():
@@ -72,6 +72,7 @@ def test_a_value_below_zero_is_no_option(tmp_path, capsys):
         ("target", ["1"], "needs az_px el_px"),
         ("target", ["far", "1"], "target far 1"),
         ("stop", ["now"], "needs no values"),
+        ("hold", [], "hold is now release"),
         ("controller", ["best"], "controller best"),
     ],
 )
@@ -81,3 +82,26 @@ def test_what_cannot_be_a_command_is_refused_in_one_line(word, values, complaint
 
     assert complaint in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_words_of_python_are_those_of_the_shell():
+    assert as_command("target 22.5 19", "right") == SetTarget(loop="right", az_px=22.5, el_px=19.0)
+    assert as_command("stop") == Stop()
+    assert as_command(Stop()) == Stop()
+
+
+@pytest.mark.parametrize("given", ["", "  ", "halt", "target 1", "stop now", "hold"])
+def test_words_that_are_no_command_raise(given):
+    with pytest.raises(ConfigError, match=r"^send: "):
+        as_command(given)
+
+
+@pytest.mark.parametrize("given", [None, 3, b"stop", Stop, Reply(accepted=True)])
+def test_what_is_no_command_at_all_raises(given):
+    with pytest.raises(TypeError, match="expected words such as"):
+        as_command(given)
+
+
+def test_a_message_has_its_own_loop():
+    with pytest.raises(TypeError):
+        as_command(Stop(), "right")

@@ -83,7 +83,7 @@ def test_the_numbers_that_logs_carry_never_change():
 
 def test_usable_commands_are_those_that_have_a_row():
     assert usable_commands(Mode.STANDBY) == [Trigger.ACQUIRE, Trigger.STOP, Trigger.OFF]
-    assert usable_commands(Mode.ACQUISITION) == [Trigger.ACQUIRE, Trigger.HOLD, Trigger.STOP]
+    assert usable_commands(Mode.ACQUISITION) == [Trigger.ACQUIRE, Trigger.RELEASE, Trigger.STOP]
     assert usable_commands(Mode.SAFE) == [Trigger.STOP, Trigger.RECOVER, Trigger.OFF]
 
 

@@ -81,7 +81,9 @@ def test_a_command_that_todays_code_refuses_is_told(logged):
     result = replayed(path)
 
     assert not result.same
-    assert result.refused == ["Recover: recover means nothing in VERNIER; from here: hold, stop"]
+    assert result.refused == [
+        "Recover: recover is not available in VERNIER. Available: release, stop"
+    ]
 
 
 def test_a_frame_that_is_not_in_the_log_is_counted(held_log):

@@ -43,8 +43,29 @@ def test_what_is_refused_or_fails_raises_and_says_why():
             instrument.hold(1.0)
         assert failed.value.attempt.outcome == "failed"
         with pytest.raises(SequenceError, match="max_offset_px is 2"):
-            instrument.target(3.0, 0.0, max_offset_px=2.0)
+            instrument.offset(3.0, 0.0, max_offset_px=2.0)
         assert mode(instrument) == "OFF"
+
+
+@pytest.mark.parametrize(("old", "today"), [("target", "offset"), ("jog", "dither")])
+def test_an_old_name_of_a_step_is_refused_with_the_new_one(old, today):
+    with Instrument(NEAR, simulate=True) as instrument:
+        with pytest.raises(AttributeError, match=f"the step {old} is now {today}"):
+            getattr(instrument, old)
+        assert not hasattr(instrument, "tagret")
+        assert not hasattr(AsyncInstrument, old)
+
+
+def test_words_are_commands_and_a_refusal_is_in_the_reply():
+    with Instrument(NEAR, simulate=True) as instrument:
+        instrument.send_and_wait("standby")
+        assert mode(instrument) == "STANDBY"
+        assert instrument.send("stop").accepted
+        refused = instrument.send("acquire", loop="right")
+        assert not refused.accepted
+        assert refused.text == "acquire is not available in SAFE. Available: stop, recover, off"
+        with pytest.raises(ConfigError, match="send: halt is no command; there are stop"):
+            instrument.send("halt")
 
 
 def test_stop_is_safe_and_no_step_runs_after_it():
@@ -63,7 +84,7 @@ def test_a_command_is_followed_to_its_end_and_its_failure_raises(monkeypatch):
         assert mode(instrument) == "STANDBY"
         instrument.send_and_wait(Stop())
         with pytest.raises(
-            SequenceError, match="acquire was refused: acquire means nothing in SAFE"
+            SequenceError, match="acquire was refused: acquire is not available in SAFE"
         ):
             instrument.send_and_wait(Acquire())
         piezo = instrument._link._simulation.devices.loops["right"].piezo
@@ -326,8 +347,8 @@ def test_every_step_is_a_method_with_its_keys_and_defaults(name):
     [
         ("hold", ["duration_s"]),
         ("stars", ["stars"]),
-        ("target", ["offset_az_px", "offset_el_px"]),
-        ("jog", ["jog_px"]),
+        ("offset", ["offset_az_px", "offset_el_px"]),
+        ("dither", ["dither_px"]),
         ("raster", ["columns", "rows", "spacing_px"]),
         ("controller", ["name"]),
         ("experiment", ["what"]),

@@ -7,7 +7,7 @@ import pytest
 from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Hold, SequenceControl, Stop
+from fitctl.messages.commands import Acquire, Release, SequenceControl, Stop
 from fitctl.sequences import view
 from fitctl.sequences.behaviours import pointing
 from fitctl.sequences.files import find_sequence, shipped_sequences
@@ -136,7 +136,7 @@ def test_a_step_waits_for_the_mode_that_it_needs_but_not_for_one_that_never_come
 
 def test_a_star_that_is_let_go_fails_the_hold_and_the_next_attempt_says_why(tried):
     run = tried()
-    run.link.meddling = [(15.0, Hold())]
+    run.link.meddling = [(15.0, Release())]
 
     run(ACQUIRE, {**HOLD, "duration_s": 60.0, "attempts": 2})
 
@@ -149,7 +149,7 @@ def test_stop_ends_the_sequence_at_once_and_has_the_last_word(tried):
     run = tried()
     run.link.meddling = [(15.0, Stop())]
 
-    run(ACQUIRE, {"step": "jog", "dwell_s": 20.0, "attempts": 3}, HOLD)
+    run(ACQUIRE, {"step": "dither", "dwell_s": 20.0, "attempts": 3}, HOLD)
 
     assert run.outcomes() == ["done", "stopped"]
     assert run.attempts[-1].ended_s < 15.5
@@ -163,7 +163,7 @@ def test_stop_ends_the_sequence_at_once_and_has_the_last_word(tried):
 
 def test_the_operator_stops_it_and_the_stages_are_held(tried):
     run = tried()
-    run.link.meddling = [(15.0, SequenceControl(action="stop"))]
+    run.link.meddling = [(15.0, SequenceControl(action="end"))]
 
     run(ACQUIRE, {**HOLD, "duration_s": 600.0}, HOLD)
 
@@ -181,7 +181,7 @@ def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
     run.link.meddling = [(when_s, interrupt)]
 
     with pytest.raises(KeyboardInterrupt):
-        run(ACQUIRE, {"step": "target", "offset_az_px": 3.0, "offset_el_px": 0.0, "dwell_s": 60.0})
+        run(ACQUIRE, {"step": "offset", "offset_az_px": 3.0, "offset_el_px": 0.0, "dwell_s": 60.0})
 
     assert run.attempts[-1].outcome == "stopped"
     assert run.link.mode() == "STANDBY"
@@ -227,7 +227,7 @@ def test_a_pause_within_a_motion_takes_effect_after_it(tried):
         (100.0, SequenceControl(action="resume")),
     ]
 
-    run(ACQUIRE, {"step": "jog", "dwell_s": 12.0}, {"step": "wait", "duration_s": 1.0})
+    run(ACQUIRE, {"step": "dither", "dwell_s": 12.0}, {"step": "wait", "duration_s": 1.0})
 
     assert run.outcomes() == ["done", "done", "done"]
     jog, wait = run.attempts[1:]
@@ -237,7 +237,7 @@ def test_a_pause_within_a_motion_takes_effect_after_it(tried):
 
 def test_a_target_that_fails_goes_back_to_the_rig_files(tried):
     run = tried()
-    away = {"step": "target", "offset_az_px": 2.0, "offset_el_px": -1.0, "dwell_s": 12.0}
+    away = {"step": "offset", "offset_az_px": 2.0, "offset_el_px": -1.0, "dwell_s": 12.0}
 
     run(ACQUIRE, away, {**away, "offset_az_px": 3.0, "rms_limit_px": 1e-4})
 
@@ -262,7 +262,7 @@ def test_motions_that_a_lost_star_ends_are_not_taken_for_whole_but_made_again(tr
 
 def test_motions_that_the_operator_stops_end_at_once(tried):
     run = tried()
-    run.link.meddling = [(15.0, SequenceControl(action="stop"))]
+    run.link.meddling = [(15.0, SequenceControl(action="end"))]
 
     run(ACQUIRE, {"step": "chirp", "channel": "fsm_az", "duration_s": 100.0})
 

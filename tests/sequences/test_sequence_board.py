@@ -43,7 +43,7 @@ def test_a_sequence_that_is_silent_has_lapsed():
     board.after(SILENCE_S + 0.1)
 
     assert board.status() is None
-    assert not board.control("stop").accepted
+    assert not board.control("end").accepted
     assert board.report(OTHER).accepted
     assert not board.report(FIRST).accepted  # it is too late
 
@@ -65,9 +65,9 @@ def test_orders_stay_until_the_next_one_whatever_the_sequence_says():
     assert board.status().wanted == "pause"
     board.control("resume")
     assert board.status().wanted == "run"
-    board.control("stop")
+    board.control("end")
     assert not board.control("resume").accepted
-    assert board.status().wanted == "stop"
+    assert board.status().wanted == "end"
     board.report(msgspec.structs.replace(FIRST, state="stopped"))
 
     board.report(OTHER)

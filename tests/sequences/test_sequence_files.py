@@ -28,6 +28,10 @@ def mistakes(tmp_path, text, rig=RIG):
     ("step", "said"),
     [
         ('step = "hold"', "step 1 (hold): duration_s: is missing"),
+        ('step = "jog"', "step 'jog' is now 'dither'"),
+        ('step = "target"', "step 'target' is now 'offset'"),
+        ('step = "dither", jog_px = 1.0', "jog_px: unknown key; it is now dither_px"),
+        ('step = "stars", on_failure = "stop"', "stop is now fail"),
         ('step = "hold", duration_s = -1.0', "step 1 (hold): duration_s: must be greater than 0"),
         ('step = "hold", duration_s = "long"', "step 1 (hold): duration_s: must be a valid number"),
         (
@@ -52,10 +56,13 @@ def mistakes(tmp_path, text, rig=RIG):
             'step = "acquire", max_offset_sky_arcsec = 9.0, search_radius_sky_arcsec = 10.0',
             "search_radius_sky_arcsec passes max_offset_sky_arcsec, 9",
         ),
-        ('step = "jog", jog_px = 4.0', "would go 5.66 px from its target; max_offset_px is 5"),
-        ('step = "jog", max_offset_sky_arcsec = 1.0', "max_offset_sky_arcsec is 1"),
-        ('step = "jog", jog_px = 30.0, max_offset_px = 100.0', "a place is off the frame"),
-        ('step = "jog", dwell_s = 5.0', "steady_after_s must be below dwell_s, 5 s"),
+        (
+            'step = "dither", dither_px = 4.0',
+            "would go 5.66 px from its target; max_offset_px is 5",
+        ),
+        ('step = "dither", max_offset_sky_arcsec = 1.0', "max_offset_sky_arcsec is 1"),
+        ('step = "dither", dither_px = 30.0, max_offset_px = 100.0', "a place is off the frame"),
+        ('step = "dither", dwell_s = 5.0', "steady_after_s must be below dwell_s, 5 s"),
         ('step = "controller", name = "../a.json"', "name: must be"),
         ('step = "experiment", what = "response"', "what: must be"),
         ('step = "experiment", what = "hysteresis"', "max_offset_px is 5"),
@@ -190,7 +197,7 @@ def test_a_steps_keys_are_set_by_its_number_or_its_name(tmp_path, override, dura
     ("override", "said"),
     [
         ("steps.4.duration_s=1.0", "there are 1 (acquire), 2 (hold), 3 (hold)"),
-        ("steps.jog.jog_px=1.0", "expected steps.NUMBER.key=value or steps.NAME.key=value"),
+        ("steps.dither.dither_px=1.0", "expected steps.NUMBER.key=value or steps.NAME.key=value"),
         ("steps.2=1.0", "expected steps.NUMBER.key=value"),
         ("steps.2.duration=1.0", "duration: unknown key; did you mean duration_s?"),
         ("steps.2.duration_s", "expected key.path=value, for example steps.2.duration_s=60.0"),

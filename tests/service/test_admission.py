@@ -5,8 +5,8 @@ import pytest
 from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import (
     Acquire,
-    Hold,
     RecentEvents,
+    Release,
     SequenceControl,
     Status,
     Stop,
@@ -34,15 +34,15 @@ def test_the_first_who_commands_has_the_instrument(admission):
 def test_another_is_refused_and_told_who_has_it_and_what_to_do(admission):
     admission.refusal(ANNA, Acquire(), 0.0)
 
-    assert admission.refusal(OWNER, Hold(), 1.0).startswith("anna has the instrument")
-    assert "take-over" in admission.refusal(OWNER, Hold(), 1.0)
+    assert admission.refusal(OWNER, Release(), 1.0).startswith("anna has the instrument")
+    assert "take-over" in admission.refusal(OWNER, Release(), 1.0)
     assert admission.commander(1.0) == "anna"
 
 
 def test_the_same_person_may_command_from_several_places(admission):
     admission.refusal(OWNER, Acquire(), 0.0)
 
-    assert admission.refusal(OWNER._replace(address="process 8"), Hold(), 1.0) == ""
+    assert admission.refusal(OWNER._replace(address="process 8"), Release(), 1.0) == ""
 
 
 def test_who_takes_over_has_it(admission):
@@ -50,7 +50,7 @@ def test_who_takes_over_has_it(admission):
 
     assert admission.refusal(OWNER, TakeOver(), 1.0) == ""
     assert admission.commander(1.0) == "owner@here"
-    assert "owner@here has the instrument" in admission.refusal(ANNA, Hold(), 2.0)
+    assert "owner@here has the instrument" in admission.refusal(ANNA, Release(), 2.0)
 
 
 @pytest.mark.parametrize("command", [Stop(), SequenceControl(action="pause"), Status()])
@@ -66,7 +66,7 @@ def test_the_lease_lapses_when_its_holder_is_silent(admission):
     admission.refusal(OWNER, Status(), LEASE_S)  # another's word is not the holder's
 
     assert admission.commander(LEASE_S + 0.1) == ""
-    assert admission.refusal(OWNER, Hold(), LEASE_S + 0.1) == ""
+    assert admission.refusal(OWNER, Release(), LEASE_S + 0.1) == ""
 
 
 def test_an_open_console_keeps_the_lease(admission):

@@ -17,7 +17,7 @@ from served import Served, rig_in, until
 from fitctl.clock import MonotonicClock, VirtualClock
 from fitctl.config import ConfigError
 from fitctl.logging.records import CommandRecord
-from fitctl.messages.commands import Hold, Status, Stop, TakeOver
+from fitctl.messages.commands import Release, Status, Stop, TakeOver
 from fitctl.messages.endpoints import (
     GATEWAY_SOCKET,
     TELEMETRY_SOCKET,
@@ -159,7 +159,7 @@ def test_clients_come_back_to_a_new_gateway_and_a_key_revoked_meanwhile_does_not
     served.start_gateway()
 
     assert served.follow(lambda t: t.commander == "", client=bob)
-    assert bob.send(Hold()).text  # from the supervisor: there is nothing to hold
+    assert bob.send(Release()).text  # from the supervisor: there is nothing to hold
     assert "the key anna was revoked or changed" in served.events()
     with pytest.raises(ConnectionError, match="does not let the key anna in"):
         anna.send(Stop(), timeout_s=0.5)

@@ -11,7 +11,7 @@ from served import Served, until
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Hold, Standby, Status, Stop, TakeOver
+from fitctl.messages.commands import Release, Standby, Status, Stop, TakeOver
 from fitctl.messages.endpoints import tcp_endpoint
 from fitctl.messages.keys import revoke_key
 from fitctl.sequences.instrument import Instrument
@@ -62,7 +62,7 @@ def test_stop_is_taken_from_whoever_may_command(served):
     holder, other = served.person("holder"), served.person("other")
     holder.send(TakeOver())
 
-    assert "holder has the instrument" in other.send(Hold()).text
+    assert "holder has the instrument" in other.send(Release()).text
     assert other.send(Stop()).accepted
     assert served.client.send(Stop()).accepted
     assert served.follow(lambda t: t.loops[0].mode == "SAFE").commander == "holder"
@@ -76,7 +76,7 @@ def test_taking_over_is_told_to_everybody(served):
 
     assert served.follow(lambda t: t.commander == "second")
     until(lambda: "second has the instrument, taken over from first" in served.events())
-    assert not first.send(Hold()).accepted
+    assert not first.send(Release()).accepted
 
 
 def test_revoking_refuses_commands_and_cuts_telemetry_of_who_is_connected(served):

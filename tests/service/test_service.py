@@ -42,7 +42,7 @@ def test_commands_lead_through_the_modes_and_telemetry_shows_it(served):
 
     loop = telemetry.loops[0]
     assert loop.last_change.target == "VERNIER"
-    assert loop.usable_commands == ["Hold", "Stop"]
+    assert loop.usable_commands == ["Release", "Stop"]
     assert telemetry.frame.width_px * telemetry.frame.height_px * 2 == len(telemetry.frame.data)
     assert telemetry.records_lost == 7
     assert {device.device for device in telemetry.devices} == {

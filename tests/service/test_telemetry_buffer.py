@@ -4,7 +4,7 @@ import pytest
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.command_table import command_record
-from fitctl.messages.commands import Hold, Reply, Stop
+from fitctl.messages.commands import Release, Reply, Stop
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.simulation import Simulation
 
@@ -25,7 +25,7 @@ def recorded(command, sender, *, accepted=True):
         ([], ""),
         ([recorded(Stop(), "anna")], "anna"),
         ([recorded(Stop(), "anna"), recorded(Stop(), "bert")], "bert"),
-        ([recorded(Stop(), "anna"), recorded(Hold(), "bert")], "anna"),
+        ([recorded(Stop(), "anna"), recorded(Release(), "bert")], "anna"),
         ([recorded(Stop(), "anna"), recorded(Stop(), "bert", accepted=False)], "anna"),
     ],
 )

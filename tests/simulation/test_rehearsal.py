@@ -5,7 +5,7 @@ import math
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Hold, Jog, Recover, SetTarget, Stop
+from fitctl.messages.commands import Jog, Recover, Release, SetTarget, Stop
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.rehearsal import RehearsalError, present_of, rehearse
 from fitctl.simulation.simulation import Simulation
@@ -81,7 +81,7 @@ def test_the_interlock_that_trips_is_foreseen_and_when(instrument):
 
 
 def test_a_jog_is_foreseen_to_its_place_or_to_its_refusal(instrument):
-    instrument.simulation.command(Hold())
+    instrument.simulation.command(Release())
     instrument.simulation.run(1.0)
     foreseen, after = instrument.foresee_and_do(Jog(az_sky_arcsec=20.0, el_sky_arcsec=-10.0))
     end = foreseen.ends[0].siderostat_sky_arcsec[1]

@@ -11,9 +11,9 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import save_design
 from fitctl.messages.commands import (
     Acquire,
-    Hold,
     Off,
     Recover,
+    Release,
     SetController,
     SetTarget,
     Standby,
@@ -135,7 +135,7 @@ def test_a_star_that_jumps_out_of_reach_is_pulled_in_again(vernier):
 
 def test_hold_keeps_the_siderostat_where_it_is(vernier):
     before = vernier.supervisor.servos["right"].position_rad.copy()
-    assert vernier.command(Hold()).accepted
+    assert vernier.command(Release()).accepted
     vernier.run(2.0)
 
     assert mode_of(vernier) is Mode.STANDBY
@@ -242,7 +242,7 @@ def test_one_command_recovers_and_another_finds_the_star_again(vernier):
 
 
 def test_off_lets_go_of_everything_and_standby_takes_it_again(vernier):
-    vernier.command(Hold())
+    vernier.command(Release())
     assert vernier.command(Off()).accepted
     assert mode_of(vernier) is Mode.OFF
     assert not vernier.supervisor.servos["right"].opened

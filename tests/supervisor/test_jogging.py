@@ -5,7 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from fitctl.messages.commands import Acquire, Hold, Jog, Off, Recover, SetBiasOffset, Standby, Stop
+from fitctl.messages.commands import (
+    Acquire,
+    Jog,
+    Off,
+    Recover,
+    Release,
+    SetBiasOffset,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import Mode
 
 
@@ -135,6 +144,6 @@ def test_the_search_leaves_the_mirror_where_the_operator_put_it(standby):
     standby.command(Acquire())
     standby.run(0.5)
     assert loop_of(standby).mirror.now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)
-    standby.command(Hold())
+    standby.command(Release())
     standby.run(0.5)
     assert loop_of(standby).mirror.now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)

@@ -9,9 +9,9 @@ from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import (
     Acquire,
-    Hold,
     Off,
     Recover,
+    Release,
     SetController,
     SetTarget,
     Shutdown,
@@ -138,7 +138,7 @@ def test_a_failure_is_over_once_another_command_is_accepted(fresh, monkeypatch):
     broken_piezo(fresh, monkeypatch)
     fresh.command(Standby())
     fresh.run(0.1)
-    assert not fresh.command(Hold()).accepted
+    assert not fresh.command(Release()).accepted
     assert state(fresh).last_failure is not None
 
     assert fresh.command(SetTarget(az_px=22.0, el_px=19.0)).accepted
@@ -178,7 +178,7 @@ def test_a_fault_during_the_search_fails_acquire_with_its_reason(no_star, monkey
     assert (found.state, found.text) == ("failed", str(SILENT))
 
 
-@pytest.mark.parametrize("command", [Hold(), Stop()], ids=["hold", "stop"])
+@pytest.mark.parametrize("command", [Release(), Stop()], ids=["release", "stop"])
 def test_a_search_that_a_person_ends_is_no_failure(no_star, command):
     reply = no_star.command(Acquire())
     no_star.command(command)

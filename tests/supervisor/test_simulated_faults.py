@@ -6,7 +6,7 @@ from simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.logging.records import DeviceHealth, FrameRecord, PiezoReading, Tick
-from fitctl.messages.commands import Acquire, Hold, Off, Recover, SetBiasOffset, Standby, Stop
+from fitctl.messages.commands import Acquire, Off, Recover, Release, SetBiasOffset, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.devices import InlineExecutor
 
@@ -75,7 +75,7 @@ def test_amplifiers_keep_their_power_however_long_the_recovery_from_safe_takes(
 
 
 def test_a_siderostat_that_does_not_come_to_where_the_search_begins_is_told(vernier, monkeypatch):
-    vernier.command(Hold())
+    vernier.command(Release())
     vernier.supervisor.servos["right"].stop()
     vernier.command(Acquire(expected_az_sky_arcsec=400.0, expected_el_sky_arcsec=0.0))
     until(vernier, Mode.STANDBY, limit_s=60.0)
@@ -135,7 +135,7 @@ def test_an_error_that_is_no_devices_leads_to_safe_and_not_to_a_crash(vernier, m
 
 
 def test_encoders_that_count_anew_make_the_old_place_of_the_star_forgotten(vernier):
-    vernier.command(Hold())
+    vernier.command(Release())
     vernier.command(Off())
     vernier.run(0.1)
     vernier.plants["right"].state.motor_rad[:] += 30.0
@@ -222,7 +222,7 @@ def test_two_devices_that_fail_at_once_are_each_told_once(vernier, monkeypatch):
 
 
 def test_a_mirror_that_is_turned_off_again_and_again_keeps_its_slew_limit(vernier):
-    vernier.command(Hold())
+    vernier.command(Release())
     fsm = vernier.rig.loops["right"].fsm
     vernier.run(3.0)
     urad = 0.9e6 * fsm.range_rad
@@ -259,7 +259,7 @@ def test_the_stacks_are_watched_on_after_the_da_has_failed(vernier, monkeypatch)
 
 
 def test_a_piezo_amplifier_that_is_closed_is_not_asked(vernier, monkeypatch):
-    vernier.command(Hold())
+    vernier.command(Release())
     vernier.run(3.0)
     assert vernier.command(Off()).accepted
     piezo = vernier.devices.loops["right"].piezo

@@ -80,7 +80,7 @@ def test_a_sequence_is_paused_resumed_and_ended_from_its_own_shell_and_others(ri
     file.write_text(WAITING)
     waiting = sequence(rig, "run", file)
     reaches(rig, "running", 1)
-    assert sequence(rig, "stop").wait(timeout=30) == 0
+    assert sequence(rig, "end").wait(timeout=30) == 0
     _, err = waiting.communicate(timeout=30)
     assert waiting.returncode == 1
     assert "stopped by the operator" in err

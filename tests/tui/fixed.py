@@ -48,11 +48,17 @@ SEQUENCES = [
     {
         "file": "jog.toml",
         "schema_version": 1,
-        "name": "jog",
+        "name": "dither",
         "description": "Jogs of the star by one pixel, both axes, and its steady RMS (Fig. 12).",
         "steps": [
             {"step": "acquire", "loop": "", "timeout_s": 120.0, "attempts": 2},
-            {"step": "jog", "loop": "", "jog_px": 1.0, "dwell_s": 20.0, "steady_after_s": 10.0},
+            {
+                "step": "dither",
+                "loop": "",
+                "dither_px": 1.0,
+                "dwell_s": 20.0,
+                "steady_after_s": 10.0,
+            },
         ],
     },
 ]

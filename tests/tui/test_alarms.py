@@ -92,7 +92,7 @@ def test_what_is_reset_by_hand_says_so():
 @pytest.mark.parametrize(
     ("action", "did"),
     [
-        ("hold", "the stages wait where they are"),
+        ("freeze", "the stages wait where they are"),
         ("flatten", "the mirror goes to its bias, the siderostat waits"),
         ("safe", "the loop went to SAFE"),
     ],
@@ -208,7 +208,7 @@ def test_the_weightiest_comes_first_and_the_rest_are_counted():
     watch = Watch(FakeSupervisor())
     watch.supervisor.interlocks = [
         *(tripped(f"number_{number}") for number in range(4)),
-        tripped("worst", action="hold"),
+        tripped("worst", action="freeze"),
     ]
     watch.hear()
     rows = watch.row()
@@ -246,7 +246,7 @@ def test_at_80_columns_the_common_alarms_need_two_rows(wrong):
 
 def test_only_what_is_shown_is_acknowledged():
     watch = Watch(FakeSupervisor())
-    watch.supervisor.interlocks = [tripped("shown", action="hold"), tripped("below")]
+    watch.supervisor.interlocks = [tripped("shown", action="freeze"), tripped("below")]
     watch.hear()
     assert "shown" in watch.row()[0]
     watch.acknowledge()

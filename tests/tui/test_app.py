@@ -5,8 +5,8 @@ import pytest
 from textual.command import CommandPalette
 
 from fitctl.messages.commands import (
-    Hold,
     Off,
+    Release,
     Reply,
     Reset,
     SetController,
@@ -74,7 +74,7 @@ def test_other_commands_do_not_reach_through_a_dialog():
         await pilot.press("escape", "h")
         await until(pilot, lambda: link.sent)
 
-    assert run(scenario).sent == [Hold(loop="right")]
+    assert run(scenario).sent == [Release(loop="right")]
 
 
 def test_ctrl_c_quits_even_over_a_dialog():
@@ -104,7 +104,7 @@ def test_loops_are_cycled_and_commands_go_to_the_shown_one():
         await until(pilot, lambda: link.sent)
 
     assert run(scenario, supervisor=FakeSupervisor(loops=("right", "left"))).sent == [
-        Hold(loop="left")
+        Release(loop="left")
     ]
 
 

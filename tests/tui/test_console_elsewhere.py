@@ -59,7 +59,7 @@ def test_without_the_rig_file_no_sequence_is_checked_or_run_but_what_is_under_wa
 
     app = attached(scenario)
     assert commands(app) == []
-    assert sent(app) == [SequenceControl(loop="right", action="stop")]
+    assert sent(app) == [SequenceControl(loop="right", action="end")]
 
 
 # ---------------------------------------------------------------- with it

@@ -86,7 +86,7 @@ def test_a_parameter_is_edited_checked_and_used():
         await pressed(app, pilot, "enter")
         job = app.jobs[-1]
         assert job.arguments[:2] == ["sequence", "check"]
-        assert "jog_px = 0.5" in Path(job.arguments[2]).read_text()
+        assert "dither_px = 0.5" in Path(job.arguments[2]).read_text()
         assert "jog*" in app.view.query_one(SequenceList).render_line(2).text
         await pressed(app, pilot, "d")
         assert app.jobs[-1].arguments[2] == job.arguments[2]
@@ -148,13 +148,13 @@ def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_st
         ("running", "run", "p", "pause"),
         ("paused", "pause", "p", "resume"),
         ("running", "pause", "p", "resume"),
-        ("running", "run", "z", "stop"),
+        ("running", "run", "z", "end"),
     ],
 )
 def test_what_runs_is_paused_resumed_and_ended_wherever_it_was_started(state, wanted, key, action):
     supervisor = FakeSupervisor()
     supervisor.running_sequence = SequenceStatus(
-        run="1", name="jog", state=state, steps=3, step_number=2, step="hold", wanted=wanted
+        run="1", name="dither", state=state, steps=3, step_number=2, step="hold", wanted=wanted
     )
 
     async def scenario(app, pilot):

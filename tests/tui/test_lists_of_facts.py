@@ -246,7 +246,7 @@ def test_the_time_to_go_falls_with_the_time():
 
     def to_go(step_number):
         supervisor.running_sequence = SequenceStatus(
-            run="1", name="jog", state="running", steps=2, step_number=step_number, step="jog"
+            run="1", name="dither", state="running", steps=2, step_number=step_number, step="dither"
         )
         message = supervisor.message()
         state.accept(message, message.time_s)
@@ -263,7 +263,11 @@ def test_the_time_to_go_falls_with_the_time():
 
 @pytest.mark.parametrize(
     ("mode", "has", "lacks"),
-    [("VERNIER", "Hold", "Recover"), ("SAFE", "Recover", "Hold"), ("STANDBY", "Acquire", "Target")],
+    [
+        ("VERNIER", "Release", "Recover"),
+        ("SAFE", "Recover", "Release"),
+        ("STANDBY", "Acquire", "Target"),
+    ],
 )
 def test_help_begins_with_what_can_be_done_in_this_mode(mode, has, lacks):
     section = now_section(shown(FakeSupervisor(mode)), AlarmBook())

@@ -60,7 +60,7 @@ def parameters(state):
     sequences.documents = [
         {
             "file": "jog.toml",
-            "name": "jog",
+            "name": "dither",
             "description": "A jog.",
             "steps": [{"step": "off", "loop": ""}],
         }
@@ -361,7 +361,7 @@ def test_a_list_scrolls_to_what_is_chosen():
 def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():
     supervisor = FakeSupervisor()
     supervisor.running_sequence = SequenceStatus(
-        run="1", name="jog", state="running", steps=3, step_number=2, step="hold", wanted="pause"
+        run="1", name="dither", state="running", steps=3, step_number=2, step="hold", wanted="pause"
     )
     told = "\n".join(plain(Progress(shown(supervisor)).draw(90, 2)))
     assert "▶ jog running; asked to pause" in told

@@ -5,7 +5,7 @@ import asyncio
 import msgspec
 import pytest
 
-from fitctl.messages.commands import Acquire, Hold, SetTarget, Stop, TakeOver
+from fitctl.messages.commands import Acquire, Release, SetTarget, Stop, TakeOver
 from fitctl.tui.commands import VIEWS
 from fitctl.tui.dialogs import Running
 from fitctl.tui.history import KEPT_S
@@ -153,7 +153,7 @@ def test_live_data_go_on_being_kept_while_the_past_is_shown():
 
 
 @pytest.mark.parametrize(
-    "command", [Acquire(), Hold(), TakeOver(), SetTarget(az_px=20.0, el_px=20.0)]
+    "command", [Acquire(), Release(), TakeOver(), SetTarget(az_px=20.0, el_px=20.0)]
 )
 def test_commands_wait_until_the_console_is_live_again(command):
     async def scenario(app, pilot):
@@ -178,10 +178,10 @@ def test_keys_that_would_be_refused_are_not_in_the_last_line():
         def keys():
             return app.view.query_one(Keys).render_line(0).text
 
-        assert "Hold" in keys()
+        assert "Release" in keys()
         assert "Target" in keys()
         await pressed(app, pilot, "comma")
-        assert "Hold" not in keys()
+        assert "Release" not in keys()
         assert "Target" not in keys()
         assert "STOP" in keys()
         assert "Now" in keys()

@@ -258,7 +258,7 @@ def test_a_click_on_a_loop_chooses_it():
 def test_the_footer_says_which_loop_a_command_goes_to_and_that_stop_is_for_all():
     footer = plain(keys_of_footer(shown(FakeSupervisor(loops=TESTBED))))[0]
     assert footer.startswith(" s STOP all ")
-    assert "right h Hold" in footer
+    assert "right h Release" in footer
     single = plain(keys_of_footer(shown(FakeSupervisor())))[0]
     assert "STOP all" not in single
 

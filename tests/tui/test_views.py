@@ -2,7 +2,7 @@
 
 import pytest
 
-from fitctl.messages.commands import Hold, Stop
+from fitctl.messages.commands import Release, Stop
 from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS, keys_of
 from fitctl.tui.widgets.keys import Keys
 from tests.tui.fixed import settle
@@ -75,7 +75,7 @@ def test_commands_work_on_every_screen():
             await pressed(app, pilot, view.key)
             await pilot.press("h")
 
-    assert sent(run(scenario)) == [Hold(loop="right")] * len(VIEWS)
+    assert sent(run(scenario)) == [Release(loop="right")] * len(VIEWS)
 
 
 def test_no_key_means_two_things_on_one_screen():

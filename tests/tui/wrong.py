@@ -51,7 +51,7 @@ def interlock_warns() -> FakeSupervisor:
 def interlock_holds() -> FakeSupervisor:
     supervisor = FakeSupervisor()
     reason = "interlock frame_missing: no frame for 0.5 s; check camera and cable"
-    supervisor.interlocks = [tripped("frame_missing", "hold", reason, "hand")]
+    supervisor.interlocks = [tripped("frame_missing", "freeze", reason, "hand")]
     return supervisor
 
 

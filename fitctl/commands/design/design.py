@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +22,7 @@ from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
 from fitctl.controllers.design.eq20 import eq20_zpk
-from fitctl.controllers.design.files import load_design, save_design
+from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.linear_loop import loopshape
 from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.controllers.design.standing import Standing, standing
@@ -43,14 +43,14 @@ def design(
         str,
         typer.Argument(
             help="vernier, coarse, bound, compare, learn, or a pair: eq20, lqg-ltr, minimum-variance, "
-            "fslq, or a saved file."
+            "fslq, a saved file (*.json), or a Python file of your own (*.py)."
         ),
     ],
     logs: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="LOG...",
-            help="learn: files of one run, or a folder, which means its newest run.",
+            metavar="FILE...",
+            help="learn: logs of one run, or a folder, which means its newest run. compare: further pairs.",
         ),
     ] = None,
     rig: RigOption = None,
@@ -78,7 +78,7 @@ def design(
     if what == "learn":
         learn(logs or [], rig, overrides, loop, out, as_json=as_json)
         return
-    if logs:
+    if logs and what != "compare":
         msg = f"design {what}: reads no log, got {logs[0]}; only fitctl design learn LOG does"
         raise ConfigError(msg)
     settings = rig_of(rig, overrides)
@@ -87,19 +87,19 @@ def design(
         "vernier": _vernier,
         "coarse": _coarse,
         "bound": _bound,
-        "compare": _compare,
+        "compare": lambda rig, loop: _compare(rig, loop, logs or []),
         **{name: _one(name) for name in DESIGNS},
     }
-    if what.endswith(".json"):
-        reports[what] = _saved(Path(what))
+    if what.endswith((".json", ".py")):
+        reports[what] = _saved(what)
     if what not in reports:
         msg = (
-            f"design: {what} is nothing to design; there are {', '.join([*reports, 'learn'])}, and files "
-            "(*.json) that --out saved"
+            f"design: {what} is nothing to design; there are {', '.join([*reports, 'learn'])}, files "
+            "(*.json) that --out saved, and Python files (*.py) of your own"
         )
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what
-    if out is not None and name not in DESIGNS:
+    if out is not None and name not in DESIGNS and not name.endswith(".py"):
         msg = f"design {what}: --out is for a pair: {', '.join(['vernier', *DESIGNS])}"
         raise ConfigError(msg)
     if plot is not None and name != "lqg-ltr":
@@ -269,11 +269,10 @@ def _one(name: str) -> Callable[[Rig, str], Report]:
     return report
 
 
-def _saved(file: Path) -> Callable[[Rig, str], Report]:
+def _saved(file: str) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
-        its_basis = basis(rig, loop)
-        design = load_design(file, its_basis, DESIGNS)
-        its_basis = on_its_mirror(its_basis, design.parameters)
+        design = design_for(rig, loop, file)
+        its_basis = on_its_mirror(basis(rig, loop), design.parameters)
         return _stands(f"{design.name} of {file}", design, its_basis, rig, loop)
 
     return report
@@ -289,10 +288,11 @@ def _stands(title: str, design: Design, its_basis: Basis, rig: Rig, loop: str) -
     return _standing_numbers(found) | {"theory": theory}, lines
 
 
-def _compare(rig: Rig, loop: str) -> Report:
+def _compare(rig: Rig, loop: str, files: Sequence[Path]) -> Report:
     its_basis = basis(rig, loop)
     least = bound(its_basis)
     found = [standing(design(its_basis), its_basis) for design in DESIGNS.values()]
+    found += [standing(design_for(rig, loop, str(file)), its_basis) for file in files]
     lines = [
         f"{'design':<17} order  crossover  phase m.  gain m.  peak  1 Hz      residual  of bound",
         *map(_compare_line, found),

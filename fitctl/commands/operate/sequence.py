@@ -1,6 +1,6 @@
 """`fitctl sequence`: run a sequence on the rig, check or rehearse it without one, steer the one that runs.
 
-What only some of its commands need is imported within them: scipy must not delay `fitctl sequence stop`.
+What only some of its commands need is imported within them: scipy must not delay `fitctl sequence end`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fitctl.commands.shared.present import present_of_rig
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address, client_of, connect, send_and_print, show_rig
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
 from fitctl.messages.commands import SequenceControl
 from fitctl.processes import ended_by_signals, interrupt
 from fitctl.sequences.files import find_sequence, shipped_sequences
@@ -179,7 +179,7 @@ def run(
 ) -> None:
     """Run a sequence on the instrument.
 
-    Ctrl-C ends the present step, holds the stages, and ends the sequence.
+    Ctrl-C ends the present step and the sequence; the loops release their stars.
     """
     from fitctl.sequences.reading import read_sequence
 
@@ -214,16 +214,23 @@ def resume(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOpt
 
 
 @app.command()
-def stop(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
-    """End the running sequence; hold its stages.
+def end(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
+    """End the running sequence.
 
-    For SAFE, see `fitctl send stop`.
+    Its loops release their stars: STANDBY. For SAFE, use `fitctl send stop`.
     """
-    _steer("stop", rig, overrides, remote)
+    _steer("end", rig, overrides, remote)
+
+
+@app.command(hidden=True)
+def stop() -> None:
+    """Refuse a name that has another meaning."""
+    msg = "sequence stop: is now fitctl sequence end; for SAFE, use fitctl send stop"
+    raise ConfigError(msg)
 
 
 def _steer(
-    action: Literal["pause", "resume", "stop"],
+    action: Literal["pause", "resume", "end"],
     rig: Path | None,
     overrides: list[str] | None,
     remote: Path | None,

@@ -107,7 +107,7 @@ def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
     if running is not None:
         text = f"{running.name} {running.state}, step {running.step_number} of {running.steps}"
         lines.append(_line("sequence", f"{text} ({running.step})"))
-    lines.append(_line("commander", telemetry.commander or "nobody"))
+    lines.append(_line("commander", telemetry.commander or "none"))
     lines.append(_line("supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"))
     return lines
 

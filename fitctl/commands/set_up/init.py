@@ -85,7 +85,7 @@ def init(
     }
     base = TESTBED if testbed else ONE_STAR
     if file.exists():
-        msg = f"{file}: is there already, and init overwrites nothing; name another file"
+        msg = f"{file}: exists already, and init overwrites nothing; name another file"
         raise ConfigError(msg)
     for device, text in options.items():
         if text and device not in DEVICES[base]:

@@ -49,7 +49,7 @@ def new(
     key = new_key(settings, name, "viewer" if viewer else "commander", host, path)
     say(f"{path}: {key.role} {key.name} of rig {key.rig} at {key.host}; hand it over in secret")
     if not settings.service.tcp_address:
-        say("the rig listens to nobody yet: set service.tcp_address and start it anew")
+        say("the rig accepts no remote connections yet: set service.tcp_address and restart it")
 
 
 @app.command("list")
@@ -72,4 +72,4 @@ def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = Non
     A running supervisor disconnects its holder at once.
     """
     revoke_key(rig_of(named_rig(rig), overrides), name)
-    say(f"{name} is let in no more")
+    say(f"key of {name} revoked")

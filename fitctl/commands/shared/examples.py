@@ -52,7 +52,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sequence run": ("fitctl sequence run my-night.toml",),
     "sequence pause": ("fitctl sequence pause",),
     "sequence resume": ("fitctl sequence resume",),
-    "sequence stop": ("fitctl sequence stop",),
+    "sequence end": ("fitctl sequence end",),
     "report": ("fitctl report --latest", "fitctl report --compare monday.mcap tuesday.mcap"),
     "plot": (
         "fitctl plot --latest error_az_px error_el_px",

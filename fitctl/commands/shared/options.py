@@ -40,7 +40,7 @@ ControllerOption = Annotated[
     typer.Option(
         "--controller",
         metavar="NAME",
-        help="eq20, lqg-ltr, minimum-variance, fslq, or a saved design.",
+        help="eq20, lqg-ltr, minimum-variance, fslq, or a file (*.json, *.py).",
         autocompletion=completion.controllers,
     ),
 ]

@@ -145,7 +145,7 @@ async def _serve_mocks(
         raise ConfigError(msg) from None
     except (OSError, zmq.ZMQError) as error:
         await testbed.stop()
-        msg = f"mocks: a port is taken: {error}; choose others with --set, or use --free-ports"
+        msg = f"mocks: a port is in use: {error}; choose others with --set, or use --free-ports"
         raise ConfigError(msg) from None
     if as_json:
         say(to_json(endpoints))

@@ -19,6 +19,7 @@ from fitctl.controllers.design.linear_loop.sampled import sampled_loop
 from fitctl.controllers.design.lqg_ltr import design_lqg_ltr
 from fitctl.controllers.design.margins import KEPT, Required, margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
+from fitctl.controllers.design.own import SUFFIX, own_design
 from fitctl.controllers.pair import LEARNT, Design
 
 DESIGNS: dict[str, Callable[[Basis], Design]] = {
@@ -30,7 +31,7 @@ DESIGNS: dict[str, Callable[[Basis], Design]] = {
 
 
 def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
-    """The design that a rig's loop asks for, or another by its name, its file (*.json) or its parameters.
+    """The design that a rig's loop asks for, or another by its name, its file (*.json, *.py) or its parameters.
 
     Raises
     ------
@@ -42,6 +43,9 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
     its_basis = basis(rig, loop_name)
     if chosen.endswith(".json"):
         design = load_design(Path(chosen), its_basis, DESIGNS)
+    elif chosen.endswith(SUFFIX):
+        with solving(f"controller {chosen}", loop_name):
+            design = own_design(Path(chosen), its_basis)
     elif chosen.startswith("{"):
         design = _learnt(chosen, its_basis)
     elif chosen in DESIGNS:
@@ -49,8 +53,8 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
             design = DESIGNS[chosen](its_basis)
     else:
         msg = (
-            f"controller {chosen}: there are {', '.join(DESIGNS)}, and files (*.json) that "
-            "`fitctl design` saved"
+            f"controller {chosen}: there are {', '.join(DESIGNS)}, files (*.json) that `fitctl design` "
+            "saved, and Python files (*.py) of your own"
         )
         raise ConfigError(msg)
     if not sampled_loop(design, on_its_mirror(its_basis, design.parameters)).stable:

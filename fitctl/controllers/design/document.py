@@ -26,6 +26,7 @@ def design_json(design: Design) -> str:
         "hysteresis_inverse": design.hysteresis_inverse,
         "parameters": design.parameters,
         **({"learnt": True} if design.learnt else {}),
+        **({"own": True} if design.own else {}),
         **{name: getattr(design, name).tolist() for name in MATRICES},
     }
     return json.dumps(document, indent=1) + "\n"
@@ -68,4 +69,5 @@ def design_from_json(text: str) -> Design:
         document["hysteresis_inverse"],
         document["parameters"],
         learnt=document.get("learnt", False),
+        own=document.get("own", False),
     )

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from fitctl.config import ConfigError
+from fitctl.config import ConfigError, is_name
 from fitctl.controllers.design.basis import Basis, basis_of
 from fitctl.controllers.design.document import FORMAT, MATRICES, design_json
+from fitctl.controllers.design.own import checked
 from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
 from fitctl.files import read_regular
 
@@ -81,6 +82,8 @@ def design_of(
             hint = "design it again for this rig: fitctl design ... --out FILE"
             raise _refusal(path, key, f"this rig needs {_shown(expected)}", _shown(got), hint)
     name = str(document.get("name"))
+    if document.get("own") is True and name not in makers and is_name(name):
+        return _as_given(document, name, path, rig_basis)
     if name not in makers:
         hint = "use a file that this fitctl saved"
         raise _refusal(path, "name", f"one of {', '.join(makers)}", _shown(name), hint)
@@ -103,6 +106,21 @@ def design_of(
         got, hint = _shown(document.get("hysteresis_inverse")), "design it again"
         raise _refusal(path, "hysteresis_inverse", str(again.hysteresis_inverse), got, hint)
     return again
+
+
+def _as_given(document: Mapping[str, Any], name: str, path: Path, rig_basis: Basis) -> Design:
+    """A design of the user's own making: there is nothing to make it from again but its matrices."""
+    matrices: dict[str, Any] = {key: document.get(key) for key in MATRICES}
+    given = Design(
+        name=name,
+        period_s=rig_basis.period_s,
+        delay_s=rig_basis.delay_s,
+        hysteresis_inverse=document.get("hysteresis_inverse") is True,
+        parameters={},
+        own=True,
+        **matrices,
+    )
+    return checked(given, rig_basis, str(path))
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -36,9 +36,6 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
     frequency_hz = np.geomspace(_LOWEST_HZ, 0.5 / its_basis.period_s, _POINTS)
     omega_rad_s = 2 * math.pi * frequency_hz
     quick = _without_delay_and_hold(its_basis)
-    quick_design = DESIGNS[design.name](
-        dataclasses.replace(basis_of(design.parameters, quick), noise_px=quick.noise_px)
-    )
     air = its_basis.air_path
     motor_px_per_rad = scale.motor_px(np.eye(2)).T
     link_px_per_rad, link_backlash_rad = np.zeros((2, 2)), math.nan
@@ -51,10 +48,20 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
         link_backlash_rad = _half_width_rad(
             link.backlash_sky_arcsec, motor_sky_rad_per_rad(link) * ARCSEC_PER_RAD
         )
+    sensitivity = 1 / (1 + sampled_response(design, its_basis)(omega_rad_s))
+    undelayed = np.abs(
+        sensitivity
+    )  # of matrices without a maker: what delay and hold cost counts as air
+    if not design.own:
+        quick_basis = basis_of(design.parameters, quick)
+        quick_design = DESIGNS[design.name](
+            dataclasses.replace(quick_basis, noise_px=quick.noise_px)
+        )
+        undelayed = 1 / np.abs(1 + sampled_response(quick_design, quick)(omega_rad_s))
     return LoopTheory(
         frequency_hz=frequency_hz,
-        sensitivity=1 / (1 + sampled_response(design, its_basis)(omega_rad_s)),
-        undelayed=1 / np.abs(1 + sampled_response(quick_design, quick)(omega_rad_s)),
+        sensitivity=sensitivity,
+        undelayed=undelayed,
         # Eq. 8 and 9 with white noise of unit intensity, on both sides of zero.
         air_px2_per_hz=2
         * air.gain_px**2

@@ -10,7 +10,7 @@ from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
 from fitctl.loop.search import refused_search
 from fitctl.loop.spiral_search import refused_area
-from fitctl.messages.commands import Acquire, Hold, Standby
+from fitctl.messages.commands import Acquire, Release, Standby
 from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
@@ -72,7 +72,7 @@ def _own_s(step: steps.Acquire, rig: Rig, loop_name: str) -> float:
 def _run(step: steps.Acquire, view: View) -> None:
     another = step.expected_az_sky_arcsec is not None or step.star_flux_dn is not None
     if another and view.tracking:
-        view.command(Hold(loop=view.loop_name))  # another star, or the same anew
+        view.command(Release(loop=view.loop_name))  # another star, or the same anew
     if view.mode is Mode.OFF:
         view.command(Standby(loop=step.loop))
 

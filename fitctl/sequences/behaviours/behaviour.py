@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.messages.commands import Hold
+from fitctl.messages.commands import Release
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences.steps import Moving
@@ -104,4 +104,4 @@ def too_far(step: Moving, rig: Rig, loop_name: str, offset_px: float) -> list[st
 def stop_tracking(_step: object, view: View) -> None:
     """Stop tracking where the stages are."""
     if view.tracking:
-        view.ask(Hold(loop=view.loop_name))
+        view.ask(Release(loop=view.loop_name))

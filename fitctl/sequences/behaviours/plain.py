@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT
-from fitctl.messages.commands import Hold, Off, SetController, Standby
+from fitctl.messages.commands import Off, Release, SetController, Standby
 from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import POWERED, Behaviour, Result, stop_tracking
@@ -15,7 +15,7 @@ def _run_standby(_step: steps.Standby, view: View) -> None:
     if view.mode is Mode.OFF:
         view.command(Standby(loop=view.loop_name))
     elif view.mode is not Mode.STANDBY:
-        view.command(Hold(loop=view.loop_name))
+        view.command(Release(loop=view.loop_name))
 
 
 def _standby_done(_step: steps.Standby, view: View) -> Result | None:

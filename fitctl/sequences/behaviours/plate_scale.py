@@ -252,10 +252,10 @@ def _calibration(
         if matrix is not None:
             found[name]["axis_gains"] = matrix
     found["siderostat"]["ball_screw_m_per_rad"] = ball_screw
-    lines = [*found_lines, "the siderostat's scale is taken into ball_screw_m_per_rad"]
+    lines = [*found_lines, "ball_screw_m_per_rad includes the siderostat's scale"]
     if fsm.hysteresis is None:
         found["fsm"]["beam_per_mirror"] = fsm.beam_per_mirror * figures["fsm_scale"]
-        lines.append("the mirror's scale is taken into beam_per_mirror")
+        lines.append("beam_per_mirror includes the mirror's scale")
     else:
         lines.append(
             "the mirror's scale is left alone: identify fsm.hysteresis anew where it is off"

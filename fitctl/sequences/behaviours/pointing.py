@@ -120,10 +120,10 @@ def _hold_s(step: steps.Hold, _rig: Rig, _loop_name: str) -> float:
 def places(step: steps.Visiting) -> list[Offset]:
     """Where the star is led, in order."""
     match step:
-        case steps.Target():
+        case steps.Offset():
             return [Offset(step.offset_az_px, step.offset_el_px)]
-        case steps.Jog():
-            there = step.jog_px
+        case steps.Dither():
+            there = step.dither_px
             return [Offset(there, there), Offset(-there, -there), Offset(0.0, 0.0)]
         case steps.Raster():
             return [*_grid(step), Offset(0.0, 0.0)]
@@ -218,7 +218,7 @@ POINTING = {
     "hold": Behaviour(
         HOLDING, _hold_done, check=_check_hold, own_s=_hold_s, pausable=True, of_beams=True
     ),
-    "target": _VISIT,
-    "jog": _VISIT,
+    "offset": _VISIT,
+    "dither": _VISIT,
     "raster": _VISIT,
 }

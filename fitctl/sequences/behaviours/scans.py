@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from fitctl.config import ARCSEC_PER_RAD, Rig
-from fitctl.messages.commands import Hold, Jog, MoveCollector
+from fitctl.messages.commands import Jog, MoveCollector, Release
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import sky_px_per_rad
 from fitctl.sequences import steps
@@ -172,7 +172,7 @@ def _beam_scan_s(step: steps.BeamScan, _rig: Rig, _loop_name: str) -> float:
 
 def _run_beam_scan(_step: steps.BeamScan, view: View) -> None:
     if view.mode is not Mode.STANDBY:
-        view.command(Hold(loop=view.loop_name))
+        view.command(Release(loop=view.loop_name))
 
 
 def _beam_scan_done(step: steps.BeamScan, view: View) -> Result | None:

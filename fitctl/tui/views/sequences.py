@@ -152,8 +152,8 @@ class SequencesView(View):
         self.console.send(SequenceControl(action="resume" if paused else "pause"))
 
     def action_end(self) -> None:
-        """End what is under way; its stages are held."""
-        self.console.send(SequenceControl(action="stop"))
+        """End what is under way; its loops release their stars."""
+        self.console.send(SequenceControl(action="end"))
 
     def action_file(self) -> None:
         """Read a file of the operator's own."""

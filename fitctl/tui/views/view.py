@@ -68,7 +68,7 @@ class View(Screen[None]):
         if self.state.mode in {"COARSE", "VERNIER"} and tick is not None:
             return f"target {tick.target_az_px:g} {tick.target_el_px:g}"
         return {"SAFE": "recover", "STANDBY": "jog 10 0", "OFF": "standby"}.get(
-            self.state.mode, "hold"
+            self.state.mode, "release"
         )
 
     def on_mount(self) -> None:

@@ -71,7 +71,7 @@ def test_a_list_may_end_with_its_first_failure():
         with pytest.raises(
             SequenceError, match=r"\(acquire, star nobody\) failed: .*no star within"
         ):
-            instrument.stars([MISSING, ALPHA], on_failure="stop", **QUICK)
+            instrument.stars([MISSING, ALPHA], on_failure="fail", **QUICK)
 
         assert [attempt.star for attempt in instrument.attempts] == ["", "nobody"]
 

@@ -66,7 +66,7 @@ def test_a_sequence_that_fails_stops_the_motion_that_it_began(testbed):
 
 
 def test_a_sequence_that_is_stopped_stops_the_motion_that_it_began(testbed):
-    testbed.link.meddling = [(9.0, SequenceControl(action="stop"))]
+    testbed.link.meddling = [(9.0, SequenceControl(action="end"))]
     testbed({"step": "standby"}, REFERENCE, SINE, {"step": "wait", "duration_s": 30.0})
     assert testbed.states[-1] == "stopped"
     assert stands_still(testbed)
@@ -143,7 +143,7 @@ OF_BEAMS = {"acquire", "ambient", "beam_scan", "hold", "standby", "off"}
 def test_a_step_that_is_for_stars_refuses_a_metrology_loop_in_one_line(name):
     keys = {
         "controller": {"name": "eq20"},
-        "target": {"offset_az_px": 0.0, "offset_el_px": 0.0},
+        "offset": {"offset_az_px": 0.0, "offset_el_px": 0.0},
         "experiment": {"what": "delay"},
         "chirp": {"channel": "fsm_az"},
         "wait": {"duration_s": 1.0},
