@@ -87,7 +87,7 @@ def test_a_parameter_is_edited_checked_and_used():
         job = app.jobs[-1]
         assert job.arguments[:2] == ["sequence", "check"]
         assert "dither_px = 0.5" in Path(job.arguments[2]).read_text()
-        assert "jog*" in app.view.query_one(SequenceList).render_line(2).text
+        assert "dither*" in app.view.query_one(SequenceList).render_line(2).text
         await pressed(app, pilot, "d")
         assert app.jobs[-1].arguments[2] == job.arguments[2]
         edited.append(job.arguments[2])

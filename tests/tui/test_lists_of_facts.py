@@ -210,7 +210,7 @@ def test_a_sequence_lasts_as_long_as_in_its_dry_run():
     sequences.chosen = 1
     steps = "\n".join(plain(Parameters(sequences.state, "", sequences).draw(60, 20)))
     assert "1 acquire  12 s" in steps
-    assert "2 jog  60 s" in steps
+    assert "2 dither  60 s" in steps
 
 
 def test_a_dry_run_that_fails_or_is_no_json_gives_no_duration():

@@ -364,7 +364,7 @@ def test_a_sequence_under_way_is_told_with_its_step_and_what_is_asked_of_it():
         run="1", name="dither", state="running", steps=3, step_number=2, step="hold", wanted="pause"
     )
     told = "\n".join(plain(Progress(shown(supervisor)).draw(90, 2)))
-    assert "▶ jog running; asked to pause" in told
+    assert "▶ dither running; asked to pause" in told
     assert "step 2/3 hold" in told
 
 
