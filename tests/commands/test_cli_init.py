@@ -151,7 +151,7 @@ def test_every_section_of_the_testbed_stands_under_its_own_heading():
 
     assert headings["loops.metrology"] == "the metrology loop"
     assert headings["loops.left"].startswith("the left stellar loop")
-    assert headings["supervisor"] == "what the supervisor insists on"
+    assert headings["supervisor"] == "the supervisor"
     assert headings["collector.hexapod"] == "the collector bench"
 
 
