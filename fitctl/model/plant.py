@@ -3,7 +3,7 @@
 A leading axis batches independent runs, each with a seed of its own: a run's result does not depend on which
 others are beside it, nor, but for rounding, on how the time is cut into calls. Parts are advanced together, in
 the order in which one acts on the next: collector, metrology loop, the stellar loop whose light comes over that
-link. docs/theory.md derives the coupling.
+link. docs/theory-testbed.md derives the coupling.
 """
 
 from __future__ import annotations
