@@ -1,8 +1,8 @@
 """Where the collector's mirrors and photodiodes stand, and what a motion of their bench does to both lights.
 
 docs/theory-testbed.md derives both. A bench turned by small angles psi carries its two mirrors along. Two
-reflections are one rotation M, so the outgoing light turns by ``((1 - M) psi) x link``: not at all where psi lies
-along the axis of M, the fold's, and by up to twice psi otherwise.
+reflections are one rotation M, so the outgoing light turns by ``((1 - M) psi) x link``: not at all where psi
+lies along the axis of M, the fold's, and by up to twice psi otherwise.
 """
 
 from __future__ import annotations
