@@ -23,8 +23,8 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 .PHONY: $(shell sed -n 's/^\([a-z-]*\):.*/\1/p' $(MAKEFILE_LIST))
 
-help:  ## Say what can be made
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+help:  ## List the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 22
 
 setup: $(READY)  ## Make .venv from the locked requirements
 
@@ -42,7 +42,7 @@ demo: $(READY)  ## Run the whole instrument on mock devices
 # Type checks run beside the tests.
 BESIDE := $(MAKE) --no-print-directory --jobs 2 --output-sync=target
 
-test: lint contract  ## Lint, import contract, types, all tests but those with a target of their own
+test: lint contract  ## Run lint, import contract, types, and all tests without a target of their own
 	@echo "Types and tests, less than five minutes ..."
 	@$(BESIDE) types test-parts
 
@@ -68,39 +68,39 @@ test-parts: $(READY)
 	$(BIN)/pytest --numprocesses 4 --dist loadfile --ignore tests/system
 
 # Nothing may run beside it: it judges real time.
-test-instrument: $(READY)  ## The whole instrument in real time, as processes on real wires
+test-instrument: $(READY)  ## Test the whole instrument in real time, as processes on real wires
 	$(BIN)/pytest --numprocesses 2 --dist loadfile tests/system $(ARGS)
 
-test-long: $(READY)  ## Batches, campaigns, whole nights, the commands of the documents (three minutes)
+test-long: $(READY)  ## Run batches, campaigns, whole nights, and the commands of the documents (three minutes)
 	$(BIN)/pytest -m long --numprocesses 3 --dist loadfile $(ARGS)
 
-test-slow: $(READY)  ## The acceptance runs: ten demos of a minute each, ten long simulations
+test-slow: $(READY)  ## Run the acceptance tests: ten demos of a minute each, ten long simulations
 	$(BIN)/pytest -m slow --timeout 1800 $(ARGS)
 
-test-console: $(READY)  ## What people do: the tutorial, the console by keys (tmux) and in a browser (Chromium)
+test-console: $(READY)  ## Test the tutorial as typed, and the console by keys (tmux) and in a browser (Chromium)
 	-@tests/install-packages tmux chromium
 	$(BIN)/pytest -m terminal tests/system --numprocesses 2 $(ARGS)
 
-test-faults: $(READY)  ## The fault catalogue: the whole instrument, in real time, under everything that can go wrong
+test-faults: $(READY)  ## Run the fault catalogue on the instrument, in real time
 	$(BIN)/pytest -m "fault and not testbed" $(FAULTS) $(ARGS)
 
 # As many as fit into continuous integration; `make test-faults-part FAULT_SEED=...` repeats a run.
 test-faults-part: FAULT_SEED ?= $(shell od -An -N2 -tu2 /dev/urandom | tr -d ' ')
-test-faults-part: $(READY)  ## 100 entries of the whole fault catalogue, drawn anew each time
+test-faults-part: $(READY)  ## Run 100 entries of the whole fault catalogue, drawn at random
 	FITCTL_FAULT_COUNT=100 FITCTL_FAULT_SEED=$(FAULT_SEED) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
 
-test-faults-testbed: $(READY)  ## The fault catalogue's rows on the whole testbed
+test-faults-testbed: $(READY)  ## Run the fault catalogue's entries for the whole testbed
 	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)
 
-reliability: $(READY)  ## The fault catalogue, and its results into docs/fault-catalogue.md
+reliability: $(READY)  ## Run the fault catalogue and write its results into docs/fault-catalogue.md
 	FITCTL_FAULT_RESULTS=$(FAULT_RESULTS) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
 	cd tests && ../$(BIN)/python -m faults.report ../$(FAULT_RESULTS)
 
-test-miswired: $(READY)  ## Commissioning of rigs that are wired wrongly, and the results into docs/commissioning.md
+test-miswired: $(READY)  ## Commission rigs that are wired wrongly, and write the results into docs/commissioning.md
 	FITCTL_MISWIRED_RESULTS=$(CURDIR)/$(MISWIRED_RESULTS) $(BIN)/pytest -m miswired tests/miswired --numprocesses 2 $(ARGS)
 	cd tests && ../$(BIN)/python -m miswired.report ../$(MISWIRED_RESULTS)
 
-test-peers: $(PEERS)  ## Other people's programs against our mocks, and our drivers against theirs
+test-peers: $(PEERS)  ## Run other people's programs against the mocks, and the drivers against theirs
 	$(BIN)/pytest -m peer tests/peers $(ARGS)
 
 $(PEERS): $(READY) requirements/peers.lock tests/install-packages tests/peers/install tests/peers/canopen/package-lock.json tests/peers/mcap/package-lock.json
@@ -108,52 +108,52 @@ $(PEERS): $(READY) requirements/peers.lock tests/install-packages tests/peers/in
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/peers.lock
 	@if tests/peers/install; then touch $(PEERS); fi  # what is missing is tried again the next time
 
-fuzz: $(READY)  ## Coverage-guided fuzzing of every parser, FUZZ_S seconds each (needs atheris)
+fuzz: $(READY)  ## Fuzz every parser with coverage guidance, FUZZ_S seconds each (needs atheris)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/fuzz.lock
 	@for target in fuzz/fuzz_*.py; do $(BIN)/python $$target -max_total_time=$(FUZZ_S) || exit 1; done
 
-mutants: $(READY)  ## Mutation testing: COUNT changes to the code drawn by SEED, and which of them the tests find
+mutants: $(READY)  ## Run mutation testing: COUNT changes to the code drawn by SEED, and which of them the tests find
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/mutants.lock
 	$(BIN)/python -m benchmarks.mutants --seed $(SEED) --count $(COUNT) $(ARGS)
 
-swarm: $(READY)  ## HOURS hours on virtual time from SEED: everything that fails, at once, and what must hold
+swarm: $(READY)  ## Run HOURS hours on virtual time from SEED with all kinds of faults, and check what must hold
 	nice -n 19 $(BIN)/python -m benchmarks.swarm --hours $(HOURS) $(if $(filter-out file,$(origin SEED)),--seed $(SEED)) $(ARGS)
 
-soak: $(READY)  ## SOAK_S seconds on mocks with random faults: what grows, is late, is lost
+soak: $(READY)  ## Run SOAK_S seconds on mocks with random faults, and report growth, delays and losses
 	$(BIN)/python -m benchmarks.soak --duration $(SOAK_S) $(ARGS)
 
-bench-sim: $(READY)  ## How many times real time the simulation and the batch run
+bench-sim: $(READY)  ## Measure the speed of the simulation and the batch, relative to real time
 	$(BIN)/python -m benchmarks.simulate $(ARGS)
 
-bench-learn: $(READY)  ## What learnt designs leave of nights that the rig file does not know (five minutes)
+bench-learn: $(READY)  ## Measure learnt designs on nights that differ from the rig file (five minutes)
 	$(BIN)/python -m benchmarks.learn $(ARGS)
 
-bench-learn-online: $(READY)  ## What a loop leaves that learns while it observes (half an hour)
+bench-learn-online: $(READY)  ## Measure loops that learn while they observe (half an hour)
 	$(BIN)/python -m benchmarks.learn_online $(ARGS)
 
-bench-testbed: $(READY)  ## What the testbed reaches while its collector moves, beside its goals (ten minutes)
+bench-testbed: $(READY)  ## Measure the testbed while its collector moves, and compare with its goals (ten minutes)
 	$(BIN)/python -m benchmarks.testbed $(ARGS)
 
-bench-report: $(READY)  ## What the report of an eight-hour night takes in time and room
+bench-report: $(READY)  ## Measure time and memory of the report of an eight-hour night
 	$(BIN)/python -m benchmarks.report $(ARGS)
 
-bench-recorder: $(READY)  ## The recorder at 500 ticks and frames a second
+bench-recorder: $(READY)  ## Measure the recorder at 500 ticks and frames a second
 	$(BIN)/python -m benchmarks.recorder $(ARGS)
 
-bench-flood: $(READY)  ## The tick while the service is flooded, beside the tick while it is not
+bench-flood: $(READY)  ## Measure the tick with and without a flood of messages to the service
 	$(BIN)/python -m benchmarks.flood $(ARGS)
 
-bench-console: $(READY)  ## What a console costs, and what it does to the loop
+bench-console: $(READY)  ## Measure the cost of a console, and its effect on the loop
 	$(BIN)/python -m benchmarks.console $(ARGS)
 
-bench-devices: $(READY)  ## Round trips of the mocks beside others, the CAN servo cycle, three servos, the camera's stream
+bench-devices: $(READY)  ## Measure round trips of the mocks, the CAN servo cycle, three servos, the camera's stream
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/bench.lock
 	$(BIN)/python -m benchmarks.roundtrips
 	$(BIN)/python -m benchmarks.can
 	$(BIN)/python -m benchmarks.servos
 	$(BIN)/python -m benchmarks.gvsp
 
-bench-loop: $(READY) $(PYRTC)/.ready  ## From the last packet to the D/A at 50 to 2000 Hz, beside pyRTC and C (8 minutes)
+bench-loop: $(READY) $(PYRTC)/.ready  ## Measure from the last packet to the D/A at 50 to 2000 Hz, beside pyRTC and C (8 minutes)
 	@tests/install-packages rt-tests
 	@$(CC) -O2 -Wall -Wextra -o $(VENV)/loop-floor benchmarks/loop/floor.c
 	$(BIN)/python -m benchmarks.loop --floor $(VENV)/loop-floor --pyrtc $(PYRTC)/bin/python \
@@ -171,28 +171,28 @@ $(PYRTC)/.ready: requirements/pyrtc.lock | $(READY)
 	@tar -xzf $(PYRTC)/pyrtcao-*.tar.gz --strip-components 1 -C $(PYRTC)/source
 	@touch $@
 
-docs: $(READY)  ## The documentation as a site, dist/docs/index.html (needs npm)
+docs: $(READY)  ## Build the documentation as a site, dist/docs/index.html (needs npm)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/docs.lock
 	@npm --prefix requirements/site ci --silent --no-audit --no-fund
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "dist/docs/index.html"
 
-pictures: $(READY)  ## Draw the schematics of the documents anew, docs/pictures/*.svg
+pictures: $(READY)  ## Draw the schematics of the documents, docs/pictures/*.svg
 	@$(BIN)/python docs/pictures/draw.py
 
 moving-picture: $(READY)  ## Record the console for the README, docs/pictures/console-moving.gif (needs Chromium)
 	@$(BIN)/python docs/pictures/take_moving.py
 
-dist: $(READY)  ## Wheel and sdist, into dist/
+dist: $(READY)  ## Build wheel and sdist, into dist/
 	$(BIN)/python -m hatchling build -d dist
 
-release-check: $(READY)  ## Wheel and sdist, installed on every Python from 3.11 on: demo and tutorial (RELEASING.md)
+release-check: $(READY)  ## Install wheel and sdist on every Python from 3.11 on, and run demo and tutorial (RELEASING.md)
 	$(BIN)/pytest -m dist tests/dist $(ARGS)
 
 LOCK := --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
     --custom-compile-command "make lock" --quiet
 
-lock: $(READY)  ## Resolve the requirements anew (needs uv and npm)
+lock: $(READY)  ## Resolve the requirements again (needs uv and npm)
 	uv pip compile pyproject.toml --extra fast --extra cluster --extra parquet --extra web --group dev $(LOCK) -o requirements/dev.lock
 	uv pip compile --group peers $(LOCK) --constraint requirements/dev.lock -o requirements/peers.lock
 	uv pip compile --group fuzz $(LOCK) --constraint requirements/dev.lock -o requirements/fuzz.lock
