@@ -41,7 +41,7 @@ LogsArgument = Annotated[
 OutOption = Annotated[
     Path | None,
     typer.Option(
-        "--out", metavar="FILE", help="The new log. [default: LOG_cut.mcap, LOG_recovered.mcap]"
+        "--out", metavar="FILE", help="Log to write. [default: LOG_cut.mcap, LOG_recovered.mcap]"
     ),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")]
@@ -107,7 +107,7 @@ def _state(log: Path, found: LogInfo) -> str:
 def info(
     logs: LogsArgument = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print everything as one JSON object, with the rig file.")
+        bool, typer.Option("--json", help="Print the result as one JSON object, with the rig file.")
     ] = False,
     latest: LatestOption = False,
     rig: RigOption = None,
@@ -251,6 +251,7 @@ def recover(
     overwrite: OverwriteOption = False,
     latest: LatestOption = False,
     rig: RigOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Make a whole log from a damaged one.
 
@@ -261,10 +262,16 @@ def recover(
         msg = f"{log}: is being recorded just now; there is nothing to mend"
         raise ConfigError(msg)
     if not verifying.verify(log).problems:
-        say(f"{log}: is whole; there is nothing to mend")
+        if as_json:
+            say(to_json({"log": str(log), "out": None}))
+        else:
+            say(f"{log}: is whole; there is nothing to mend")
         return
     target = out or log.with_name(f"{log.stem}_recovered.mcap")
     saved = copying.recover(log, target, overwrite=overwrite)
+    if as_json:
+        say(to_json({"log": str(log), "out": str(target), **asdict(saved)}))
+        return
     lost = f"{saved.damaged_chunks} damaged chunks passed over, " if saved.damaged_chunks else ""
     say(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
@@ -286,6 +293,7 @@ def cut(
     overwrite: OverwriteOption = False,
     latest: LatestOption = False,
     rig: RigOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Copy a span of time, some topics, or both.
 
@@ -305,20 +313,27 @@ def cut(
     records = copying.cut(
         log, target, from_ns=from_ns, to_ns=to_ns, topics=topics, overwrite=overwrite
     )
+    if as_json:
+        say(to_json({"log": str(log), "out": str(target), "records": records}))
+        return
     say(f"{target}: {records} of {sum(found.counts.values())} records")
 
 
 @app.command()
 def merge(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP files.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The new log.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Log to write.")],
     overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Join logs in the order of time.
 
     For example the logs of one night, or the two halves of a log that a crash cut in two.
     """
     records, doubles = copying.merge(logs, out, overwrite=overwrite)
+    if as_json:
+        say(to_json({"out": str(out), "records": records, "doubles": doubles}))
+        return
     also = f"; {doubles} were in two logs" if doubles else ""
     say(f"{out}: {records} records of {len(logs)} logs{also}")
 
@@ -331,11 +346,12 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="Folder for the tables. [default: LOG_FORMAT beside LOG]"
+            "--out", metavar="DIR", help="Folder to write. [default: LOG_FORMAT beside LOG]"
         ),
     ] = None,
     latest: LatestOption = False,
     rig: RigOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Write each topic of a log as a table.
 
@@ -344,7 +360,10 @@ def export(
     log = chosen_log("log export", log, rig, latest=latest)
     target = out or log.with_name(f"{log.stem}_{format_}")
     files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
-    for file, rows in sorted(files.items()):
+    if as_json and files:
+        written = [{"file": str(file), "rows": rows} for file, rows in sorted(files.items())]
+        say(to_json({"log": str(log), "files": written}))
+    for file, rows in () if as_json else sorted(files.items()):
         say(f"{file}: {rows} rows")
     if not files:
         msg = f"export: {log} has nothing to write as {format_}; frames need npz or parquet"

@@ -46,7 +46,7 @@ def plot(
     ] = None,
     window: Annotated[bool, typer.Option("--window", help="Open a window instead.")] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a picture instead: PNG, SVG or PDF.")
+        Path | None, typer.Option(metavar="FILE", help="Picture to write instead: PNG, SVG or PDF.")
     ] = None,
     latest: LatestOption = False,
     rig: RigOption = None,

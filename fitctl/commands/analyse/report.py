@@ -45,7 +45,7 @@ def report(
     show: Annotated[bool, typer.Option("--open", help="Open the report in the browser.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder for everything. [default: beside the first LOG]"),
+        typer.Option(metavar="DIR", help="Folder to write. [default: beside the first LOG]"),
     ] = None,
     rig: Annotated[
         Path | None,
@@ -54,7 +54,7 @@ def report(
     latest: LatestOption = False,
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="Print all figures as one JSON object, as in report.json."),
+        typer.Option("--json", help="Print the result as one JSON object, as in report.json."),
     ] = False,
 ) -> None:
     """Make a report of a night: verdict, plots, losses, configuration.

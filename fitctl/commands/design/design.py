@@ -63,7 +63,7 @@ def design(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Save the pair (*.json), for loops.NAME.vernier.controller."
+            metavar="FILE", help="Design to write (*.json), for loops.NAME.vernier.controller."
         ),
     ] = None,
 ) -> None:

@@ -18,9 +18,7 @@ from fitctl.identify.errors import IdentifyError
 
 
 def figures(
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for everything; created if missing.")
-    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write; created if missing.")],
     rig: RigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",

@@ -14,8 +14,8 @@ import typer
 
 from fitctl import demo as demos
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
-from fitctl.commands.shared.printing import progress_line, say
+from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SeedOption, SetOption
+from fitctl.commands.shared.printing import progress_line, say, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.commands.shared.supervisor import address, client_of, show_rig
 from fitctl.config import ConfigError, Rig, default_rig_path
@@ -75,12 +75,13 @@ def identify(
     seed: SeedOption = 0,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The fragment. [default: RIG-LOOP-WHAT.toml]"),
+        typer.Option(metavar="FILE", help="Fragment to write. [default: RIG-LOOP-WHAT.toml]"),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The plot. [default: a PNG beside the fragment]"),
+        typer.Option(metavar="FILE", help="Plot to write. [default: a PNG beside the fragment]"),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure the parameters of a rig, and write a fragment that its rig file includes.
 
@@ -132,6 +133,11 @@ def identify(
         say(f"identify {what}: {error}", err=True)
         raise typer.Exit(FAILED) from None
     _write(fragment_path, lambda: write_whole(fragment_path, text.encode()))
+    if as_json:
+        found_values = {"what": what, "loop": loop, "values": finding.fragment()}
+        written = {"fragment": str(fragment_path), "plot": str(plot_path)}
+        say(to_json(found_values | written | {"lines": finding.lines()}))
+        return
     for line in finding.lines():
         say(line)
     say(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")

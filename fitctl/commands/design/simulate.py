@@ -43,7 +43,7 @@ def simulate(
     controller: ControllerOption = None,
     seed: SeedOption = 0,
     duration: Annotated[
-        float, typer.Option(min=1.0, max=1e6, help="Virtual time, in seconds.")
+        float, typer.Option(min=1.0, max=1e6, metavar="SECONDS", help="Virtual time.")
     ] = 120.0,
     runs: Annotated[
         int, typer.Option(min=1, help="Number of runs, with seeds from --seed on.")

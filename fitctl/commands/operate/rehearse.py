@@ -39,7 +39,9 @@ def rehearse(
     ] = "",
     limit_s: Annotated[
         float,
-        typer.Option("--timeout", metavar="SECONDS", min=1.0, help="Give up after this time."),
+        typer.Option(
+            "--timeout", metavar="SECONDS", min=1.0, help="Longest wait for the rehearsal."
+        ),
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:

@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperCommand
 
 from fitctl.commands.shared import completion
-from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, require_loop, rig_of
 from fitctl.commands.shared.supervisor import connect, send_and_print, send_to_all
@@ -52,6 +52,7 @@ def send(
         float | None,
         typer.Option("--timeout", metavar="SECONDS", min=0.1, help="Longest wait; implies --wait."),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Send one command to the supervisor.
 
@@ -68,12 +69,12 @@ def send(
         running = running_rigs()
         if len(running) > 1:
             say(f"send: {len(running)} supervisors run; stopping all of them", err=True)
-            raise typer.Exit(send_to_all(running, wanted, "send"))
+            raise typer.Exit(send_to_all(running, wanted, "send", as_json=as_json))
     if remote is None and loop and (named_rig(rig) or overrides):
         require_loop("send", rig_of(named_rig(rig), overrides), loop)
     client = connect("send", rig, overrides, remote)
     wait_s = _wait_s(wanted, wait, timeout_s)
-    raise typer.Exit(send_and_print(client, wanted, "send", wait_s))
+    raise typer.Exit(send_and_print(client, wanted, "send", wait_s, as_json=as_json))
 
 
 def _wait_s(wanted: AnyCommand, wait: bool | None, timeout_s: float | None) -> float | None:

@@ -65,7 +65,7 @@ OutOption = Annotated[
     typer.Option(
         "--out",
         metavar="DIR",
-        help="Folder for calibrations: fragments for the include list of the rig file.",
+        help="Folder to write calibrations to: fragments for the include list of a rig file.",
     ),
 ]
 
@@ -93,7 +93,8 @@ def list_(
         ),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Every step with every key, as JSON.")
+        bool,
+        typer.Option("--json", help="Print one JSON object a sequence, with every step and key."),
     ] = False,
 ) -> None:
     """List the shipped sequences."""

@@ -77,7 +77,7 @@ def watch(
     overrides: SetOption = None,
     remote: RemoteOption = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Each line is one JSON object; `kind` says what of.")
+        bool, typer.Option("--json", help="Print one JSON object a line, with its `kind`.")
     ] = False,
     duration: Annotated[
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="Without it, until Ctrl-C.")

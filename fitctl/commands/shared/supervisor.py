@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import typer
+from msgspec.structs import asdict
 
 from fitctl.commands.shared.exits import FAILED, INTERRUPTED, NO_SUPERVISOR, STILL_UNDER_WAY
-from fitctl.commands.shared.printing import say
+from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.client import Client
@@ -125,7 +126,12 @@ def connect(
 
 
 def send_and_print(
-    client: Client, command: AnyCommand, sender: str, wait_s: float | None = None
+    client: Client,
+    command: AnyCommand,
+    sender: str,
+    wait_s: float | None = None,
+    *,
+    as_json: bool = False,
 ) -> int:
     """Send one command, print the reply and close the client; returns the exit status.
 
@@ -138,19 +144,22 @@ def send_and_print(
     sender : str
         The command of ``fitctl`` that sends it, for its error message.
     wait_s : float, optional
+    as_json : bool
+        Print one JSON object: the reply, and with `wait_s` the ``outcomes`` by loop, or whether it ``ended``.
     """
     try:
         reply = _reply(client, command)
-        status = print_reply(reply, sender)
-        if wait_s is None or isinstance(reply, ConnectionError) or not reply.accepted:
+        waits = wait_s is not None and isinstance(reply, Reply) and reply.accepted
+        status = 0 if as_json and waits else print_reply(reply, sender, as_json=as_json)
+        if wait_s is None or not isinstance(reply, Reply) or not reply.accepted:
             return status
-        return _wait_and_print(client, command, reply, sender, wait_s)
+        return _wait_and_print(client, command, reply, sender, wait_s, as_json=as_json)
     finally:
         client.close()
 
 
 def _wait_and_print(
-    client: Client, command: AnyCommand, reply: Reply, sender: str, wait_s: float
+    client: Client, command: AnyCommand, reply: Reply, sender: str, wait_s: float, *, as_json: bool
 ) -> int:
     """Wait for the outcome of an accepted command, print it, a line for each loop; returns the exit status."""
     word = ROWS[type(command)].word
@@ -158,7 +167,11 @@ def _wait_and_print(
     try:
         with ended_by_signals(interrupt):
             if isinstance(command, Shutdown):
-                return _print_end(wait_for_end(client, wait_s), wait_s)
+                ended = wait_for_end(client, wait_s)
+                if as_json:
+                    say(to_json(asdict(reply) | {"ended": ended}))
+                    return 0 if ended else STILL_UNDER_WAY
+                return _print_end(ended, wait_s)
             found = wait_for_outcomes(client, reply, wait_s)
     except ConnectionError as error:
         say(f"{sender}: {error}", err=True)
@@ -166,7 +179,9 @@ def _wait_and_print(
     except KeyboardInterrupt:
         say(f"{sender}: no longer waiting; {word} goes on. See: fitctl status", err=True)
         return INTERRUPTED
-    for loop, outcome in found.items():
+    if as_json:
+        say(to_json(asdict(reply) | {"outcomes": found}))
+    for loop, outcome in () if as_json else found.items():
         say(_outcome_text(loop, outcome, wait_s), err=outcome.state != "done")
     return max(_EXITS[outcome.state] for outcome in found.values())
 
@@ -196,14 +211,16 @@ def _outcome_text(loop: str, outcome: CommandOutcome, wait_s: float) -> str:
 _EXITS = {"done": 0, "failed": FAILED, "ended": FAILED, "under way": STILL_UNDER_WAY}
 
 
-def send_to_all(running: list[RunningRig], command: AnyCommand, sender: str) -> int:
+def send_to_all(
+    running: list[RunningRig], command: AnyCommand, sender: str, *, as_json: bool = False
+) -> int:
     """Send one command to several supervisors at once and print each reply; returns the exit status."""
     with ThreadPoolExecutor(len(running)) as threads:
         replies = list(threads.map(lambda rig: _reply_of(rig, command), running))
     statuses = []
     for rig, reply in zip(running, replies, strict=True):
         show_rig(rig.name, f"{rig.file} (process {rig.pid})")
-        statuses.append(print_reply(reply, sender))
+        statuses.append(print_reply(reply, sender, as_json=as_json))
     return max(statuses)
 
 
@@ -222,11 +239,14 @@ def _reply(client: Client, command: AnyCommand) -> Reply | ConnectionError:
         return error
 
 
-def print_reply(reply: Reply | ConnectionError, sender: str) -> int:
+def print_reply(reply: Reply | ConnectionError, sender: str, *, as_json: bool = False) -> int:
     """Print a reply, or why there is none; returns the exit status."""
     if isinstance(reply, ConnectionError):
         say(f"{sender}: {reply}", err=True)
         return FAILED
+    if as_json:
+        say(to_json(reply))
+        return 0 if reply.accepted else FAILED
     wall_minus_monotonic_s = time.time() - reply.time_s
     for event in reply.events:
         stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)

@@ -40,7 +40,7 @@ def demo(
     overrides: SetOption = None,
     seed: SeedOption = 0,
     duration: Annotated[
-        float, typer.Option(min=1.0, help="How long to run without a console, in seconds.")
+        float, typer.Option(min=1.0, metavar="SECONDS", help="How long to run without a console.")
     ] = 60.0,
     headless: Annotated[
         bool, typer.Option("--headless", help="Open no console, even on a terminal.")
