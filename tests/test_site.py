@@ -15,6 +15,7 @@ from fitctl.cli import COMMANDS
 from fitctl.config import default_rig_path
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.commands import AnyCommand
+from fitctl.sequences.reading import STEPS
 
 OUTSIDE = {"CHANGELOG.md", "CONTRIBUTING.md", "RELEASING.md"}  # of docs/
 
@@ -115,6 +116,29 @@ def test_every_command_and_every_topic_has_a_section(reference):
         section = page.split(f"## {topic.format(loop='right')}\n")[1].split("\n## ")[0]
         for field in MESSAGES[kind].DESCRIPTOR.fields:
             assert f"| `{field.name}` |" in section
+
+
+def test_every_step_is_a_method_in_the_python_reference(reference):
+    page = reference.python()
+    for name, kind in STEPS.items():
+        section = page.split(f"#### {name}\n")[1].split("\n#### ")[0]
+        for key in kind.model_fields.keys() - {"step"}:
+            assert f"| `{key}` |" in section
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "fitctl.Instrument",
+        "fitctl.AsyncInstrument",
+        "fitctl.simulation.simulation.Simulation",
+        "fitctl.controllers.pair.Design",
+        "fitctl.drivers.interface",
+        "fitctl.logging.reading",
+    ],
+)
+def test_what_scientists_use_is_in_the_python_reference(reference, name):
+    assert f"::: {name}\n" in reference.python()
 
 
 def test_what_python_documents_exists(reference):

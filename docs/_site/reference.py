@@ -18,6 +18,8 @@ from fitctl.cli import COMMANDS, app, load_command
 from fitctl.config import Rig, default_rig_path
 from fitctl.logging.schemas import MESSAGES, TOPICS
 from fitctl.messages.commands import AnyCommand
+from fitctl.sequences.instrument import Instrument
+from fitctl.sequences.reading import STEPS
 
 LOOP = "right"
 
@@ -246,9 +248,13 @@ This page lists what scripts import. [Sequences](../sequences.md#from-python) ha
 
 ::: fitctl.Instrument
 
+{steps}
+
 ## AsyncInstrument
 
 ::: fitctl.AsyncInstrument
+
+It has the methods of the steps above, too: `await instrument.hold(30.0)`.
 
 ## Reading logs
 
@@ -261,12 +267,55 @@ This page lists what scripts import. [Sequences](../sequences.md#from-python) ha
 ## Simulation
 
 ::: fitctl.simulation.simulation.Simulation
+
+## Designs
+
+::: fitctl.controllers.pair.Design
+
+::: fitctl.controllers.design.basis.Basis
+
+::: fitctl.controllers.design.choose.design_for
+
+## Drivers
+
+::: fitctl.drivers.interface
 """
+
+
+def python() -> str:
+    """Classes and functions by their docstrings, and the methods that steps are, by their keys."""
+    return PYTHON.replace("{steps}", _steps())
+
+
+def _steps() -> str:
+    """Each step as a method: its arguments in order, their types, defaults and meanings."""
+    parts = [
+        "### Steps",
+        "Methods of `Instrument` and `AsyncInstrument`; each returns its figures.",
+    ]
+    for name, kind in STEPS.items():
+        signature = inspect.signature(getattr(Instrument, name))
+        arguments = [each for key, each in signature.parameters.items() if key != "self"]
+        own = [each for each in arguments if each.kind is not inspect.Parameter.KEYWORD_ONLY]
+        rows = [
+            [
+                f"`{each.name}`",
+                "required" if each.default is inspect.Parameter.empty else f"`{each.default!r}`",
+                kind.model_fields[each.name].description or "",
+            ]
+            for each in arguments
+        ]
+        usage = ", ".join([*(each.name for each in own), "*", "..."])
+        text = inspect.cleandoc(kind.__doc__ or "")
+        parts += [f"#### {name}", f"`instrument.{name}({usage})`", text]
+        parts.append(table(["argument", "default", "meaning"], rows))
+    return "\n\n".join(parts)
+
 
 PAGES: dict[str, Callable[[], str]] = {
     "reference/command-line.md": command_line,
     "reference/rig-keys.md": rig_keys,
     "reference/commands.md": commands,
     "reference/topics.md": topics,
-    "reference/python.md": lambda: PYTHON,
+    "reference/python.md": python,
 }

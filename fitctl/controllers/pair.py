@@ -62,6 +62,16 @@ class Design:
     own : bool
         Made by a Python file of the user's (:mod:`fitctl.controllers.design.own`): its matrices are all that
         there is to it.
+
+    Examples
+    --------
+    >>> from fitctl.config import default_rig_path, load_rig
+    >>> from fitctl.controllers.design.choose import design_for
+    >>> design = design_for(load_rig(default_rig_path()), "right", "minimum-variance")
+    >>> design.a.shape, design.b.shape, design.c.shape, design.d.shape
+    ((5, 5), (5, 5), (2, 5), (2, 5))
+    >>> design.period_s
+    0.02
     """
 
     name: str

@@ -1,7 +1,9 @@
 """What the supervisor sees of the devices, and the errors that they raise.
 
 One folder a device beside this file. Each driver checks, times out and translates; none decides.
-Every call returns or raises within the device's time limit. A driver is used by one thread at a time.
+Every call returns or raises a :class:`DeviceError` within the device's time limit. A driver is used by one
+thread at a time. Times are seconds of the host's monotonic clock; angles are radians of the motor shaft; voltages
+are at the D/A unless said otherwise. Pairs are azimuth, then elevation.
 """
 
 from __future__ import annotations
@@ -29,6 +31,14 @@ class DeviceError(Exception):
         What should have happened, and what did.
     hint : str
         The next step for the operator.
+
+    Examples
+    --------
+    >>> raise DeviceTimeout("D/A", "127.0.0.1:502", "an answer within 0.25 s", "none", "check its cable")
+    Traceback (most recent call last):
+    ...
+    fitctl.drivers.interface.DeviceTimeout: D/A at 127.0.0.1:502: expected an answer within 0.25 s, got none; \
+check its cable
     """
 
     def __init__(self, device: str, endpoint: str, expected: str, got: str, hint: str = "") -> None:
@@ -115,7 +125,18 @@ class CameraDriver(Protocol):
         ...
 
     def next_frame(self, timeout_s: float) -> Frame | None:
-        """The next complete frame, oldest first; None when none came in time."""
+        """Wait for the next complete frame, oldest first.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Longest wait.
+
+        Returns
+        -------
+        Frame or None
+            None if no frame was complete in time.
+        """
         ...
 
     def counts(self) -> CameraCounts:
@@ -177,10 +198,23 @@ class ServoAmplifiers(Protocol):
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period: command both motors, read both encoders.
 
-        Returns None when no reading came within the period; the caller judges how often it may. Once
-        enabled it must be called every period: it is also what keeps the master's heartbeat, without
-        which a drive stops by itself. Raises DeviceError when the link or the drive is lost; a fault
-        of an axis comes in the reading.
+        Once enabled it must be called every period: it is also what keeps the master's heartbeat, without
+        which a drive stops by itself.
+
+        Parameters
+        ----------
+        velocity_rad_s : pair of float
+            Of the motor shafts, azimuth and elevation.
+
+        Returns
+        -------
+        ServoReading or None
+            None if no reading came within the period. A fault of an axis is in the reading.
+
+        Raises
+        ------
+        DeviceError
+            If the link or the drive is lost.
         """
         ...
 
@@ -221,17 +255,29 @@ class MirrorDac(Protocol):
         ...
 
     def send_v(self, volts: NDArray[np.float64]) -> None:
-        """Send the command that sets all three channels at once; shape (3,), stack 1 first.
+        """Send the command that sets all three channels at once; returns as soon as it is on its way.
 
-        Returns as soon as it is on its way. One that was not confirmed yet is confirmed first.
+        A command that is not yet confirmed is confirmed first.
+
+        Parameters
+        ----------
+        volts : array, shape (3,)
+            Stack 1 first.
+
+        Raises
+        ------
+        DeviceError
+            As :meth:`confirm`, of the command before.
         """
         ...
 
     def confirm(self) -> None:
-        """Wait, within the device's time limit, until it confirms the last :meth:`send_v`.
+        """Wait until the device confirms the last :meth:`send_v`; returns at once if it has.
 
-        Returns at once where nothing is to be confirmed. Raises DeviceError when no confirmation comes,
-        or a refusal.
+        Raises
+        ------
+        DeviceError
+            If no confirmation comes within the device's time limit, or a refusal.
         """
         ...
 

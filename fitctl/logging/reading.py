@@ -98,12 +98,36 @@ class LogInfo:
 
 
 def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-    """All messages in the order in which they were written, or those of some topics.
+    """Read the messages of a log in the order in which they were written.
+
+    A log that is being recorded, or whose recorder was killed, is read as far as it is whole.
+
+    Parameters
+    ----------
+    path : Path
+        An MCAP log of fitctl.
+    topics : collection of str, optional
+        Only these, such as ``/fit/right/tick``. :func:`log_info` lists the topics of a log.
+
+    Yields
+    ------
+    LogMessage
+        ``message`` has the fields of the record, with units in their names.
 
     Raises
     ------
     LogError
         If the file is missing, no MCAP log, or finished and yet damaged.
+
+    Examples
+    --------
+    >>> squares = [
+    ...     entry.message.error_az_px**2
+    ...     for entry in read_records(Path("night.mcap"), ["/fit/right/tick"])
+    ...     if entry.message.mode == "VERNIER"
+    ... ]
+    >>> (sum(squares) / len(squares)) ** 0.5 < 0.1
+    True
     """
     with opened(path) as (stream, finished), up_to_the_tear(path, finished):
         kind = IndexedReader if finished else NonSeekingReader
@@ -222,12 +246,26 @@ class _Block:
 
 
 def log_info(path: Path) -> LogInfo:
-    """What a log holds, from its index, or from reading it through if it has none.
+    """Describe a log: from its index, or from reading it through if it has none.
+
+    Parameters
+    ----------
+    path : Path
+        An MCAP log.
+
+    Returns
+    -------
+    LogInfo
 
     Raises
     ------
     LogError
         If the file is missing, no MCAP log, or finished and yet damaged.
+
+    Examples
+    --------
+    >>> log_info(Path("night.mcap")).counts["/fit/right/tick"] > 1000
+    True
     """
     with opened(path) as (stream, finished):
         counts: Counter[str] = Counter()

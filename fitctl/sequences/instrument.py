@@ -47,6 +47,11 @@ def _figures_of(attempt: SequenceAttempt) -> dict[str, float | None]:
 class Instrument(StepMethods[Figures]):
     """One instrument, blocking: a method returns when its step is done, or raises.
 
+    Each step of a sequence is a method with the step's keys as arguments, such as :meth:`acquire` and
+    :meth:`hold`. It returns the figures of the step: a dict of numbers with units in their names (``_px`` on
+    the camera, ``_sky_arcsec`` on the sky, ``_s``), NaN where a value is unknown. Where a step was for several
+    loops, each name begins with the loop's and ``_``.
+
     Leaving the ``with`` block leaves the instrument as it is: a star that is held stays held.
 
     Parameters
@@ -70,6 +75,17 @@ class Instrument(StepMethods[Figures]):
         If the rig file or the key file cannot be used, or no rig is named and several supervisors run.
     ConnectionError
         If no supervisor answers.
+
+    Examples
+    --------
+    >>> with Instrument(simulate=True, seed=1) as instrument:
+    ...     acquired = instrument.acquire()
+    ...     held = instrument.hold(5.0, settle_s=5.0)
+    >>> sorted(held)  # doctest: +NORMALIZE_WHITESPACE
+    ['frames_seen', 'limit_px', 'rms_az_px', 'rms_az_sky_arcsec', 'rms_el_px',
+     'rms_el_sky_arcsec']
+    >>> held["rms_az_px"] < held["limit_px"]
+    True
     """
 
     def __init__(
@@ -103,11 +119,21 @@ class Instrument(StepMethods[Figures]):
         self.close()
 
     def close(self) -> None:
-        """Let go of the connection; the instrument goes on."""
+        """Disconnect; the instrument goes on."""
         self._link.close()
 
     def run(self, step: steps.Step) -> Figures:
-        """Run one step; its figures, NaN where a value could not be had.
+        """Run one step.
+
+        Parameters
+        ----------
+        step : Step
+            One of :mod:`fitctl.sequences.steps`, such as ``steps.Hold(duration_s=30.0)``.
+
+        Returns
+        -------
+        dict of str to float
+            The figures of the step.
 
         Raises
         ------
@@ -119,7 +145,17 @@ class Instrument(StepMethods[Figures]):
         return self._run(self._runner_of(NAME, [step]), [step])[0]
 
     def run_sequence(self, file: Path | str) -> list[Figures]:
-        """Run a sequence file, or a shipped sequence by its name; the figures of each step, as :meth:`run`.
+        """Run a sequence file, or a shipped sequence by its name.
+
+        Parameters
+        ----------
+        file : path
+            TOML or YAML, or the bare name of a shipped sequence.
+
+        Returns
+        -------
+        list of dict of str to float
+            The figures of each step.
 
         Raises
         ------
@@ -160,11 +196,21 @@ class Instrument(StepMethods[Figures]):
 
     @property
     def attempts(self) -> list[SequenceAttempt]:
-        """Every attempt of the newest step or file, as the log has them."""
+        """Every attempt of the newest step or file, as :class:`fitctl.logging.records.SequenceAttempt`."""
         return [] if self._runner is None else list(self._runner.attempts)
 
     def write_calibrations(self, folder: Path | str) -> list[Path]:
-        """Write what the newest step or file has measured for the rig file; the fragments' paths.
+        """Write what the newest step or file has measured for the rig file.
+
+        Parameters
+        ----------
+        folder : path
+            An existing folder.
+
+        Returns
+        -------
+        list of Path
+            The fragments, for the ``include`` list of the rig file.
 
         Raises
         ------
@@ -253,7 +299,19 @@ class Instrument(StepMethods[Figures]):
                 raise SequenceError(msg)
 
     def telemetry(self) -> Telemetry:
-        """What the instrument is doing now."""
+        """The newest telemetry message.
+
+        Returns
+        -------
+        Telemetry
+            ``loops`` with mode and state of each loop, ``ticks``, ``devices`` and more; see
+            :class:`fitctl.messages.telemetry.Telemetry`.
+
+        Raises
+        ------
+        ConnectionError
+            If no telemetry arrives within 2 s.
+        """
         since_s = self._link.now_s()
         while True:
             telemetry = self._link.receive(2.0)
@@ -264,7 +322,7 @@ class Instrument(StepMethods[Figures]):
                 return telemetry
 
     def stop(self) -> None:
-        """SAFE, at once: every loop; from any thread.
+        """Stop every loop at once: SAFE. From any thread, also while a step runs.
 
         Raises
         ------
@@ -277,7 +335,7 @@ class Instrument(StepMethods[Figures]):
             raise SequenceError(msg)
 
     def end_step(self) -> None:
-        """From another thread: end the step or the file that is running; the stages are held where they are."""
+        """From another thread: end the step or file that is running; its loops release their stars."""
         if self._runner is not None:
             self._runner.contact.stop_wanted.set()
 
@@ -301,11 +359,32 @@ def _where(rig: Rig, folder: Path | str | None, remote: Path | str | None) -> Pa
 
 
 class AsyncInstrument(StepMethods[Awaitable[Figures]]):
-    """The same, to be awaited; cancelling a step or a file ends it and holds the stages.
+    """One instrument, to be awaited: the methods of :class:`Instrument`, with the same arguments and figures.
 
-    Steps and files run one after the other, in a thread of their own. One that waits for another one's end
-    has not begun: cancelled, it never does, and the other goes on. Commands, STOP above all, wait for none.
-    Is given what :class:`Instrument` is given, and made by ``async with``.
+    Steps and files run one after the other, in a thread of their own. If you cancel a running step, it ends,
+    and its loops release their stars. A step that you cancel before its turn never starts. :meth:`stop` and
+    :meth:`send` wait for no step.
+
+    Parameters
+    ----------
+    rig, simulate, folder, remote, seed
+        As for :class:`Instrument`.
+
+    Raises
+    ------
+    ConfigError, ConnectionError
+        As :class:`Instrument`, when the ``async with`` block is entered.
+    SequenceError
+        From a method, if the block was not entered.
+
+    Examples
+    --------
+    >>> import asyncio
+    >>> async def night():
+    ...     async with AsyncInstrument(simulate=True, seed=1) as instrument:
+    ...         return await instrument.acquire()
+    >>> sorted(asyncio.run(night()))  # doctest: +NORMALIZE_WHITESPACE
+    ['acquired_s', 'found_az_sky_arcsec', 'found_el_sky_arcsec', 'found_flux_dn']
     """
 
     def __init__(
@@ -391,11 +470,11 @@ class AsyncInstrument(StepMethods[Awaitable[Figures]]):
         await self._in_thread(lambda: instrument.send_and_wait(command, timeout_s, loop))
 
     async def stop(self) -> None:
-        """SAFE, at once, also while a step runs: every loop."""
+        """Stop every loop at once: SAFE, also while a step runs. Raises as :meth:`Instrument.stop`."""
         await self._at_once(self._instrument.stop)
 
     def end_step(self) -> None:
-        """End the step or the file that is running; the stages are held where they are."""
+        """End the step or file that is running; its loops release their stars."""
         for runner in self._unfinished[:1]:
             runner.contact.stop_wanted.set()
 

@@ -51,21 +51,47 @@ Floats = NDArray[np.float64]
 
 
 class Simulation:
-    """A rig on the virtual clock.
+    """A rig on the virtual clock: the supervisor and its loops with simulated devices, in this process.
+
+    The same rig and seed give the same run, to the last bit.
 
     Parameters
     ----------
     rig : Rig
+        With the sections ``plant`` and ``mocks``.
     seed : int
-        Of everything random.
+        Of everything random: noise, air, and the star's place.
     star_offset_px : array, shape (2,), optional
-        Where the star is at the start; by default drawn from the seed.
+        Where the star is at the start, az and el from the target in px; by default drawn from the seed.
     record : callable, optional
-        Takes every record, as the recorder would.
+        Gets every record of :mod:`fitctl.logging.records`, as the recorder would; frames too.
     history_s : float, optional
-        How long true positions are kept, by default as the rig says.
+        How long true positions are kept, by default ``plant.history_s``.
     advises : bool
         Loops with ``learn = "advise"`` have a learner, too. Advice is for people, and most runs have none.
+
+    Attributes
+    ----------
+    ticks : list of Tick
+        Of all stellar loops, in order.
+    mode_changes : list of ModeChange
+    clock : VirtualClock
+    plants : dict of str to StellarPart
+        The truth, by loop.
+
+    Raises
+    ------
+    ConfigError
+        If the rig cannot be simulated, or a controller cannot be designed.
+
+    Examples
+    --------
+    >>> from fitctl.config import default_rig_path, load_rig
+    >>> simulation = Simulation(load_rig(default_rig_path()), seed=1)
+    >>> simulation.acquire()
+    >>> simulation.run(15.0)
+    >>> simulation.ticks[-1].mode
+    'VERNIER'
     """
 
     def __init__(

@@ -125,7 +125,7 @@ def test_pipx_installs_it(wheel, tmp_path):
     run(tmp_path / "tools" / "bin" / "pipx", "install", wheel, cwd=tmp_path, **own)
 
     assert wheel.name.split("-")[1] in run(tmp_path / "bin" / "fitctl", "--version", cwd=tmp_path)
-    assert "right" in run(tmp_path / "bin" / "fitctl", "simulate", "--duration", "5", cwd=tmp_path)
+    assert "well" in run(tmp_path / "bin" / "fitctl", "check", cwd=tmp_path)
 
 
 def test_it_says_what_to_do_next_and_finds_its_files(installed, tmp_path):
