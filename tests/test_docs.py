@@ -72,7 +72,7 @@ NOT_RUN = {
     "fitctl sequence pause*": "needs a running supervisor: tests/system/test_sequences.py",
     "fitctl sequence resume": "needs a running supervisor: tests/system/test_sequences.py",
     "fitctl sequence run *": "needs a running supervisor: tests/system/test_tutorial.py",
-    "fitctl sequence stop": "needs a running supervisor: tests/system/test_sequences.py",
+    "fitctl sequence end": "needs a running supervisor: tests/system/test_sequences.py",
     "fitctl simulate --runs 100 *": "as in designing.md, which is run",
     "fitctl status*": "needs a running supervisor: tests/system/test_tutorial.py",
     "fitctl watch*": "needs a running supervisor: tests/system/test_tutorial.py",

@@ -2,8 +2,8 @@
 
 One folder a device beside this file. Each driver checks, times out and translates; none decides.
 Every call returns or raises a :class:`DeviceError` within the device's time limit. A driver is used by one
-thread at a time. Times are seconds of the host's monotonic clock; angles are radians of the motor shaft; voltages
-are at the D/A unless said otherwise. Pairs are azimuth, then elevation.
+thread at a time. Times are seconds of the host's monotonic clock; angles are radians of the motor shaft;
+voltages are at the D/A unless said otherwise. Pairs are azimuth, then elevation.
 """
 
 from __future__ import annotations
