@@ -200,5 +200,5 @@ def test_mocks_on_a_taken_port_say_so():
         )
 
     assert result.returncode == 2
-    assert "port is taken" in result.stderr
+    assert "port is in use" in result.stderr
     assert "Traceback" not in result.stderr

@@ -71,7 +71,7 @@ def test_a_key_made_for_a_rig_that_does_not_listen_says_so(settings, capsys):
     off = ["--set", "service.tcp_address=", "--host", "rig"]
 
     assert fitctl("keys", "new", "anna", *settings, *off) == 0
-    assert "listens to nobody yet" in capsys.readouterr().out
+    assert "accepts no remote connections yet" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")

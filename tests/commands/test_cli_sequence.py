@@ -71,7 +71,7 @@ def test_check_says_every_mistake_on_a_line(sequence, tmp_path):
     status, _, err = sequence("check", path)
     assert status == 2
     assert len(err.splitlines()) == 1
-    assert "step 2 (jog): the star would go 5.66 px" in err
+    assert "step 2 (dither): the star would go 5.66 px" in err
 
 
 def test_check_tells_what_is_well(sequence):

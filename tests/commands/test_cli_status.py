@@ -106,7 +106,7 @@ def test_a_failed_command_is_a_trouble_with_what_to_do():
 
     assert lines(told(supervisor)) == [
         "right: standby failed: piezo at ttyUSB0: expected an answer, got none; "
-        "all devices were let go again; is it on?; then standby"
+        "all devices were closed again; is it on?; then standby"
     ]
 
 

@@ -258,7 +258,7 @@ def test_the_modes_of_a_row_are_the_modes_there_are():
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("interlocks.flux_low.quantity=moon", "nobody measures that; there are star_flux_fraction"),
+        ("interlocks.flux_low.quantity=moon", "unknown quantity; available: star_flux_fraction"),
         ("interlocks.flux_low.high=0.5", "interlocks.flux_low.high: must be above 0.75"),
         ("interlocks.flux_low.modes=[]", "interlocks.flux_low.modes"),
         ("interlocks.flux_low.modes=['ON']", "interlocks.flux_low.modes"),
