@@ -58,7 +58,11 @@ def star_moves(site: Site) -> str:
     """What the step moves."""
     reach = site.loop.acquisition.search_radius_sky_arcsec
     motor = scales(site.rig, site.loop).motor_sky_arcsec_per_rad
-    return f"nothing if a star is on the camera; otherwise the motors, up to {reach / motor:.1f} rad each way"
+    if len(site.rig.stellar_loops) > 1:
+        first = f"azimuth by {ROUGH_RAD:g} rad, to see which star it moves; if none"
+    else:
+        first = "nothing if a star is on the camera; otherwise"
+    return f"{first} the motors, up to {reach / motor:.1f} rad each way"
 
 
 def check_star(site: Site) -> Outcome:
@@ -73,10 +77,11 @@ def check_star(site: Site) -> Outcome:
     with streaming(site) as camera:
         spots = Watch(site, camera, None).spots()
         moved_rad, looks = 0.0, 0
-        if _bright(spots) < stars:
+        if stars > 1 or not spots:
             with powered(site) as motors:
                 watch = Watch(site, camera, motors)
-                _, looks = search(site, watch, spots)
+                if stars == 1 or not _moves_a_star(watch):
+                    _, looks = search(site, watch, spots)
                 spots = watch.spots()
                 moved_rad = motors.furthest_rad
     if not spots:
@@ -111,6 +116,16 @@ def check_star(site: Site) -> Outcome:
     return Outcome(
         lines, figures, site.found(star_flux_dn=round(spots[0].flux_dn, 1), other_spots=other)
     )
+
+
+def _moves_a_star(watch: Watch) -> bool:
+    """Whether one of the stars on the camera moves with azimuth, which is back where it was afterwards."""
+    start_rad = watch.goal_rad.copy()
+    before = watch.places_px()
+    watch.turn_to(start_rad + np.array([ROUGH_RAD, 0.0]))
+    after = watch.places_px()
+    watch.turn_to(start_rad)
+    return displaced(before, after) is not None
 
 
 def _bright(spots: list[Star]) -> int:

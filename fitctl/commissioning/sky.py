@@ -208,7 +208,14 @@ def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[
         "shutter, lamp, exposure and "
         "alignment, or turn the siderostat to the star by hand"
     )
-    raise StepError(msg)
+    if still:
+        msg += (
+            f". What is on the camera does not move with {site.name}'s motors: check whether its amplifiers "
+            "are those of another loop"
+        )
+    raise StepError(
+        msg, {} if watch.motors is None else {"furthest_rad": watch.motors.furthest_rad}
+    )
 
 
 def square_spiral(turns: int) -> list[tuple[int, int]]:

@@ -91,6 +91,22 @@ STEPS: dict[str, Step] = {
         5.0,
         amplifiers.check_amplifiers,
     ),
+    "photodiodes": Step(
+        "Which photodiode is where, as the beam moves over them",
+        "beam",
+        beam.photodiodes_moves,
+        ("amplifiers",),
+        40.0,
+        beam.check_photodiodes,
+    ),
+    "collector": Step(
+        "Which way the hexapod moves the photodiodes under the beam",
+        "collector",
+        beam.collector_moves,
+        ("photodiodes",),
+        60.0,
+        beam.check_collector,
+    ),
     "star": Step(
         "The star is on the camera, alone, and as bright as the rig file says",
         "star",
@@ -122,22 +138,6 @@ STEPS: dict[str, Step] = {
         ("amplifiers",),
         100.0,
         travel.check_travel,
-    ),
-    "photodiodes": Step(
-        "Which photodiode is where, as the beam moves over them",
-        "beam",
-        beam.photodiodes_moves,
-        ("amplifiers",),
-        40.0,
-        beam.check_photodiodes,
-    ),
-    "collector": Step(
-        "Which way the hexapod moves the photodiodes under the beam",
-        "collector",
-        beam.collector_moves,
-        ("photodiodes",),
-        60.0,
-        beam.check_collector,
     ),
     "gentle": Step(
         "The first closed loop: the siderostat at a tenth of its gain",
@@ -213,14 +213,19 @@ class Task(NamedTuple):
     loop : str
         Empty for a step of the rig.
     step : Step
+    link : str
+        The loop that holds the link over which the loop's star comes; empty without one.
     """
 
     name: str
     loop: str
     step: Step
+    link: str = ""
 
     def needs(self) -> Iterator[str]:
-        """Names of the tasks that must be done before."""
+        """Names of the tasks that must be done before: over a link, no star comes before its beam does."""
+        if self.link:
+            yield f"{self.link}.photodiodes"
         for name in self.step.needs:
             of_rig = STEPS[name].of == "rig"
             yield name if of_rig or not self.loop else f"{self.loop}.{name}"
@@ -236,8 +241,14 @@ def tasks_of(rig: Rig) -> list[Task]:
         "beam": beams,
         "collector": beams if rig.collector else [],
     }
+    links = {loop: one.link or "" for loop, one in rig.stellar_loops.items()}
     return [
-        Task(f"{loop}.{name}" if loop else name, loop, step)
+        Task(
+            f"{loop}.{name}" if loop else name,
+            loop,
+            step,
+            links[loop] if name == "star" else "",
+        )
         for name, step in STEPS.items()
         for loop in loops[step.of]
     ]

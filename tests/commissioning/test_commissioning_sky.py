@@ -7,7 +7,7 @@ from commissioning.motor_bench import RIG, BenchAmplifiers, site_of
 from fitctl.clock import VirtualClock
 from fitctl.commissioning.motors import Motors
 from fitctl.commissioning.outcome import StepError
-from fitctl.commissioning.sky import Watch
+from fitctl.commissioning.sky import Watch, displaced
 
 
 def watch_of(**wiring):
@@ -43,3 +43,21 @@ def test_no_motor_is_sent_beyond_the_travel():
     with pytest.raises(StepError, match="beyond the travel"):
         watch.turn_to(np.array([0.0, 1.01 * RIG.loops["right"].siderostat.travel_rad]))
     assert bench.furthest_rad == 0.0
+
+
+STILL, OTHER = np.array([28.0, 20.0]), np.array([12.0, 20.0])
+
+
+@pytest.mark.parametrize("by_px", [(2.4, 0.0), (-9.0, 9.0)])
+def test_the_one_star_that_has_moved_is_found_among_others(by_px):
+    was, now = displaced([STILL, OTHER], [OTHER + by_px, 0.1 + STILL])
+    assert was == pytest.approx(OTHER)
+    assert now == pytest.approx(OTHER + by_px)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [([STILL, OTHER], [STILL, OTHER]), ([STILL, OTHER], [STILL]), ([STILL], [STILL, OTHER])],
+)
+def test_stars_that_stand_still_come_or_go_have_not_moved(before, after):
+    assert displaced(before, after) is None

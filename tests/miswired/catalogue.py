@@ -394,6 +394,7 @@ CHANNEL = "loops.{}.siderostat.device.channel"
 INPUTS = "loops.metrology.sensor.device.inputs"
 AZIMUTH = "collector.geometry.link_azimuth"
 OF_RIGHT = ("devices", "camera", "stacks", "amplifiers", "star", "siderostat", "mirror")
+OF_ALL = (*OF_RIGHT[:4], "photodiodes", "collector", *OF_RIGHT[4:])
 OF_BEAM = ("devices", "metrology.amplifiers", "metrology.photodiodes")
 
 
@@ -403,19 +404,21 @@ def _testbed(name, *wrong, only=OF_BEAM, **expected):
 
 
 def _of_right(other):
+    steps = tuple(name if name in OF_RIGHT[:2] else f"right.{name}" for name in OF_RIGHT)
+    beam = OF_BEAM[1:] if other == "left" else ()  # without it, left's star is not on the camera
     return _testbed(
         f"amplifiers of right and {other} exchanged",
-        only=tuple(name if name in OF_RIGHT[:2] else f"right.{name}" for name in OF_RIGHT),
+        only=(*steps[:4], *beam, *steps[4:]),
         exchanged=(CHANNEL.format("right"), CHANNEL.format(other)),
-        named={"left": "another star", "metrology": "whether this siderostat"}[other],
-        most_rad=7.0,
+        named={"left": "another star", "metrology": "are those of another loop"}[other],
+        most_rad=7.0 if other == "left" else 40.0,  # what is no star of it is searched in vain
         most_v=2.6,
         loop=other,
     )
 
 
 TESTBED_ENTRIES = [
-    _testbed("nothing", only=(*OF_RIGHT, "photodiodes", "collector"), most_v=2.6),
+    _testbed("nothing", only=OF_ALL, most_v=2.6),
     _of_right("left"),
     _of_right("metrology"),
     *(
