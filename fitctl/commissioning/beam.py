@@ -145,7 +145,8 @@ def check_photodiodes(site: Site) -> Outcome:
             places_m = _places(watch, threshold_v)
             beam_m = -np.nanmean(places_m, axis=0)
             site.report(f"the beam is az {1e3 * beam_m[0]:+.1f}, el {1e3 * beam_m[1]:+.1f} mm off")
-            if np.max(np.abs(beam_m)) < _CENTRED_M and not np.isnan(places_m).any():
+            if np.max(np.abs(beam_m)) < _CENTRED_M:
+                _refuse_dark(watch, places_m)
                 break
             watch.move_m(-beam_m)
         else:
@@ -153,6 +154,18 @@ def check_photodiodes(site: Site) -> Outcome:
             raise StepError(msg, {"off_m": float(np.max(np.abs(beam_m)))})
         lights_v = watch.lights_v()
     return _photodiodes_outcome(site, places_m - np.mean(places_m, axis=0), lights_v)
+
+
+def _refuse_dark(watch: BeamWatch, places_m: Floats) -> None:
+    """Raise StepError if a photodiode has no light with the beam in the middle of the others."""
+    inputs = watch.loop.sensor.device.inputs
+    dark = [f"AIN{inputs[n]}" for n in range(4) if np.isnan(places_m[n]).any()]
+    if dark:
+        msg = (
+            f"{' and '.join(dark)}: no light, though the beam is on the other photodiodes; check its cable and "
+            "the photodiode"
+        )
+        raise StepError(msg)
 
 
 def _places(watch: BeamWatch, threshold_v: float) -> Floats:

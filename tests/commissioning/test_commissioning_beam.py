@@ -71,7 +71,8 @@ class BeamDiodes:
     """A Gaussian beam on four photodiodes, moved by a bench's motors; `order` is how they are connected."""
 
     def __init__(self, bench, start_m, order, light=1.0):
-        self.bench, self.start_m, self.order, self.light = bench, np.array(start_m), order, light
+        self.bench, self.start_m, self.order = bench, np.array(start_m), order
+        self.light = np.array(light)
         self.sensor = RIG.metrology_loops["metrology"].sensor
         self.m_per_rad = self.sensor.link_length_m * motor_sky_rad_per_rad(
             RIG.loops["metrology"].siderostat
@@ -123,3 +124,8 @@ def test_the_beam_is_brought_to_the_middle_and_each_photodiode_is_found(step, st
 def test_without_light_the_step_ends(step):
     with pytest.raises(StepError, match="no photodiode has light"):
         step((0.0, 0.0), light=0.0)
+
+
+def test_a_photodiode_without_light_is_named(step):
+    with pytest.raises(StepError, match="AIN3: no light"):
+        step((0.01, 0.02), light=(1.0, 1.0, 1.0, 0.0))

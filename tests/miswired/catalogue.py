@@ -432,7 +432,7 @@ TESTBED_ENTRIES = [
     _testbed(
         "photodiode el- unplugged",
         "mocks.faults=[{ device = 'metrology.labjack', kind = 'unplugged', part = 'AIN3' }]",
-        named="photodiodes",
+        named="AIN3: no light",
     ),
     _testbed(
         "hexapod turned by 90 degrees about the link",
