@@ -147,7 +147,7 @@ def test_commissioning_finds_it(entry, tmp_path):
         if key.endswith("_deg"):
             assert abs((found[key] - value + 180) % 360 - 180) < 3.0
         else:
-            assert found[key] == pytest.approx(value, rel=0.1)
+            assert found[key] == pytest.approx(value, rel=0.1, abs=0.01)
     assert watched.most_rad <= entry.most_rad
     assert watched.most_v <= entry.most_v
 
