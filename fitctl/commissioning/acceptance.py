@@ -55,6 +55,7 @@ def check_acceptance(site: Site) -> Outcome:
                 el_sky_arcsec=JOG_ARCSEC * math.sin(angle),
             )
             loop.command(away)
+            time.sleep(_PAUSE_S)
             took_s.append(loop.acquire())
             if number + 1 < times:
                 stops_s.append(loop.stop())

@@ -93,7 +93,7 @@ class Loop:
         if not reply.accepted:
             msg = f"the supervisor refuses {type(command).__name__.lower()}: {reply.text}"
             raise StepError(msg)
-        if isinstance(command, Acquire):
+        if isinstance(command, Acquire) or not reply.number:  # without one, it is done at once
             return
         for outcome in wait_for_outcomes(self.client, reply, _START_S).values():
             if outcome.state != "done":

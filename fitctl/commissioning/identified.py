@@ -27,6 +27,7 @@ from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, experiment_s
 
 SURE = 3.0  # standard deviations by which a rig file's value must differ
 _REPORT_EVERY_S = 10.0
+_ALIKE = 1.02  # of the least residual; then the simpler design is taken
 _WORTH_IT = 0.9  # of the residual that the rig file's design leaves
 
 
@@ -193,7 +194,9 @@ def check_design(site: Site) -> Outcome:
             "by hand (docs/designing.md)"
         )
         raise StepError(msg, figures)
-    best = min(safe, key=lambda name: found[name][0].residual_px)
+    least_px = min(found[name][0].residual_px for name in safe)
+    alike = [name for name in safe if found[name][0].residual_px <= _ALIKE * least_px]
+    best = min(alike, key=lambda name: found[name][0].order)
     if here in safe and _WORTH_IT * found[here][0].residual_px <= found[best][0].residual_px:
         lines.append(f"{here}, the rig file's, is kept")
         return Outcome(lines, figures)

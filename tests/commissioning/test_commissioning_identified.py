@@ -40,7 +40,7 @@ def controller(name):
 def test_a_design_without_margins_gives_way_to_the_best_that_has_them():
     outcome = check_design(with_settings(controller("eq20")))
     chosen = outcome.found["loops"]["right"]["vernier"]["controller"]
-    assert chosen in {"minimum-variance", "fslq"}
+    assert chosen == "minimum-variance"  # fslq leaves as little, with more states
     assert outcome.figures[f"{chosen} phase_margin_deg"] >= 35
     assert outcome.figures["eq20 phase_margin_deg"] < 35
     assert outcome.state == "measured"
