@@ -22,6 +22,7 @@ FINE_RAD = 1.0
 _TAKE_UP = 0.5  # of a step, before it: backlash
 LEAST_PX = 0.7  # by a rough step
 _NEAR_PX = 3.0
+APART_PX = 7.0  # of two stars, to be told apart on the way
 SCALE_APART = 0.08
 ROTATION_APART_DEG = 5.0
 _EVEN = 1.15  # of the two singular values
@@ -167,6 +168,8 @@ def check_siderostat(site: Site) -> Outcome:
             )
             raise StepError(msg, {"furthest_rad": motors.furthest_rad})
         watch.follow(place_px, rough)
+        if len(site.rig.stellar_loops) > 1:
+            _refuse_meeting(site, watch.places_px(), place_px, target_px)
         for _ in range(3):
             off_px = target_px - watch.place_px()
             if np.max(np.abs(off_px)) < _NEAR_PX:
@@ -179,6 +182,21 @@ def check_siderostat(site: Site) -> Outcome:
         fine = np.array([_fine(site, watch, axis, size) for axis in range(2)]).T
         furthest_rad = motors.furthest_rad
     return _siderostat_outcome(site, fine / scale.motor_px_per_rad, furthest_rad)
+
+
+def _refuse_meeting(site: Site, places_px: list[Floats], own_px: Floats, target_px: Floats) -> None:
+    """Raise StepError if another star is where the loop's own would be sent."""
+    others = [one for one in places_px if np.linalg.norm(one - own_px) > APART_PX]
+    near = [one for one in others if np.linalg.norm(one - target_px) < APART_PX]
+    if near:
+        az, el = near[0]
+        msg = (
+            f"the motors of {site.name} move the star at az {own_px[0]:.1f}, el {own_px[1]:.1f} px, and "
+            f"another star, at az {az:.1f}, el {el:.1f} px, is near the target of {site.name}. Either the "
+            f"amplifiers of {site.name} are exchanged with another loop's: exchange their addresses in the rig file. Or "
+            "the other star is in the way: move it aside, and repeat the step"
+        )
+        raise StepError(msg)
 
 
 def _rough(site: Site, watch: Watch, axis: int) -> tuple[Floats, Floats]:

@@ -12,6 +12,7 @@ from fitctl.commissioning.mirror import _mirror_outcome
 from fitctl.commissioning.outcome import StepError
 from fitctl.commissioning.plate import (
     _flipped,
+    _refuse_meeting,
     _siderostat_outcome,
     similar,
 )
@@ -118,3 +119,15 @@ def test_a_rotation_with_a_scale_is_taken_apart(turned, size):
     assume(abs(turned) < 170)
     parts = similar(size * rotation(turned))
     assert parts == pytest.approx((size, turned, 1.0))
+
+
+RIGHT_PX, LEFT_PX = np.array([30.0, 21.0]), np.array([11.0, 19.0])
+TARGET_PX = np.array([28.0, 20.0])
+
+
+def test_a_star_is_not_sent_where_another_one_is():
+    """As where two loops' amplifiers are exchanged."""
+    with pytest.raises(StepError, match="another star"):
+        _refuse_meeting(site_of(), [LEFT_PX, RIGHT_PX], LEFT_PX, TARGET_PX)
+    _refuse_meeting(site_of(), [LEFT_PX, RIGHT_PX], RIGHT_PX, TARGET_PX)
+    _refuse_meeting(site_of(), [LEFT_PX], LEFT_PX, TARGET_PX)
