@@ -110,7 +110,7 @@ def ticks_of(run: LoopRun, step_s: float) -> dict[str, np.ndarray]:
     """A batch's ticks as a log has them, as far as learning reads them."""
     kept = run.ticks
     error_px = kept["star_px"] - kept["command_px"]
-    columns = {"time_s": kept["now_s"], "mid_exposure_s": kept["exposed_step"] * step_s}
+    columns = {"time_s": kept["now_s"], "mid_exposure_s": kept["exposed_step"][:, 0] * step_s}
     for axis, name in enumerate(("az", "el")):
         columns[f"error_{name}_px"] = error_px[:, axis]
         columns[f"mirror_{name}_rad"] = kept["exposed_mirror_rad"][:, axis]
