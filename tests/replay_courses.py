@@ -133,11 +133,11 @@ def a_mirror_that_the_watchdog_moves(simulation):
     assert simulation.command(SetBiasOffset(az_urad=100.0, el_urad=0.0)).accepted
     simulation.run(1.0)
     dac = simulation.devices.loops["right"].dac
-    simulation.clock.sleep_until(simulation.clock.now_s() + 0.4)
+    simulation.clock.sleep_until(simulation.clock.now_s() + 0.45)
     dac._stack_v[:] = 5.0
     simulation.run(0.5)
     reads, dac.read_v = dac.read_v, failing(TIMEOUT)
-    simulation.clock.sleep_until(simulation.clock.now_s() + 0.4)
+    simulation.clock.sleep_until(simulation.clock.now_s() + 0.45)
     simulation.run(0.5)
     dac.read_v = reads
     simulation.command(Recover())

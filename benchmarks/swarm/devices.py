@@ -230,6 +230,11 @@ class SwarmAmplifiers:
         self.fault = "overcurrent"
 
     @property
+    def watches_nobody(self) -> bool:
+        """It goes on as it is when its master has gone."""
+        return self._driver == "ensemble"
+
+    @property
     def velocity_rad_s(self) -> AzEl:
         """What the motors turn by now, as commanded."""
         return self._inner._commanded_rad_s if self.powered else _STILL

@@ -60,6 +60,7 @@ _OF_ONE_LOOP = 0.3  # so many commands name one
 _WITHOUT_FAULTS = 0.15  # so many runs have none of a device
 _CONSOLE_SLOW = 0.2  # so many runs have a console that misses messages
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
+_FAR, _FAR_ARCSEC = 0.4, 550.0  # so many searches are made elsewhere, at most so far away
 _REPEATED, _REPEATED_S = 0.1, 0.02  # so many commands come again so soon: a key that is held
 _BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
 
@@ -207,6 +208,14 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     console_loss: float = 0.0
 
 
+def drawn_search(random: Random) -> Acquire:
+    """About where the star is expected, or far from there: the siderostat goes as fast as it can."""
+    if random.random() > _FAR:
+        return Acquire()
+    az_arcsec, el_arcsec = (random.uniform(-_FAR_ARCSEC, _FAR_ARCSEC) for _ in range(2))
+    return Acquire(expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec)
+
+
 _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "onwards": lambda _: None,
     "stop": lambda _: Stop(),
@@ -215,6 +224,7 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "standby": lambda _: Standby(),
     "acquire": lambda _: Acquire(),
     "release": lambda _: Release(),
+    "hold": lambda _: Hold(),
     "status": lambda _: Status(),
     "take-over": lambda _: TakeOver(),
     "target": lambda random: SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30)),

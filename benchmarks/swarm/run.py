@@ -327,6 +327,10 @@ class Instrument:
         service = self.service
         if service is None:
             return
+        if isinstance(command, Acquire) and command.expected_az_sky_arcsec is not None:
+            for name in self.rig.loops:
+                if command.loop in {"", name}:
+                    self.found_s.pop(name, None)  # the star is expected elsewhere from now on
         self._posted += 1
         number = self._posted
         self._unanswered[number] = self.time.now_s(), type(command).__name__

@@ -647,8 +647,8 @@ class StellarLoop(Loop):
     def star_place(self) -> StarPlace | None:
         """Where its star is, for a supervisor after this one; None where nothing is known of it."""
         estimator = self.star_finder.estimator
-        if estimator.origin_px is None:
-            return None
+        if self._recalled is not None or estimator.origin_px is None:
+            return self._recalled  # what has not come to use yet is not forgotten
         az_rad, el_rad = self.servo.position_rad.tolist()
         link_rad = np.zeros(2) if self.link is None else self.link.turned_rad
         link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))

@@ -17,7 +17,7 @@ from fitctl.stages.injector import Injection, Injector, stack_v_per_px
 
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3  # of mirror angles; frames are far younger when they are used
-_UNWRITTEN_S = 0.2  # after so long without a write, the D/A's own watchdog may have acted
+_UNWRITTEN_S = 0.4  # after so long without a write, the D/A's own watchdog may have acted
 
 
 class MirrorStage:

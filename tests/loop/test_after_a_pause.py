@@ -73,7 +73,7 @@ def test_a_mirror_that_was_moved_while_other_devices_were_opened_goes_on_from_th
 
 
 def test_outputs_that_stayed_are_no_news(off_bias):
-    stall(off_bias, 0.3)
+    stall(off_bias, 0.45)
     off_bias.run(0.5)
 
     assert not any("watchdog has moved" in event.message for event in events_of(off_bias))
@@ -86,7 +86,7 @@ def test_a_dac_that_does_not_answer_after_a_pause_has_failed(off_bias):
     dac.read_v = failing(DeviceTimeout("D/A", "here", "an answer", "none", "look"))
     sent = steps_v(dac)
 
-    stall(off_bias, 0.3)
+    stall(off_bias, 0.45)
     off_bias.run(0.5)
 
     assert mode_of(off_bias) is Mode.SAFE
@@ -96,7 +96,7 @@ def test_a_dac_that_does_not_answer_after_a_pause_has_failed(off_bias):
 def test_a_short_pause_does_not_ask_the_dac(off_bias):
     off_bias.devices.loops["right"].dac.read_v = failing(AssertionError("asked"))
 
-    stall(off_bias, 0.15)
+    stall(off_bias, 0.3)
     off_bias.run(0.5)
 
     assert mode_of(off_bias) is Mode.STANDBY

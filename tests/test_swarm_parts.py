@@ -1,0 +1,297 @@
+"""What the swarm has beside the supervisor: recorder, service, console, sequences, and their invariants."""
+
+from random import Random
+
+import msgspec
+import pytest
+
+from benchmarks.swarm.clients import SENDERS, STEPS
+from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.past import put_back
+from benchmarks.swarm.plan import (
+    _SETTINGS,
+    _SLOW_SERVO,
+    RIGS,
+    Cloud,
+    FullDisk,
+    Kill,
+    Order,
+    Plan,
+    RecorderDeath,
+    Sequence,
+    Stall,
+    Strike,
+    drawn_plan,
+)
+from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
+from benchmarks.swarm.run import RIGS as FOLDER
+from benchmarks.swarm.run import run_plan
+from benchmarks.swarm.threads import VirtualTime
+from fitctl.config import load_rig
+from fitctl.logging.queue import RecordQueue
+from fitctl.logging.records import Event, RecorderStatus
+from fitctl.messages.commands import (
+    Acquire,
+    Hold,
+    Off,
+    RecorderReport,
+    Recover,
+    SetBiasOffset,
+    Standby,
+    Status,
+    Stop,
+    TakeOver,
+)
+from fitctl.messages.modes import Mode
+from fitctl.service.admission import Admission
+from fitctl.tui.state import ConsoleState
+
+
+def plan(*happenings, duration_s=8.0, rig="fit-mock.toml", settings=()):
+    return Plan(
+        seed=1,
+        rig=rig,
+        settings=list(settings),
+        duration_s=duration_s,
+        happenings=sorted(happenings, key=lambda happening: happening.at_s),
+    )
+
+
+def gives(at_s, command, who="ada"):
+    return Order(at_s=at_s, who=who, command=command)
+
+
+# ------------------------------------------------------------ the recorder
+
+
+@pytest.fixture
+def time():
+    time = VirtualTime()
+    yield time
+    time.end()
+
+
+@pytest.fixture
+def queue(monkeypatch):
+    monkeypatch.setattr("fitctl.logging.queue.zmq", ZMQ)
+    return RecordQueue("swarm", 50)
+
+
+def offer(queue, time, count):
+    for number in range(count):
+        record = Event(time_s=time.now_s(), severity="info", source="test", message=str(number))
+        queue.offer(record)
+
+
+def test_a_recorder_that_dies_loses_nothing_that_was_not_confirmed(time, queue):
+    recorder = SwarmRecorder(time, queue)
+    for _ in range(6):
+        offer(queue, time, 7)
+        time.run_until(time.now_s() + 0.2)
+        recorder.die()
+        time.run_until(time.now_s() + 1.5)
+        queue.pump()
+    for _ in range(20):
+        queue.pump()
+        time.run_until(time.now_s() + 0.2)
+
+    assert recorder.written == set(range(42))
+    assert recorder.unaccounted() == ""
+
+
+def test_what_a_full_disk_keeps_out_is_counted(time, queue):
+    recorder = SwarmRecorder(time, queue)
+    recorder.disk_is_full = True
+    for _ in range(10):
+        offer(queue, time, 10)
+        time.run_until(time.now_s() + 1.0)
+
+    assert queue.lost > 0
+    assert recorder.unaccounted() == ""
+
+
+def test_a_record_that_nobody_counts_is_noticed(time, queue):
+    recorder = SwarmRecorder(time, queue)
+    recorder.disk_is_full = True
+    for _ in range(10):
+        offer(queue, time, 10)
+        time.run_until(time.now_s() + 1.0)
+    queue.lost = 0
+
+    assert "0 counted" in recorder.unaccounted()
+
+
+# ------------------------------------------------------------ lease and rights
+
+
+@pytest.fixture
+def invariants(time):
+    return Invariants(load_rig(FOLDER / "fit-mock.toml"), time, {}, {})
+
+
+STATUS = RecorderStatus(time_s=0.0, path="", records=0, lost=0, bytes_written=0)
+COMMANDS = (Hold(), Stop(), Status(), TakeOver())
+
+
+def test_the_rules_of_the_service_are_those_of_the_invariant(time, invariants):
+    admission, random = Admission(30.0), Random(3)
+    for _ in range(500):
+        time.run_until(time.now_s() + random.expovariate(0.1))
+        sender = SENDERS[random.choice(list(SENDERS))]
+        command = random.choice(COMMANDS)
+        refusal = admission.refusal(sender, command, time.now_s())
+        invariants.admitted(sender, command, refusal)
+
+    assert invariants.violations == []
+
+
+@pytest.mark.parametrize(
+    ("who", "command", "refusal"),
+    [
+        ("dora", Stop(), ""),  # who may only watch
+        ("ben", Hold(), ""),  # without the lease
+        ("ada", Hold(), "no"),  # with it
+        ("ben", RecorderReport(status=STATUS), ""),  # which is for this machine's
+    ],
+)
+def test_more_or_less_than_ones_rights_is_a_violation(invariants, who, command, refusal):
+    invariants.admitted(SENDERS["ada"], Standby(), "")
+    assert invariants.violations == []
+
+    invariants.admitted(SENDERS[who], command, refusal)
+
+    assert [one.invariant for one in invariants.violations] == ["lease and rights are kept"]
+
+
+# ------------------------------------------------------------ whole runs
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_each_rig_holds_its_stars_where_nothing_happens(rig):
+    result = run_plan(plan(gives(0.1, None), gives(6.0, None), duration_s=7.0, rig=rig))
+
+    assert result.violations == []
+    assert result.modes["VERNIER"] >= 1
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_every_setting_is_one_that_the_rig_can_have(rig):
+    load_rig(FOLDER / rig, list(_SETTINGS))
+    load_rig(FOLDER / "fit-mock.toml", [*_SETTINGS, *_SLOW_SERVO])
+
+
+def test_plans_have_every_kind_of_happening():
+    kinds = {
+        type(happening)
+        for seed in range(40)
+        for happening in drawn_plan(Random(seed), seed, "fit-mock.toml").happenings
+    }
+
+    assert kinds >= {Order, Stall, Kill, Cloud, RecorderDeath, FullDisk, Sequence}
+
+
+def test_a_sequence_runs_beside_operators_and_ends():
+    happenings = [
+        Sequence(at_s=0.1, who="ada", steps=["acquire", "target", "hold", "off"]),
+        gives(9.0, Stop(), "ben"),
+        RecorderDeath(at_s=4.0),
+        FullDisk(at_s=5.0, lasts_s=2.0),
+    ]
+
+    result = run_plan(plan(*happenings, duration_s=12.0))
+
+    assert result.violations == []
+    assert result.modes["SAFE"] >= 1
+    assert {"VERNIER", "ACQUISITION"} <= result.modes.keys()
+
+
+def test_the_steps_of_sequences_are_those_that_plans_draw():
+    from benchmarks.swarm import plan as plans
+
+    assert set(plans._STEPS) == STEPS.keys()
+
+
+def test_a_console_that_shows_another_mode_is_noticed(monkeypatch):
+    accept = ConsoleState.accept
+
+    def accept_late(self, message, now_s):
+        for loop in message.loops:
+            if loop.mode == Mode.ACQUISITION.name:
+                message = msgspec.structs.replace(
+                    message, loops=[msgspec.structs.replace(loop, mode="STANDBY")]
+                )
+        accept(self, message, now_s)
+
+    monkeypatch.setattr(ConsoleState, "accept", accept_late)
+    result = run_plan(plan(gives(0.1, None), gives(1.0, Acquire()), duration_s=2.0))
+
+    assert "the console shows what is" in {one.invariant for one in result.violations}
+
+
+# ------------------------------------------------------------ defects of the past, each from a plan of its own
+
+
+FAR = Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0)
+KILLED_S = (40.0, 52.0, 64.0, 76.0)  # late in a search for a star behind a cloud
+FOUND = {
+    "watchdog-step": (
+        plan(
+            gives(0.1, Standby()),
+            gives(1.5, SetBiasOffset(az_urad=100.0, el_urad=0.0)),
+            Stall(at_s=3.0, lasts_s=1.6),
+            gives(6.0, Standby()),
+        ),
+        "the mirror rests no faster than its slew",
+    ),
+    "repeated-off": (
+        plan(
+            gives(0.1, Standby()),
+            gives(1.5, SetBiasOffset(az_urad=100.0, el_urad=0.0)),
+            *[gives(3.0 + 0.001 * number, Off()) for number in range(4)],
+        ),
+        "the mirror rests no faster than its slew",
+    ),
+    "stall-is-stuck": (
+        plan(gives(0.1, Standby()), gives(2.0, FAR), Stall(at_s=2.2, lasts_s=0.15)),
+        "an axis that is not stuck is not called so",
+    ),
+    "star-forgotten": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            Strike(at_s=2.2, device="right siderostat", fault="unplugged", lasts_s=0.3),
+            gives(4.0, Recover()),
+            gives(6.0, Recover()),
+        ),
+        "encoders that count on keep the star's place",
+    ),
+    "killed-in-a-search": (
+        plan(
+            gives(0.1, None),
+            gives(2.0, None),
+            Cloud(at_s=12.0, lasts_s=70.0, part=0.0),
+            *[Kill(at_s=at_s, back_after_s=0.1) for at_s in KILLED_S],
+            *[gives(at_s + later_s, None) for at_s in KILLED_S for later_s in (0.5, 2.0, 3.0)],
+            duration_s=84.0,
+        ),
+        "healed, every star is held within 60 s",
+    ),
+    "powered-unread": (
+        plan(gives(0.1, Standby())),
+        "encoders are read before motors have power",
+    ),
+    "oldest-frame": (
+        plan(gives(0.1, Standby()), Stall(at_s=3.0, lasts_s=0.3)),
+        "a tick acts on the newest frame",
+    ),
+}
+
+
+@pytest.mark.parametrize("defect", FOUND)
+def test_a_defect_of_the_past_is_found_from_a_plan(defect):
+    found_from, invariant = FOUND[defect]
+    with put_back(defect):
+        violated = {one.invariant for one in run_plan(found_from).violations}
+
+    assert invariant in violated
+    assert run_plan(found_from).violations == []
