@@ -10,7 +10,7 @@ from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import (
     _SETTINGS,
-    _SLOW_SERVO,
+    _SLOW,
     RIGS,
     Cloud,
     FullDisk,
@@ -22,6 +22,7 @@ from benchmarks.swarm.plan import (
     Stall,
     Strike,
     drawn_plan,
+    slow_servos,
 )
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.run import RIGS as FOLDER
@@ -166,9 +167,13 @@ def test_more_or_less_than_ones_rights_is_a_violation(invariants, who, command, 
 # ------------------------------------------------------------ whole runs
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_each_rig_holds_its_stars_where_nothing_happens(rig):
-    result = run_plan(plan(gives(0.1, None), gives(6.0, None), duration_s=7.0, rig=rig))
+@pytest.mark.parametrize(
+    ("rig", "settings"),
+    [*((rig, []) for rig in RIGS), *((rig, slow_servos(rig, 1)) for rig in _SLOW)],
+)
+def test_each_rig_holds_its_stars_where_nothing_happens(rig, settings):
+    quiet = plan(gives(0.1, None), gives(6.0, None), duration_s=7.0, rig=rig, settings=settings)
+    result = run_plan(quiet)
 
     assert result.violations == []
     assert result.modes["VERNIER"] >= 1
@@ -177,7 +182,8 @@ def test_each_rig_holds_its_stars_where_nothing_happens(rig):
 @pytest.mark.parametrize("rig", RIGS)
 def test_every_setting_is_one_that_the_rig_can_have(rig):
     load_rig(FOLDER / rig, list(_SETTINGS))
-    load_rig(FOLDER / "fit-mock.toml", [*_SETTINGS, *_SLOW_SERVO])
+    for which in range(2) if rig in _SLOW else ():
+        load_rig(FOLDER / rig, [*_SETTINGS, *slow_servos(rig, which)])
 
 
 def test_plans_have_every_kind_of_happening():

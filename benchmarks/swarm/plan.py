@@ -46,14 +46,15 @@ _SETTINGS = (
     "loops.right.acquisition.search_again_s=10.0",
 )
 """Texts of which some runs have some."""
-_SLOW_SERVO = (
-    "loops.right.siderostat.servo.rate_hz=50.0",
-    "loops.right.siderostat.servo.gain_per_s=15.0",
-    "loops.right.siderostat.servo.following_error_limit_rad=10.0",
-    "interlocks.following_error.high=8.0",
-)
-"""Of runs of the default rig whose servo runs at 50 Hz instead of 500."""
 _SETTING = 0.15  # so many runs have each
+_SLOW_SERVO = {
+    "servo.rate_hz": (100.0, 50.0),
+    "servo.gain_per_s": (40.0, 15.0),
+    "servo.following_error_limit_rad": (4.0, 10.0),
+}
+"""Of a siderostat whose servo runs at 100 or 50 Hz instead of 500."""
+_SLOW = {"fit-mock.toml": 0.15, "two-stars.toml": 0.5, "fit-testbed.toml": 0.6}
+"""So many runs have slow servos; they are faster, too."""
 DURATION_S = 120.0
 OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # so many commands name one
@@ -248,6 +249,15 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
 """By their words; without a command, the one that leads on."""
 
 
+def slow_servos(rig: str, which: int) -> list[str]:
+    """Settings with which the siderostats of a rig are servoed at 100 or 50 Hz."""
+    return [
+        f"loops.{loop}.siderostat.{key}={values[which]}"
+        for loop in RIGS[rig]
+        for key, values in _SLOW_SERVO.items()
+    ] + [f"interlocks.following_error.high={(3.0, 8.0)[which]}"]
+
+
 def devices_of(rig: str) -> list[str]:
     """The devices of a rig."""
     devices = ["camera"]
@@ -318,8 +328,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     happenings.sort(key=lambda happening: happening.at_s)
     settings = ["supervisor.telemetry_hz=5.0"]  # as the rig has it, it takes a tenth of the time
     settings += [text for text in _SETTINGS if random.random() < _SETTING]
-    if rig == "fit-mock.toml" and random.random() < _SETTING:
-        settings += _SLOW_SERVO
+    if random.random() < _SLOW.get(rig, 0.0):
+        settings += slow_servos(rig, random.randrange(2))
     return Plan(
         seed=seed,
         rig=rig,
