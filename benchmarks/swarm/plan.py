@@ -225,7 +225,6 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "standby": lambda _: Standby(),
     "acquire": lambda _: Acquire(),
     "release": lambda _: Release(),
-    "hold": lambda _: Hold(),
     "status": lambda _: Status(),
     "take-over": lambda _: TakeOver(),
     "target": lambda random: SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30)),

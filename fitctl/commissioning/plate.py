@@ -193,8 +193,8 @@ def _refuse_meeting(site: Site, places_px: list[Floats], own_px: Floats, target_
         msg = (
             f"the motors of {site.name} move the star at az {own_px[0]:.1f}, el {own_px[1]:.1f} px, and "
             f"another star, at az {az:.1f}, el {el:.1f} px, is near the target of {site.name}. Either the "
-            f"amplifiers of {site.name} are exchanged with another loop's: exchange their addresses in the rig file. Or "
-            "the other star is in the way: move it aside, and repeat the step"
+            f"amplifiers of {site.name} are exchanged with another loop's: exchange their addresses in the rig "
+            "file. Or the other star is in the way: move it aside, and repeat the step"
         )
         raise StepError(msg)
 
