@@ -76,10 +76,11 @@ class Loop:
         raise StepError(msg)
 
     def reason(self) -> str:
-        """What the newest telemetry says is wrong."""
+        """Why the loop is in its mode, by the newest telemetry."""
         telemetry = self.client.receive(1.0)
-        texts = [] if telemetry is None else [event.message for event in telemetry.events[-3:]]
-        return "; ".join(texts) or "see the supervisor's log"
+        loops = () if telemetry is None else telemetry.loops
+        changes = [one.last_change for one in loops if one.name == self._site.name]
+        return next((one.reason for one in changes if one is not None), "see the supervisor's log")
 
     def command(self, command: AnyCommand) -> None:
         """Send a command and wait until it is done.
