@@ -80,9 +80,10 @@ class Motors:
         )
         if reading.fault:
             msg = (
-                f"the amplifiers report a fault: {reading.fault}. Where the motor turned by itself just "
-                "before, its encoder counts against it: exchange the encoder's A and B lines, or set its "
-                "direction in the amplifier"
+                f"the amplifiers report a fault: {reading.fault}. Where the motor did not turn as commanded, "
+                "look for a mechanical end, a brake or a limit of the amplifier. Where it turned by itself, "
+                "its encoder counts against it: exchange the encoder's A and B lines, or set its direction in "
+                "the amplifier"
             )
             raise StepError(msg)
 

@@ -136,7 +136,7 @@ STEPS: dict[str, Step] = {
         "siderostat",
         travel.moves,
         ("amplifiers",),
-        100.0,
+        65.0,
         travel.check_travel,
     ),
     "gentle": Step(
@@ -144,7 +144,7 @@ STEPS: dict[str, Step] = {
         "star",
         closed.gentle_moves,
         ("siderostat", "mirror", "travel"),
-        40.0,
+        70.0,
         closed.check_gentle,
         supervised=True,
     ),
@@ -168,10 +168,10 @@ STEPS: dict[str, Step] = {
             supervised=True,
         )
         for name, title, takes_s in (
-            ("airpath", "The air path, as the camera shows it", 100.0),
-            ("hysteresis", "Hysteresis and stroke of each stack", 160.0),
-            ("backlash", "The play between the siderostat's motors and the beam", 100.0),
-            ("delay", "The time from mid-exposure to the command, as the star shows it", 70.0),
+            ("airpath", "The air path, as the camera shows it", 95.0),
+            ("hysteresis", "Hysteresis and stroke of each stack", 130.0),
+            ("backlash", "The play between the siderostat's motors and the beam", 85.0),
+            ("delay", "The time from mid-exposure to the command, as the star shows it", 60.0),
         )
     },
     "design": Step(
@@ -187,7 +187,7 @@ STEPS: dict[str, Step] = {
         "star",
         acceptance.accept_moves,
         ("design",),
-        900.0,
+        620.0,
         acceptance.check_acceptance,
         supervised=True,
     ),
