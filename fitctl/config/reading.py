@@ -126,7 +126,7 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
     try:
         return tomllib.loads(read_text(path, missing))
     except tomllib.TOMLDecodeError as error:
-        msg = f"{path}: not TOML: {error}; mend it there: expected key = value, or [table]"
+        msg = f"{path}: not TOML: {error}; correct it there: expected key = value, or [table]"
         raise ConfigError(msg) from None
 
 

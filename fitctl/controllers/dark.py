@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 _MOST_BYTES = 64 << 20
 _MOST_BAD = 0.1  # of the pixels
 FULL_WELL_DN = 65535  # a pixel that reads this has more light than it can say
-_MEASURE = "measure it anew: fitctl sequence run dark"
+_MEASURE = "measure it again: fitctl sequence run dark"
 
 
 class Dark:

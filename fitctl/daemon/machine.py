@@ -76,7 +76,7 @@ class Machine:
             self._asked_s = time.monotonic()
             self._wanted.set()
         elif time.monotonic() - asked_s > _LATE_S:
-            self._tell(f"has not told its free space for {_LATE_S:g} s")
+            self._tell(f"has not reported its free space for {_LATE_S:g} s")
 
     def _ask_disk(self) -> None:
         while True:
@@ -95,7 +95,7 @@ class Machine:
         disk = f"the disk of {self._folder}"
         if trouble and trouble != was:
             remedy = "look at that disk, and at its link if it is not in this computer"
-            text = f"{disk} {trouble}; interlocks go by the last it told; {remedy}"
+            text = f"{disk} {trouble}; interlocks use the last value; {remedy}"
             self._note("warning", "computer", text)
         elif was and not trouble:
-            self._note("info", "computer", f"{disk} tells its free space again")
+            self._note("info", "computer", f"{disk} reports its free space again")

@@ -227,7 +227,7 @@ def _children(
             any(loop.learn != "off" for loop in rig.stellar_loops.values()),
             "learner",
             "learner",
-            "a new one is started; it learns anew",
+            "a new one is started, and learns from the beginning",
             PATIENCE_S,
         ),
     )

@@ -81,7 +81,7 @@ class _Source:
     def insist_sound(self) -> None:
         """Refuse to go on with a file that lacks something in its midst; a cut end is none."""
         if self.damaged_chunks or (self.finished and self.unread_bytes):
-            msg = f"{self.path}: is damaged; mend it with `fitctl log recover` first"
+            msg = f"{self.path}: is damaged; repair it with `fitctl log recover` first"
             raise LogError(msg)
 
     def _inside(self, record: McapRecord) -> list[McapRecord]:

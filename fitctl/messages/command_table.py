@@ -138,7 +138,7 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         msg = f"send: {word} is now {RENAMED[word]}"
         raise ConfigError(msg)
     if word not in WORDS:
-        msg = f"send: {word} is no command; there are {', '.join(WORDS)}"
+        msg = f"send: unknown command {word!r}. Available: {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
     named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]

@@ -166,7 +166,9 @@ def allowed_keys(rig: Rig) -> tuple[dict[str, AllowedKey], list[str]]:
         if key.name == path.stem:
             keys[key.public] = key
         else:
-            problems.append(f"{path}: is named {key.name} inside; rename the file, or make it anew")
+            problems.append(
+                f"{path}: is named {key.name} inside; rename the file, or make it again"
+            )
     return keys, problems
 
 
@@ -233,14 +235,17 @@ def _read(path: Path, kind: type[T]) -> T:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             text = file.read(65536)
         if mode & 0o077:
-            msg = f"{path}: others may read it (mode {mode:04o}); make sure that nobody has, then: chmod 600"
+            msg = (
+                f"{path}: other users can read it (mode {mode:04o}); revoke it if somebody may have read it, "
+                "then: chmod 600"
+            )
             raise ConfigError(msg)
         return msgspec.toml.decode(text, type=kind)
     except OSError as error:
         msg = f"{path}: cannot be read: {error.strerror}; `fitctl keys new` makes key files"
         raise ConfigError(msg) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        msg = f"{path}: is no key file of fitctl: {error}; `fitctl keys new` makes them"
+        msg = f"{path}: is not a key file of fitctl: {error}; `fitctl keys new` makes them"
         raise ConfigError(msg) from None
 
 

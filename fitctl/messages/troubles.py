@@ -27,7 +27,7 @@ _AFTER_FAILURE = {
     "recover": "all devices were closed again",
     "acquire": "the siderostat waits where it is",
     "search": "the siderostat waits where it is",
-    "controller": "the design before it stays at work",
+    "controller": "the previous design stays in force",
     "off": "the loop is OFF",
 }
 # A quantity out of range, and those whose trips explain it: the warning about it names no cause of its own.
@@ -297,7 +297,7 @@ def _of_recording(telemetry: Telemetry) -> Iterator[Trouble]:
         yield Trouble(
             "recorder",
             "warning",
-            f"the recorder has said nothing for {silent_s:.0f} s",
+            f"the recorder has been silent for {silent_s:.0f} s",
             recorder.time_s,
             f"{go_on}, records wait for it",
             "see the events, and the disk of logging.folder",

@@ -167,7 +167,7 @@ def read_steps(info: LogInfo, rig: Rig) -> Iterator[LoggedStep]:
     Raises
     ------
     LogError
-        If it cannot be replayed: it begins in the midst of a run, has no ticks or no frames, or was recorded
+        If it cannot be replayed: it begins in the middle of a run, has no ticks or no frames, or was recorded
         before ticks told what a replay needs.
     """
     step, before_tick = LoggedStep(), defaultdict[str, list[Logged]](list)
@@ -264,6 +264,6 @@ def _insist_on_start(info: LogInfo, first_ns: int) -> None:
 
 def _midst(info: LogInfo, why: str) -> LogError:
     return LogError(
-        f"{info.path}: begins in the midst of a run ({why}), and what was before decides too; give all files "
-        "of the run, from its first on: fitctl replay FIRST SECOND ..."
+        f"{info.path}: begins in the middle of a run ({why}), and earlier records matter, too; name all files "
+        "of the run from the first: fitctl replay FIRST SECOND ..."
     )

@@ -6,7 +6,7 @@ import difflib
 import itertools
 import shutil
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +25,7 @@ MOST_FIELDS = 12
 _ROWS = 20_000
 _TERMINAL_BINS = 400
 _COLOURS = ("blue", "orange", "green", "magenta", "cyan", "red")
+_MOST_PIECES = 40
 _LEAST_LINES = 12  # of a panel
 UNITS = ("px", "v", "s", "rad", "arcsec", "dn", "fraction", "progress", "ns")
 
@@ -218,13 +219,10 @@ def as_text(
         panel.theme("simple" if colours else "colorless")
         _label_above(panel, [labels[one.label] for one in its], colours=colours)
         for one, colour in zip(its, itertools.cycle(_COLOURS), strict=False):
-            at_s, low, high = envelope(one.time_s, one.values, _TERMINAL_BINS)
-            both_s, both = np.repeat(at_s, 2), np.column_stack([low, high]).ravel()
-            there = ~np.isnan(both)
-            if there.any():
+            for at_s, values in _pieces(one):
                 marker = plotext.marker("hd", colour) if colours else "hd"
                 points = panel.signal(
-                    (both_s[there] / time.s_per_unit).tolist(), both[there].tolist(), marker=marker
+                    (at_s / time.s_per_unit).tolist(), values.tolist(), marker=marker
                 )
                 panel.draw(points.lines())
         if ylim is not None:
@@ -232,6 +230,19 @@ def as_text(
         panel.label(unit, "y")
     panel.label(time.label, "x")
     return str(figure.build().string(colorless=not colours))
+
+
+def _pieces(series: Series) -> Iterator[tuple[Floats, Floats]]:
+    """What a terminal draws as lines: none crosses a time without values, unless there are many of them."""
+    there = np.flatnonzero(~np.isnan(series.values))
+    parts = np.split(there, np.flatnonzero(np.diff(there) > 1) + 1)
+    for rows in [there] if len(parts) > _MOST_PIECES else parts:
+        bins = max(2, round(_TERMINAL_BINS * len(rows) / max(1, len(there))))
+        at_s, low, high = envelope(series.time_s[rows], series.values[rows], bins)
+        both_s, both = np.repeat(at_s, 2), np.column_stack([low, high]).ravel()
+        drawn = ~np.isnan(both)
+        if drawn.any():
+            yield both_s[drawn], both[drawn]
 
 
 def _label_above(panel: Any, labels: Sequence[str], *, colours: bool) -> None:

@@ -98,7 +98,7 @@ def _newest_run(folder: Path) -> list[LogInfo]:
 def _identity(log: LogInfo) -> tuple[str, ...]:
     """The same for all files of a run: rig, and the two clocks at its start."""
     if "rig" not in log.metadata:
-        msg = f"{log.path}: says of no rig what it recorded; name a log that fitctl recorded"
+        msg = f"{log.path}: has no rig in it; name a log that fitctl recorded"
         raise LogError(msg)
     clock = log.metadata.get("clock", {})
     return log.metadata["rig"].get("name", ""), *clock.values()

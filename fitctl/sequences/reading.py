@@ -167,10 +167,10 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
     """One mistake as one line."""
     match problem["type"]:
         case "union_tag_not_found":
-            mistake = f"step is missing; there are {', '.join(STEPS)}"
+            mistake = f"step is missing. Available: {', '.join(STEPS)}"
         case "union_tag_invalid":
             tag = problem["ctx"]["tag"]
-            mistake = f"{tag!r} is no step; there are {', '.join(STEPS)}"
+            mistake = f"unknown step {tag!r}. Available: {', '.join(STEPS)}"
             if tag in RENAMED_STEPS:
                 mistake = f"step {tag!r} is now {RENAMED_STEPS[tag]!r}"
         case "extra_forbidden":

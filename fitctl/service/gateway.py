@@ -44,7 +44,9 @@ _MOST_DROPPED_AT_ONCE = 1000.0
 _HUNG_S = 10
 _NO_KEY = "revoked keys"  # all of them together, where messages are counted
 _REVOKED = Reply(accepted=False, text="this key has been revoked")
-_NO_SUPERVISOR = Reply(accepted=False, text="the supervisor takes no commands just now; try again")
+_NO_SUPERVISOR = Reply(
+    accepted=False, text="the supervisor accepts no commands at the moment; try again"
+)
 _MOST_EVENTS = 100  # lines that wait for a supervisor that takes none
 
 Route = tuple[bytes, bytes]

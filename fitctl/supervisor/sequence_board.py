@@ -68,7 +68,7 @@ class SequenceBoard:
         if known.wanted == "end":
             return Reply(accepted=False, text=f"{action}: sequence {known.name} is being stopped")
         self._status = msgspec.structs.replace(known, wanted=_WANTED[action])
-        self._journal.event("info", _SOURCE, f"{known.name}: {action}, asked for by the operator")
+        self._journal.event("info", _SOURCE, f"{known.name}: {action}, by the operator")
         return Reply(accepted=True)
 
     def _report_change(self, before: SequenceStatus | None, now: SequenceStatus) -> None:

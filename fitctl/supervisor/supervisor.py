@@ -456,7 +456,7 @@ class Supervisor:
         return Reply(
             accepted=True,
             number=number,
-            text="designing; fitctl status shows the controller at work",
+            text="designing; fitctl status shows the controller in force",
         )
 
     def _learn(self, report: LearnerReport, names: list[str]) -> Reply:

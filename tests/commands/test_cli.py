@@ -71,7 +71,7 @@ BAD_INPUT = {
     "a missing rig file": (["check", "--rig", "no-such.toml"], "no-such.toml: no such rig file"),
     "a --set without a value": (["check", "--set", "camera.width_px"], "expected key.path=value"),
     "a log that is not there": (["log", "info", "no-such.mcap"], "no-such.mcap"),
-    "a command that is none": (["send", "explode"], "explode is no command"),
+    "a command that is none": (["send", "explode"], "unknown command 'explode'"),
     "a negative duration": (["simulate", "--duration", "-3"], "duration"),
     "a negative seed": (["simulate", "--seed", "-1"], "seed"),
     "a loop that is none": (
@@ -104,7 +104,15 @@ BAD_INPUT = {
 
 # How a line says what was expected, or what to do now.
 NEXT_STEPS = (
-    *("must be", "may be at most", "expected", "did you mean", "there are", "rig fit-mock has"),
+    *(
+        "must be",
+        "may be at most",
+        "expected",
+        "did you mean",
+        "there are",
+        "Available: ",
+        "rig fit-mock has",
+    ),
     *("name another", "choose another", "lower it", "logs are", "(see fitctl"),
 )
 

@@ -111,7 +111,7 @@ def test_recover_says_how_many_records_were_saved_and_overwrites_nothing(log, wh
 
 
 def test_recover_leaves_a_whole_log_alone(log, whole):
-    assert log("recover", whole) == (0, f"{whole}: is whole; there is nothing to mend", "")
+    assert log("recover", whole) == (0, f"{whole}: is not damaged; there is nothing to repair", "")
     assert list(whole.parent.iterdir()) == [whole]
 
 

@@ -56,7 +56,7 @@ def test_an_instrument_that_is_off_is_well():
         (lambda: told(FakeSupervisor("SAFE")), "right is SAFE: "),
         (lambda: told(recorder=None), "nothing is being recorded"),
         (lambda: told_of_losses(3), "3 records are missing"),
-        (lambda: told(time_s=told().time_s + 1.1 * RECORDER_SILENT_S), "said nothing for 11 s"),
+        (lambda: told(time_s=told().time_s + 1.1 * RECORDER_SILENT_S), "silent for 11 s"),
     ],
     ids=["safe", "no recorder", "losses", "silent recorder"],
 )
@@ -91,7 +91,7 @@ def test_a_lost_star_is_one_trouble_as_long_as_it_is_searched_for():
 
     assert found == [
         "right: star lost 133 s ago; the loop searches again, round 2, within 108 arcsec of its last place; "
-        "check shutter and clouds; hold, stop or acquire ends the search",
+        "check shutter and clouds; release, stop or acquire ends the search",
         "interlock disk_space: full",
     ]
 

@@ -27,7 +27,7 @@ ENTRIES = (
         "did not end within 5 s and was killed; it did not confirm the last", within_s=5.0
     ),
     Entry(
-        "room on the disk", "is not told", STAYS, "has not told its free space for 5 s",
+        "room on the disk", "is not told", STAYS, "has not reported its free space for 5 s",
         within_s=8.0, rig="silent disk",
     ),
     Entry("clock", "3600", STAYS, "clock_step_s 3600 is above", within_s=4.0, rig="own clock"),

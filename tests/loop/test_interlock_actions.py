@@ -208,7 +208,7 @@ def test_a_disk_that_does_not_answer_holds_nobody_and_is_told_of_once(tmp_path, 
 
     answers.set()
     until(lambda: len(told) == 2)
-    assert "tells its free space again" in told[1][2]
+    assert "reports its free space again" in told[1][2]
     assert measured["disk_free_bytes"] == 7e9
     assert asked.count(tmp_path) == 1
 

@@ -68,7 +68,7 @@ def test_a_value_below_zero_is_no_option(tmp_path, capsys):
         ("acquire", ["wide"], "needs no values, and may have search_radius_sky_arcsec="),
         ("acquire", ["field_overlap"], "needs no values"),
         ("acquire", ["field_overlap=much"], "acquire field_overlap=much"),
-        ("explode", [], "is no command; there are stop, "),
+        ("explode", [], "unknown command 'explode'. Available: stop, "),
         ("target", ["1"], "needs az_px el_px"),
         ("target", ["far", "1"], "target far 1"),
         ("stop", ["now"], "needs no values"),

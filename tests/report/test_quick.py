@@ -4,7 +4,7 @@ import pytest
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.messages.modes import Mode
-from fitctl.report.quick import MOST_FIELDS, as_figure, as_text, read_series
+from fitctl.report.quick import MOST_FIELDS, Series, as_figure, as_text, read_series
 
 
 def labels(series):
@@ -116,6 +116,16 @@ def test_the_vertical_range_is_as_wanted(held):
     text = as_text(held[1], series, (-0.25, 0.125), colours=False)
     assert "-0.25" in text
     assert "0.12" in text
+
+
+def test_no_line_crosses_a_time_without_values(held):
+    time_s = np.arange(100.0)
+    values = np.where((time_s < 30) | (time_s >= 60), 1.0, np.nan).astype(np.float32)
+    lines = as_text(held[1], [Series("/t", "x_px", time_s, values)], colours=False).splitlines()
+
+    (drawn,) = (line for line in lines if len(set(line) & set("▀▄█▌▐")) > 0)
+    inside = drawn[drawn.index("┤") + 1 : drawn.rindex("│")]
+    assert inside[len(inside) * 2 // 5 : len(inside) // 2].strip() == ""
 
 
 def test_no_legend_lies_on_the_data(held):

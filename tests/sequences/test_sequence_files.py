@@ -38,7 +38,7 @@ def mistakes(tmp_path, text, rig=RIG):
             'step = "wait", duration_s = 1.0, timeout = 1.0',
             "timeout: unknown key; did you mean timeout_s?",
         ),
-        ('step = "hodl"', "'hodl' is no step; there are standby, acquire, hold"),
+        ('step = "hodl"', "unknown step 'hodl'. Available: standby, acquire, hold"),
         ("duration_s = 1.0", "step 1: step is missing"),
         ('step = "acquire", attempts = 0', "attempts: must be greater than or equal to 1"),
         ('step = "acquire", timeout_s = inf', "timeout_s: must be"),

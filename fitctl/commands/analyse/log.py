@@ -259,20 +259,20 @@ def recover(
     """
     log = chosen_log("log recover", log, rig, latest=latest)
     if folder.in_use(log):
-        msg = f"{log}: is being recorded just now; there is nothing to mend"
+        msg = f"{log}: is still being recorded; there is nothing to repair"
         raise ConfigError(msg)
     if not verifying.verify(log).problems:
         if as_json:
             say(to_json({"log": str(log), "out": None}))
         else:
-            say(f"{log}: is whole; there is nothing to mend")
+            say(f"{log}: is not damaged; there is nothing to repair")
         return
     target = out or log.with_name(f"{log.stem}_recovered.mcap")
     saved = copying.recover(log, target, overwrite=overwrite)
     if as_json:
         say(to_json({"log": str(log), "out": str(target), **asdict(saved)}))
         return
-    lost = f"{saved.damaged_chunks} damaged chunks passed over, " if saved.damaged_chunks else ""
+    lost = f"{saved.damaged_chunks} damaged chunks skipped, " if saved.damaged_chunks else ""
     say(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
     )

@@ -25,7 +25,7 @@ from fitctl.processes import ended_by_signals, interrupt
 
 _LINE_S = 1.0
 _POLL_S = 0.2
-_SILENCE = "nothing is heard of a supervisor; if none is running: fitctl run"
+_SILENCE = "no telemetry from a supervisor; if none is running, start one: fitctl run"
 
 
 class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):

@@ -101,7 +101,7 @@ def init(
     open_questions = [device for device, choice in given.items() if not choice]
     if open_questions and not mocks:
         _must_be_a_terminal(base, open_questions)
-        say("What hardware is there? Enter takes what stands in brackets.")
+        say("Name your hardware. Press Enter for the value in brackets.")
         _show_serial_ports()
         name = name or typer.prompt("Name of the rig", default=file.stem)
     devices = {

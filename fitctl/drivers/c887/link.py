@@ -206,9 +206,7 @@ class C887Link:
 
     def _nonsense(self, expected: str, got: str) -> NoReturn:
         self.close()
-        hint = (
-            "check collector.hexapod.baud_rate, and that nobody else uses this port; then recover"
-        )
+        hint = "check collector.hexapod.baud_rate, and that no other program uses this port; then recover"
         raise self.endpoint.error(DeviceProtocolError, expected, got, hint)
 
     def _silent(self, expected: str, got: str) -> DeviceTimeout:

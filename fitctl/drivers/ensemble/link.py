@@ -124,7 +124,7 @@ class EnsembleLink:
     def nonsense(self, expected: str, got: str) -> DeviceProtocolError:
         """The error for an answer that cannot be; the link is closed."""
         self._give_up()
-        hint = "check that nobody else uses this port of the controller, then recover"
+        hint = "check that no other program uses this port of the controller, then recover"
         return self._endpoint.error(DeviceProtocolError, expected, got, hint)
 
     def _send(self, text: str) -> float:

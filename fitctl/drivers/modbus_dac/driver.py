@@ -245,5 +245,5 @@ class ModbusDac:
     def _nonsense(self, expected: str, got: str) -> DeviceProtocolError:
         """An answer that cannot be; the connection goes, because the next one would be out of step."""
         self.close()
-        hint = f"check that {self._where} lead to the D/A, and that nobody else talks on its line"
+        hint = f"check that {self._where} lead to the D/A, and that nothing else talks on its line"
         return DeviceProtocolError(_NAME, self._endpoint, expected, got, hint)

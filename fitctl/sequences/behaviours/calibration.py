@@ -25,7 +25,7 @@ def require_folder(folder: Path) -> None:
     ConfigError
     """
     if not folder.is_dir() or not os.access(folder, os.W_OK):
-        msg = f"{folder}: is no folder to write in; calibrations go there: name another with --out"
+        msg = f"{folder}: is not a folder that can be written; name another for the calibrations with --out"
         raise ConfigError(msg)
 
 

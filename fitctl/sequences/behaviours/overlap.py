@@ -142,7 +142,7 @@ def _check(step: steps.Overlap, rig: Rig, loop_name: str) -> list[str]:
     if rig.fringes is None:
         return [f"rig {rig.name} has no section fringes, which names the two stars"]
     if loop_name not in rig.fringes.loops:
-        return [f"loop {loop_name!r} is none of fringes.loops: {', '.join(rig.fringes.loops)}"]
+        return [f"loop {loop_name!r} is not in fringes.loops: {', '.join(rig.fringes.loops)}"]
     without = [name for name in rig.fringes.loops if fringe_of(rig.stellar_loops[name]) is None]
     if without:
         return [f"loops.{name}.other_spots has no spot of the name {FRINGE}" for name in without]
