@@ -257,7 +257,7 @@ def test_a_command_that_means_nothing_is_refused_with_what_does(vernier):
 
     assert not reply.accepted
     assert "VERNIER" in reply.text
-    assert "hold" in reply.text
+    assert "release" in reply.text
 
 
 def test_a_command_for_an_unknown_loop_is_refused_by_name(vernier):
