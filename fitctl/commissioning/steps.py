@@ -196,7 +196,7 @@ STEPS: dict[str, Step] = {
         "star",
         acceptance.cables_moves,
         ("acceptance",),
-        150.0,
+        65.0,
         acceptance.check_cables,
         supervised=True,
     ),
