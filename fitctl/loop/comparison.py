@@ -36,6 +36,11 @@ class Comparison:
     loop_name : str
     learnt, before : Design
         The one at work, and the one before it.
+
+    Attributes
+    ----------
+    before_error_px : tuple of float
+        What the design before would have left on the last frame.
     """
 
     def __init__(self, rig: Rig, loop_name: str, learnt: Design, before: Design) -> None:
@@ -51,6 +56,7 @@ class Comparison:
         """Frames are missing, or say nothing of the designs: begin again."""
         for paper in self._papers:
             paper.restart()
+        self.before_error_px: AzEl = (0.0, 0.0)
         self._frames = 0
         self._first_px: Floats | None = None
         self._means_px2 = np.zeros((3, 2))
@@ -63,6 +69,8 @@ class Comparison:
         if self._first_px is None:
             self._first_px = disturbance_px
         before, learnt = (paper.step(disturbance_px - self._first_px) for paper in self._papers)
+        az_px, el_px = before.tolist()
+        self.before_error_px = az_px, el_px
         self._frames += 1
         counted = self._frames - self._settle_frames
         if counted > 0:

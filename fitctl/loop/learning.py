@@ -7,12 +7,13 @@ a tick. All of it follows from the ticks and the learner's reports, so that a re
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import Design, Measurement
 from fitctl.loop.comparison import Comparison
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LearningState
@@ -26,6 +27,8 @@ PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 # The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS. The
 # comparison finds later what is worse by less.
 _WATCHES = ((0.3, 2.0), (10.0, 1.25))
+# A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault.
+_LOUDER = 2.0
 _STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
 _NEWS = 0.1  # by which part a gain must differ from the one last reported to be reported again
 
@@ -54,6 +57,7 @@ class Learning:
         self._still_px = _STILL_PX_PER_S * rig.camera.period_s
         self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
         self._means_px2 = [[0.0, 0.0] for _ in _WATCHES]
+        self._before_px2 = [[0.0, 0.0] for _ in _WATCHES]
         self._limit_px = math.inf
         self._by_hand = False
         self._calm_since_s: float | None = None
@@ -107,9 +111,18 @@ class Learning:
     # ------------------------------------------------------------ changes
 
     def changed(
-        self, before: Design, now: Design, report: LearnerReport | None, *, by_itself: bool
+        self,
+        before: Design,
+        now: Design,
+        report: LearnerReport | None,
+        recent: Iterable[Measurement],
+        *,
+        by_itself: bool,
     ) -> None:
-        """Another design is at work: a learnt one with its report, or another without."""
+        """Another design is at work: a learnt one with its report, or another without.
+
+        Recent frames, in their order and without gaps, tell the comparison where star and vibrations are.
+        """
         self._told = 0.0
         self._comparison = None
         if report is None:
@@ -123,8 +136,10 @@ class Learning:
             self.before = before
         if self.before is not None:
             self._comparison = Comparison(self._rig, self._loop_name, now, self.before)
+            for seen in recent:
+                self._comparison.observe(seen.error_px, seen.mirror_rad, seen.motor_rad)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
-        for means in self._means_px2:
+        for means in (*self._means_px2, *self._before_px2):
             means[:] = [report.learnt_camera_px**2] * 2
 
     def fell_back(self, reason: str, now_s: float) -> None:
@@ -181,15 +196,17 @@ class Learning:
 
     def _why_back(self, error_px: AzEl) -> str:
         worse = "" if self._comparison is None else self._comparison.why_back
-        limit_px = self._limit_px
-        if not math.isnan(self._before_px):  # a louder night is louder for the design before, too
-            limit_px = max(limit_px, self._before_px)
-        for (over_s, factor), keep, means in zip(
-            _WATCHES, self._keep, self._means_px2, strict=True
+        before_px = None if self._comparison is None else self._comparison.before_error_px
+        for (over_s, factor), keep, means, before in zip(
+            _WATCHES, self._keep, self._means_px2, self._before_px2, strict=True
         ):
             for axis in (0, 1):
                 means[axis] = keep * means[axis] + (1.0 - keep) * error_px[axis] ** 2
+                if before_px is not None:
+                    before[axis] = keep * before[axis] + (1.0 - keep) * before_px[axis] ** 2
             rms_px = math.sqrt(max(means))
+            louder_px = min(math.sqrt(max(before)), _LOUDER * self._limit_px)
+            limit_px = max(self._limit_px, louder_px)
             if rms_px > factor * limit_px:
                 worse = (
                     f"the learnt design leaves {rms_px:.4f} px on frames over {over_s:g} s; the design before "

@@ -67,6 +67,11 @@ class Pointing:
         """The pair last wanted more than the mirror's range."""
         return self.pair.saturated
 
+    @property
+    def recent(self) -> list[Measurement]:
+        """The last seconds' frames, without gaps."""
+        return list(self._recent)
+
     def use(self, design: Design) -> None:
         """Work with another design; where the star is held, :meth:`start_pair` is next."""
         self.pair = Pair(design, self._scale, self._range_rad)

@@ -537,7 +537,9 @@ class StellarLoop(Loop):
 
         A learnt design comes with its report; `by_itself` is without an operator's command.
         """
-        self.learning.changed(self.pointing.design, design, report, by_itself=by_itself)
+        self.learning.changed(
+            self.pointing.design, design, report, self.pointing.recent, by_itself=by_itself
+        )
         now_s, before, motor_rad = self._clock.now_s(), self.controller, self.servo.position_rad
         link_rad = self._read_link(now_s)
         self.pointing.use(design)

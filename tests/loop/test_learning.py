@@ -8,6 +8,7 @@ import pytest
 from learner_reports import PAPER, SHAKEN, report
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.document import parameters_json
 from fitctl.controllers.design.margins import design_with_margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
@@ -206,9 +207,9 @@ def test_while_the_target_moves_nothing_changes(shaken):
 
 
 def test_a_design_that_does_worse_is_left_within_a_second():
-    """It was made for another night: it expects a line where there is none, and misses the one that is."""
-    night = Night(*SHAKEN)
-    night.report(lines=(), measured_px=0.05, learnt_camera_px=0.05)
+    """It was made for another night: it expects a strong line where there is none."""
+    night = Night("loops.right.vernier.controller=minimum-variance")
+    night.report(lines=(Line(4.0, 0.1, 0.3),), measured_px=0.0165, learnt_camera_px=0.0165)
     night.simulation.run(1.0)
     _, back = night.changes()
 
@@ -230,6 +231,17 @@ def test_a_design_that_is_only_a_little_worse_is_left_too():
     assert "the design before would have left" in back.reason
 
 
+def test_a_line_that_beats_is_no_reason_to_go_back():
+    """For a third of a second it is thrice what it is over a minute, with either design."""
+    night = Night(*SHAKEN)
+    same = design_minimum_variance(dataclasses.replace(PAPER, noise_px=0.0101))
+    night.loop.use(same, report=report(measured_px=0.06, learnt_camera_px=0.06), by_itself=True)
+    night.simulation.run(20.0)
+
+    assert len(night.changes()) == 1
+    assert np.abs(night.error_px(20.0)).max() > 2 * 0.06
+
+
 def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
     """The design before would leave more, too."""
     louder = (
@@ -243,7 +255,7 @@ def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
 
     assert state.state == "in force"
     assert state.measured_px > 1.25 * 0.016
-    assert state.before_px == pytest.approx(state.measured_px, rel=0.05)
+    assert state.before_px == pytest.approx(state.measured_px, rel=0.1)
 
 
 def test_after_a_way_back_there_is_a_pause():
