@@ -221,7 +221,7 @@ def a_learnt_design(simulation):
     simulation.run(3.0)
     simulation.command(learner_report())
     simulation.run(5.0)
-    simulation.command(learner_report(lines=(), measured_px=0.03, learnt_camera_px=0.03))
+    simulation.command(learner_report(lines=(), measured_px=0.015, learnt_camera_px=0.015))
     simulation.run(2.0)
     assert simulation.supervisor.loops["right"].learning.state.state == "fell back"
     simulation.command(SetController(name="learnt"))
