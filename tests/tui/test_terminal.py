@@ -52,13 +52,17 @@ class OnTerminal:
         self.modes_before = termios.tcgetattr(self.inside)
         self.shown = b""
         self._stacks = folder.with_name("stacks")
+        # Tests before this one may have set a terminal's size; at 80 columns an alarm takes the row of "Operate".
+        env = {
+            name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}
+        }
         self.process = subprocess.Popen(
             [sys.executable, "-c", program, str(folder), str(self._stacks)],
             stdin=self.inside,
             stdout=self.inside,
             stderr=self.inside,
             start_new_session=True,
-            env=os.environ | {"TERM": "xterm-256color", "OPENBLAS_NUM_THREADS": "1"},
+            env=env | {"TERM": "xterm-256color", "OPENBLAS_NUM_THREADS": "1"},
         )
         threading.Thread(target=self._read, daemon=True).start()
 
