@@ -89,7 +89,10 @@ def test_comments_stay_and_new_keys_bring_theirs(old):
             assert line in text
     assert 'compression = "zstd"\n' in text
     assert "retain_days = 365.0               # since the last write" in text
-    assert "# ---------------------------------------------------------------- what must be" in text
+    assert (
+        "# ---------------------------------------------------------------- interlocks: limits"
+        in text
+    )
 
 
 def test_an_upgraded_rig_moves_and_waits_as_before(old, tmp_path):

@@ -33,10 +33,10 @@ from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import Event, RecorderStatus
 from fitctl.messages.commands import (
     Acquire,
-    Hold,
     Off,
     RecorderReport,
     Recover,
+    Release,
     SetBiasOffset,
     Standby,
     Status,
@@ -131,7 +131,7 @@ def invariants(time):
 
 
 STATUS = RecorderStatus(time_s=0.0, path="", records=0, lost=0, bytes_written=0)
-COMMANDS = (Hold(), Stop(), Status(), TakeOver())
+COMMANDS = (Release(), Stop(), Status(), TakeOver())
 
 
 def test_the_rules_of_the_service_are_those_of_the_invariant(time, invariants):
@@ -150,8 +150,8 @@ def test_the_rules_of_the_service_are_those_of_the_invariant(time, invariants):
     ("who", "command", "refusal"),
     [
         ("dora", Stop(), ""),  # who may only watch
-        ("ben", Hold(), ""),  # without the lease
-        ("ada", Hold(), "no"),  # with it
+        ("ben", Release(), ""),  # without the lease
+        ("ada", Release(), "no"),  # with it
         ("ben", RecorderReport(status=STATUS), ""),  # which is for this machine's
     ],
 )
@@ -198,7 +198,7 @@ def test_plans_have_every_kind_of_happening():
 
 def test_a_sequence_runs_beside_operators_and_ends():
     happenings = [
-        Sequence(at_s=0.1, who="ada", steps=["acquire", "target", "hold", "off"]),
+        Sequence(at_s=0.1, who="ada", steps=["acquire", "offset", "hold", "off"]),
         gives(9.0, Stop(), "ben"),
         RecorderDeath(at_s=4.0),
         FullDisk(at_s=5.0, lasts_s=2.0),

@@ -52,7 +52,7 @@ class OnTerminal:
         self.modes_before = termios.tcgetattr(self.inside)
         self.shown = b""
         self._stacks = folder.with_name("stacks")
-        # Tests before this one may have set a terminal's size; at 80 columns an alarm takes the row of "Operate".
+        # Tests before this one may have set a terminal's size: at 80 columns an alarm takes the row of tabs.
         env = {
             name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,9 +27,10 @@ def describe(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
     """Have cameras started from now on describe themselves otherwise."""
 
     def change(old: str, new: str) -> None:
-        name, xml = memory._description("xml")
-        assert old in xml.decode()
-        changed = xml.decode().replace(old, new).encode()
+        name = "fit_camera.xml"
+        xml = Path(memory.__file__).with_name(name).read_text()
+        assert old in xml
+        changed = xml.replace(old, new).encode()
         monkeypatch.setattr(memory, "_description", lambda _: (name, changed))
 
     return change
