@@ -108,7 +108,7 @@ def _amplifiers(rig, back_end):
     )
     if rig == ENSEMBLE:  # it counts in its own units, and follows itself
         return
-    for counts in (1000, 16000):
+    for counts in (1000,) if rig == BAL else (1000, 16000):  # its counters have 16 bits
         yield entry(
             f"encoders of {counts} counts for 4000",
             (f"{SIDEROSTAT}.encoder_counts_per_rev={counts}",),
@@ -361,7 +361,10 @@ OPTICS = [
     _optics("D/A at 0 V at the start", f"{DAC}.safe_v=0.0", step="mirror", most_v=7.6),
     _optics(
         "mirror mounted mirrored",
-        "plant.loops.right.fsm_axis_gains=[[-1.0, 0.0], [0.0, 1.0]]",
+        # For the star, a mirror image along azimuth is stacks 1 and 3 exchanged, and a quarter turn.
+        f"{FSM}.piezo.channels=[3, 2, 1]",
+        f"{FSM}.dac.channels=[3, 2, 1]",
+        f"{FSM}.rotation_deg=-90.0",
         step="mirror",
         found={
             f"{FSM}.dac.channels": [3, 2, 1],
