@@ -32,7 +32,8 @@ def outcome(result):
     if result["troubles"]:
         return f"named by `{next(iter(result['troubles'])).rpartition('.')[2]}`"
     keys = ", ".join(
-        f"`{key.removeprefix('loops.right.')}`" for key, value in result["found"].items()
+        f"`{key.removeprefix('loops.right.').removeprefix('loops.')}`"
+        for key, value in result["found"].items()
     )
     return f"corrected: {keys}" if keys else "passed"
 
