@@ -55,6 +55,9 @@ def _messages(client: Client) -> list[Telemetry]:
         if all(loop.name in ticked or loop.mode == "OFF" for loop in message.loops):
             break
     if not messages:
-        msg = f"no telemetry came within {LISTEN_S:g} s, so the present state is not known"
+        msg = (
+            f"no telemetry within {LISTEN_S:g} s, so the present state is not known; start a supervisor with "
+            "fitctl run"
+        )
         raise ConnectionError(msg)
     return messages
