@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+pytestmark = pytest.mark.long
 STEPS = """
 import sys
 from fitctl.cli import main

@@ -106,6 +106,7 @@ def test_the_logs_of_an_experiment_are_those_that_were_written_meanwhile(rig, lo
     assert experimented(rig, logs) == logs
 
 
+@pytest.mark.long
 def test_what_the_supervisor_names_as_its_log_is_read_only_if_it_is_a_log_of_ours(
     rig, logs, monkeypatch
 ):

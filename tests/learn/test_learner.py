@@ -125,6 +125,7 @@ def test_without_a_long_enough_piece_the_report_says_so(rig, vernier):
     assert "the longest piece in VERNIER is" in report.text
 
 
+@pytest.mark.long
 def test_a_learning_loop_leaves_little_of_a_night_that_its_rig_file_does_not_know():
     night = load_rig(default_rig_path(), [*SHAKEN, "loops.right.learn=on"])
     simulation = Simulation(night, 1, history_s=200.0)

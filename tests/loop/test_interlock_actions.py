@@ -203,7 +203,7 @@ def test_a_disk_that_does_not_answer_holds_nobody_and_is_told_of_once(tmp_path, 
 
     assert len(told) == 1
     assert told[0][:2] == ("warning", "computer")
-    assert "has not told its free space" in told[0][2]
+    assert "has not reported its free space" in told[0][2]
     assert measured["recorder_backlog_fraction"] == 1  # of after it: what needs no disk goes on
 
     answers.set()

@@ -43,6 +43,7 @@ def held(simulate_with):
     return make
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dark_s", [1.0, 5.0, 30.0, 180.0])
 def test_a_star_that_comes_back_where_it_was_is_held_again(held, dark_s):
     simulation = held()

@@ -35,7 +35,7 @@ def test_the_files_that_a_run_was_rotated_into_are_replayed_as_one(logged, tmp_p
         result.loops["right"].ticks
         > sum(tick.time_s < simulation.clock.now_s() - 0.1 for tick in simulation.ticks) - 3
     )
-    with pytest.raises(LogError, match=r"midst of a run .* give all files of the run"):
+    with pytest.raises(LogError, match=r"middle of a run .* name all files of the run"):
         replayed(second)
 
 

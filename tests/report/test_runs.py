@@ -138,7 +138,7 @@ def foreign(path, metadata):
 @pytest.mark.parametrize(
     ("metadata", "error", "told"),
     [
-        ({}, LogError, "says of no rig what it recorded"),
+        ({}, LogError, "has no rig in it; name a log that fitctl recorded"),
         ({"rig": {"name": "x", "json": "{"}}, ConfigError, "not JSON.*--rig"),
         ({"rig": {"name": "x", "json": '{"name": "x"}'}}, ConfigError, "--rig"),
     ],

@@ -4,6 +4,7 @@ import asyncio
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -183,14 +184,14 @@ def test_an_adapter_that_takes_long_to_connect_holds_up_no_other_bus(siderostat,
 
 
 def test_a_connection_that_breaks_or_is_closed_holds_up_no_other_bus(siderostat, monkeypatch):
-    monkeypatch.setattr(
-        protocol_socket, "time", time
-    )  # its close waits 0.3 s, but not in other tests
+    closing_s = 2.0  # 0.3 s in pyserial, which a busy machine may stand still for
+    slow = SimpleNamespace(sleep=lambda _seconds: time.sleep(closing_s))
+    monkeypatch.setattr(protocol_socket, "time", slow)
 
     def oldest_reading_s(servo):
-        """Within half a second."""
+        """Within a second."""
         ages_s = []
-        end_s = time.monotonic() + 0.5
+        end_s = time.monotonic() + 0.5 * closing_s
         while time.monotonic() < end_s:
             ages_s.append(time.monotonic() - servo.read_state().reading.time_s)
             time.sleep(0.002)
@@ -205,7 +206,7 @@ def test_a_connection_that_breaks_or_is_closed_holds_up_no_other_bus(siderostat,
             for servo in servos:
                 hold(servo)
             end()
-            assert oldest_reading_s(servos[1]) < 0.25
+            assert oldest_reading_s(servos[1]) < 0.4 * closing_s
             assert servos[1].fault is None
             one.heal()
 

@@ -106,6 +106,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(name, truth):
     assert 0.5 < np.std(errors) < 1.6
 
 
+@pytest.mark.long
 def test_samples_that_are_late_are_found_at_two_speeds_behind_a_play():
     errors = [(one.found.late_ms - 1e3 * LATE_S) / one.sd.late_ms for one in results()]
     # The floor that the encoder's counts set makes this interval a careful one.
