@@ -166,6 +166,7 @@ def test_the_scales_that_are_measured_correct_the_rig_file(tmp_path):
     )
 
 
+@pytest.mark.long
 def test_a_camera_that_is_turned_is_measured_within_the_stated_uncertainty(tmp_path):
     """The rig file says 25 and 35 degrees; the camera stands at 30. The fragment then holds the star."""
     said_deg, truth_deg = {"siderostat": 25.0, "fsm": 35.0}, 30.0
@@ -196,6 +197,7 @@ UNEVEN = [
 ]
 
 
+@pytest.mark.long
 def test_gains_of_the_axes_are_measured_and_the_fragment_undoes_them(tmp_path):
     rig = load_rig(default_rig_path(), UNEVEN)
     with Instrument(rig, simulate=True, seed=1) as instrument:
