@@ -341,5 +341,9 @@ def test_python_blocks_run_on_a_log(block, checkout):
         check=False,
     )
 
+    if done.returncode and "ConnectionError" in block.text:  # what it is for
+        assert done.stderr.startswith("no supervisor answers")
+        assert done.stderr.count("\n") == 1
+        return
     assert done.returncode == 0, done.stderr
     assert "nan" not in done.stdout

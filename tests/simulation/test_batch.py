@@ -291,7 +291,7 @@ def test_a_rig_with_more_lines_than_fit_is_refused():
     "overrides",
     [
         ["interlocks.fsm_edge.action=flatten"],
-        ["interlocks.star_lost.action=hold"],
+        ["interlocks.star_lost.action=freeze"],
         ["interlocks.siderostat_rate.high=0.5"],
         ["plant.frame_delay_s=0.07"],  # later than the frame-age row allows
     ],
