@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from fitctl.controllers.design.basis import Basis, design_parameters
-from fitctl.controllers.design.linear_loop.disturbance import disturbance
-from fitctl.controllers.design.linear_loop.sampled import hold
+from fitctl.controllers.design.linear_loop.disturbance import disturbance, hold
 from fitctl.controllers.design.predictor import Gains, predicting_design, star_filter
 from fitctl.controllers.pair import Design
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from fitctl.controllers.design.basis import Basis, design_parameters
-from fitctl.controllers.design.linear_loop.disturbance import disturbance
-from fitctl.controllers.design.linear_loop.sampled import hold
+from fitctl.controllers.design.linear_loop.disturbance import disturbance, hold
 from fitctl.controllers.design.predictor import Gains, predicting_design, star_filter
 from fitctl.controllers.pair import Design
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_discrete_are, solve_discrete_lyapunov
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.linear_loop.disturbance import disturbance
-from fitctl.controllers.design.linear_loop.sampled import hold, sampled_loop, timing
+from fitctl.controllers.design.linear_loop.disturbance import disturbance, hold
+from fitctl.controllers.design.linear_loop.sampled import sampled_loop, timing
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]

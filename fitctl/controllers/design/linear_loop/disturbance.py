@@ -1,4 +1,4 @@
-"""What moves a star, as one linear system: the air path, and beside it the lines of vibrations."""
+"""What moves a star, as one linear system: air path and lines of vibrations, at a moment and during a hold."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_continuous_lyapunov
+from scipy.linalg import block_diag, expm, solve_continuous_lyapunov
 
 from fitctl.controllers.design.basis import Basis, Line
 from fitctl.model.air_path import discretize, state_space
 
 Floats = NDArray[np.float64]
+_NODES = 8  # of Gauss-Legendre: exact to rounding for anything smooth over one period
 
 
 class Disturbance(NamedTuple):
@@ -74,3 +75,36 @@ def line_px2_per_hz(own_hz: float, half_width_hz: float | Floats, frequency_hz: 
     own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
     omega2 = (2 * math.pi * frequency_hz) ** 2
     return np.asarray(4 * width * own**2 / ((own**2 - omega2) ** 2 + width**2 * omega2))
+
+
+class Hold(NamedTuple):
+    """The time for which a command acts, as nodes of a quadrature.
+
+    Attributes
+    ----------
+    part, weight : arrays, shape (nodes,)
+        Place within the hold, from 0 to 1, and weight, of sum 1.
+    star : array, shape (nodes, n)
+        The star's own motion there is this of the disturbance's state at mid-exposure,
+    new_px2 : array, shape (nodes,)
+        and besides something new of this variance.
+    """
+
+    part: Floats
+    weight: Floats
+    star: Floats
+    new_px2: Floats
+
+
+def hold(moving: Disturbance, period_s: float, delay_s: float) -> Hold:
+    """The time from `delay_s` after mid-exposure to one period later."""
+    a, seen = moving.a, moving.seen
+    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    part = (node + 1) / 2
+    times_s = delay_s + part * period_s
+    return Hold(
+        part=part,
+        weight=weight / 2,
+        star=np.array([seen @ expm(a * time_s) for time_s in times_s]),
+        new_px2=np.array([seen @ moving.over(time_s)[1] @ seen for time_s in times_s]),
+    )

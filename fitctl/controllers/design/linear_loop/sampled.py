@@ -12,14 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, expm
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.linear_loop.disturbance import Disturbance
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]
-_NODES = 8  # of Gauss-Legendre: exact to rounding for anything smooth over one period
 _ROUNDING = 1e-9
 
 
@@ -93,7 +90,8 @@ def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
     command = np.hstack([design.d @ from_stages, design.c])
     command_error = design.d[:, 0]
     n = len(design.a)
-    a = block_diag(advance, design.a)
+    a = np.zeros((size + n, size + n))  # by numpy alone: a supervisor imports no scipy
+    a[:size, :size], a[size:, size:] = advance, design.a
     a[:size] += drive @ command
     a[size:, :size] = design.b @ from_stages
     return SampledLoop(
@@ -103,37 +101,4 @@ def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
         command=command,
         command_error=command_error,
         motor_held=np.eye(size + n)[newest_motor],
-    )
-
-
-class Hold(NamedTuple):
-    """The time for which a command acts, as nodes of a quadrature.
-
-    Attributes
-    ----------
-    part, weight : arrays, shape (nodes,)
-        Place within the hold, from 0 to 1, and weight, of sum 1.
-    star : array, shape (nodes, n)
-        The star's own motion there is this of the disturbance's state at mid-exposure,
-    new_px2 : array, shape (nodes,)
-        and besides something new of this variance.
-    """
-
-    part: Floats
-    weight: Floats
-    star: Floats
-    new_px2: Floats
-
-
-def hold(moving: Disturbance, period_s: float, delay_s: float) -> Hold:
-    """The time from `delay_s` after mid-exposure to one period later."""
-    a, seen = moving.a, moving.seen
-    node, weight = np.polynomial.legendre.leggauss(_NODES)
-    part = (node + 1) / 2
-    times_s = delay_s + part * period_s
-    return Hold(
-        part=part,
-        weight=weight / 2,
-        star=np.array([seen @ expm(a * time_s) for time_s in times_s]),
-        new_px2=np.array([seen @ moving.over(time_s)[1] @ seen for time_s in times_s]),
     )
