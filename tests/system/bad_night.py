@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fitctl.config import default_rig_path
+from fitctl.messages.commands import Recover
 
 from .conftest import fitctl, running
 from .screens import LIMIT_S, SIZE, browser_of, terminal_of
@@ -145,6 +146,15 @@ def lose_the_link(night):
     finally:
         supervisor.send_signal(signal.SIGCONT)
     screen.until("● live")
+    # The drives and the camera missed the supervisor, too: a STOP leaves this fault as the reason.
+    loops = tuple(loop.name for loop in night.loops())
+    night.reach("SAFE", *loops)
+    screen.until("✗ SAFE")
+    screen.press("Space")
+    screen.until("STOP confirmed")
+    screen.until("✗ SAFE")
+    assert night.rig.client.send(Recover()).accepted
+    night.reach("STANDBY", *loops)
 
 
 def stop(night):
