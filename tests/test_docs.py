@@ -283,6 +283,7 @@ def test_what_is_not_run_is_documented_and_the_tests_that_run_it_are_there():
             assert any(fnmatchcase(" ".join(found.words), pattern) for found in ran), pattern
 
 
+@pytest.mark.long
 def test_the_mocks_print_the_endpoints_that_the_documents_show():
     documented = next(c.output for c in ours() if c.words[1:2] == ("mocks",) and c.output)
     arguments = [sys.executable, "-m", "fitctl", "mocks", "--free-ports"]

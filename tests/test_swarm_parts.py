@@ -167,6 +167,7 @@ def test_more_or_less_than_ones_rights_is_a_violation(invariants, who, command, 
 # ------------------------------------------------------------ whole runs
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "settings"),
     [*((rig, []) for rig in RIGS), *((rig, slow_servos(rig, 1)) for rig in _SLOW)],
@@ -196,6 +197,7 @@ def test_plans_have_every_kind_of_happening():
     assert kinds >= {Order, Stall, Kill, Cloud, RecorderDeath, FullDisk, Sequence}
 
 
+@pytest.mark.long
 def test_a_sequence_runs_beside_operators_and_ends():
     happenings = [
         Sequence(at_s=0.1, who="ada", steps=["acquire", "offset", "hold", "off"]),
@@ -293,6 +295,7 @@ FOUND = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("defect", FOUND)
 def test_a_defect_of_the_past_is_found_from_a_plan(defect):
     found_from, invariant = FOUND[defect]

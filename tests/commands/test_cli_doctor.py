@@ -235,6 +235,7 @@ def test_a_socket_that_a_supervisor_left_behind_keeps_nobody_from_asking(doctor,
     assert status == 0
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     os.geteuid() != 0 or not shutil.which("unshare"), reason="needs root and unshare"
 )

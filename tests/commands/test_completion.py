@@ -12,6 +12,8 @@ from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.config import CONTROLLERS, default_rig_path
 from fitctl.sequences.files import shipped_sequences
 
+pytestmark = pytest.mark.long
+
 # Each sources ./script and prints what it offers at Tab after its arguments, one a line.
 BASH = """
 source ./script

@@ -178,7 +178,10 @@ def test_readings_are_the_motors_angles_in_whole_counts_and_dated(bench, enabled
     before_s = time.monotonic()
     first = exchange_for(enabled, 0.1, SLOWLY)
     assert before_s < first.time_s < time.monotonic()
-    settled = exchange_for(enabled, 0.15, STILL)
+    until(enabled, lambda _: not bench.motors.moving)
+    settled = exchange_for(
+        enabled, 0.02, STILL
+    )  # of motors that stand, however long the machine stood
     truth = bench.motors.position_rad()
     assert settled.position_rad == pytest.approx(truth, abs=1.5 * bench.count_rad)
     assert settled.position_rad[0] > 0.1

@@ -18,6 +18,8 @@ from fitctl.logging.queue import RecordQueue
 from fitctl.logging.reading import log_info, read_records, tick_arrays
 from fitctl.logging.verifying import verify
 
+pytestmark = pytest.mark.long
+
 SHIPPED = load_rig(default_rig_path()).logging
 MAY_BE_LOST_S = 1.0
 

@@ -18,6 +18,8 @@ from served import Served, until
 from fitctl.messages.commands import Status, Stop
 from fitctl.messages.endpoints import tcp_endpoint
 
+pytestmark = pytest.mark.long
+
 _LISTENS_S = 60.0
 _RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 

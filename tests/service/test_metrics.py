@@ -229,6 +229,7 @@ def test_a_request_that_trickles_is_cut_off_too(served, monkeypatch):
             trickle(line)
 
 
+@pytest.mark.long
 def test_many_who_never_ask_leave_few_threads_and_a_scrape_comes_through_after_them(
     served, monkeypatch
 ):

@@ -183,6 +183,7 @@ def test_an_adapter_that_takes_long_to_connect_holds_up_no_other_bus(siderostat,
         assert len(readings_within(servos[0], 0.1)) > 2
 
 
+@pytest.mark.long
 def test_a_connection_that_breaks_or_is_closed_holds_up_no_other_bus(siderostat, monkeypatch):
     closing_s = 2.0  # 0.3 s in pyserial, which a busy machine may stand still for
     slow = SimpleNamespace(sleep=lambda _seconds: time.sleep(closing_s))

@@ -12,6 +12,8 @@ from fitctl.drivers.interface import (
     DeviceUnreachable,
 )
 
+pytestmark = pytest.mark.long
+
 # Twice response_timeout_s for a question after one that went wrong, and stalls of the machine.
 SOON_S = 2.0
 
