@@ -101,7 +101,8 @@ class Invariants:
         self._powerless_since_s.clear()
         self._unneeded_since_s.clear()
         self._busy_since_s = math.inf
-        self._stepped_s = self._clock.now_s()
+        # A machine that stands still does so for the next supervisor too.
+        self._stepped_s = max(self._stepped_s, self._clock.now_s())
 
     def violated(self, invariant: str, detail: str) -> None:
         """Note a violation; the first of each invariant says enough."""
@@ -114,6 +115,9 @@ class Invariants:
         self._stepped_s = self._clock.now_s() + duration_s
         for name in self._stopped_s:
             self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
+        for since_s in (self._powerless_since_s, self._unneeded_since_s):
+            for name in since_s:
+                since_s[name] += duration_s
 
     # ------------------------------------------------------------ commands and records
 

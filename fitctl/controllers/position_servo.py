@@ -14,11 +14,16 @@ AzEl = tuple[float, float]
 
 @dataclass(slots=True)
 class Axis:
-    """One axis: where its motor shall be, and what moves it there."""
+    """One axis: where its motor shall be, and what moves it there.
+
+    `moving_rad` is how far the reference moved in the last period; it falls to zero, at a rate that the
+    motor can follow, before the reference turns round.
+    """
 
     target_rad: float
     reference_rad: float
     step_rad: float = 0.0
+    moving_rad: float = 0.0
     velocity_rad_s: float = 0.0
 
 
@@ -36,10 +41,18 @@ def axis_velocity_rad_s(servo: Any, axis: Any, position_rad: float) -> float:
     """One servo period of one axis: the velocity command for the measured motor angle."""
     # In line and by comparison: it runs 500 times a second for each axis.
     left_rad, step_rad = axis.target_rad - axis.reference_rad, axis.step_rad
-    if -step_rad <= left_rad <= step_rad or step_rad <= left_rad <= -step_rad:
-        reference_rad = axis.target_rad
+    moving_rad, brake_rad = axis.moving_rad, servo.brake_rad
+    # The motor, too, has to turn round; without the wait it would be behind until the move ends.
+    turns_round = moving_rad * step_rad < 0.0 and not -brake_rad <= moving_rad <= brake_rad
+    reference_rad = axis.reference_rad
+    if left_rad == 0.0 or turns_round:
+        axis.moving_rad = max(0.0, moving_rad - brake_rad) + min(0.0, moving_rad + brake_rad)
     else:
-        reference_rad = axis.reference_rad + step_rad
+        axis.moving_rad = step_rad
+        if -step_rad <= left_rad <= step_rad or step_rad <= left_rad <= -step_rad:
+            reference_rad = axis.target_rad
+        else:
+            reference_rad += step_rad
     axis.reference_rad = reference_rad
     error_rad = reference_rad - position_rad
     if -servo.resolution_rad < error_rad < servo.resolution_rad:
@@ -64,9 +77,10 @@ class PositionServo:
     """Motor angle to velocity command, both axes.
 
     Set-points come at the frame rate; between them the reference moves in a straight line, so that a
-    search is a smooth walk. With the amplifier's own lag and one period of latency the loop is a
-    second-order one of 45 Hz. Both axes' angles and velocities are pairs of plain floats, which are
-    several times quicker than arrays.
+    search is a smooth walk. Before it turns round it waits until the motor has slowed down: a motor
+    that still turns the other way would look stuck until the move ends. With the amplifier's own lag and
+    one period of latency the loop is a second-order one of 45 Hz. Both axes' angles and velocities are
+    pairs of plain floats, which are several times quicker than arrays.
 
     Parameters
     ----------
@@ -92,6 +106,8 @@ class PositionServo:
         self.gain_per_s = gain_per_s
         self.velocity_limit_rad_s = velocity_limit_rad_s
         self.velocity_step_rad_s = acceleration_limit_rad_s2 * period_s
+        # Half of what the motor can: it is behind by its lag.
+        self.brake_rad = 0.5 * self.velocity_step_rad_s * period_s
         self.period_s = period_s
         self.resolution_rad = resolution_rad
         self.periods_per_setpoint = max(1, round(setpoint_period_s / period_s))

@@ -123,7 +123,9 @@ class SiderostatServo:
         self._followed_s = 0.0
         self.encoders_jumped = False  # until the loop has concluded from it
         self.turned_on_rad = 0.0
-        self._last_rad_s = _STILL
+        self._unread_rad_s: list[
+            AzEl
+        ] = []  # commands since the last reading, and the one before it
         self._recalled_rad: AzEl | None = None
         self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         self._disabling = False
@@ -267,19 +269,20 @@ class SiderostatServo:
             with suppress(Exception):
                 self._amplifiers.exchange(velocity_rad_s)
             return
+        self._unread_rad_s.append(velocity_rad_s)
         try:
-            self._servo_by(self._amplifiers.exchange(velocity_rad_s), asked_s, velocity_rad_s)
+            self._servo_by(self._amplifiers.exchange(velocity_rad_s), asked_s)
         except Exception as error:
             self._fail(error)
 
-    def _servo_by(self, reading: ServoReading | None, asked_s: float, velocity_rad_s: AzEl) -> None:
+    def _servo_by(self, reading: ServoReading | None, asked_s: float) -> None:
         now_s = self._clock.now_s()
         self.round_trip_s = now_s - asked_s
         if reading is None:
             self._missed_readings += 1
         else:
             self._accept_reading(reading, now_s)
-            self._last_rad_s = velocity_rad_s
+            del self._unread_rad_s[:-1]
         if now_s - self._timely_s > self._settings.reading_timeout_s:
             raise self._no_reading()
         if reading is None:
@@ -376,20 +379,21 @@ class SiderostatServo:
     def _find_position(self) -> None:
         """Read the encoders before power is on: nothing is ever servoed about a place never read.
 
-        A drive that stopped answering may have turned on at its last velocity; its encoders count on from the
-        same zero. Any other difference means that they count from elsewhere now.
+        A drive that stopped answering may have turned on at any velocity that it was sent since; its encoders
+        count on from the same zero. Any other difference means that they count from elsewhere now.
         """
-        knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
-        recalled_rad, self._recalled_rad = self._recalled_rad, None
-        self._history.clear()
         deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
         while (reading := self._amplifiers.exchange(_STILL)) is None:
             if self._clock.now_s() > deadline_s:
                 raise self._no_reading()
+        knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
+        recalled_rad, self._recalled_rad = self._recalled_rad, None
+        self._history.clear()
         self._accept_reading(reading, self._clock.now_s())
         self._servo.reset(reading.position_rad)
-        most_rad = [_SPEED_MARGIN * rad_s * (reading.time_s - last_s) for rad_s in self._last_rad_s]
-        least_rad = [0.0, 0.0]
+        for_s = _SPEED_MARGIN * (reading.time_s - last_s)
+        by_axis = list(zip(_STILL, *self._unread_rad_s, strict=True))
+        least_rad, most_rad = ([for_s * limit(rad_s) for rad_s in by_axis] for limit in (min, max))
         if recalled_rad is not None:
             knew, last_rad = True, recalled_rad
             most_rad = [self._velocity_limit_rad_s * _ON_ITS_OWN_S] * 2
@@ -399,10 +403,10 @@ class SiderostatServo:
         # After a loss of power they begin at zero, and no motor turns.
         at_zero = max(map(abs, reading.position_rad)) < _ENCODER_JUMP_RAD
         turned_on = not at_zero and all(
-            min(least, most) - _ENCODER_JUMP_RAD <= rad <= max(least, most) + _ENCODER_JUMP_RAD
+            least - _ENCODER_JUMP_RAD <= rad <= most + _ENCODER_JUMP_RAD
             for rad, least, most in zip(turned_rad, least_rad, most_rad, strict=True)
         )
-        self._last_rad_s = _STILL
+        self._unread_rad_s.clear()
         self.encoders_jumped = self.encoders_jumped or (far and not turned_on)
         self.turned_on_rad = max(map(abs, turned_rad)) if far and turned_on else 0.0
 

@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fitctl.controllers.position_servo import PositionServo
 
 GAIN_PER_S, SPEED_RAD_S, ACCELERATION_RAD_S2 = 135.0, 60.0, 6000.0
 PERIOD_S, SETPOINT_PERIOD_S = 0.002, 0.02
+FOLLOWING_LIMIT_RAD = 1.0  # of the shipped rigs
 moves = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=10)
 
 
@@ -91,3 +92,38 @@ def test_an_error_below_one_encoder_count_is_left_alone():
     )
     velocity_rad_s = servo.step((-0.0015, -0.0017))
     assert velocity_rad_s == pytest.approx([0.0, GAIN_PER_S * 0.0017])
+
+
+class LaggingMotors:
+    """Motors that take a command two periods late, as over a bus, and then follow it within a period."""
+
+    def __init__(self):
+        self.position_rad = np.zeros(2)
+        self._velocity_rad_s = np.zeros(2)
+        self._commands = [np.zeros(2)] * 2
+
+    def turn(self, velocity_rad_s):
+        self._commands.append(np.array(velocity_rad_s))
+        wanted_rad_s = self._commands.pop(0)
+        self._velocity_rad_s += (1 - np.exp(-1)) * (wanted_rad_s - self._velocity_rad_s)
+        self.position_rad = self.position_rad + PERIOD_S * self._velocity_rad_s
+        return tuple(self.position_rad.tolist())
+
+
+turns = st.lists(
+    st.tuples(st.floats(-6, 6), st.floats(-6, 6), st.integers(1, 12)), min_size=1, max_size=10
+)
+
+
+@given(turns=turns)
+@example(turns=[(1.534, 0.0, 1), (-3.645, 0.0, 6)])
+def test_motors_that_turn_round_at_full_speed_do_not_look_stuck(turns):
+    servo, motors = make_servo(), LaggingMotors()
+    position_rad, behind_rad = (0.0, 0.0), []
+    for az_rad, el_rad, setpoints in turns:
+        for _ in range(setpoints):
+            servo.move_to((az_rad, el_rad))
+            for _ in range(10):
+                position_rad = motors.turn(servo.step(position_rad))
+                behind_rad.append(servo.following_error_rad(position_rad))
+    assert max(behind_rad) < FOLLOWING_LIMIT_RAD

@@ -319,6 +319,39 @@ def test_motors_that_turned_on_unwatched_are_not_encoders_that_jumped(
     assert servo.position_rad == pytest.approx([found_rad, 0.0])
 
 
+def test_motors_that_turned_on_at_a_command_whose_answer_never_came_are_no_encoders_that_jumped(
+    servo, amplifiers
+):
+    servo.hold(servo.position_rad)
+    run(servo, 5)
+    servo.move_to(np.array([5.0, 0.0]))
+    amplifiers.silent = True
+    while servo.fault is None:
+        run(servo, 1)
+    turned_rad = max(rad_s for rad_s, _ in amplifiers.commands) * 2.0
+    amplifiers.silent = False
+    amplifiers.clock.sleep_until(amplifiers.clock.now_s() + 2.0)
+    amplifiers.position_rad = (turned_rad, 0.0)
+    servo.open()
+
+    assert turned_rad > 10.0
+    assert not servo.encoders_jumped
+    assert servo.turned_on_rad == pytest.approx(turned_rad)
+
+
+def test_encoders_that_jumped_are_noticed_though_they_could_not_be_read_at_once(servo, amplifiers):
+    run(servo, 5)
+    servo.close()
+    amplifiers.position_rad = (40.0, 0.0)
+    amplifiers.silent = True
+    with pytest.raises(DeviceTimeout):
+        servo.open()
+    amplifiers.silent = False
+    servo.open()
+
+    assert servo.encoders_jumped
+
+
 def test_a_reversal_at_full_speed_is_no_following_error(servo, amplifiers):
     servo.hold(servo.position_rad)
     for target in (1.0, 2.0, 0.0, 2.0, 0.0):

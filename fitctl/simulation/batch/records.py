@@ -28,8 +28,13 @@ MOST_LINES, MOST_EPOCHS = 8, 64
 MOST_REQUESTS = 64  # of the photodiodes, under way at one time
 RING_STEPS, BLOCK_NODES, SIDE_PX = 1024, 8, 2 * HALF_WINDOW_PX + 1
 
+
+def _numbers(*names: str) -> list[tuple[str, str]]:
+    return [(name, "f8") for name in names]
+
+
 _AXIS = np.dtype(  # fitctl.controllers.position_servo.Axis
-    [("target_rad", "f8"), ("reference_rad", "f8"), ("step_rad", "f8"), ("velocity_rad_s", "f8")]
+    _numbers("target_rad", "reference_rad", "step_rad", "moving_rad", "velocity_rad_s")
 )
 _CANDIDATE = np.dtype([("motor_rad", "f8", (2,)), ("since_s", "f8"), ("frames", "i8")])
 
@@ -186,10 +191,6 @@ BEAM_WORK = np.dtype(
 )
 
 
-def _numbers(*names: str) -> list[tuple[str, str]]:
-    return [(name, "f8") for name in names]
-
-
 # fitctl.model.plant_constants.Epoch; of those that are not used, `from_node` is never reached.
 EPOCH = np.dtype(
     [
@@ -241,7 +242,8 @@ BEAM_SETTINGS = np.dtype(
         (
             "servo",
             [
-                *_numbers("gain_per_s", "velocity_limit_rad_s", "velocity_step_rad_s", "period_s"),
+                *_numbers("gain_per_s", "velocity_limit_rad_s", "velocity_step_rad_s", "brake_rad"),
+                *_numbers("period_s"),
                 ("periods_per_setpoint", "i8"),
                 ("resolution_rad", "f8"),
             ],

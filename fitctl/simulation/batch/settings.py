@@ -386,6 +386,7 @@ def _siderostat(rig: Rig, loop_name: str) -> dict[str, Any]:
             "gain_per_s",
             "velocity_limit_rad_s",
             "velocity_step_rad_s",
+            "brake_rad",
             "period_s",
             "periods_per_setpoint",
             "resolution_rad",
