@@ -45,6 +45,7 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.modes import Mode
 from fitctl.service.admission import Admission
+from fitctl.stages.servo import SiderostatServo
 from fitctl.tui.state import ConsoleState
 
 
@@ -236,10 +237,35 @@ def test_a_console_that_shows_another_mode_is_noticed(monkeypatch):
     assert "the console shows what is" in {one.invariant for one in result.violations}
 
 
+POWER_CUT = plan(
+    gives(0.1, Standby()),
+    gives(2.0, Acquire(expected_az_sky_arcsec=400.0, expected_el_sky_arcsec=0.0)),
+    Strike(at_s=6.0, device="right siderostat", fault="power cut"),
+    gives(7.0, Recover()),
+)
+
+
+@pytest.mark.long
+def test_after_a_power_cut_of_its_amplifiers_a_star_is_found_again():
+    result = run_plan(POWER_CUT)
+
+    assert result.violations == []
+    assert result.modes["VERNIER"] >= 1
+
+
+def test_encoders_that_lost_their_zero_unnoticed_are_a_violation(monkeypatch):
+    never = property(lambda _: False, lambda _, jumped: None)
+    monkeypatch.setattr(SiderostatServo, "encoders_jumped", never, raising=False)
+    violated = {one.invariant for one in run_plan(POWER_CUT).violations}
+
+    assert "encoders that count from elsewhere are noticed" in violated
+
+
 # ------------------------------------------------------------ defects of the past, each from a plan of its own
 
 
 FAR = Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0)
+BACK = Acquire(expected_az_sky_arcsec=-200.0, expected_el_sky_arcsec=0.0)
 KILLED_S = (40.0, 52.0, 64.0, 76.0)  # late in a search for a star behind a cloud
 FOUND = {
     "watchdog-step": (
@@ -272,6 +298,23 @@ FOUND = {
             gives(6.0, Recover()),
         ),
         "encoders that count on keep the star's place",
+    ),
+    "unanswered-turn": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            gives(30.0, Release()),
+            Strike(at_s=31.985, device="right siderostat", fault="mute", lasts_s=0.5),
+            gives(32.0, Acquire()),
+            gives(34.0, Recover()),
+            duration_s=36.0,
+            settings=slow_servos("fit-mock.toml", 1),
+        ),
+        "encoders that count on keep the star's place",
+    ),
+    "turn-is-stuck": (
+        plan(gives(0.1, Standby()), gives(2.0, FAR), gives(2.2, BACK)),
+        "an axis that is not stuck is not called so",
     ),
     "killed-in-a-search": (
         plan(

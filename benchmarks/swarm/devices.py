@@ -97,6 +97,7 @@ class SwarmAmplifiers:
         )
         self.powered = False
         self.fault = ""
+        self.zero_rad: AzEl = (0.0, 0.0)  # motor angles at which the encoders read zero
         _, mocks = rig.mock_parts()
         mock = mocks.loops[loop_name]
         self._enables = False  # the analogue amplifiers' enable lines, as last asked for
@@ -224,6 +225,11 @@ class SwarmAmplifiers:
         self.fault = ""
         self.line.connected = False
 
+    def lose_power(self) -> None:
+        """It restarts, and its encoders count from zero wherever the motors are."""
+        self.reset()
+        self.zero_rad = self._inner.exchange(_STILL).position_rad
+
     def trip(self) -> None:
         """It finds a fault of its own, and takes the power from its motors."""
         self._power_down()
@@ -263,7 +269,9 @@ class SwarmAmplifiers:
     def _as_driver_has_it(self, reading: ServoReading) -> ServoReading:
         # No line of analogue amplifiers reports that an axis is enabled.
         has_power = self._enables and not self.fault if self._enables_by_line else self.powered
-        return ServoReading(reading.time_s, reading.position_rad, has_power, self.fault)
+        (az_rad, el_rad), (zero_az_rad, zero_el_rad) = reading.position_rad, self.zero_rad
+        position_rad = az_rad - zero_az_rad, el_rad - zero_el_rad
+        return ServoReading(reading.time_s, position_rad, has_power, self.fault)
 
     def _hear(self, velocity_rad_s: AzEl) -> ServoReading:
         """Obey, watch from now on whether more comes, and read the encoders."""

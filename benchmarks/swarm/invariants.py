@@ -32,6 +32,7 @@ _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
 _MOST_STEP_S = 1.0  # and as much for each loop with a D/A, which is read after a pause
 _MOST_PERIODS = 2.0  # a frame on which a tick acts is no older than that and its delay
 _WELL_S = 2.0
+_JUMP_RAD = 1.0  # what motors may coast unseen, and somewhat more
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
 _MOST_ALIKE = 3
@@ -77,7 +78,7 @@ class Invariants:
         self._powerless_since_s: dict[str, float] = {}
         self._unneeded_since_s: dict[str, float] = {}
         self._busy_since_s = math.inf
-        self._stepped_s = 0.0
+        self._stepped_s = self._stalled_until_s = 0.0
         self.nothing_fails = False
         self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
         self._power_up_s: dict[str, float] = {}
@@ -86,6 +87,7 @@ class Invariants:
         self._piezo_read_s: dict[str, float] = {}
         self._lease = "", -math.inf
         self._opened: set[str] = set()
+        self._zeros_lost_rad: dict[str, float] = {}
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
@@ -112,12 +114,22 @@ class Invariants:
 
     def stalled(self, duration_s: float) -> None:
         """The machine stands still for so long from now on, and nothing can be expected of it."""
-        self._stepped_s = self._clock.now_s() + duration_s
+        now_s = self._clock.now_s()
+        before_s = max(now_s, self._stalled_until_s)
+        self._stalled_until_s = max(before_s, now_s + duration_s)
+        self._stepped_s = max(self._stepped_s, self._stalled_until_s)
         for name in self._stopped_s:
             self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
         for since_s in (self._powerless_since_s, self._unneeded_since_s):
             for name in since_s:
-                since_s[name] += duration_s
+                since_s[name] += self._stalled_until_s - before_s
+
+    def zero_lost(self, name: str) -> None:
+        """A loop's encoders begin anew at zero."""
+        position_rad = 0.0
+        if self._supervisor is not None:
+            position_rad = float(np.abs(self._supervisor.loops[name].servo.position_rad).max())
+        self._zeros_lost_rad[name] = max(position_rad, self._zeros_lost_rad.get(name, 0.0))
 
     # ------------------------------------------------------------ commands and records
 
@@ -172,11 +184,21 @@ class Invariants:
             case DevicesOpened():
                 self._texts.clear()
                 if not record.error:
+                    self._encoders_read(record)
                     self._opened.add(record.loop)
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
             case Tick(number=number) if number >= 0:
                 self._acted_on(record)
+
+    def _encoders_read(self, opened: DevicesOpened) -> None:
+        name = opened.loop
+        lost_rad = self._zeros_lost_rad.pop(name, None)
+        if opened.encoders_jumped and lost_rad is None:
+            self.violated("encoders that count on keep the star's place", name)
+        is_far = lost_rad is not None and lost_rad > _JUMP_RAD and name in self._opened
+        if is_far and not opened.encoders_jumped:
+            self.violated("encoders that count from elsewhere are noticed", name)
 
     def _acted_on(self, tick: Tick) -> None:
         camera = self._rig.camera
@@ -213,8 +235,6 @@ class Invariants:
                 self._texts[event.message] += 1
             if self._texts[event.message] > _MOST_ALIKE:
                 self.violated("a cause is reported once", f"{event.source}: {event.message}")
-        if "star's place is forgotten" in event.message:
-            self.violated("encoders that count on keep the star's place", event.message)
 
     # ------------------------------------------------------------ what is sent
 

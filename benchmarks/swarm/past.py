@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
+from fitctl.controllers.position_servo import PositionServo
 from fitctl.drivers.interface import AzEl, Frame
 from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
@@ -82,6 +83,16 @@ def _find_position_as_a_jump(self: SiderostatServo) -> None:
     self.encoders_jumped = self.encoders_jumped or self.turned_on_rad > 0.0
 
 
+def _find_position_by_answers(self: SiderostatServo) -> None:
+    del self._unread_rad_s[1:]
+    _FIND_POSITION(self)
+
+
+def _turns_round_at_once(self: PositionServo, *arguments: Any) -> None:
+    _POSITION_SERVO_INIT(self, *arguments)
+    self.brake_rad = math.inf
+
+
 def _open_unread(self: SiderostatServo) -> Any:
     self._stopped = True
     self.fault = None
@@ -132,6 +143,7 @@ def _find_nothing(self: MirrorStage) -> None:
 _ASK = PiezoWatch.ask
 _SERVO_INIT = SiderostatServo.__init__
 _FIND_POSITION = SiderostatServo._find_position
+_POSITION_SERVO_INIT = PositionServo.__init__
 _FAIL = SiderostatServo._fail
 _ENTER = Loop._enter
 _SUPERVISOR_INIT = Supervisor.__init__
@@ -186,6 +198,16 @@ DEFECTS = {
         "f9f5b71",
         "motors that turned on while amplifiers did not answer are encoders with another zero",
         [(SiderostatServo, "_find_position", _find_position_as_a_jump)],
+    ),
+    "unanswered-turn": Defect(
+        "069db82",
+        "motors that turned on at a command whose answer never came are encoders with another zero",
+        [(SiderostatServo, "_find_position", _find_position_by_answers)],
+    ),
+    "turn-is-stuck": Defect(
+        "069db82",
+        "a siderostat that turns round at full speed is a stuck axis",
+        [(PositionServo, "__init__", _turns_round_at_once)],
     ),
     "powered-unread": Defect(
         "bf6a8c0",

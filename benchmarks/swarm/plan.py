@@ -55,7 +55,14 @@ _SLOW_SERVO = {
 """Of a siderostat whose servo runs at 100 or 50 Hz instead of 500."""
 _SLOW = {"fit-mock.toml": 0.15, "two-stars.toml": 0.5, "fit-testbed.toml": 0.6}
 """So many runs have slow servos; they are faster, too."""
-DURATION_S = 120.0
+_FAST_FRAMES = (
+    "camera.frame_rate_hz=500.0",
+    "camera.exposure_s=0.001",
+    "camera.frame_delay_s=0.0035",
+)
+_FAST = {"fit-mock.toml": 0.1}
+"""So many runs have ten times as many frames, for a third of the time."""
+DURATION_S, FAST_DURATION_S = 120.0, 40.0
 OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # so many commands name one
 _WITHOUT_FAULTS = 0.15  # so many runs have none of a device
@@ -80,7 +87,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True, tag="order"):
 
 
 class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
-    """A fault of one device begins, and ends after a while; a reset has no duration."""
+    """A fault of one device begins, and ends after a while; a reset and a power cut have no duration."""
 
     at_s: float
     device: str
@@ -279,8 +286,11 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     Each run has some kinds of faults and commands, and others not at all, at a pace of its own: what everything
     together would drown is found where most of it is left out.
     """
-    loops, devices, duration_s = RIGS[rig], devices_of(rig), DURATION_S
-    faults = random.sample(("reset", *FAULTS), random.randint(1, 1 + len(FAULTS)))
+    loops, devices = RIGS[rig], devices_of(rig)
+    fast = random.random() < _FAST.get(rig, 0.0)
+    duration_s = FAST_DURATION_S if fast else DURATION_S
+    kinds = ("reset", "power cut", *FAULTS)
+    faults = random.sample(kinds, random.randint(1, len(kinds)))
     struck = random.sample(devices, random.randint(1, len(devices)))
     words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
     strikes: list[Callable[[Random, float], Happening]] = []
@@ -327,7 +337,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     happenings.sort(key=lambda happening: happening.at_s)
     settings = ["supervisor.telemetry_hz=5.0"]  # as the rig has it, it takes a tenth of the time
     settings += [text for text in _SETTINGS if random.random() < _SETTING]
-    if random.random() < _SLOW.get(rig, 0.0):
+    if fast:
+        settings += _FAST_FRAMES
+    elif random.random() < _SLOW.get(rig, 0.0):
         settings += slow_servos(rig, random.randrange(2))
     return Plan(
         seed=seed,
@@ -341,11 +353,13 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
 
 def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> Happening:
     device, fault = random.choice(devices), random.choice(faults)
+    if fault == "power cut" and not device.endswith("siderostat"):
+        fault = "reset"  # only encoders forget anything
     return Strike(
         at_s=at_s,
         device=device,
         fault=fault,
-        lasts_s=0.0 if fault == "reset" else 10 ** random.uniform(-2.0, 1.0),
+        lasts_s=0.0 if fault in {"reset", "power cut"} else 10 ** random.uniform(-2.0, 1.0),
         size=drawn_slowness(random) if fault == "slow" else 0.0,
     )
 

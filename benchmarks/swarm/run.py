@@ -41,6 +41,7 @@ from benchmarks.swarm.plan import (
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.threads import VirtualExecutor, VirtualTime, installed
 from fitctl.config import Rig, load_rig
+from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import Devices, LoopDevices
@@ -59,6 +60,7 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.metrology.part import MetrologyPart
+from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.simulation.devices import SimulatedMirror
 from fitctl.stages.periodic import PeriodicThread
@@ -83,9 +85,9 @@ _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
 
 
 @functools.cache
-def _design_once(rig_file: str, name: str, controller: str) -> Design:
+def _design_once(rig_file: str, settings: tuple[str, ...], name: str, controller: str) -> Design:
     """Designs are the same for every seed."""
-    return design_for(load_rig(RIGS / rig_file), name, controller)
+    return design_for(load_rig(RIGS / rig_file, settings), name, controller)
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -304,7 +306,9 @@ class Instrument:
     def _design(self, _rig: Rig, name: str, controller: str) -> Design:
         if self._designs_take_time:  # those of the start come before time goes on
             self.time.sleep(self._design_random.uniform(0.5, _MOST_DESIGN_S))
-        return _design_once(self._plan.rig, name, controller)
+        plan = self._plan
+        of_camera = tuple(text for text in plan.settings if text.startswith("camera."))
+        return _design_once(plan.rig, of_camera, name, controller)
 
     def _record(self, record: AnyRecord) -> None:
         self._digest.update(self._encode(record))
@@ -346,12 +350,23 @@ class Instrument:
         for name, loop in self.supervisor.loops.items() if self.running else ():
             make = _LEADS_ON.get(loop.mode)
             if make is Acquire and from_zero and name not in self.found_s:
-                expected = Acquire(
-                    loop=name, expected_az_sky_arcsec=0.0, expected_el_sky_arcsec=0.0
-                )
-                self.give(who, expected)
+                self.give(who, self._acquire_where_it_is(name))
             elif make is not None:
                 self.give(who, make(loop=name))
+
+    def _acquire_where_it_is(self, name: str) -> Acquire:
+        """About where the encoders read zero at the start, before they lost it.
+
+        A star is expected on the other side of where the siderostat goes for it.
+        """
+        sky_rad_per_rad = motor_sky_rad_per_rad(self.rig.loops[name].siderostat)
+        az_arcsec, el_arcsec = (
+            zero_rad * sky_rad_per_rad * ARCSEC_PER_RAD
+            for zero_rad in self.amplifiers[name].zero_rad
+        )
+        return Acquire(
+            loop=name, expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec
+        )
 
     def answers_due(self) -> None:
         """No command waits longer for its answer than a step may take."""
@@ -390,12 +405,23 @@ class Instrument:
                 self.time.call_at(self.time.now_s() + happening.lasts_s, partial(self._dim, 1.0))
             case Strike(fault="reset"):
                 self.resets[happening.device]()
+            case Strike(fault="power cut"):
+                self._cut_power(happening.device.removesuffix(" siderostat"))
             case Strike():
                 line = self.lines[happening.device]
                 line.faults[happening.fault] = happening.size
                 self.time.call_at(
                     self.time.now_s() + happening.lasts_s, partial(line.heal, happening.fault)
                 )
+
+    def _cut_power(self, name: str) -> None:
+        """A loop's encoders begin anew at zero: nobody knows any longer where stars are that it turns."""
+        self.invariants.zero_lost(name)
+        self.amplifiers[name].lose_power()
+        self.found_s.pop(name, None)
+        for linked, loop in self.rig.stellar_loops.items():
+            if loop.link == name:
+                self.found_s.pop(linked, None)
 
     def _empty_disk(self) -> None:
         self._disk_is_full = False
