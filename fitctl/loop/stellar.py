@@ -271,7 +271,7 @@ class StellarLoop(Loop):
             (other.candidate_spots(frame.mid_exposure_s) for other in self.others),
         )
         if self.mode is Mode.ACQUISITION and (
-            self.waits_for or not self.search.has_arrived(beam_rad)
+            self._search_due is not None or self.waits_for or not self.search.has_arrived(beam_rad)
         ):
             return None  # what is seen on the way is another star
         follows = self.mode in FOLLOWING and self.following.lost == 0

@@ -14,6 +14,7 @@ from fitctl.simulation.batch.mirror import held_rad, mirror_px, mirror_to, mirro
 from fitctl.simulation.batch.siderostat import motor_rad, siderostat_to
 
 ACQUISITION, COARSE, VERNIER = int(Mode.ACQUISITION), int(Mode.COARSE), int(Mode.VERNIER)
+NOT_DUE, ANEW, AGAIN = -1, 0, 1  # a search that waits until it may begin
 
 
 @compilable()

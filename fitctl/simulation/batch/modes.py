@@ -14,12 +14,19 @@ from fitctl.controllers.search_rounds import round_fraction
 from fitctl.messages.modes import STELLAR_MODES, Mode, Trigger, transition
 from fitctl.model.compiled import compilable
 from fitctl.model.optics import turned
-from fitctl.simulation.batch.laws import ACQUISITION, COARSE, VERNIER, start_pair
+from fitctl.simulation.batch.laws import (
+    ACQUISITION,
+    AGAIN,
+    ANEW,
+    COARSE,
+    NOT_DUE,
+    VERNIER,
+    start_pair,
+)
 from fitctl.simulation.batch.sensor import stages_px
 from fitctl.simulation.batch.siderostat import motor_px, motor_rad, siderostat_to
 
 OFF, STANDBY, LOCKED = int(Mode.OFF), int(Mode.STANDBY), int(Mode.LOCKED)
-NOT_DUE, ANEW, AGAIN = -1, 0, 1  # a search that waits until it may begin
 ACQUIRE, POWER_UP = int(Trigger.ACQUIRE), int(Trigger.STANDBY)
 STAR_FOUND, STAR_LOST = int(Trigger.STAR_FOUND), int(Trigger.STAR_LOST)
 IN_REACH, OUT_OF_REACH = int(Trigger.IN_REACH), int(Trigger.OUT_OF_REACH)

@@ -21,7 +21,7 @@ from fitctl.controllers.spot_fit import NODES, STEPS_PER_PX, node
 from fitctl.model.compiled import compilable
 from fitctl.model.light import REACH_SIGMAS, light_fractions
 from fitctl.model.scene import render
-from fitctl.simulation.batch.laws import ACQUISITION, COARSE, VERNIER, has_arrived
+from fitctl.simulation.batch.laws import ACQUISITION, COARSE, NOT_DUE, VERNIER, has_arrived
 from fitctl.simulation.batch.mirror import mirror_px
 from fitctl.simulation.batch.records import SIDE_PX
 from fitctl.simulation.batch.siderostat import motor_px
@@ -288,7 +288,7 @@ def sense(ss: Any, rr: Any, ww: Any, i: int) -> int:
     """
     s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
     r.star_visible = 0
-    if r.mode == ACQUISITION and (r.waits or not has_arrived(s, r)):
+    if r.mode == ACQUISITION and (r.search_due != NOT_DUE or r.waits or not has_arrived(s, r)):
         return SENSED
     if follows(r):
         az_px, el_px = stages_px(s, r)
