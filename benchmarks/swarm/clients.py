@@ -1,6 +1,6 @@
-"""The service and its clients on virtual time: who may command, what a console shows, sequences that run.
+"""The service and its clients on virtual time: admission of commands, consoles and running sequences.
 
-Known limitations: messages are passed as they are, without a socket, so that none is late or too long.
+Known limitations: messages do not pass through a socket, so none is late or too long.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SENDERS = {
     "cleo": Sender("cleo", "here", "commander", is_local=True),
     "dora": Sender("dora", "elsewhere", "viewer", is_local=False),
 }
-"""By name; the first three may command."""
+"""By name. The first three can send commands."""
 STEPS: dict[str, Callable[[], steps.Step]] = {
     "standby": steps.Standby,
     "acquire": steps.Acquire,
@@ -41,13 +41,13 @@ STEPS: dict[str, Callable[[], steps.Step]] = {
     ),
     "off": steps.Off,
 }
-"""What the sequences of operators are made of."""
+"""The steps of which operators make their sequences."""
 _ANSWERED_HERE = {"Status", "RecentEvents", "RecorderReport", "TakeOver"}
 _REPLY_S = 5.0
 
 
 class Service:
-    """Of one supervisor: admits commands, and publishes telemetry.
+    """The service of one supervisor: it admits commands and publishes telemetry.
 
     Parameters
     ----------
@@ -55,9 +55,9 @@ class Service:
     time : VirtualTime
     invariants : Invariants
     pid : int
-        Of the supervisor's process.
+        Process number of the supervisor.
     lost, offered : callable
-        Counts of the record queue.
+        Return the counts of the record queue.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class Service:
         time.spawn(self._run, "service")
 
     def take(self, record: AnyRecord) -> None:
-        """Leave a record for consoles."""
+        """Add a record to the next telemetry."""
         self.events += isinstance(record, Event)
         self.buffer.add(record)
 
     def send(self, sender: Sender, command: AnyCommand, reply: Callable[[Reply], None]) -> None:
-        """Give a command."""
+        """Send a command."""
         refusal = self._admission.refusal(sender, command, self._time.now_s())
         self._invariants.admitted(sender, command, refusal)
         if refusal or type(command).__name__ in _ANSWERED_HERE:
@@ -118,12 +118,12 @@ class Service:
 
 
 class Console:
-    """A console that misses messages, and must know what it missed.
+    """A console that misses messages and must count them.
 
     Parameters
     ----------
     loss : float
-        Part of the messages that do not come.
+        Fraction of the messages that do not arrive.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Console:
         self._supervisor: Supervisor | None = None
 
     def connect(self, service: Service, supervisor: Supervisor) -> None:
-        """Hear this one from now on."""
+        """Receive telemetry from this service from now on."""
         self._service, self._supervisor = service, supervisor
         self._missed = self._heard = 0
         self._first = True
@@ -147,7 +147,7 @@ class Console:
 
     def _take(self, message: Telemetry) -> None:
         if self._random.random() < self._loss:
-            self._missed += not self._first  # nobody knows of those before the first
+            self._missed += not self._first  # messages before the first cannot be counted
             return
         self._first = False
         self._heard += len(message.events)
@@ -172,12 +172,12 @@ class Console:
 
 
 class Link:
-    """A sequence's connection, as :class:`fitctl.messages.client.Client`.
+    """A sequence's connection; stands for :class:`fitctl.messages.client.Client`.
 
     Parameters
     ----------
     service : callable
-        The service that there is now, None while there is none.
+        Returns the present service, or None.
     """
 
     def __init__(
@@ -195,12 +195,12 @@ class Link:
         return self._time.now_s()
 
     def send(self, command: AnyCommand) -> Reply:
-        """Give a command, and wait for its reply.
+        """Send a command, and wait for its reply.
 
         Raises
         ------
         ConnectionError
-            If none comes in time.
+            If no reply arrives in time.
         """
         service, answered, replies = self._service(), VirtualEvent(self._time), []
 
@@ -216,7 +216,7 @@ class Link:
         return replies[0]
 
     def receive(self, timeout_s: float) -> Telemetry | None:
-        """The next telemetry, None if none comes in time."""
+        """The next telemetry, or None if none arrives in time."""
         service = self._service()
         if service is not None and service is not self._heard:
             self._heard = service
@@ -227,7 +227,7 @@ class Link:
         return self._telemetry.pop(0) if self._telemetry else None
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop receiving telemetry."""
         if self._heard is not None:
             self._heard.subscribers.remove(self._take)
 
@@ -237,7 +237,7 @@ class Link:
 
 
 class RunningSequence:
-    """A sequence of `STEPS` in a process of its own; however it ends is well, as long as it does.
+    """A sequence of `STEPS` in its own process. It may end in any way, but must end.
 
     Attributes
     ----------
@@ -251,7 +251,7 @@ class RunningSequence:
         self._contact = Contact(link, rig, "swarm", len(words))  # type: ignore[arg-type]
 
     def run(self) -> None:
-        """Run it; this is its thread."""
+        """Run the sequence; called in its own thread."""
         try:
             run_steps(Runner(self._contact), self._steps)
         except (SequenceError, ConnectionError):
@@ -261,5 +261,5 @@ class RunningSequence:
             self._link.close()
 
     def stop(self) -> None:
-        """Somebody wants it to end."""
+        """Request the end of the sequence."""
         self._contact.stop_wanted.set()

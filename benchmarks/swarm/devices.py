@@ -1,10 +1,10 @@
-"""Devices as bad as real ones: those of :mod:`fitctl.simulation.devices` behind lines that fail.
+"""Devices that fail as real ones do: those of :mod:`fitctl.simulation.devices` behind lines with faults.
 
-A device acts by itself whatever becomes of its line: a drive turns on at its last velocity until it misses its
-master, and a D/A that is not written to goes to its safe voltages.
+A device keeps running when its line fails. A drive keeps its last velocity until it misses the master's
+heartbeat. A D/A that receives no writes goes to its safe voltages.
 
-A CANopen drive stops with a fault when it misses its master; the station of analogue amplifiers takes the
-enable lines away until the next write; an Ensemble watches nobody, and turns until its own limits.
+A CANopen drive that misses its master stops with a fault. The I/O station of analogue amplifiers drops the
+enable lines until the next write. An Ensemble has no such watchdog, and turns until it reaches its own limits.
 
 Known limitations: a drive without its master stops at once, without a ramp; a reset takes no time.
 """
@@ -61,7 +61,7 @@ def _identity(model: str) -> DeviceIdentity:
 
 
 class SwarmAmplifiers:
-    """Both axes' amplifiers behind a bus.
+    """The amplifiers of both axes, on a bus.
 
     Parameters
     ----------
@@ -71,9 +71,9 @@ class SwarmAmplifiers:
     loop_name : str
     random : Random
     commanded : callable
-        Hears the loop's name and each velocity that is sent.
+        Called with the loop's name and each velocity sent.
     powered_unread : callable
-        Hears the loop's name where motors are given power and no encoder was read since opening.
+        Called with the loop's name if the driver powers the motors before it has read an encoder since opening.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class SwarmAmplifiers:
         self.zero_rad: AzEl = (0.0, 0.0)  # motor angles at which the encoders read zero
         _, mocks = rig.mock_parts()
         mock = mocks.loops[loop_name]
-        self._enables = False  # the analogue amplifiers' enable lines, as last asked for
+        self._enables = False  # last state requested of the analogue amplifiers' enable lines
         self._limit_rad = math.inf
         self.master_timeout_s = _LOOK_S
         if self._driver == "cia402":
@@ -127,7 +127,7 @@ class SwarmAmplifiers:
     # ------------------------------------------------------------ the driver
 
     def open(self) -> DeviceIdentity:
-        """Connect and configure, which takes many exchanges."""
+        """Connect and configure, in many exchanges."""
         self.line.open()
         self._enables = self._was_read = False
         for _ in range(20):
@@ -152,7 +152,7 @@ class SwarmAmplifiers:
             )
 
     def disable(self) -> None:
-        """Take power from both axes."""
+        """Remove power from both axes."""
         self._enables = False
         self.line.ask(self._power_down)
 
@@ -163,14 +163,14 @@ class SwarmAmplifiers:
         self.line.ask(self._clear)
 
     def stage(self, velocity_rad_s: AzEl) -> None:
-        """Have a command ready for the bus."""
+        """Keep a command for the next synchronization."""
         if not self.line.connected or "unplugged" in self.line.faults:
             raise self.line.broken()
         self._commanded(self.name, velocity_rad_s)
         self._staged_rad_s = velocity_rad_s
 
     def synchronize(self) -> None:
-        """Send the command that is ready, if there is one; the drive acts, and reads its encoders."""
+        """Send the staged command, if there is one. The drive applies it and reads its encoders."""
         velocity_rad_s, self._staged_rad_s = self._staged_rad_s, None
         if velocity_rad_s is None:
             return
@@ -180,7 +180,7 @@ class SwarmAmplifiers:
         self._sync = self._time.now_s(), self.line.delay_s(), reading
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
-        """One servo period, which waits for the encoders as long as a period lasts."""
+        """One servo period: wait at most that long for the encoder reading."""
         if self._sync is None:
             if self._staged_rad_s is None:
                 self.stage(velocity_rad_s)
@@ -220,7 +220,7 @@ class SwarmAmplifiers:
     # ------------------------------------------------------------ the device
 
     def reset(self) -> None:
-        """It restarts: no power, nothing configured, and its encoders count from where they were."""
+        """Restart without power or configuration; the encoders keep their counts."""
         self._power_down()
         self.fault = ""
         self.line.connected = False
@@ -231,18 +231,18 @@ class SwarmAmplifiers:
         self.zero_rad = self._inner.exchange(_STILL).position_rad
 
     def trip(self) -> None:
-        """It finds a fault of its own, and takes the power from its motors."""
+        """Detect an internal fault and remove power from the motors."""
         self._power_down()
         self.fault = "overcurrent"
 
     @property
     def watches_nobody(self) -> bool:
-        """It goes on as it is when its master has gone."""
+        """Whether it keeps moving when its master falls silent."""
         return self._driver == "ensemble"
 
     @property
     def velocity_rad_s(self) -> AzEl:
-        """What the motors turn by now, as commanded."""
+        """The velocity at which the motors turn now, as commanded."""
         return self._inner._commanded_rad_s if self.powered else _STILL
 
     def _nothing(self) -> None:
@@ -267,18 +267,18 @@ class SwarmAmplifiers:
         return self._as_driver_has_it(self._inner.exchange(self._inner._commanded_rad_s))
 
     def _as_driver_has_it(self, reading: ServoReading) -> ServoReading:
-        # No line of analogue amplifiers reports that an axis is enabled.
+        # Analogue amplifiers have no line that reports an enabled axis.
         has_power = self._enables and not self.fault if self._enables_by_line else self.powered
         (az_rad, el_rad), (zero_az_rad, zero_el_rad) = reading.position_rad, self.zero_rad
         position_rad = az_rad - zero_az_rad, el_rad - zero_el_rad
         return ServoReading(reading.time_s, position_rad, has_power, self.fault)
 
     def _hear(self, velocity_rad_s: AzEl) -> ServoReading:
-        """Obey, watch from now on whether more comes, and read the encoders."""
+        """Apply the velocity, restart the watchdog and read the encoders."""
         inner = self._inner
         self._last_master_s = self._time.now_s()
         if self._enables_by_line and self._enables and not (self.powered or self.fault):
-            inner.enable()  # the station's watchdog took the lines away; a write is obeyed
+            inner.enable()  # the watchdog dropped the enable lines; a write restores them
             self.powered = True
         if self.powered:
             reading = inner.exchange(velocity_rad_s)
@@ -297,7 +297,7 @@ class SwarmAmplifiers:
         if self._time.now_s() < due_s - 1e-9:
             self._time.call_at(due_s, self._watch)
             return
-        if self._driver == "ensemble":  # watches nobody; its own limits end a free run
+        if self._driver == "ensemble":  # no watchdog: only its own limits stop the motors
             if max(map(abs, self._read().position_rad)) > self._limit_rad:
                 self._inner.exchange(_STILL)
             self._time.call_at(self._time.now_s() + _LOOK_S, self._watch)
@@ -309,7 +309,7 @@ class SwarmAmplifiers:
 
 
 class SwarmDac:
-    """The D/A behind Modbus, with a watchdog."""
+    """The D/A converter on Modbus, with a watchdog."""
 
     def __init__(
         self,
@@ -341,7 +341,7 @@ class SwarmDac:
         return _identity("D/A")
 
     def send_v(self, volts: Floats) -> None:
-        """Send the voltages, which take effect when they arrive; a write before is confirmed first."""
+        """Send the voltages after confirming the previous write. They take effect when they arrive."""
         self.confirm()
         if not self.line.connected or "unplugged" in self.line.faults:
             raise self.line.broken()
@@ -349,14 +349,14 @@ class SwarmDac:
         self._unconfirmed = volts.copy(), self._time.now_s()
 
     def confirm(self) -> None:
-        """Wait until the voltages have been taken."""
+        """Wait until the station has accepted the voltages."""
         unconfirmed, self._unconfirmed = self._unconfirmed, None
         if unconfirmed is not None:
             volts, _ = unconfirmed
             self.line.ask(lambda: self._set(volts))
 
     def read_v(self) -> Floats:
-        """Read the outputs, three times."""
+        """Read the outputs, in three exchanges."""
         self.confirm()
         for _ in range(2):
             self.line.ask(self._mirror.read_v)
@@ -368,7 +368,7 @@ class SwarmDac:
         self.line.close()
 
     def reset(self) -> None:
-        """It restarts at its safe voltages."""
+        """Restart at the safe voltages."""
         self._mirror.send_v(np.full(3, self._safe_v))
         self.line.connected = False
 
@@ -389,7 +389,7 @@ class SwarmDac:
 
 
 class SwarmPiezo:
-    """The piezo amplifier on a serial line: slow, and every answer may be wrong."""
+    """The piezo amplifier on a serial line: slow, and any answer may be wrong."""
 
     def __init__(
         self, mirror: SimulatedMirror, time: VirtualTime, rig: Rig, loop_name: str, random: Random
@@ -410,14 +410,14 @@ class SwarmPiezo:
         return _identity("piezo amplifier")
 
     def stack_volts(self) -> Floats:
-        """Measure; a stuck stack reads its most."""
+        """Measure the stacks; a stuck stack reads the limit."""
         volts = np.array([self.line.ask(self._mirror.stack_volts)[stack] for stack in range(3)])
         if self.stuck_stack is not None:
             volts[self.stuck_stack] = self._limit_v
         return volts
 
     def limit_v(self) -> float:
-        """The limit switch."""
+        """Read the limit switch."""
         limit_v = self.line.ask(self._mirror.limit_v)
         if not math.isclose(limit_v, self._limit_v):
             raise DeviceMismatch("piezo amplifier", self.line.endpoint, "its limit", "another")
@@ -428,12 +428,12 @@ class SwarmPiezo:
         self.line.close()
 
     def reset(self) -> None:
-        """It restarts."""
+        """Restart."""
         self.line.connected = False
 
 
 class SwarmPhotodiodes(SimulatedPhotodiodes):
-    """The photodiodes' converter at the other end of a network."""
+    """The photodiodes' converter, on a network."""
 
     def __init__(
         self, plant: MetrologyPart, time: VirtualTime, rig: Rig, loop_name: str, random: Random
@@ -453,13 +453,13 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
         return super().open()
 
     def send_request(self) -> None:
-        """Ask for a sample."""
+        """Request a sample."""
         if not self.line.connected or "unplugged" in self.line.faults:
             raise self.line.broken()
         super().send_request()
 
     def receive(self) -> DiodeReading | None:
-        """The newest sample, which a fault may keep."""
+        """The newest sample, unless a fault withholds it."""
         faults = self.line.faults
         if not self.line.connected or "unplugged" in faults:
             raise self.line.broken()
@@ -481,7 +481,7 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
         self.line.close()
 
     def reset(self) -> None:
-        """It restarts."""
+        """Restart."""
         self.line.connected = False
 
 
@@ -503,7 +503,7 @@ class SwarmHexapod(SimulatedHexapod):
         return super().open()
 
     def reference(self) -> None:
-        """A reference move takes seconds."""
+        """Make a reference move, which takes seconds."""
         self.line.ask(lambda: None)
         ends_s = self._time.now_s() + _REFERENCE_S
         while self._time.now_s() < ends_s:
@@ -516,11 +516,11 @@ class SwarmHexapod(SimulatedHexapod):
         self.line.ask(partial(super().move_to, pose, velocity_mm_s))
 
     def pose(self) -> HexapodReading:
-        """Where it is."""
+        """Read the pose."""
         return self.line.ask(super().pose)
 
     def stop(self) -> None:
-        """Brake, and wait until it is at rest."""
+        """Brake, and wait until the platform is at rest."""
         self.line.ask(super().stop)
 
     def close(self) -> None:
@@ -528,19 +528,19 @@ class SwarmHexapod(SimulatedHexapod):
         self.line.close()
 
     def reset(self) -> None:
-        """It restarts where it is, and has to be referenced."""
+        """Restart at the present pose, without a reference."""
         super().stop()
         self._referenced = False
         self.line.connected = False
 
     @property
     def moves(self) -> bool:
-        """Its platform moves now."""
+        """Whether the platform is moving."""
         return self._time.now_s() < self._trajectory.ends_s
 
 
 class SwarmCamera(SimulatedCamera):
-    """The camera behind its network: frames come late, all at once, or not at all."""
+    """The camera on its network: frames arrive late, all at once, or not at all."""
 
     def __init__(self, rig: Rig, time: VirtualTime, plant: Plant, random: Random) -> None:
         super().__init__(rig, time, plant)  # type: ignore[arg-type]
@@ -552,7 +552,7 @@ class SwarmCamera(SimulatedCamera):
         self._clear_dn = self._scene._flux_dn
 
     def dim(self, part: float) -> None:
-        """The spots have so much of their light."""
+        """Dim all spots to a part of their light."""
         self._scene._flux_dn = self._clear_dn * part
 
     def open(self) -> DeviceIdentity:
@@ -569,7 +569,7 @@ class SwarmCamera(SimulatedCamera):
         self._streams = True
 
     def next_frame(self, timeout_s: float) -> Frame | None:
-        """The next frame, which a fault may keep."""
+        """The next frame, unless a fault withholds it."""
         faults, now_s = self.line.faults, self._time.now_s()
         if not self.line.connected or "unplugged" in faults or "garbled" in faults:
             self._time.sleep(min(timeout_s, 0.01))
@@ -581,7 +581,7 @@ class SwarmCamera(SimulatedCamera):
             self._time.sleep_until(now_s + timeout_s)
             return None
         behind = int((now_s - arrives_s) / self._camera.period_s)
-        if behind > _MOST_LATE_FRAMES:  # nobody keeps more
+        if behind > _MOST_LATE_FRAMES:  # no buffer keeps more
             self._frames += behind
             self._lost += behind
             return self.next_frame(timeout_s)
@@ -597,7 +597,7 @@ class SwarmCamera(SimulatedCamera):
         return Frame(self._frames, exposed_s, self._time.now_s(), image)
 
     def counts(self) -> CameraCounts:
-        """Frames, and those that were lost."""
+        """Count the frames, and the lost ones."""
         return CameraCounts(self._frames, self._lost, 0)
 
     def stop(self) -> None:
@@ -610,7 +610,7 @@ class SwarmCamera(SimulatedCamera):
         self.line.close()
 
     def reset(self) -> None:
-        """It restarts, and streams no more."""
+        """Restart, without a stream."""
         self._streams = False
         self.line.connected = False
 

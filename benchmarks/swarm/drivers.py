@@ -1,11 +1,11 @@
-"""Each driver against its mock over a bad wire: no answer is ever taken for another's, and every call ends.
+"""Each driver against its mock over a bad wire: answers are matched to their requests, and every call ends.
 
-A call ends in a value or in a `DeviceError`, within a time. A value is one that the device had between the
-call's beginning and its end; what was commanded without an error has happened by then.
+A call returns a value or raises a `DeviceError` within a time limit. The device had the returned value at some
+time during the call. A command that raised no error has taken effect when the call returns.
 
-Known limitations: what a protocol cannot tell apart is not tried. Over Modbus RTU, RS-232 and the Ensemble's
-ASCII answers have no number: a second copy comes with the first there, and on a serial line no answer comes
-later than the driver waits for late ones.
+Known limitations: the tests leave out what a protocol cannot distinguish. Answers over Modbus RTU, RS-232 and
+the Ensemble's ASCII interface have no number. There, a duplicate arrives together with the original, and on a
+serial line no answer arrives after the driver has stopped waiting for late ones.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ RIGS = default_rig_path().parent
 _SLACK_S = 2e-3
 _MDT693_S = 0.02  # from a command to its answer
 _SPEED_RAD_S = 3.0
-_V_PER_S, _AROUND_S = 0.2, 40.0  # of photodiodes whose voltages tell the time
-_UNSURE_S = 0.015  # by which these know it
+_V_PER_S, _AROUND_S = 0.2, 40.0  # slope and period of photodiode voltages that encode the time
+_UNSURE_S = 0.015  # uncertainty of that time
 _PAUSES_S = (0.0, 0.002, 0.02, 0.3)
 
 
 class Mistaken(AssertionError):
-    """A driver returned what its device did not have, or a call did not end."""
+    """A driver returned a value that its device did not have, or a call took too long."""
 
 
 class Motors:
-    """Two ideal motors, which begin far from each other."""
+    """Two ideal motors, at different angles."""
 
     def __init__(self, time: WireTime) -> None:
         self._time = time
@@ -79,23 +79,23 @@ class Motors:
         self._velocity_rad_s = (az, el)
 
     def set_enabled(self, axis: int, enabled: bool) -> None:
-        """Give current, or take it away."""
+        """Switch the current on or off."""
         self.position_rad()
         self._enabled[axis] = enabled
 
 
 class Course:
-    """What a device had, and since when."""
+    """The values that a device had, and since when."""
 
     def __init__(self) -> None:
         self._values: list[tuple[float, Any]] = []
 
     def add(self, time_s: float, value: Any) -> None:
-        """From now on it has this."""
+        """Record a new value from this time on."""
         self._values.append((time_s, value))
 
     def between(self, begin_s: float, end_s: float) -> list[Any]:
-        """All that it had then."""
+        """All values between two times."""
         values = self._values
         nexts = [time_s for time_s, _ in values[1:]] + [math.inf]
         return [
@@ -106,15 +106,15 @@ class Course:
 
 
 class Bench:
-    """A driver, the mock behind the wire, and what may be asked of it.
+    """A driver, a mock behind a wire, and the calls to make.
 
     Attributes
     ----------
     driver : driver
     calls : list of callable
-        What is called, each of which checks what it gets.
+        Calls of the driver; each checks its own result.
     most_s : float
-        No call takes longer.
+        Maximum duration of a call.
     """
 
     driver: Any
@@ -126,11 +126,11 @@ class Bench:
         self.wire = Wire(time, troubles, self.hear, self.reboot, **options)
 
     def hear(self, data: Any) -> None:
-        """The device hears something."""
+        """Pass data to the device."""
         raise NotImplementedError
 
     def reboot(self) -> None:
-        """The device restarts."""
+        """Restart the device."""
         raise NotImplementedError
 
 
@@ -139,7 +139,7 @@ def _rig(name: str = "fit-mock.toml", *settings: str) -> Rig:
 
 
 class _Modbus:
-    """The requests in what comes over TCP, answered one by one."""
+    """Splits a TCP stream into requests and answers each."""
 
     def __init__(self, server: ModbusTcpServer, wire: Callable[[bytes], None]) -> None:
         self._server = server
@@ -176,11 +176,11 @@ class DacBench(Bench):
         self._course.add(self.time.now_s, tuple(volts))
 
     def hear(self, data: bytes) -> None:
-        """Modbus requests."""
+        """Pass Modbus requests to the device."""
         self._modbus.hear(data)
 
     def reboot(self) -> None:
-        """Its outputs are safe."""
+        """Restart with safe outputs."""
         self._mock._fault_changed("reboot")
 
     def _next_v(self) -> np.ndarray:
@@ -224,7 +224,7 @@ class RtuBench(DacBench):
         self.driver = ModbusDac(self._dac)
 
     def hear(self, data: bytes) -> None:
-        """One frame."""
+        """Pass one frame to the device."""
         request = parse_frame(data)
         if request is None or request[0] != self._dac.device_id:
             return
@@ -255,17 +255,17 @@ class Mdt693Bench(Bench):
         self.driver = Mdt693(piezo)
         self.calls = [self._volts, self._limit]
         self.most_s = 60 * piezo.response_timeout_s
-        time.sleep(60.0)  # what it measures has settled
+        time.sleep(60.0)  # until its measurements settle
 
     def hear(self, data: bytes) -> None:
-        """Commands, each ended by a CR."""
+        """Pass commands, each ended by a CR, to the device."""
         *commands, self._pending = (self._pending + data).split(b"\r")
         for command in commands:
             answer = self._controller.answer(command.decode("ascii", "replace"))
             self.time.call_later(_MDT693_S, self.wire.answer, answer.encode("ascii"))
 
     def reboot(self) -> None:
-        """Everything as at power-up."""
+        """Restart as at power-up."""
         self._controller.power_up()
         self._pending = b""
 
@@ -301,7 +301,7 @@ class AmplifierBench(Bench):
         self._watch()
 
     def settings(self) -> Sequence[str]:
-        """Texts that replace values of the rig file."""
+        """``key.path=value`` texts that replace values of the rig file."""
         return ()
 
     def _watch(self) -> None:
@@ -326,7 +326,7 @@ class AmplifierBench(Bench):
         if not self.time.now_s - 5.0 < reading.time_s <= self.time.now_s:
             msg = f"a reading of {reading.time_s - self.time.now_s:.3f} s from now"
             raise Mistaken(msg)
-        # An encoder counts down; positions are as of somewhen about the time that the reading says.
+        # An encoder rounds down, and the reading's time is uncertain by the response timeout.
         count_rad = 2 * math.tau / self.siderostat.encoder_counts_per_rev
         uncertain_s = self.siderostat.device.response_timeout_s
         near = self._course.between(
@@ -353,16 +353,16 @@ class BalAnalogBench(AmplifierBench):
         self.driver = BalAnalogAmplifiers(self.siderostat)
 
     def hear(self, data: bytes) -> None:
-        """Modbus requests."""
+        """Pass Modbus requests to the device."""
         self._modbus.hear(data)
 
     def reboot(self) -> None:
-        """Outputs are safe."""
+        """Restart with safe outputs."""
         self._mock._fault_changed("reboot")
 
 
 class EnsembleBench(AmplifierBench):
-    """An Ensemble by its ASCII interface."""
+    """An Ensemble on its ASCII interface."""
 
     rig = "ensemble.toml"
     options = MappingProxyType({"has_numbers": False})
@@ -379,14 +379,14 @@ class EnsembleBench(AmplifierBench):
         self.driver = EnsembleAmplifiers(self.siderostat)
 
     def hear(self, data: bytes) -> None:
-        """Commands, a line each."""
+        """Pass commands, one on each line, to the device."""
         for line in self._lines.feed(data):
             if line.strip():
                 answer = self._mock._answer(line.decode("ascii", "replace"))
                 self.time.call_later(self._reply_s, self.wire.answer, answer)
 
     def reboot(self) -> None:
-        """No power; everything as at power-up."""
+        """Restart without power, as at power-up."""
         self._mock._fault_changed("reboot")
         self._lines.clear()
 
@@ -402,26 +402,26 @@ class Cia402Bench(AmplifierBench):
         self.driver = Cia402Amplifiers(self.siderostat)
 
     def settings(self) -> Sequence[str]:
-        """Not SLCAN: the bus itself is the wire."""
+        """Use a virtual bus instead of SLCAN: the bus itself is the wire."""
         return ("loops.right.siderostat.device.interface=virtual",)
 
     def attach(self, received: Callable[[CanFrame], None]) -> None:
-        """As an adapter: a drive listens."""
+        """Called as the adapter: register the drive's receiver."""
         self._received = received
 
     def send_line(self, line: bytes) -> None:
-        """As an adapter: a drive sends a frame."""
+        """Called as the adapter: the drive sends a frame."""
         frame = decode_frame(line.rstrip(b"\r"))
         self.wire.answer(
             can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
         )
 
     def hear(self, data: can.Message) -> None:
-        """One frame."""
+        """Pass one frame to the device."""
         self._received(CanFrame(data.arbitration_id, bytes(data.data)))
 
     def reboot(self) -> None:
-        """No power; everything as at power-up."""
+        """Restart without power, as at power-up."""
         self._mock._power_off()
         self._mock._reset_communication()
 
@@ -443,16 +443,16 @@ class LabJackBench(Bench):
         self.most_s = 20 * device.response_timeout_s + 1.0
 
     def hear(self, data: bytes) -> None:
-        """Modbus requests."""
+        """Pass Modbus requests to the device."""
         self._modbus.hear(data)
 
     def reboot(self) -> None:
-        """Its inputs' settings are those of power-up."""
+        """Restart with the input settings of power-up."""
         for setting, values in self._mock._values.items():
             values[:] = [setting.default] * len(values)
 
     def _true_v(self, time_s: float) -> Sequence[float]:
-        """Each photodiode's voltage tells the time."""
+        """Voltages that encode the time."""
         return [0.2 * place + _V_PER_S * (time_s % _AROUND_S) for place in range(4)]
 
     def _sample(self) -> None:
@@ -473,7 +473,7 @@ class LabJackBench(Bench):
         if max(sampled_s) - min(sampled_s) > _UNSURE_S:
             msg = f"photodiodes of different times: {reading.volts}"
             raise Mistaken(msg)
-        # Its time is midway between request and answer; the request is the last one before the sample.
+        # The driver dates a sample midway between answer and request, the last one before the sample.
         asked_s = [one for one in self._asked_s if one <= sampled_s[0] + _UNSURE_S]
         if not asked_s or not asked_s[-1] - _UNSURE_S <= reading.time_s <= self.time.now_s:
             msg = f"a sample of {sampled_s[0]:.4f} s is dated {reading.time_s:.4f} s"
@@ -489,20 +489,20 @@ BENCHES: dict[str, Callable[[WireTime, Iterator[Trouble | None]], Bench]] = {
     "CiA 402": Cia402Bench,
     "LabJack T7": LabJackBench,
 }
-"""By the driver's name."""
+"""By name of the driver."""
 
 
 def run_wire(
     name: str, troubles: Sequence[Trouble | None], calls: Sequence[tuple[int, float]]
 ) -> dict[str, int]:
-    """Make calls, each after a pause, over a wire with these troubles; how each ended, by its error's name.
+    """Make calls, each after a pause, over a wire with these troubles; count the outcomes by name of the error.
 
     Raises
     ------
     Mistaken
-        If an answer was taken for another's, or a call took too long.
+        If a driver matched an answer to the wrong request, or a call took too long.
     Exception
-        What a call ended in that is no `DeviceError`.
+        Any other error of a call that is not a `DeviceError`.
     """
     time, ended = WireTime(), dict[str, int]()
     coming: Iterator[Trouble | None] = iter(troubles)
@@ -511,7 +511,7 @@ def run_wire(
     def troubles_once_open() -> Iterator[Trouble | None]:
         yield from coming
 
-    # The mock's timers need the loop of the wire's time; the wire comes with the bench.
+    # The mock's timers need the wire's event loop, but the bench makes the wire.
     wire = _Deferred(lambda: holder[0].wire)
     with virtual(time, wire):  # type: ignore[arg-type]
         bench = BENCHES[name](time, troubles_once_open())
@@ -536,7 +536,7 @@ def run_wire(
 
 
 class _Deferred:
-    """The wire of a bench that is still being made."""
+    """The wire of a bench, before the bench exists."""
 
     def __init__(self, wire: Callable[[], Wire]) -> None:
         self._wire = wire
@@ -546,7 +546,7 @@ class _Deferred:
 
 
 def drawn_run(random: Random) -> tuple[list[Trouble | None], list[tuple[int, float]]]:
-    """Troubles and calls at random."""
+    """Draw troubles and calls."""
     part = random.choice((0.02, 0.1, 0.3))
     kinds = random.sample(KINDS, random.randint(1, len(KINDS)))
     troubles = [

@@ -1,4 +1,4 @@
-"""A driver's line to its device: every exchange takes time, and may fail as the driver would fail."""
+"""A driver's line to its device: every exchange takes time, and may fail with the errors of a real driver."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ Result = TypeVar("Result")
 _SLICE_S = 0.0005
 
 FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
-"""Of a line, while they last: answers come late; requests are lost; answers are lost; the device refuses;
-answers make no sense; nothing is connected."""
+"""Faults of a line, in this order: late answers, lost requests, lost answers, a device that refuses,
+answers that make no sense, and a cable that is unplugged."""
 
 
 class Bus:
-    """A bus, as :class:`fitctl.drivers.interface.ServoBus`; what to do on it at once is added by its drives.
+    """A :class:`fitctl.drivers.interface.ServoBus`, to which each drive adds what it sends.
 
     Attributes
     ----------
     meanwhile : callable or None
-        Called again and again while a drive waits for an answer.
+        Called repeatedly while a drive waits for an answer.
     drives : list of callable
-        Send what is staged.
+        One for each drive; sends its staged command.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Bus:
         self.drives: list[Callable[[], None]] = []
 
     def synchronize(self) -> None:
-        """Send all commands that are staged."""
+        """Send all staged commands."""
         for send in self.drives:
             send()
 
@@ -51,24 +51,24 @@ class Line:
     Parameters
     ----------
     device, endpoint : str
-        For errors.
+        Named in errors.
     time : VirtualTime
     random : Random
     usual_s : float
-        What an exchange usually takes.
+        Usual duration of an exchange.
     timeout_s : float
         The driver's own time limit.
 
     Attributes
     ----------
     faults : dict of str to float
-        Those in force, of `FAULTS`; of "slow", how much slower.
+        The faults in force, from `FAULTS`. The value of "slow" is the factor.
     healed_s : float
         When the last fault ended.
     connected : bool
-        The driver has opened it, and it has not broken since.
+        Whether the driver has opened the line, and it has not broken since.
     bus : Bus or None
-        Whose other drives go on while this one waits.
+        The bus whose other drives continue while this one waits.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Line:
         self._usual_s = usual_s
 
     def heal(self, *faults: str) -> None:
-        """End faults; without a name, all."""
+        """End these faults, or all of them if none is named."""
         for fault in faults or list(self.faults):
             self.faults.pop(fault, None)
         self.healed_s = self._time.now_s()
@@ -114,12 +114,12 @@ class Line:
         self.connected = False
 
     def delay_s(self) -> float:
-        """What the next exchange takes."""
+        """Draw the duration of the next exchange."""
         delay_s = self._usual_s * (0.7 + 0.6 * self._random.random())
         return delay_s * self.faults["slow"] if "slow" in self.faults else delay_s
 
     def ask(self, act: Callable[[], Result]) -> Result:
-        """Have the device do something, and wait for its answer.
+        """Send a request that the device carries out with ``act``, and return its answer.
 
         Raises
         ------
@@ -168,7 +168,7 @@ class Line:
         self._sleep_until(self._time.now_s() + duration_s)
 
     def _sleep_until(self, deadline_s: float) -> None:
-        """Wait, and let what shares the thread go on meanwhile."""
+        """Wait, and meanwhile let the bus's other drives run."""
         bus = self.bus
         while bus is not None and bus.meanwhile is not None and self._time.now_s() < deadline_s:
             self._time.sleep_until(min(deadline_s, self._time.now_s() + _SLICE_S))
@@ -176,20 +176,20 @@ class Line:
         self._time.sleep_until(deadline_s)
 
     def timeout(self) -> DeviceTimeout:
-        """The error of an answer that did not come."""
+        """The error for an answer that did not arrive in time."""
         return DeviceTimeout(
             self.device, self.endpoint, f"an answer within {self.timeout_s:g} s", "none", "check it"
         )
 
     def garbled(self) -> DeviceProtocolError:
-        """The error of an answer that makes no sense; the link is given up."""
+        """The error for an answer that makes no sense; it also closes the line."""
         self.connected = False
         return DeviceProtocolError(
             self.device, self.endpoint, "an answer", "nonsense", "check the line"
         )
 
     def broken(self) -> DeviceUnreachable:
-        """The error of a link that broke."""
+        """The error for a broken line; it also closes the line."""
         self.connected = False
         return self._unreachable("a broken connection")
 
@@ -198,5 +198,5 @@ class Line:
 
 
 def drawn_slowness(random: Random) -> float:
-    """How much slower: from somewhat to a thousand times."""
+    """Draw a factor for "slow", from 1 to 1000."""
     return math.pow(10.0, 3.0 * random.random())

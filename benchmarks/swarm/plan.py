@@ -1,4 +1,4 @@
-"""What happens in one run: drawn from a seed before it begins, so that a part of it can be left out."""
+"""What happens in one run, drawn from a seed before the run begins, so that parts of it can be left out."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ RIGS: dict[str, tuple[str, ...]] = {
     "ensemble.toml": ("right",),
     "fit-bal-analog.toml": ("right",),
 }
-"""Files of ``rigs/``, each with its loops."""
+"""Files in ``rigs/``, each with its loops."""
 _RIG_WEIGHTS = (8, 3, 2, 3, 3)
 _SETTINGS = (
     "service.lease_s=10.0",
@@ -45,36 +45,36 @@ _SETTINGS = (
     "supervisor.telemetry_hz=20.0",
     "loops.right.acquisition.search_again_s=10.0",
 )
-"""Texts of which some runs have some."""
-_SETTING = 0.15  # so many runs have each
+"""Settings that some runs change."""
+_SETTING = 0.15  # fraction of runs that change each of them
 _SLOW_SERVO = {
     "servo.rate_hz": (100.0, 50.0),
     "servo.gain_per_s": (40.0, 15.0),
     "servo.following_error_limit_rad": (4.0, 10.0),
 }
-"""Of a siderostat whose servo runs at 100 or 50 Hz instead of 500."""
+"""Settings of a siderostat whose servo runs at 100 or at 50 Hz instead of 500."""
 _SLOW = {"fit-mock.toml": 0.15, "two-stars.toml": 0.5, "fit-testbed.toml": 0.6}
-"""So many runs have slow servos; they are faster, too."""
+"""Fraction of runs with slow servos. These runs also take less time."""
 _FAST_FRAMES = (
     "camera.frame_rate_hz=500.0",
     "camera.exposure_s=0.001",
     "camera.frame_delay_s=0.0035",
 )
 _FAST = {"fit-mock.toml": 0.1}
-"""So many runs have ten times as many frames, for a third of the time."""
+"""Fraction of runs with ten times as many frames; they last a third as long."""
 DURATION_S, FAST_DURATION_S = 120.0, 40.0
 OPERATORS = ("ada", "ben", "cleo", "dora")
-_OF_ONE_LOOP = 0.3  # so many commands name one
-_WITHOUT_FAULTS = 0.15  # so many runs have none of a device
-_CONSOLE_SLOW = 0.2  # so many runs have a console that misses messages
+_OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
+_WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
+_CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
-_FAR, _FAR_ARCSEC = 0.4, 550.0  # so many searches are made elsewhere, at most so far away
-_REPEATED, _REPEATED_S = 0.1, 0.02  # so many commands come again so soon: a key that is held
-_BURST, _BURST_S = 0.4, 0.05  # so many happenings follow another so soon
+_FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
+_REPEATED, _REPEATED_S = 0.1, 0.02  # fraction of commands repeated, and mean delay: a key held down
+_BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True, tag="order"):
-    """An operator gives a command; without one, whatever leads the first loop on towards its star."""
+    """An operator sends a command; ``None`` is whichever one brings the first loop closer to its star."""
 
     at_s: float
     who: str
@@ -82,12 +82,12 @@ class Order(msgspec.Struct, frozen=True, kw_only=True, tag="order"):
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "onwards" if self.command is None else type(self.command).__name__
 
 
 class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
-    """A fault of one device begins, and ends after a while; a reset and a power cut have no duration."""
+    """A fault of one device, and how long it lasts; a reset or a power cut has no duration."""
 
     at_s: float
     device: str
@@ -97,36 +97,36 @@ class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return f"{self.device.rpartition(' ')[2]} {self.fault}"
 
 
 class Stall(msgspec.Struct, frozen=True, kw_only=True, tag="stall"):
-    """The machine stands still."""
+    """The whole machine stalls for a time."""
 
     at_s: float
     lasts_s: float
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "stall"
 
 
 class Kill(msgspec.Struct, frozen=True, kw_only=True, tag="kill"):
-    """The supervisor's process is killed, and a new one started after a while."""
+    """The supervisor's process is killed, and a new one starts ``back_after_s`` later."""
 
     at_s: float
     back_after_s: float
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "kill"
 
 
 class Cloud(msgspec.Struct, frozen=True, kw_only=True, tag="cloud"):
-    """All stars have another part of their light for a while."""
+    """All stars dim to ``part`` of their light for a time."""
 
     at_s: float
     lasts_s: float
@@ -134,47 +134,47 @@ class Cloud(msgspec.Struct, frozen=True, kw_only=True, tag="cloud"):
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "cloud"
 
 
 class RecorderDeath(msgspec.Struct, frozen=True, kw_only=True, tag="recorder"):
-    """The recorder is killed; a new one comes."""
+    """The recorder is killed; the supervisor starts a new one."""
 
     at_s: float
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "recorder death"
 
 
 class FullDisk(msgspec.Struct, frozen=True, kw_only=True, tag="disk"):
-    """Nothing can be written to the log's disk for a while."""
+    """The log's disk is full for a time."""
 
     at_s: float
     lasts_s: float
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "full disk"
 
 
 class ClockStep(msgspec.Struct, frozen=True, kw_only=True, tag="clock"):
-    """The computer's wall clock is set."""
+    """The computer's wall clock is set forward or back."""
 
     at_s: float
     by_s: float
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "clock step"
 
 
 class Sequence(msgspec.Struct, frozen=True, kw_only=True, tag="sequence"):
-    """An operator starts a sequence, of steps of `benchmarks.swarm.clients.STEPS`."""
+    """An operator starts a sequence of steps from `benchmarks.swarm.clients.STEPS`."""
 
     at_s: float
     who: str
@@ -182,7 +182,7 @@ class Sequence(msgspec.Struct, frozen=True, kw_only=True, tag="sequence"):
 
     @property
     def kind(self) -> str:
-        """For the statistics."""
+        """The name used in the statistics."""
         return "sequence"
 
 
@@ -195,17 +195,17 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     seed : int
-        Of everything that is not a happening: the plant's noise, each delay.
+        Seed of everything else that is random, such as the plant's noise and each delay.
     rig : str
-        A file of ``rigs/``.
+        A file in ``rigs/``.
     settings : list of str
-        ``key.path=value`` texts that replace values of the file.
+        ``key.path=value`` texts that replace values of the rig file.
     duration_s : float
-        Until everything is healed.
+        Until all faults end and the healing begins.
     happenings : list
-        In the order of their times.
+        In order of time.
     console_loss : float
-        Part of the messages that the console misses.
+        Fraction of the messages that the console misses.
     """
 
     seed: int
@@ -217,7 +217,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def drawn_search(random: Random) -> Acquire:
-    """About where the star is expected, or far from there: the siderostat goes as fast as it can."""
+    """A search near the star's expected place, or far from it, so that the siderostat slews at full speed."""
     if random.random() > _FAR:
         return Acquire()
     az_arcsec, el_arcsec = (random.uniform(-_FAR_ARCSEC, _FAR_ARCSEC) for _ in range(2))
@@ -252,11 +252,11 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
         az_urad=random.uniform(-100, 100), el_urad=random.uniform(-100, 100)
     ),
 }
-"""By their words; without a command, the one that leads on."""
+"""By name. ``None`` stands for the command that brings a loop closer to its star."""
 
 
 def slow_servos(rig: str, which: int) -> list[str]:
-    """Settings with which the siderostats of a rig are servoed at 100 or 50 Hz."""
+    """Settings that slow the servos of a rig's siderostats to 100 or 50 Hz."""
     return [
         f"loops.{loop}.siderostat.{key}={values[which]}"
         for loop in RIGS[rig]
@@ -274,7 +274,7 @@ def devices_of(rig: str) -> list[str]:
 
 
 def plan_of(seed: int) -> Plan:
-    """The plan of a seed."""
+    """The plan that a seed gives."""
     random = Random(seed)  # noqa: S311 - a repeatable draw
     rig = random.choices(list(RIGS), _RIG_WEIGHTS)[0]
     return drawn_plan(random, seed, rig)
@@ -283,8 +283,8 @@ def plan_of(seed: int) -> Plan:
 def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     """A plan for a rig.
 
-    Each run has some kinds of faults and commands, and others not at all, at a pace of its own: what everything
-    together would drown is found where most of it is left out.
+    Each run draws a few kinds of faults and commands, leaves out the others, and has its own pace. A defect
+    that many faults at once would hide shows in a run that has few of them.
     """
     loops, devices = RIGS[rig], devices_of(rig)
     fast = random.random() < _FAST.get(rig, 0.0)
@@ -308,13 +308,12 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     if not fault_free:
         strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
-    people = OPERATORS[
-        : random.randint(1, len(OPERATORS))
-    ]  # who does not have the lease is refused
+    # The service refuses commands from operators without the lease.
+    people = OPERATORS[: random.randint(1, len(OPERATORS))]
     attend_s = 10 ** random.uniform(0.0, 1.3)
     happenings: list[Happening] = []
     at_s = 0.1
-    while at_s < duration_s:  # somebody wants the star, and tries again and again
+    while at_s < duration_s:  # the first operator keeps trying to hold the star
         happenings.append(Order(at_s=at_s, who=OPERATORS[0]))
         at_s += random.expovariate(1 / attend_s)
     at_s = 0.2
@@ -335,7 +334,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
                 again_s += random.expovariate(1 / _REPEATED_S)
                 happenings.append(Order(at_s=again_s, who=who, command=command))
     happenings.sort(key=lambda happening: happening.at_s)
-    settings = ["supervisor.telemetry_hz=5.0"]  # as the rig has it, it takes a tenth of the time
+    # At the rig's own rate, telemetry takes a tenth of the run's time.
+    settings = ["supervisor.telemetry_hz=5.0"]
     settings += [text for text in _SETTINGS if random.random() < _SETTING]
     if fast:
         settings += _FAST_FRAMES

@@ -1,7 +1,7 @@
-"""The recorder beside the supervisor on virtual time: it dies, and the queue before it is the real one.
+"""A recorder on virtual time that can die, behind the supervisor's real record queue.
 
-The wire stands in for ZeroMQ: it keeps what was sent to a recorder until that takes it, and loses it when the
-recorder dies. A recorder that dies loses what it has not flushed; a new one comes after a while.
+`Wire` replaces ZeroMQ. It keeps each message until the recorder receives it, and loses all of them when the
+recorder dies. A recorder that dies also loses what it has not flushed. A new one starts a second later.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from benchmarks.swarm.threads import VirtualTime
 from fitctl.logging.queue import RecordQueue
 
 _TAKE_S, _FLUSH_S = 0.05, 0.5
-_BACK_S = 1.0  # as fitctl.daemon.children looks once a second
+_BACK_S = 1.0  # fitctl.daemon.children checks once a second
 _encode = msgspec.msgpack.encode
 _sequence_of = msgspec.msgpack.Decoder(tuple[int, int, msgspec.Raw]).decode
 _UNREACHABLE, _AGAIN = 113, 11
 
 
 class WireError(Exception):
-    """As ``zmq.ZMQError``."""
+    """Stands for ``zmq.ZMQError``."""
 
     def __init__(self, errno: int) -> None:
         super().__init__(errno)
@@ -30,18 +30,18 @@ class WireError(Exception):
 
 
 class FullError(WireError):
-    """As ``zmq.Again``."""
+    """Stands for ``zmq.Again``."""
 
 
 class Wire:
-    """As the queue's ROUTER, with the recorder's end of it.
+    """Stands for the queue's ROUTER socket and the recorder's end of it.
 
     Attributes
     ----------
     size : int
-        Messages on the way, at most.
+        Maximum number of messages on the wire.
     recorder : bytes
-        Who is there; empty while nobody is.
+        Identity of the connected recorder; empty without one.
     """
 
     def __init__(self) -> None:
@@ -52,11 +52,11 @@ class Wire:
         self._answers: deque[tuple[bytes, bytes]] = deque()
 
     def answer(self, number: int) -> None:
-        """The recorder says something."""
+        """Send an answer from the recorder."""
         self._answers.append((self.recorder, _encode(number)))
 
     def poll(self, _timeout_ms: int) -> bool:
-        """Whether an answer is there."""
+        """Whether an answer has arrived."""
         return bool(self._answers)
 
     def recv_multipart(self, _flags: int) -> tuple[bytes, bytes]:
@@ -64,7 +64,7 @@ class Wire:
         return self._answers.popleft()
 
     def send_multipart(self, parts: list[bytes], _flags: int) -> None:
-        """Send, if there is a recorder and room on the way to it."""
+        """Send, if a recorder is connected and the wire has room."""
         if parts[0] != self.recorder:
             raise WireError(_UNREACHABLE)
         if len(self.sent) >= self.size:
@@ -72,12 +72,12 @@ class Wire:
         self.sent.append(parts[1])
 
     def setsockopt(self, option: int, value: int) -> None:
-        """How many messages may be on the way."""
+        """Set how many messages the wire takes."""
         if option == ZMQ.SNDHWM:
             self.size = value
 
     def bind(self, _endpoint: str) -> None:
-        """There is nobody else."""
+        """Do nothing: a wire has only these two ends."""
 
 
 ZMQ = SimpleNamespace(
@@ -90,24 +90,24 @@ ZMQ = SimpleNamespace(
     ROUTER_MANDATORY=2,
     NOBLOCK=0,
 )
-"""As the module ``zmq``, as far as the queue uses it."""
+"""Stands for the parts of the module ``zmq`` that the queue uses."""
 
 
 class SwarmRecorder:
-    """A recorder of one supervisor, started again as long as that one lives.
+    """The recorder of one supervisor, restarted as long as the supervisor lives.
 
     Parameters
     ----------
     time : VirtualTime
     queue : RecordQueue
-        Its socket is a `Wire`.
+        A queue whose socket is a `Wire`.
 
     Attributes
     ----------
     written : set of int
-        Sequences of the records in its files.
+        Sequence numbers of the records in its files.
     disk_is_full : bool
-        Whatever it flushes ends it.
+        While true, a flush kills the recorder.
     """
 
     def __init__(self, time: VirtualTime, queue: RecordQueue) -> None:
@@ -122,11 +122,11 @@ class SwarmRecorder:
         self._start()
 
     def end(self) -> None:
-        """Its supervisor is no more."""
+        """Stop for good, because the supervisor has ended."""
         self._ended = True
 
     def die(self) -> None:
-        """It is killed."""
+        """Die, and start again after a second."""
         if self._ended or not self._wire.recorder:
             return
         self._wire.recorder = b""
@@ -144,7 +144,7 @@ class SwarmRecorder:
         self._take(self._starts)
 
     def _take(self, start: int) -> None:
-        """Take what is there; a start that is over does nothing."""
+        """Receive all messages, and flush when due. Does nothing if the recorder was restarted meanwhile."""
         if self._ended or start != self._starts or not self._wire.recorder:
             return
         sent = self._wire.sent
@@ -163,7 +163,7 @@ class SwarmRecorder:
         self._time.call_at(now_s + _TAKE_S, lambda: self._take(start))
 
     def unaccounted(self) -> str:
-        """Which records are neither written, nor waiting, nor counted; empty if all are."""
+        """Report records that are neither written, waiting nor counted as lost; empty without any."""
         queue = self._queue
         waiting = {sequence for sequence, _ in queue._kept}
         missing = queue.offered - len(self.written | waiting)
