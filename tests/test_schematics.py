@@ -10,6 +10,8 @@ import pytest
 from documents import DOCUMENTS, ROOT
 from PIL import Image
 
+from fitctl.identify.drawing import for_dark_pages
+
 PICTURES = ROOT / "docs" / "pictures"
 SVG = "{http://www.w3.org/2000/svg}"
 CHARACTER_PX = 7.5  # of 14 px sans-serif, a wide one
@@ -92,3 +94,12 @@ def test_the_consoles_picture_has_neither_a_font_from_elsewhere_nor_the_name_of_
     assert "@font-face" not in mended
     assert me not in mended
     assert take_moving.height(mended) == take_moving.height(shown)
+
+
+def test_every_plot_has_colours_for_a_dark_page_too():
+    plots = [*(PICTURES / "theory").glob("*.svg"), PICTURES / "learning-6hz.svg"]
+
+    assert len(plots) > 8
+    for path in plots:
+        text = path.read_text()
+        assert text == for_dark_pages(text), f"{path.name}: written without for_dark_pages"

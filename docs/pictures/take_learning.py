@@ -4,6 +4,7 @@ python docs/pictures/take_learning.py
 """
 
 import asyncio
+import io
 import os
 import time
 from pathlib import Path
@@ -14,7 +15,7 @@ from scipy.signal import welch
 
 from fitctl import demo
 from fitctl.config import default_rig_path
-from fitctl.identify.drawing import BLUE, GREEN, VERMILION, new_figure
+from fitctl.identify.drawing import BLUE, GREEN, VERMILION, for_dark_pages, new_figure
 from fitctl.messages.client import Client
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.tui.app import ConsoleApp
@@ -70,7 +71,9 @@ def draw(rows: np.ndarray, changed_s: float, period_s: float) -> None:
         spectrum.loglog(hz[1:], psd[1:].mean(axis=1), color=colour, label=name)
     spectrum.set(xlabel="frequency (Hz)", ylabel="error on frames (px²/Hz)")
     spectrum.legend()
-    figure.savefig(HERE / "learning-6hz.svg")
+    svg = io.StringIO()
+    figure.savefig(svg, format="svg")
+    (HERE / "learning-6hz.svg").write_text(for_dark_pages(svg.getvalue()), encoding="utf-8")
 
 
 def main() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from fitctl.identify.drawing import for_dark_pages
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,9 +64,11 @@ class Plate:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write a figure as PNG and as SVG; the same data give the same files."""
+    """Write a figure as PNG and as SVG, which also suits a dark page; the same data give the same files."""
     import matplotlib
 
     with matplotlib.rc_context({"svg.hashsalt": name, "path.simplify_threshold": 0.5}):
         figure.savefig(folder / f"{name}.png", dpi=_DPI, metadata={"Software": None})
-        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        svg = io.StringIO()
+        figure.savefig(svg, format="svg", metadata={"Date": None})
+    (folder / f"{name}.svg").write_text(for_dark_pages(svg.getvalue()), encoding="utf-8")
