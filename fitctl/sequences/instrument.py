@@ -36,6 +36,10 @@ from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import Figures, SequenceError
 
 NAME = "python"  # under which consoles see steps that a program runs
+_NONE_RUNS = (
+    "no supervisor of yours runs on this machine; start one with fitctl demo or fitctl run, name a rig file, "
+    "or try Instrument(simulate=True)"
+)
 
 T = TypeVar("T")
 
@@ -347,8 +351,7 @@ def _load(path: Path | str | None, *, the_running: bool) -> Rig:
         return load_rig(named or default_rig_path())
     found = only_running_rig("Instrument")
     if found is None:
-        msg = "no supervisor of yours runs on this machine; start one with fitctl run, or name a rig file"
-        raise ConnectionError(msg)
+        raise ConnectionError(_NONE_RUNS)
     return load_rig(Path(found.file), found.settings)
 
 
