@@ -40,7 +40,7 @@ LIMIT_TOLERANCE_V = 1.0  # within which the driver compares limits
 _NETWORK_INTERFACE = re.compile(r"[^\s/:]{1,15}")
 _SLCAN_CHANNEL = "the adapter's serial port, such as /dev/ttyACM0, or socket://host:port"
 _SOCKETCAN_CHANNEL = "a network interface, such as can0"
-_OTHER_CHANNELS = "docs/wiring-a-rig.md lists interfaces and their channels"
+_OTHER_CHANNELS = "docs/devices/cia402.md lists interfaces and their channels"
 
 
 class Optics(Settings):
