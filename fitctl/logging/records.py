@@ -240,7 +240,7 @@ class DeviceFailure(Record, frozen=True, kw_only=True):
 
 
 class ControllerChange(Record, frozen=True, kw_only=True):
-    """Another design is at work from the next tick on; motor angles as in :class:`ModeChange`."""
+    """Another design is in force from the next tick on; motor angles as in :class:`ModeChange`."""
 
     loop: str
     source: str

@@ -119,7 +119,7 @@ class Learning:
         *,
         by_itself: bool,
     ) -> None:
-        """Another design is at work: a learnt one with its report, or another without.
+        """Another design is in force: a learnt one with its report, or another without.
 
         Recent frames, in their order and without gaps, tell the comparison where star and vibrations are.
         """
@@ -143,7 +143,7 @@ class Learning:
             means[:] = [report.learnt_camera_px**2] * 2
 
     def fell_back(self, reason: str, now_s: float) -> None:
-        """The design before is at work again."""
+        """The previous design is in force again."""
         self._fell_back = reason
         self._paused_until_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, MOST_PAUSE_S)

@@ -121,7 +121,7 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
         ``learn`` of the rig file.
     state : str
         "collecting" until the first report; "advice" where the learnt design would leave clearly less; "kept"
-        where it would not; "in force" while a learnt design is at work; "fell back" after it left too much.
+        where it would not; "in force" while it drives the loop; "fell back" after it left too much.
     text : str
         The night, or what happened, for people.
     report : LearnerReport, optional
@@ -148,7 +148,7 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it.
 
-    ``controller_file`` is the saved design that is at work, on the supervisor's machine; it is empty when the
+    ``controller_file`` is the saved design in force, on the supervisor's machine; it is empty when the
     design was made from the rig's values. ``outcomes`` are those of the
     commands under way, and of the last that ended. ``kind`` is the loop's in the rig file; a metrology loop's
     ``requirement_px`` is its requirement on the beam in the camera's pixels. ``waits_for`` is what the loop

@@ -497,7 +497,7 @@ class Supervisor:
         error = future.exception()
         if error is None:
             self.stellar_loops[name].use(future.result(), report=report)
-            ended(f"controller {controller} is at work", failed=False)
+            ended(f"controller {controller} is in force", failed=False)
         else:
             why = error_text(error)
             self._journal.event("error", name, f"no design {controller}: {why}")

@@ -381,7 +381,7 @@ class ConsoleApp(App[None]):
         if not self._is_now("Silence"):
             return
         self.alarms.silence()
-        self.notify("no bell for these alarms; a new one rings", timeout=3)
+        self.notify("bell silenced for these alarms; a new alarm rings", timeout=3)
 
     def action_rehearse(self) -> None:
         """Ask for a command, and show what it would do, computed by a process of its own."""
@@ -389,13 +389,15 @@ class ConsoleApp(App[None]):
         if not self._is_now("Rehearse"):
             return
         if rig_arguments is None:
-            text = "a rehearsal needs the rig file: leave the console, and give it that file too, with --rig"
+            text = "a rehearsal needs the rig file: start the console again with --rig FILE"
             self.notify(text, severity="warning", timeout=8)
             return
 
         def refused(text: str) -> str:
             word = next(iter(text.split()), "")
-            return "" if word in WORDS else f"{word or 'nothing'} is no command: {', '.join(WORDS)}"
+            return (
+                "" if word in WORDS else f"unknown command {word!r}. Available: {', '.join(WORDS)}"
+            )
 
         def rehearse(text: str | None) -> None:
             if text:
@@ -403,9 +405,7 @@ class ConsoleApp(App[None]):
                 job = self.start_job(["rehearse", *text.split(), *where])
                 self.push_screen(Running(f"Rehearse {text}", job))
 
-        prompt = (
-            "what to rehearse: a command with its values, as fitctl send has it; nothing is sent"
-        )
+        prompt = "command to rehearse, with its values, as for fitctl send; nothing is sent"
         words = self.view.to_rehearse() if self.view else ""
         self.push_screen(Ask("Rehearse", prompt, words, refused), rehearse)
 
@@ -433,7 +433,7 @@ class ConsoleApp(App[None]):
         yield SystemCommand("Take over", take_over.help, partial(self.send, TakeOver()))
         for name in CONTROLLER_CHOICES:
             set_controller = partial(self.send, SetController(name=name))
-            about = "In VERNIER the mirror goes on where it is"
+            about = "In VERNIER, the mirror continues from where it is"
             yield SystemCommand(f"controller {name}", about, set_controller)
         for trip in self.state.loop.state.interlocks if self.state.loop else ():
             reset = partial(self.send, Reset(name=trip.name))

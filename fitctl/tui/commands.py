@@ -181,7 +181,12 @@ KEYS = (
     Key("c", "c", "Colours", "screen.colours", "colour map of the focal plane", "operate"),
     Key("up,down", "↑↓", "Choose", "", "choose a reading", "devices"),
     Key(
-        "enter", "enter", "More", "screen.more", "all about the chosen device or reading", "devices"
+        "enter",
+        "enter",
+        "More",
+        "screen.more",
+        "details of the chosen device or reading",
+        "devices",
     ),
     Key("n", "n", "Reset", "screen.reset", "reset the chosen interlock", "devices"),
     Key("w", "w", "Window", "app.window", "over 10, 60 or 1 s", "loop"),
@@ -202,9 +207,9 @@ KEYS = (
     ),
     Key("f", "f", "File", "screen.file", "open a sequence file of your own", "sequences"),
     Key("up,down", "↑↓", "Choose", "", "choose a log", "logs"),
-    Key("enter", "enter", "Info", "screen.tool('info')", "what the chosen log holds", "logs"),
+    Key("enter", "enter", "Info", "screen.tool('info')", "contents of the chosen log", "logs"),
     Key("m", "m", "Keep", "screen.keep", "protect it from deletion, or undo that", "logs"),
-    Key("f", "f", "Verify", "screen.tool('verify')", "check that it is whole", "logs"),
+    Key("f", "f", "Verify", "screen.tool('verify')", "verify that it is complete", "logs"),
     Key("t", "t", "Report", "screen.tool('report')", "make a report of it", "logs"),
     Key("y", "y", "Replay", "screen.tool('replay')", "run its frames through today's code", "logs"),
     Key(

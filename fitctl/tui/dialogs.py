@@ -108,15 +108,15 @@ class Alarms(Sheet[float | None]):
 
 
 class Running(Sheet[None]):
-    """What another fitctl command prints, while it is at work and after; leaving ends the command."""
+    """The output of another fitctl command, while it runs and afterwards. Closing ends the command."""
 
-    HINT = "esc closes, and ends what is at work · s stops the instrument"
+    HINT = "esc closes and ends the command · s stops the instrument"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,q,enter", "dismiss", "Close", show=False),
     ]
 
     def __init__(self, title: str, job: Job) -> None:
-        super().__init__(title, Text("at work", DIM))
+        super().__init__(title, Text("running", DIM))
         self._job = job
 
     def on_mount(self) -> None:
@@ -130,7 +130,7 @@ class Running(Sheet[None]):
 
     def _draw(self) -> None:
         printed = "\n".join(map(plain, self._job.text().splitlines()))
-        state = "\n◌ at work" if self._job.status is None else ""
+        state = "\n◌ running" if self._job.status is None else ""
         self.query_one("#text", Static).update(Text(f"{printed}{state}", INK))
 
 
@@ -189,7 +189,7 @@ class Ask(ModalScreen[str | None]):
         """The field, and what is wrong with it."""
         with Vertical(classes="sheet") as sheet:
             sheet.border_title = escape(self._title)
-            sheet.border_subtitle = "enter takes it · esc leaves · ^s stops"
+            sheet.border_subtitle = "enter accepts · esc cancels · ^s stops"
             yield Static(Text(self._prompt, DIM))
             yield Input(self._value, id="value")
             yield Static("", id="refused")

@@ -68,7 +68,7 @@ def test_another_controller_differs_and_the_table_says_where_and_that_it_is_open
     assert (int(ticks) > 50, float(first_s) > 0.4, unit) == (True, True, "V")
     assert float(worst) > float(rms) > 0
     assert "loop right begins with controller lqg-ltr, in the log with eq20" in text
-    assert "open loop: whatever today's code commands, the frames are the log's" in text
+    assert "open loop: today's commands do not change the frames, which are the log's" in text
 
 
 def test_a_log_too_short_for_an_expected_rms_says_so(replay, log):

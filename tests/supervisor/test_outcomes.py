@@ -87,7 +87,7 @@ def test_each_command_that_takes_time_ends_done(fresh):
     course = [
         (Standby(), "STANDBY: all devices open"),
         (Acquire(), "VERNIER: "),
-        (SetController(name="eq20"), "controller eq20 is at work"),
+        (SetController(name="eq20"), "controller eq20 is in force"),
         (Stop(), None),
         (Recover(), "STANDBY: all devices open"),
         (Off(), "OFF: "),

@@ -422,7 +422,7 @@ def learnt(state, **values):
             ),
             ["before        0.0980 px on the same frames"],
         ),
-        (learnt("fell back"), ["fell back to the design before"]),
+        (learnt("fell back"), ["returned to the previous design"]),
     ],
     ids=lambda value: getattr(value, "state", ""),
 )

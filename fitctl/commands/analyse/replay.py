@@ -41,8 +41,8 @@ _ROWS = {
     "visibility": ("visibility", ""),
 }
 _OPEN_LOOP = (
-    "open loop: whatever today's code commands, the frames are the log's, and after each tick the stages go "
-    "on from where\nthe log sent them; modes and the controllers' own state go on from today's"
+    "open loop: today's commands do not change the frames, which are the log's; after each tick the stages are "
+    "where\nthe log sent them; modes and the controllers' own state continue from today's"
 )
 
 
@@ -233,9 +233,7 @@ def _lines(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> Iterato
         yield from _loop_lines(info, name, loop)
     yield from (f"accepted then, refused today: {text}" for text in result.refused)
     if result.controllers_left_out:
-        yield (
-            f"left out: {result.controllers_left_out} commands of the log that would change the controller"
-        )
+        yield f"left out: the log's commands to change the controller ({result.controllers_left_out})"
     if result.records_lost:
         yield f"{result.records_lost} records were lost on the way to the log; what follows them may differ"
     if result.same:

@@ -57,7 +57,7 @@ def fringe_line(state: ConsoleState, columns: int) -> Line:
     is_old = state.newest is None or state.newest.time_s - state.fringes.newest_s > LIVE_S
     held = recent[np.isfinite(recent).all(axis=1)]
     if is_old or not len(held):
-        return [*label, text("no visibility: both stars must be followed", DIM)]
+        return [*label, text("no visibility: both loops must hold a star", DIM)]
     visibility, az_arcsec, el_arcsec = held.mean(axis=0)
     tilt = f"{number(az_arcsec, '+.2f')}″ {number(el_arcsec, '+.2f')}″"
     parts: list[Line] = [

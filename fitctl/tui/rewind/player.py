@@ -64,5 +64,5 @@ class Player:
         except LogError as error:
             return str(error)
         if moment is None:
-            return "nothing was received until then"
+            return "no data had arrived by then"
         return state_of(moment, time_s)

@@ -22,7 +22,7 @@ from fitctl.tui.views.view import View
 
 _SIGNS = (
     ("+ in a box", "centroid in its 7×7 px window; the four blue lines point at the target"),
-    ("◦", "another spot that moves with the star, such as its fringe spot, by the rig file"),
+    ("◦", "another spot that moves with the star, such as its fringe spot, from the rig file"),
     (
         "dotted lines",
         "zero and ± the requirement; RMS is of the last 10 s in this mode, about the target",
@@ -33,7 +33,7 @@ _SIGNS = (
         "the siderostat on the sky, az and el, in arcsec; to go: to its set-point, at the motors",
     ),
     ("median/worst", "of the last second, in ms: compute time, frame age, servo lateness"),
-    ("✓ ▲ ✗ · ○", "well, warning, fault, not judged in this mode, closed"),
+    ("✓ ▲ ✗ · ○", "well, warning, fault, not evaluated in this mode, closed"),
 )
 _ALWAYS = (
     ("space ^s", "STOP as well; ^s stops while you type, too"),
@@ -64,7 +64,7 @@ class HelpView(View):
     def parts(self) -> ComposeResult:
         """The filter, while there is one, and the whole of it."""
         yield Input(
-            placeholder="words to look for; enter keeps them, esc shows everything", id="filter"
+            placeholder="words to find; enter keeps the filter, esc shows everything", id="filter"
         )
         with VerticalScroll(id="sheet"):
             yield Static("", id="help")
@@ -187,5 +187,5 @@ def table(sections: Iterable[Section]) -> Table:
         for name, meaning, colour in section.rows:
             grid.add_row(Text(f"  {name}", f"bold {colour}", no_wrap=True), Text(meaning, INK))
     if not grid.row_count:
-        grid.add_row(Text("nothing has these words; esc shows everything", INK))
+        grid.add_row(Text("no row has these words; esc shows everything", INK))
     return grid

@@ -16,8 +16,8 @@ from fitctl.tui.widgets.spectrum import ErrorBudget, Spectrum
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 
 NEEDS_RIG = (
-    "Margins follow from the rig file, which is not known here: leave the console, and give it that file too, "
-    "with --rig FILE."
+    "The console computes margins from the rig file and does not have it here. Start the console again with "
+    "--rig FILE."
 )
 LEARNT_HERE = (
     "A learnt design has a sensitivity of at most 2, and margins of at least 6 dB and 35°."

@@ -135,7 +135,7 @@ class OperateView(View):
 
     def _aim_at(self, az_px: float, el_px: float) -> None:
         if not has_target(self.state.loop):
-            self.notify("target and window are moved while a star is held", timeout=3)
+            self.notify("target and window can move only while the loop holds a star", timeout=3)
             return
         frame = self.state.newest.frame if self.state.newest else None
         if frame is not None:
@@ -159,7 +159,8 @@ class OperateView(View):
             self._set_hand("")
         elif self.pad.stage(self.state.loop) is None:
             self.notify(
-                "stages are moved by hand in STANDBY, targets while a star is held", timeout=4
+                "you can jog stages in STANDBY, and the target while the loop holds a star",
+                timeout=4,
             )
         else:
             self._set_hand("jog")

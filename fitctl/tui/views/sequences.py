@@ -25,8 +25,8 @@ HINT = (
     "g runs it on the instrument."
 )
 NEEDS_RIG = (
-    "A sequence is checked, rehearsed and run with the rig file, which is not known here: leave the console, "
-    "and give it that file too, with --rig FILE. What is under way can be paused and ended."
+    "The console needs the rig file to check, rehearse and run sequences, and does not have it here. Start the "
+    "console again with --rig FILE. You can pause and end a running sequence without it."
 )
 
 

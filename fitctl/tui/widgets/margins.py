@@ -116,7 +116,7 @@ class Margins(Panel):
         if figures is None:
             return [*lines, [text(shorten(f"✗ {self._evaluated.problem}", columns), RED)]]
         if not figures["stable"]:
-            return [*lines, [text("✗ unstable by the rig file's values", RED, bold=True)]]
+            return [*lines, [text("✗ unstable with the rig file's values", RED, bold=True)]]
         attenuation = ""
         for hz in (0.1, 0.5, 1.0, 2.0):
             value = figures.get(f"attenuation_{hz:g}hz")
@@ -151,7 +151,7 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
     elif learning.state == "in force":
         gain = f"on frames {learning.measured_px:.4f} px, expected {learning.expected_px:.4f}"
     elif learning.state == "fell back":
-        gain, colour = "fell back to the design before", ORANGE
+        gain, colour = "returned to the previous design", ORANGE
     lines = [[text("learning".ljust(_NAME_COLUMNS), DIM), text(gain, colour)]]
     if not math.isnan(learning.before_px):
         before = f"{learning.before_px:.4f} px on the same frames, computed"

@@ -41,14 +41,14 @@ class Printed(Panel):
         moving = self.moving
         if moving is not None:
             self.notify(
-                f"still at work: {moving.command_line}", severity="warning", timeout=4, markup=False
+                f"still running: {moving.command_line}", severity="warning", timeout=4, markup=False
             )
         else:
             self.show(start_job(arguments, outlives=outlives))
 
     @property
     def moving(self) -> Job | None:
-        """The command, while it is at work and moves the stages."""
+        """The command, while it runs and moves the stages."""
         job = self.job
         return job if job is not None and job.outlives and job.status is None else None
 
@@ -81,5 +81,5 @@ class Printed(Panel):
 
 def _how_it_went(status: int | None) -> tuple[str, str, str]:
     if status is None:
-        return "◌", SKY, "at work"
+        return "◌", SKY, "running"
     return ("✓", GREEN, "done") if status == 0 else ("✗", RED, f"status {status}")

@@ -221,7 +221,7 @@ class Detail(Panel):
                 lines += event_lines(event, self.state.wall_s(event.time_s), columns)
             if len(lines) >= rows:
                 break
-        return lines or [[text("no event names it", DIM)]]
+        return lines or [[text("no event mentions it", DIM)]]
 
 
 def _wrapped(content: str, columns: int) -> Iterator[tuple[bool, str]]:
@@ -286,7 +286,7 @@ def device_lines(devices: DeviceList, device: DeviceHealth) -> list[tuple[str, s
     return [
         ("state", device.state),
         ("endpoint", device.endpoint),
-        ("identity", device.identity or "not told yet"),
+        ("identity", device.identity or "no reading yet"),
         ("says", device.detail),
         ("link", devices.link_of(device) or "no reading"),
         ("since", wall(devices.state.wall_s(device.time_s)) + " (last told)"),

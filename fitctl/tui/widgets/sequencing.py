@@ -202,7 +202,7 @@ class Progress(Panel):
         newest = self.state.newest
         status = newest.running_sequence if newest else None
         if newest is None or status is None:
-            return [[text("no sequence is under way on the instrument", DIM)]]
+            return [[text("no sequence is running on the instrument", DIM)]]
         asked = "" if status.wanted == "run" else f"; asked to {status.wanted}"
         part = status.step_number / max(1, status.steps)
         again = f", attempt {status.attempt}" if status.attempt > 1 else ""

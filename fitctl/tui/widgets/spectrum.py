@@ -97,7 +97,7 @@ class ErrorBudget(Panel):
             return [[text(_NOT_EVALUATED, DIM)]]
         found = loop_budget(loop, theory)
         if found is None:
-            why = f"error budget: from {SETTLE_S:g} s after VERNIER began, of {LEAST_TICKS} ticks with a star"
+            why = f"error budget: needs {LEAST_TICKS} ticks with a star, from {SETTLE_S:g} s of VERNIER on"
             return [[text(why, DIM)]]
         lines = [
             _verdict_line(found, theory, columns),
