@@ -2,6 +2,8 @@
 
 import getpass
 import importlib
+import io
+import re
 import socket
 import sys
 from xml.etree import ElementTree as ET
@@ -9,6 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from documents import DOCUMENTS, ROOT
 from PIL import Image
+from rich.console import Console
 
 from fitctl.identify.drawing import for_dark_pages
 
@@ -82,18 +85,31 @@ def test_frames_become_a_picture_that_moves_and_keeps_their_colours(take_moving,
             assert picture.info["duration"] == (250, 310, 3000)[number]
 
 
-def test_the_consoles_picture_has_neither_a_font_from_elsewhere_nor_the_name_of_its_taker(
+def test_a_console_is_shown_without_a_font_from_elsewhere_and_the_name_of_its_taker(
     take_moving,
 ):
     me = f"{getpass.getuser()}@{socket.gethostname()}"
-    shown = (PICTURES / "console.svg").read_text() + me
+    console = Console(record=True, file=io.StringIO(), width=60)
+    console.print(f"by {me}")
+    shown = console.export_svg()
     assert "@font-face" in shown
+    assert me in shown
 
     mended = take_moving.for_everybody(shown)
 
     assert "@font-face" not in mended
     assert me not in mended
     assert take_moving.height(mended) == take_moving.height(shown)
+
+
+def test_the_pictures_of_consoles_have_no_font_from_elsewhere_and_no_name_of_a_machine():
+    pictures = list(PICTURES.glob("console*.svg"))
+
+    assert len(pictures) > 7
+    for path in pictures:
+        shown = path.read_text()
+        assert "@font-face" not in shown, path.name
+        assert not re.search(r"by&#160;\w+@", shown), path.name
 
 
 def test_every_plot_has_colours_for_a_dark_page_too():

@@ -4,6 +4,8 @@ import asyncio
 import time
 from pathlib import Path
 
+from photograph import for_everybody
+
 from fitctl import demo
 from fitctl.config import default_rig_path
 from fitctl.messages.client import Client
@@ -20,7 +22,7 @@ async def take(running: demo.Instrument, path: Path) -> None:
         end_s = time.monotonic() + SECONDS
         while time.monotonic() < end_s:
             await pilot.pause(0.2)
-        app.save_screenshot(path.name, path=str(path.parent))
+        path.write_text(for_everybody(app.export_screenshot()), encoding="utf-8")
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+from photograph import for_everybody
 from scipy.signal import welch
 
 from fitctl import demo
@@ -40,7 +41,8 @@ async def console(running: demo.Instrument) -> None:
         end_s = time.monotonic() + 10.0
         while time.monotonic() < end_s:
             await pilot.pause(0.2)
-        app.save_screenshot("console-learnt.svg", path=str(HERE))
+        shown = for_everybody(app.export_screenshot())
+        (HERE / "console-learnt.svg").write_text(shown, encoding="utf-8")
 
 
 def true_px(running: demo.Instrument, start_s: float, end_s: float) -> tuple[float, float]:

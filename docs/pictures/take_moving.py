@@ -7,17 +7,14 @@ Needs Chromium.
 """
 
 import asyncio
-import getpass
-import os
 import re
-import socket
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
+from photograph import for_everybody, photograph
 from PIL import Image
 
 from fitctl import demo
@@ -71,38 +68,15 @@ def _after(wait_s: float) -> Callable[[], bool]:
     return lambda: time.monotonic() > end_s
 
 
-def for_everybody(svg: str) -> str:
-    """An SVG of the console without fonts from elsewhere, and without the name of who took it."""
-    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
-    me = f"{getpass.getuser()}@{socket.gethostname()}"
-    return svg.replace("Fira Code", "DejaVu Sans Mono").replace(me, "you".ljust(len(me), "\u00a0"))
-
-
 def drawn(shown: list[str], folder: Path) -> list[Image.Image]:
     """SVG drawn by Chromium, all in one size."""
-    # Chromium refuses to run as root, as in a container, with its sandbox. The pages are our own.
-    without_sandbox = ["--no-sandbox"] if os.geteuid() == 0 else []
     frames: list[Image.Image] = []
     for svgs in (shown[n : n + FRAMES_A_PAGE] for n in range(0, len(shown), FRAMES_A_PAGE)):
         page = folder / "page.html"
         page.write_text(PAGE + "".join(map(for_everybody, svgs)), encoding="utf-8")
         height_px = height(svgs[0])
         picture = folder / "page.png"
-        subprocess.run(
-            [  # noqa: S607
-                "chromium",
-                "--headless",
-                *without_sandbox,
-                "--hide-scrollbars",
-                f"--user-data-dir={folder}/profile",
-                f"--window-size={WIDTH_PX},{height_px * len(svgs)}",
-                f"--screenshot={picture}",
-                page.as_uri(),
-            ],
-            check=True,
-            capture_output=True,
-            timeout=120,
-        )
+        photograph(page, picture, WIDTH_PX, height_px * len(svgs))
         with Image.open(picture) as whole:
             frames += [
                 whole.crop((0, top, WIDTH_PX, top + height_px)).convert("RGB")

@@ -9,6 +9,7 @@ python -m system.bad_night ../docs/pictures --browser
 import argparse
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from contextlib import contextmanager
@@ -160,9 +161,11 @@ def lose_the_link(night):
 def stop(night):
     """STOP for all loops, by the space bar."""
     screen = night.screen
+    time.sleep(3.0)  # the devices that are shown are those after recover
     screen.press("Space")
     screen.until("■ SAFE")
     night.reach("SAFE", *(loop.name for loop in night.loops()))
+    time.sleep(1.5)
     night.keep("stopped")
 
 
@@ -196,6 +199,9 @@ def main():
         "--all", action="store_true", help="pictures of all moments that are looked at"
     )
     options = parser.parse_args()
+    sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "pictures"))
+    from photograph import for_everybody
+
     size = tuple(map(int, options.size.split("x")))
     with tempfile.TemporaryDirectory() as work, testbed(Path(work) / "logs") as rig:
         console = browser_of(rig, work) if options.browser else terminal_of(rig, size)
@@ -204,7 +210,9 @@ def main():
 
             def keep(name):
                 if options.all or name in wanted:
-                    screen.save(options.folder / f"console-{prefix}{name}")
+                    path = screen.save(options.folder / f"console-{prefix}{name}")
+                    if path.suffix == ".svg":
+                        path.write_text(for_everybody(path.read_text()))
                 print(f"{name}\n{screen.screen()}", flush=True)
 
             night = Night(rig, screen, keep)

@@ -104,7 +104,7 @@ class Terminal(Screen):
         self._run("resize-window", "-t", "fitctl", "-x", columns, "-y", rows)
 
     def save(self, path):
-        """Write what it shows, with its colours, as SVG."""
+        """Write what it shows, with its colours, as SVG; the file."""
         columns, rows = self._size
         console = Console(
             width=columns, height=rows, file=io.StringIO(), record=True,
@@ -113,9 +113,9 @@ class Terminal(Screen):
         shown = self._run("capture-pane", "-e", "-N", "-p", "-t", "fitctl")
         for line in shown.splitlines():
             console.print(Text.from_ansi(line), no_wrap=True, overflow="crop")
-        Path(path).with_suffix(".svg").write_text(
-            console.export_svg(title="fitctl", unique_id=Path(path).stem, theme=THEME)
-        )
+        path = Path(path).with_suffix(".svg")
+        path.write_text(console.export_svg(title="fitctl", unique_id=path.stem, theme=THEME))
+        return path
 
     def is_open(self):
         listed = subprocess.run([*self._tmux, "list-sessions"], capture_output=True, check=False)
@@ -236,8 +236,10 @@ class Browser(Screen):
         return base64.b64decode(self._ask("Page.captureScreenshot")["data"])
 
     def save(self, path):
-        """Write the page as PNG."""
-        Path(path).with_suffix(".png").write_bytes(self.picture())
+        """Write the page as PNG; the file."""
+        path = Path(path).with_suffix(".png")
+        path.write_bytes(self.picture())
+        return path
 
     def close(self):
         with self._runner as runner:
