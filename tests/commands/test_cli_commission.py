@@ -105,6 +105,11 @@ def test_a_reason_stays_in_the_record(commission, two_steps):
     assert result["verdict"].startswith("commissioned, but for what was skipped")
 
 
+def test_what_is_skipped_is_not_done_even_by_its_name(commission, two_steps):
+    status, _ = commission("--yes", "--skip", "one=no lamp tonight", "--only", "one")
+    assert (status, two_steps) == (0, [])
+
+
 def test_two_commissionings_are_compared(commission, two_steps, tmp_path):
     commission("--yes", "--until", "one")
     earlier = tmp_path / "earlier.json"

@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import pytest
 pytestmark = pytest.mark.long
 STEPS = """
 import sys
+import time
 from fitctl.cli import main
 from fitctl.commissioning import steps
 from fitctl.commissioning.outcome import Cable, Outcome, StepError
@@ -31,7 +33,16 @@ def cable(site):
         site.cable(Cable("the camera's cable", "camera"), on)
     return Outcome(["it came back"])
 
+def moving(_site):
+    try:
+        print("MOVING", flush=True)
+        time.sleep(60)
+    finally:
+        time.sleep(0.5)
+        print("STANDS", flush=True)
+
 nothing = lambda _site: "nothing"
+steps.STEPS["moving"] = steps.Step("moves", "star", nothing, (), 1.0, moving)
 steps.STEPS["cable"] = steps.Step("cables", "star", nothing, (), 1.0, cable)
 main(["commission", *sys.argv[1:]])
 """
@@ -160,6 +171,19 @@ def test_a_failed_step_is_repeated_by_the_next_call_and_another_one_by_its_name(
         "right.two": "skipped",
         "right.three": "failed",
     }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_step_whose_motors_then_stand(at_terminal, tmp_path, number):
+    terminal = at_terminal("--only", "moving")
+    terminal.answer("yes")
+    terminal.wait_for("MOVING")
+    os.kill(terminal.process.pid, number)
+    os.kill(terminal.process.pid, number)  # which must not keep the motors from standing
+    assert terminal.end() == 130
+    assert "STANDS" in terminal.text
+    assert "nothing is recorded of the step that was running" in terminal.text
+    assert not (tmp_path / "fit-mock.commissioning.json").exists()
 
 
 def test_a_cable_is_taken_off_and_put_on_again_by_a_person(at_terminal, tmp_path):

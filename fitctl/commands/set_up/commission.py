@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.exits import FAILED, INTERRUPTED
 from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig
@@ -23,6 +24,7 @@ from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 from fitctl.config.reading import read_parts
 from fitctl.config.simulated import places
 from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench
+from fitctl.processes import ENDING_SIGNALS, ended_by_signals
 
 _MARKS: dict[State, str] = {
     "passed": "passed",
@@ -95,12 +97,24 @@ def commission(
     if list_steps:
         _list(course, tasks)
         return
-    for text in skipped or []:
-        _skip(course, tasks, text)
-    _do_all(course, wanted, again=bool(only), yes=yes)
+    left_out = [task for text in skipped or [] for task in _skip(course, tasks, text)]
+    wanted = [task for task in wanted if task not in left_out]
+    try:
+        with ended_by_signals(_interrupt_once):
+            _do_all(course, wanted, again=bool(only), yes=yes)
+    except KeyboardInterrupt:
+        say("commission: interrupted; nothing is recorded of the step that was running", err=True)
+        raise typer.Exit(INTERRUPTED) from None
     _conclude(course, tasks, earlier, as_json=as_json)
     if not all(course.record.done(task.name) for task in wanted):
         raise typer.Exit(FAILED)
+
+
+def _interrupt_once() -> None:
+    """End the running step, whose motors then stand; a second signal must not end that."""
+    for number in ENDING_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def _by_hand(cable: Cable, on: bool) -> None:
@@ -158,13 +172,15 @@ def _known(tasks: list[Task], names: list[str]) -> list[str]:
     return names
 
 
-def _skip(course: Course, tasks: list[Task], text: str) -> None:
+def _skip(course: Course, tasks: list[Task], text: str) -> list[Task]:
     name, _, reason = text.partition("=")
     if not reason.strip():
         msg = f"commission: --skip {text}: expected STEP=REASON, such as star='cloudy'"
         raise ConfigError(msg)
-    for task in chosen(tasks, _known(tasks, [name])):
+    left_out = chosen(tasks, _known(tasks, [name]))
+    for task in left_out:
         skip(course, task, reason.strip())
+    return left_out
 
 
 def _do_all(course: Course, wanted: list[Task], *, again: bool, yes: bool) -> None:
