@@ -145,6 +145,8 @@ def _time_s(state: ConsoleState) -> float:
 
 def _wrong_now(state: ConsoleState) -> Iterator[Alarm]:
     if state.stale:
+        if not state.waits_for_supervisor:
+            return
         yield _no_data(state)
     for trouble in () if state.newest is None else troubles(state.newest):
         if trouble.severity != "note":

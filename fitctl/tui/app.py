@@ -41,6 +41,7 @@ from fitctl.tui.rewind.playback import BEFORE_S, Playback
 from fitctl.tui.rewind.recent import Recent
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.terminal import TerminalDriver
+from fitctl.tui.views.commissioning import CommissioningView
 from fitctl.tui.views.devices import DevicesView
 from fitctl.tui.views.help import HelpView
 from fitctl.tui.views.logs import LogsView
@@ -73,6 +74,9 @@ class ConsoleApp(App[None]):
         nothing that needs one may be run.
     remote_arguments : sequence of str
         And with which they reach its instrument, where that is on another machine.
+    commissioning : sequence of str, optional
+        With which `fitctl commission` does the steps of this rig; None where this console does not do them.
+        One that does has a supervisor only while a step runs one.
     log_folder : Path
         Where the rig's logs are; None when that is on another machine.
     start_job : callable
@@ -95,6 +99,7 @@ class ConsoleApp(App[None]):
         "sequences": SequencesView,
         "logs": LogsView,
         "help": HelpView,
+        "commissioning": CommissioningView,
     }
     DEFAULT_MODE = "operate"
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -119,6 +124,7 @@ class ConsoleApp(App[None]):
         clock: Callable[[], float] = time.monotonic,
         rig_arguments: Sequence[str] | None = (),
         remote_arguments: Sequence[str] = (),
+        commissioning: Sequence[str] | None = None,
         log_folder: Path | None = Path("logs"),
         start_job: Callable[..., Job] = Job,
         graphics: Graphics = Graphics.HALF_BLOCKS,
@@ -131,12 +137,14 @@ class ConsoleApp(App[None]):
         self.clock = clock
         self.rig_arguments = rig_arguments
         self.remote_arguments = list(remote_arguments)
+        self.commissioning = commissioning
+        self.step_job: Job | None = None
         self.log_folder = log_folder
         self.start_job = start_job
         self.pictures: PictureSender | None = None
         if graphics is not Graphics.HALF_BLOCKS:
             self.pictures = PictureSender(graphics, self._write_to_terminal)
-        self.state = ConsoleState(clock())
+        self.state = ConsoleState(clock(), waits_for_supervisor=commissioning is None)
         self.alarms = AlarmBook()
         self._recent = Recent(lambda: tuple(self.playback.live.events))
         self.playback = Playback(
@@ -171,6 +179,8 @@ class ConsoleApp(App[None]):
             self.playback.oldest()
         else:
             self._wire.start()
+        if self.commissioning is not None:
+            self.action_view("commissioning")
 
     def on_unmount(self) -> None:
         """Let go of everything."""
@@ -232,7 +242,12 @@ class ConsoleApp(App[None]):
     # ------------------------------------------------------------ commands
 
     def send(self, command: AnyCommand) -> None:
-        """Send a command for the shown loop; a stop goes to all loops. In the past only a stop is sent."""
+        """Send a command for the shown loop; a stop goes to all loops. In the past only a stop is sent.
+
+        A stop also ends a running step of the commissioning, whose motors have no supervisor at first.
+        """
+        if isinstance(command, Stop):
+            self.end_step()
         why_not = self.playback.why_not(command)
         if why_not:
             title = f"▲ {type(command).__name__} is not sent"
@@ -240,6 +255,14 @@ class ConsoleApp(App[None]):
             return
         loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
         self._wire.send(msgspec.structs.replace(command, loop=loop))
+
+    def end_step(self) -> None:
+        """End the running step of the commissioning."""
+        if self.step_job is not None and self.step_job.status is None:
+            self.step_job.interrupt()
+            self.notify(
+                "its motors stand, and lose their power", title="■ the step ends", timeout=5
+            )
 
     def _keep(self) -> None:
         """Keep the instrument; hear what was missed."""
@@ -271,6 +294,9 @@ class ConsoleApp(App[None]):
             self._recall(reply)
             return
         if reply is None:
+            if name == "Stop" and self.commissioning is not None and self.state.stale:
+                self.notify("no supervisor runs now", title="■ STOP", timeout=5)
+                return
             if name == "Stop":
                 problem += "\nThe instrument may still move. Press STOP again, or cut its power."
             self.notify(
@@ -409,11 +435,6 @@ class ConsoleApp(App[None]):
         words = self.view.to_rehearse() if self.view else ""
         self.push_screen(Ask("Rehearse", prompt, words, refused), rehearse)
 
-    def _show_commissioning(self) -> None:
-        """Show what the commissioning of the rig has done, by a process of its own."""
-        job = self.start_job(["commission", "--list", *(self.rig_arguments or ())])
-        self.push_screen(Running("Commissioning", job))
-
     def action_alarms(self) -> None:
         """Open the alarms in full."""
         self.push_screen(Alarms(self.state, self.alarms), self._show_alarm)
@@ -447,9 +468,6 @@ class ConsoleApp(App[None]):
             if key.action and key.label not in {"Palette", "Help"}:
                 run = partial(self._run, key.action)
                 yield SystemCommand(key.label, f"{key.help} ({key.shown})", run)
-        if self.rig_arguments is not None and not self.playback.log_name:
-            steps = "The steps of the rig's commissioning: done, failed, to do"
-            yield SystemCommand("Commissioning", steps, self._show_commissioning)
         yield SystemCommand(
             "Shut down the supervisor",
             "SAFE, OFF, then end the supervisor process",

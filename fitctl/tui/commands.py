@@ -31,6 +31,9 @@ VIEWS = (
     ViewName("4", "sequences", "Sequences", "list, edit, rehearse, run, stop"),
     ViewName("5", "logs", "Logs", "list, keep, verify, report, replay"),
     ViewName("6", "help", "Help", "every key, mode and sign"),
+    ViewName(
+        "7", "commissioning", "Commissioning", "its steps and results; run, repeat, skip them"
+    ),
 )
 
 
@@ -212,6 +215,11 @@ KEYS = (
     Key("f", "f", "Verify", "screen.tool('verify')", "verify that it is complete", "logs"),
     Key("t", "t", "Report", "screen.tool('report')", "make a report of it", "logs"),
     Key("y", "y", "Replay", "screen.tool('replay')", "run its frames through today's code", "logs"),
+    Key("up,down", "↑↓", "Choose", "", "choose a step", "commissioning"),
+    Key("g", "g", "Go on", "screen.go", "do the steps that are left to do", "commissioning"),
+    Key("d", "d", "Do", "screen.do", "do the chosen step, also again", "commissioning"),
+    Key("n", "n", "Skip", "screen.skip", "leave it out, with a reason", "commissioning"),
+    Key("z", "z", "End it", "screen.end", "end the running step", "commissioning"),
     Key(
         "slash", "/", "Find", "screen.filter", "show only rows with the words that you type", "help"
     ),

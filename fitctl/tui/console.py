@@ -24,6 +24,8 @@ class Console(Protocol):
     quit_shuts_down: bool
     rig_arguments: Sequence[str] | None
     remote_arguments: list[str]
+    commissioning: Sequence[str] | None
+    step_job: Job | None
     log_folder: Path | None
     start_job: Callable[..., Job]
     playback: Playback
@@ -33,6 +35,9 @@ class Console(Protocol):
 
     def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
         """Do something once the operator has said yes."""
+
+    def end_step(self) -> None:
+        """End the running step of the commissioning."""
 
     def draw_all(self) -> None:
         """Bring everything on the screen up to date now."""

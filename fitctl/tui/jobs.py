@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 
 END_WAIT_S = 3.0
 MOST_BYTES = 200_000
+_ASKS = ": "  # at the end of a question
 GENTLY = ("nice", "-n", "10")  # a rehearsal or a report takes no time from the instrument
 
 
@@ -22,19 +26,30 @@ class Job:
     arguments : sequence of str
     outlives : bool
         It goes on when the console is left; otherwise :meth:`end` ends it.
+    asks : bool
+        It moves the stages, asks before it does, and ends with the console; :meth:`answer` answers it.
     """
 
-    def __init__(self, arguments: Sequence[str], *, outlives: bool = False) -> None:
+    def __init__(
+        self, arguments: Sequence[str], *, outlives: bool = False, asks: bool = False
+    ) -> None:
         self.command_line = " ".join(["fitctl", *arguments])
-        self.outlives = outlives
+        self.outlives, self.asks = outlives, asks
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  # closed by end()
+        own = ["--console-pid", str(os.getpid())] if asks else []
         self._process = subprocess.Popen(
-            [*([] if outlives else GENTLY), sys.executable, "-m", "fitctl", *arguments],
-            stdin=subprocess.DEVNULL,
+            [*([] if self.moves else GENTLY), sys.executable, "-m", "fitctl", *arguments, *own],
+            stdin=subprocess.PIPE if asks else subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            bufsize=0,  # an answer that came too late is not kept for close()
         )
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves the stages."""
+        return self.outlives or self.asks
 
     @property
     def status(self) -> int | None:
@@ -47,13 +62,37 @@ class Job:
         self._output.seek(max(0, size - MOST_BYTES))
         return self._output.read().decode(errors="replace")
 
+    def question(self) -> str:
+        """What it has asked and waits for: a line that it has not ended. Empty without one."""
+        if not self.asks or self.status is not None:
+            return ""
+        line = self.text().rpartition("\n")[2]
+        return line if line.endswith(_ASKS) else ""
+
+    def answer(self, text: str) -> None:
+        """Answer its question; nothing if it has ended meanwhile."""
+        if self._process.stdin is not None:
+            with suppress(BrokenPipeError):
+                self._process.stdin.write(f"{text}\n".encode())
+
+    def interrupt(self) -> None:
+        """Have it stop what it moves and end, as Ctrl-C does on a terminal."""
+        if self.status is None:
+            self._process.send_signal(signal.SIGINT)
+
     def end(self) -> None:
-        """Ask it to end, and insist; nothing if it has, or if it outlives the console."""
+        """Ask it to end, and insist; nothing if it has, or if it outlives the console.
+
+        One that moves the stages takes the time that it needs to bring them to a stand.
+        """
         if self.status is None and not self.outlives:
             self._process.terminate()
             try:
                 self._process.wait(END_WAIT_S)
             except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+                if not self.asks:
+                    self._process.kill()
+                    self._process.wait()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
         self._output.close()

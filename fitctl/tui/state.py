@@ -209,9 +209,12 @@ class ConsoleState:
         `FRINGE_FIELDS` of each overlap.
     live : bool
         Whether it follows the supervisor; otherwise it is of the past.
+    waits_for_supervisor : bool
+        Whether silence is an alarm: it is not where most steps of a commissioning have no supervisor.
     """
 
-    def __init__(self, started_s: float) -> None:
+    def __init__(self, started_s: float, *, waits_for_supervisor: bool = True) -> None:
+        self.waits_for_supervisor = waits_for_supervisor
         self.newest: Telemetry | None = None
         self.received_s = started_s
         self.now_s = started_s

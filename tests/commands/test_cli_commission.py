@@ -63,6 +63,24 @@ def test_the_list_has_every_step_and_what_it_moves(commission, tmp_path):
     assert "each motor by 0.03 rad and back" in text
 
 
+def test_the_list_for_programs_has_what_each_step_needs_and_what_came_of_it(commission, two_steps):
+    commission("--yes", "--until", "one")
+    status, text = commission("--list", "--json")
+    assert status == 0
+    listed = json.loads(text)
+    one, two = listed["tasks"]
+    assert (one["name"], one["done"], one["entry"]["state"]) == ("right.one", True, "passed")
+    assert (two["done"], two["entry"], two["missing"]) == (False, None, [])
+    assert two["moves"] == "nothing"
+    assert "1 of 2 steps to do" in listed["verdict"]
+
+
+def test_a_console_needs_a_terminal(commission):
+    status, text = commission("--console")
+    assert status == 2
+    assert "needs a terminal" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

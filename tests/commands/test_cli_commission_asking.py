@@ -47,6 +47,7 @@ steps.STEPS["cable"] = steps.Step("cables", "star", nothing, (), 1.0, cable)
 main(["commission", *sys.argv[1:]])
 """
 ASKS = "Go? (yes, no, skip)"
+REAL = "loops.right.siderostat.device.channel=/dev/ttyACM0"
 _TIMEOUT_S = 30.0
 
 
@@ -194,3 +195,40 @@ def test_a_cable_is_taken_off_and_put_on_again_by_a_person(at_terminal, tmp_path
     assert terminal.end() == 0
     assert "it came back" in terminal.text
     assert tasks(tmp_path) == {"right.cable": "passed"}
+
+
+def test_a_console_answers_through_the_standard_input(tmp_path):
+    job = asking(tmp_path, "--until", "two", parent_pid=os.getpid())
+    text, _ = job.communicate(b"yes\nno\n", timeout=_TIMEOUT_S)
+    assert job.returncode == 1
+    assert b"Moves: the one motor." in text
+    assert f"{ASKS} [no]: yes\n".encode() in text
+    assert b"the next call goes on here" in text
+    assert tasks(tmp_path) == {"right.one": "passed"}
+
+
+def test_a_step_ends_with_its_console_and_real_devices_are_asked_about_there_too(tmp_path):
+    job = asking(tmp_path, "--only", "moving", "--set", REAL, parent_pid=os.getpid())
+    job.stdin.write(b"yes\n")
+    job.stdin.flush()
+    text = b""
+    while b"MOVING" not in text:
+        text += job.stdout.read1()
+    job.terminate()  # as fitctl.processes.end_with_parent does once the console has gone
+    text += job.stdout.read()
+    assert job.wait(_TIMEOUT_S) == 130
+    assert b"STANDS" in text
+
+
+def test_without_its_console_no_step_begins(tmp_path):
+    job = asking(tmp_path, parent_pid=1)  # this process is not
+    job.wait(_TIMEOUT_S)
+    assert b"DONE" not in job.stdout.read()
+    assert not (tmp_path / "fit-mock.commissioning.json").exists()
+
+
+def asking(folder, *arguments, parent_pid):
+    command = [sys.executable, "-c", STEPS, "--console-pid", str(parent_pid), *arguments]
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=folder
+    )

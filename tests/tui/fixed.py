@@ -64,19 +64,89 @@ SEQUENCES = [
 ]
 
 
+def step(name, title, moves, takes_s, entry=None, missing=()):
+    done = entry is not None and entry["state"] != "failed"
+    return {
+        "name": name,
+        "title": title,
+        "moves": moves,
+        "takes_s": takes_s,
+        "missing": list(missing),
+        "done": done,
+        "entry": entry,
+    }
+
+
+def ended(state, took_s, *lines, found=(), trouble="", tries=1):
+    return {
+        "state": state,
+        "at": "2026-11-23T17:00:35Z",
+        "took_s": took_s,
+        "lines": list(lines),
+        "figures": {},
+        "found": dict(found),
+        "trouble": trouble,
+        "tries": tries,
+    }
+
+
+TURNED = {"loops": {"right": {"siderostat": {"wiring": {"velocity_signs": [-1, 1]}}}}}
+STEPS = [
+    step("devices", "Every device answers", "nothing", 5.0, ended("passed", 2.1, "camera: here")),
+    step("camera", "Dark, noise and delay", "nothing", 8.0, ended("skipped", 0.0, trouble="day")),
+    step(
+        "right.amplifiers",
+        "Each motor turns on command, and its encoder counts it",
+        "each motor by 0.03 rad and back",
+        5.0,
+        ended("corrected", 4.9, "azimuth: counted -1.00 rad", found=TURNED, tries=2),
+    ),
+    step(
+        "right.stacks",
+        "Each D/A channel moves its stack",
+        "each stack by 0.3 V",
+        12.0,
+        ended("failed", 8.4, trouble="stack 2: check the cable"),
+    ),
+    step("right.star", "The star is on the camera", "both motors, up to 13 rad", 60.0),
+    step("right.mirror", "How the star moves", "each stack", 20.0, missing=["right.star"]),
+]
+COMMISSIONING = {
+    "rig": "fit-mock",
+    "verdict": "not commissioned: right.stacks failed",
+    "tasks": STEPS,
+}
+
+
 class FakeJob:
     """Answers at once what a command would print."""
 
     started: list["FakeJob"]
 
-    def __init__(self, arguments, *, outlives=False):
+    def __init__(self, arguments, *, outlives=False, asks=False):
         self.arguments = list(arguments)
         self.command_line = " ".join(["fitctl", *arguments])
-        self.outlives = outlives
-        self.status = 0
-        self.ended = False
+        self.outlives, self.asks = outlives, asks
+        self.moves = outlives or asks
+        self.status = None if asks else 0
+        self.printed = ""
+        self.answers = []
+        self.interrupted = self.ended = False
+
+    def question(self):
+        return self.printed.rpartition("\n")[2]
+
+    def answer(self, text):
+        self.answers.append(text)
+
+    def interrupt(self):
+        self.interrupted = True
 
     def text(self):
+        if self.asks:
+            return self.printed
+        if self.arguments[:2] == ["commission", "--list"]:
+            return json.dumps(COMMISSIONING)
         if self.arguments[0] == "design":
             return json.dumps(DESIGN)
         if self.arguments[:2] == ["sequence", "list"]:

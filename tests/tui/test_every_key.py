@@ -34,7 +34,7 @@ from tests.tui.fixed import FixedApp, make_logs
 
 SCREENS = [ConsoleApp.MODES[view.name] for view in VIEWS]
 BOUND = (ConsoleApp, Choice, *SCREENS, Reader, Alarms, Running, Confirm, Ask)
-OF_ITS_OWN_ACCORD = (["sequence", "list"], ["log", "summary"])
+OF_ITS_OWN_ACCORD = (["sequence", "list"], ["log", "summary"], ["commission", "--list"])
 LOG = "fit-mock_20261132T031500Z.mcap"
 STAR = {"hand": "aim", "cursor_px": (24.0, 19.5)}
 CLOSED = {"dialog": ""}
@@ -178,6 +178,8 @@ LISTS = [
             ("f", "4", {"dialog": "Ask"}),
         ],
     ),
+    # A console of a supervisor only shows the steps: tests/tui/test_commissioning.py does them.
+    *lines(ConsoleApp.MODES["commissioning"], [(key, "7", {}) for key in ("g", "d", "n", "z")]),
     *lines(
         ConsoleApp.MODES["logs"],
         [

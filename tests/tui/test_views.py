@@ -27,19 +27,6 @@ def test_every_screen_is_a_key_a_click_and_a_palette_entry_away():
     run(scenario)
 
 
-def test_the_palette_shows_what_the_commissioning_of_the_rig_has_done():
-    async def scenario(app, pilot):
-        commands = app.get_system_commands(app.screen)
-        next(command for command in commands if command.title == "Commissioning").callback()
-        await settle(app, pilot)
-        assert app.jobs[-1].arguments[:2] == ["commission", "--list"]
-        assert "last line" in str(app.screen.query_one("#text").render())
-        await pressed(app, pilot, "escape")
-        assert app.jobs[-1].ended
-
-    run(scenario)
-
-
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
 @pytest.mark.parametrize("key", ["s", "space", "ctrl+s"])
 def test_stop_is_one_key_on_every_screen(view, key):

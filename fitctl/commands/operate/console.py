@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,7 +14,7 @@ from fitctl.commands.operate.logged_loops import loops_at_start
 from fitctl.commands.operate.web import serve_console
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
-from fitctl.commands.shared.supervisor import address, connect
+from fitctl.commands.shared.supervisor import address, client_of, connect
 from fitctl.commands.shared.terminal import has_terminal
 from fitctl.config import ConfigError
 from fitctl.logging.errors import LogError
@@ -87,6 +88,37 @@ def console(
     _run(app)
 
 
+def commissioning_console(rig: Path, overrides: Sequence[str], options: Sequence[str]) -> None:
+    """A console that runs the steps of a commissioning; it waits for a supervisor only while a step has one.
+
+    Parameters
+    ----------
+    rig : Path
+    overrides : sequence of str
+        As of ``--set``.
+    options : sequence of str
+        Other options of ``fitctl commission``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no terminal.
+    """
+    if not has_terminal():
+        raise ConfigError(_NO_TERMINAL)
+    described = rig_of(rig, list(overrides))
+    client, arguments = client_of(described), rig_arguments(rig, overrides)
+    app = ConsoleApp(
+        client,
+        clock=client.now_s,
+        rig_arguments=arguments,
+        commissioning=[*arguments, *options],
+        log_folder=Path(described.logging.folder).expanduser(),
+        graphics=graphics_of(Graphics("auto"), os.environ),
+    )
+    _run(app, niceness=0)  # a step inherits it, and points the star
+
+
 def _show_log(log: Path, remote: Path | None, graphics: str, *, web: bool) -> None:
     """A console of what was; nothing is attached."""
     if web or remote is not None:
@@ -107,9 +139,9 @@ def _show_log(log: Path, remote: Path | None, graphics: str, *, web: bool) -> No
     _run(app)
 
 
-def _run(app: ConsoleApp) -> None:
+def _run(app: ConsoleApp, niceness: int = _NICENESS) -> None:
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     # Whatever points the star goes first. What the console starts gives way as well: a sequence, too, only
     # asks the supervisor for what that then does in its own time.
-    os.nice(_NICENESS)
+    os.nice(niceness)
     app.run()

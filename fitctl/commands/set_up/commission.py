@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,7 +25,7 @@ from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 from fitctl.config.reading import read_parts
 from fitctl.config.simulated import places
 from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench
-from fitctl.processes import ENDING_SIGNALS, ended_by_signals
+from fitctl.processes import ENDING_SIGNALS, end_with_parent, ended_by_signals
 
 _MARKS: dict[State, str] = {
     "passed": "passed",
@@ -66,6 +67,13 @@ def commission(
         Path | None,
         typer.Option(metavar="RECORD", help="Compare with the record of another commissioning."),
     ] = None,
+    on_console: Annotated[
+        bool, typer.Option("--console", help="On the screen Commissioning of a console.")
+    ] = False,
+    console_pid: Annotated[
+        int | None,
+        typer.Option(hidden=True, help="The console that answers on the standard input."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Commission a rig: prove it step by step, correct its rig file, and stop at the first trouble.
@@ -76,9 +84,18 @@ def commission(
     """
     path = named_rig(rig) or default_rig_path()
     settings = load_rig(path, overrides or ())
+    where = _folder(path, folder, reads_only=list_steps)
+    if on_console:
+        from fitctl.commands.operate.console import commissioning_console
+
+        short = ["--quick"] if quick else []
+        commissioning_console(path, overrides or (), ["--folder", str(where), *short])
+        return
+    real = [place.device for place in places(settings).values() if not place.simulated]
     if not list_steps:
-        _require_permission(settings, yes=yes)
-    files = Files(path, _folder(path, folder, reads_only=list_steps))
+        _require_permission(real, yes=yes, by_console=console_pid is not None)
+    end_with_parent(console_pid)
+    files = Files(path, where)
     course = Course(
         path,
         tuple(overrides or ()),
@@ -86,7 +103,7 @@ def commission(
         load(files.record, settings.name),
         _reporter(silent=as_json),
         quick,
-        partial(_by_bench, settings) if yes else _by_hand,
+        _by_hand if real or not (yes or console_pid) else partial(_by_bench, settings),
     )
     earlier = None if compare is None else load_any(compare)
     tasks = tasks_of(settings)
@@ -95,7 +112,7 @@ def commission(
         last = chosen(tasks, _known(tasks, [until]))[-1]
         wanted = [task for task in wanted if tasks.index(task) <= tasks.index(last)]
     if list_steps:
-        _list(course, tasks)
+        _list(course, tasks, as_json=as_json)
         return
     left_out = [task for text in skipped or [] for task in _skip(course, tasks, text)]
     wanted = [task for task in wanted if task not in left_out]
@@ -118,11 +135,19 @@ def _interrupt_once() -> None:
 
 
 def _by_hand(cable: Cable, on: bool) -> None:
-    typer.prompt(
+    _ask(
         f"{'Put' if on else 'Take off'} {cable.name}{' on again' if on else ''}, then press Enter",
         default="",
         show_default=False,
     )
+
+
+def _ask(question: str, **options: Any) -> str:
+    """An answer of a person; what a console answers is printed, as a terminal shows what is typed."""
+    answer: str = typer.prompt(question, **options)
+    if not sys.stdin.isatty():
+        say(answer)
+    return answer.strip()
 
 
 def _by_bench(rig: Rig, cable: Cable, on: bool) -> None:
@@ -141,12 +166,11 @@ def _by_bench(rig: Rig, cable: Cable, on: bool) -> None:
         raise StepError(now.error)
 
 
-def _require_permission(rig: Rig, *, yes: bool) -> None:
-    real = [place.device for place in places(rig).values() if not place.simulated]
+def _require_permission(real: list[str], *, yes: bool, by_console: bool) -> None:
     if yes and real:
         msg = f"commission: --yes is for mocks; these devices are real: {', '.join(real)}"
         raise ConfigError(msg)
-    if not yes and not has_terminal():
+    if not (yes or by_console or has_terminal()):
         msg = "commission: asks before each step, which needs a terminal; on mocks, give --yes"
         raise ConfigError(msg)
 
@@ -194,9 +218,9 @@ def _do_all(course: Course, wanted: list[Task], *, again: bool, yes: bool) -> No
         course.report(f"{task.name}: {task.step.title}. About {task.step.takes_s:g} s.")
         course.report(f"Moves: {task.step.moves(course.site(task, course.rig(task.name)))}.")
         if not yes:
-            answer = typer.prompt("Go? (yes, no, skip)", default="no").strip().lower()
+            answer = _ask("Go? (yes, no, skip)", default="no").lower()
             if answer in {"s", "skip"}:
-                skip(course, task, typer.prompt("Reason for the record"))
+                skip(course, task, _ask("Reason for the record"))
                 continue
             if answer not in {"y", "yes"}:
                 course.report("stopped; the next call goes on here")
@@ -217,8 +241,13 @@ def _seen_lines(entry: Entry) -> list[str]:
     return [*entry.lines, *found, *([entry.trouble] if entry.trouble else [])]
 
 
-def _list(course: Course, tasks: list[Task]) -> None:
+def _list(course: Course, tasks: list[Task], *, as_json: bool) -> None:
     rig = course.rig()
+    conclusion = verdict(course.record, [task.name for task in tasks])
+    if as_json:
+        listed = [_listed(course, task, rig) for task in tasks]
+        say(to_json({"rig": course.record.rig, "verdict": conclusion, "tasks": listed}))
+        return
     for task in tasks:
         entry = course.record.tasks.get(task.name)
         state = "to do" if entry is None else f"{_MARKS[entry.state]} {entry.at}"
@@ -226,7 +255,21 @@ def _list(course: Course, tasks: list[Task]) -> None:
         say(f"{'':<24} moves: {task.step.moves(course.site(task, rig))}")
         for line in () if entry is None else _seen_lines(entry):
             say(f"{'':<24} {line}")
-    say(f"{course.record.rig}: {verdict(course.record, [task.name for task in tasks])}")
+    say(f"{course.record.rig}: {conclusion}")
+
+
+def _listed(course: Course, task: Task, rig: Rig) -> dict[str, Any]:
+    """A task and what came of it, for programs."""
+    entry = course.record.tasks.get(task.name)
+    return {
+        "name": task.name,
+        "title": task.step.title,
+        "moves": task.step.moves(course.site(task, rig)),
+        "takes_s": task.step.takes_s,
+        "missing": course.missing(task),
+        "done": course.record.done(task.name),
+        "entry": entry,
+    }
 
 
 def _conclude(

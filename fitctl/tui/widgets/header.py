@@ -149,6 +149,8 @@ class Header(Panel):
 
     def _link(self) -> Line:
         state = self.state
+        if state.live and state.stale and not state.waits_for_supervisor:
+            return [text("no supervisor", DIM)]
         if state.newest is None:
             return [text(" ◌ connecting ", PAPER, on=SKY, bold=True)]
         if not state.live:
@@ -188,6 +190,8 @@ class Header(Panel):
     def _screens(self) -> Line:
         line: Line = []
         for key, name, label, _ in VIEWS:
+            if name == "commissioning" and self.state.waits_for_supervisor and name != self._view:
+                continue  # of no use at night
             if name == self._view:
                 piece = [text(f" {key} {label} ", PAPER, on=INK, bold=True)]
             else:

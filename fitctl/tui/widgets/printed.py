@@ -36,21 +36,24 @@ class Printed(Panel):
         if self.job is not None:
             self.job.end()
 
-    def start(self, start_job: Callable[..., Job], *arguments: str, outlives: bool = False) -> None:
-        """Run another fitctl command in place of the one before, unless that moves the stages still."""
+    def start(self, start_job: Callable[..., Job], *arguments: str, **options: bool) -> None:
+        """Run another fitctl command in place of the one before, unless that moves the stages still.
+
+        `options` are those of :class:`~fitctl.tui.jobs.Job`.
+        """
         moving = self.moving
         if moving is not None:
             self.notify(
                 f"still running: {moving.command_line}", severity="warning", timeout=4, markup=False
             )
         else:
-            self.show(start_job(arguments, outlives=outlives))
+            self.show(start_job(arguments, **options))
 
     @property
     def moving(self) -> Job | None:
         """The command, while it runs and moves the stages."""
         job = self.job
-        return job if job is not None and job.outlives and job.status is None else None
+        return job if job is not None and job.moves and job.status is None else None
 
     def show(self, job: Job) -> None:
         """Let a command take the place of the one before, which is ended."""
