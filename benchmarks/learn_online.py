@@ -34,6 +34,14 @@ from fitctl.simulation.statistics import true_residual_rms
 LOOP = "right"
 BEGIN_S, END_S = 120.0, 300.0
 FIT = ("loops.right.sensor=fit",)
+LIGHT = ("camera.electrons_per_dn=1.0",)
+SMEAR = ("plant.exposure_instants=5",)
+SIDEREAL = (
+    f"loops.{LOOP}.star_rate_sky_arcsec_s={{az=12.0,el=-9.0}}",
+    f"plant.loops.{LOOP}.star_rate_sky_arcsec_s={{az=12.0,el=-9.0}}",
+    f"loops.{LOOP}.siderostat.travel_sky_arcsec=6000.0",  # as far as the star moves
+    f"loops.{LOOP}.siderostat.device.position_limit_rad=0.0",
+)
 CONTROLLER = f"loops.{LOOP}.vernier.controller=minimum-variance"
 _SUMS = ("true_sum2", "residual_steps")
 AIR = f"plant.loops.{LOOP}.air_path"
@@ -92,6 +100,9 @@ SIX = lines(6.0, rms_px=0.05)
 NIGHTS = [
     Night("the paper's, centroid", "1.08"),
     Night("the paper's, fit", "1.05", FIT),
+    Night("1 electron a DN, smear, centroid", "1.08", LIGHT, SMEAR),
+    Night("1 electron a DN, smear, fit", "1.08", (*FIT, *LIGHT), SMEAR),
+    Night("a star at the sidereal rate", "as the paper's, centroid", SIDEREAL),
     Night(
         "30 % hysteresis", "1.08", (), (f"plant.loops.{LOOP}.hysteresis.loop_width_fraction=0.3",)
     ),
