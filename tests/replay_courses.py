@@ -262,6 +262,10 @@ MOVING = [
     "loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}",
     "plant.loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}",
 ]
+FAINTER = [
+    "plant.loops.right.spots=[{name='a', offset_px={az=0.0, el=0.0}, flux_dn=20000.0, diameter_px=3.0}]",
+    "loops.right.vernier.controller=minimum-variance",
+]
 COURSES = {
     "every command": (every_command, [], {"RELEASE", "STOP", "RECOVER", "OFF", "IN_REACH"}),
     "a star that moves": (every_command, MOVING, {"RELEASE", "STOP", "RECOVER", "IN_REACH"}),
@@ -278,6 +282,7 @@ COURSES = {
     "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
     "a learnt design": (a_learnt_design, [*SHAKEN, "loops.right.learn=on"], {"IN_REACH"}),
+    "a star of another light": (hold_a_star, FAINTER, {"IN_REACH"}),
     "a stall": (a_stall, [], {"IN_REACH"}),
     "the D/A's own watchdog": (a_mirror_that_the_watchdog_moves, [SOON], {"FAULT", "IN_REACH"}),
     "a star of a killed supervisor": (a_star_of_a_killed_supervisor, [], {"IN_REACH"}),

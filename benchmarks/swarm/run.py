@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -75,6 +76,7 @@ _START_S = 2.0
 _LAST_RECORDS_S = 5.0
 _SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
+_NOISE_STEP = 1.05
 _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
@@ -85,9 +87,15 @@ _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
 
 
 @functools.cache
-def _design_once(rig_file: str, settings: tuple[str, ...], name: str, controller: str) -> Design:
+def _design_once(
+    rig_file: str,
+    settings: tuple[str, ...],
+    name: str,
+    controller: str,
+    noise_px: float | None,
+) -> Design:
     """Designs are the same for every seed."""
-    return design_for(load_rig(RIGS / rig_file, settings), name, controller)
+    return design_for(load_rig(RIGS / rig_file, settings), name, controller, noise_px)
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -303,12 +311,16 @@ class Instrument:
         if wrong:
             self.invariants.violated("a record is written or counted", wrong)
 
-    def _design(self, _rig: Rig, name: str, controller: str) -> Design:
+    def _design(
+        self, _rig: Rig, name: str, controller: str, noise_px: float | None = None, /
+    ) -> Design:
         if self._designs_take_time:  # those of the start come before time goes on
             self.time.sleep(self._design_random.uniform(0.5, _MOST_DESIGN_S))
         plan = self._plan
         of_camera = tuple(text for text in plan.settings if text.startswith("camera."))
-        return _design_once(plan.rig, of_camera, name, controller)
+        if noise_px is not None:  # so many clouds would have too many designs made
+            noise_px = _NOISE_STEP ** round(math.log(noise_px, _NOISE_STEP))
+        return _design_once(plan.rig, of_camera, name, controller, noise_px)
 
     def _record(self, record: AnyRecord) -> None:
         self._digest.update(self._encode(record))

@@ -7,9 +7,9 @@ linear is here, once for all designs: the mirror's diamond, and the deadzone fee
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,9 +93,17 @@ class Design:
         return LEARNT if self.learnt else self.name
 
 
-Designer = Callable[[Rig, str, str], Design]
-"""Makes the design of a rig's loop by its controller's name or file, or by the parameters of a learnt design
-(:func:`fitctl.controllers.design.document.parameters_json`); empty for the one of the rig file."""
+class Designer(Protocol):
+    """Makes designs of a rig's loops."""
+
+    def __call__(
+        self, rig: Rig, loop_name: str, controller: str, noise_px: float | None = None, /
+    ) -> Design:
+        """By the controller's name or file, or by the parameters of a learnt design.
+
+        For the last there is :func:`fitctl.controllers.design.document.parameters_json`. An empty `controller`
+        is that of the rig file; `noise_px` is the sensor's noise, by default for the light of the rig file.
+        """
 
 
 class Measurement(NamedTuple):

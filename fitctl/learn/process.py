@@ -32,13 +32,15 @@ class LoopLearner:
         self._rig = rig
         self._learner = Learner(rig, loop_name)
         self._controller = ""
+        self._noise_px: float | None = None
         self._report: Future[LearnerReport] | None = None
 
     def hear(self, telemetry: Telemetry, state: LoopState) -> None:
         """One message."""
         learnt = "" if state.learning is None else state.learning.design_json
         self._controller = learnt or state.controller_file or state.controller
-        self._learner.watch(self._controller, telemetry.time_s)
+        self._noise_px = state.noise_px
+        self._learner.watch(f"{self._controller} {self._noise_px}", telemetry.time_s)
         for tick in telemetry.ticks:
             if tick.loop == self.loop_name:
                 self._learner.add(tick)
@@ -49,11 +51,11 @@ class LoopLearner:
         if self._report is not None and self._report.done():
             ready, self._report = self._report.result(), None
         if self._report is None and self._learner.due:
-            self._report = executor.submit(self._make, self._controller)
+            self._report = executor.submit(self._make, self._controller, self._noise_px)
         return ready
 
-    def _make(self, controller: str) -> LearnerReport:
-        return self._learner.report(design_for(self._rig, self.loop_name, controller))
+    def _make(self, controller: str, noise_px: float | None) -> LearnerReport:
+        return self._learner.report(design_for(self._rig, self.loop_name, controller, noise_px))
 
 
 def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:

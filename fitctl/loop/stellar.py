@@ -104,6 +104,7 @@ class StellarLoop(Loop):
         self._flattened = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
         self._has_held = False  # since the devices were opened
+        self.noise_px: float | None = None
         self._recalled: StarPlace | None = None
         self._is_recalled = False  # what the star finder expects, and no search has begun there yet
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
@@ -532,11 +533,14 @@ class StellarLoop(Loop):
         *,
         report: LearnerReport | None = None,
         by_itself: bool = False,
+        noise_px: float | None = None,
     ) -> None:
         """Work with another design from the next tick on; in VERNIER the mirror goes on where it is.
 
-        A learnt design comes with its report; `by_itself` is without an operator's command.
+        A learnt design comes with its report, one for another noise than the rig file's with that noise;
+        `by_itself` is without an operator's command.
         """
+        self.noise_px = noise_px
         self.learning.changed(
             self.pointing.design, design, report, self.pointing.recent, by_itself=by_itself
         )
@@ -617,6 +621,7 @@ class StellarLoop(Loop):
             else None,
             waits_for=self.waits_for,
             learning=self.learning.state,
+            noise_px=self.noise_px,
         )
 
     def begin(self, stack_v: Floats | None) -> None:

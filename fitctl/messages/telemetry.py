@@ -153,6 +153,8 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     commands under way, and of the last that ended. ``kind`` is the loop's in the rig file; a metrology loop's
     ``requirement_px`` is its requirement on the beam in the camera's pixels. ``waits_for`` is what the loop
     waits for while it holds its stages where they are, for people; empty while it waits for nothing.
+    ``noise_px`` is the sensor's noise for which the design was made anew, from the star's measured light; null
+    for a design for the light of the rig file.
     """
 
     name: str
@@ -176,6 +178,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     kind: Literal["stellar", "metrology"] = "stellar"
     waits_for: str = ""
     learning: LearningState | None = None
+    noise_px: float | None = None
 
 
 class CollectorState(msgspec.Struct, frozen=True, kw_only=True):

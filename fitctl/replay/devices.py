@@ -425,7 +425,7 @@ class LoggedExecutor(Executor):
                 servos[loop].fault = None
             self._openings.append(_Waiting(future, loops, lambda: self._found(loops)))
         elif fn is design_for:
-            _, loop, controller = args
+            _, loop, controller, *_ = args
             waiting = _Waiting(future, [loop], lambda: fn(*args))
             title = LEARNT if controller.startswith("{") else controller
             self._designs.append(((loop, title), waiting))

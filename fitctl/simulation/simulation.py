@@ -181,8 +181,9 @@ class Simulation:
     def _learn(self) -> None:
         """Have the learners report, in no time: what they need to compute is no part of the virtual clock's."""
         for name, learner in self.learners.items():
-            design = self.supervisor.stellar_loops[name].pointing.design
-            learner.watch(design.title, self.clock.now_s())
+            loop = self.supervisor.stellar_loops[name]
+            design = loop.pointing.design
+            learner.watch(f"{design.title} {loop.noise_px}", self.clock.now_s())
             if learner.due:
                 self.supervisor.post(learner.report(design), lambda _: None)
 

@@ -67,6 +67,7 @@ from fitctl.supervisor.loop_commands import LOOP_COMMANDS, obey_loop_command, wh
 from fitctl.supervisor.outcomes import Outcomes
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.sequence_board import SequenceBoard
+from fitctl.supervisor.starlight import Starlight
 from fitctl.supervisor.timing import TimingBook
 
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
@@ -161,6 +162,7 @@ class Supervisor:
         self._left: deque[AnyRecord] = deque()
         self._quantities: deque[QuantityReading] = deque()
         self._designs: deque[Job] = deque()
+        self._starlight = [Starlight(rig, loop, journal) for loop in self.stellar_loops.values()]
         self._reported_s = clock.now_s()
         self.piezos = {
             name: PiezoWatch(loop, piezo, executor, journal)
@@ -267,6 +269,7 @@ class Supervisor:
                 self._record(tick)
             self._timing.add(tick)
             self._make_safer(loop, was_safe=was_safe)
+        self._design_for_light()
         self.outcomes.observe(self.loops)
         if self.collector is not None:
             self.collector.check()
@@ -502,6 +505,17 @@ class Supervisor:
             why = error_text(error)
             self._journal.event("error", name, f"no design {controller}: {why}")
             ended(f"no design {controller}: {why}", failed=True)
+
+    def _design_for_light(self) -> None:
+        """Have designs made for the light of their stars, where that has become another."""
+        for light in self._starlight:
+            noise_px = light.observe()
+            if noise_px is not None:
+                name, loop = light.loop.name, light.loop
+                future = self._design_executor.submit(
+                    self._design, self.rig, name, loop.pointing.design.name, noise_px
+                )
+                self._designs.append(Job(future, partial(light.designed, noise_px)))
 
     # ------------------------------------------------------------ beside the ticks
 

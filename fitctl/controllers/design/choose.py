@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +30,12 @@ DESIGNS: dict[str, Callable[[Basis], Design]] = {
 }
 
 
-def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
+def design_for(
+    rig: Rig, loop_name: str, controller: str = "", noise_px: float | None = None
+) -> Design:
     """The design that a rig's loop asks for, or another by its name, its file (*.json, *.py) or its parameters.
+
+    With `noise_px`, a shipped design is for that noise of the sensor, not the rig file's.
 
     Raises
     ------
@@ -50,7 +54,7 @@ def design_for(rig: Rig, loop_name: str, controller: str = "") -> Design:
         design = _learnt(chosen, its_basis)
     elif chosen in DESIGNS:
         with solving(f"controller {chosen}", loop_name):
-            design = DESIGNS[chosen](its_basis)
+            design = DESIGNS[chosen](replace(its_basis, noise_px=noise_px or its_basis.noise_px))
     else:
         msg = (
             f"controller {chosen}: there are {', '.join(DESIGNS)}, files (*.json) that `fitctl design` "
@@ -86,7 +90,7 @@ def _learnt(document_json: str, its_basis: Basis) -> Design:
     if margins(design, its_basis, required).excess(required) > KEPT:
         msg = f"controller {LEARNT}: its margins are not those that a learnt design must keep; {advice}"
         raise ConfigError(msg)
-    return dataclasses.replace(design, learnt=True)
+    return replace(design, learnt=True)
 
 
 @contextmanager

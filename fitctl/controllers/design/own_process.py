@@ -22,7 +22,11 @@ _TIMEOUT_S = (
 
 
 def design_in_own_process(
-    rig: Rig, loop_name: str, controller: str = "", timeout_s: float = _TIMEOUT_S
+    rig: Rig,
+    loop_name: str,
+    controller: str = "",
+    noise_px: float | None = None,
+    timeout_s: float = _TIMEOUT_S,
 ) -> Design:
     """As :func:`fitctl.controllers.design.choose.design_for`, bit for bit, by another process.
 
@@ -33,7 +37,8 @@ def design_in_own_process(
     """
     chosen = controller or rig.stellar_loops[loop_name].vernier.controller
     remedy = f"fitctl design {chosen} --loop {loop_name} shows what it does"
-    request = json.dumps({"rig": rig.model_dump_json(), "loop": loop_name, "controller": chosen})
+    asked = {"loop": loop_name, "controller": chosen, "noise_px": noise_px}
+    request = json.dumps({"rig": rig.model_dump_json(), **asked})
     try:
         done = subprocess.run(
             [sys.executable, "-m", __name__],
@@ -68,8 +73,8 @@ def _main() -> int:
 
     request = json.load(sys.stdin)
     try:
-        rig = Rig.model_validate_json(request["rig"])
-        design = design_for(rig, request["loop"], request["controller"])
+        rig = Rig.model_validate_json(request.pop("rig"))
+        design = design_for(rig, request.pop("loop"), **request)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return _UNUSABLE

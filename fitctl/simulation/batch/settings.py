@@ -12,7 +12,7 @@ from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.config.plant import MOST_INSTANTS
 from fitctl.controllers.attribution import look_places_px
 from fitctl.controllers.beam_hold import BeamHold
-from fitctl.controllers.centroid import StarSensor
+from fitctl.controllers.centroid import StarSensor, sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.mirror import Mirror
@@ -55,9 +55,11 @@ from fitctl.simulation.statistics import SETTLE_S, TILT_EVERY, motion_start_s
 from fitctl.stages.injector import PERIOD_S
 from fitctl.stages.mirror import HISTORY_S as MIRROR_HISTORY_S
 from fitctl.stages.servo import FOLLOWING_S, HISTORY_S
+from fitctl.supervisor.starlight import MOST_RATIO, noise_ratio, uses_noise
 
 Floats = NDArray[np.float64]
 _NO_FIT = np.zeros((PLACES, PLACES, 3, SIDE_PX**2))
+_MOST_NOISE_RATIO = 0.98 * MOST_RATIO  # beyond it, a loop may design for the measured light
 _OWN_SIGMAS = 10.0  # a spot is never farther than this from where it should be beside the first
 
 
@@ -86,6 +88,10 @@ def star_settings(
     pointing = Pointing(rig, loop_name, target_px, design_for(rig, loop_name))
     pair = pointing.pair
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
+    noise_px = sensor_noise_px(rig.camera, loop, plant.spots[0].flux_dn)
+    if uses_noise(pointing.design) and noise_ratio(pointing.design, noise_px) > _MOST_NOISE_RATIO:
+        msg = f"the star of loop {loop_name} has another light, and the batch's designs stay as they are"
+        raise BatchRefusalError(msg)
     writes = math.ceil(MIRROR_HISTORY_S / min(camera.period_s, PERIOD_S))
     if writes > MOST_HISTORY:
         msg = f"its rates give {writes} writes to remember; the batch holds {MOST_HISTORY}"

@@ -22,6 +22,9 @@ NEEDS_RIG = (
 LEARNT_HERE = (
     "A learnt design has a sensitivity of at most 2, and margins of at least 6 dB and 35°."
 )
+FOR_THE_LIGHT = (
+    "Made for the star's measured light, {:.4f} px of noise: its margins are not known here."
+)
 FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known here."
 
 
@@ -66,6 +69,8 @@ class LoopScreen(View):
             return LEARNT_HERE
         if loop.controller_file and self.console.remote_arguments:
             return FILE_ELSEWHERE
+        if loop.noise_px is not None:
+            return FOR_THE_LIGHT.format(loop.noise_px)
         return NEEDS_RIG if self.console.rig_arguments is None else ""
 
     def on_unmount(self) -> None:
