@@ -69,6 +69,17 @@ def every_command(simulation):
     simulation.run(0.3)
 
 
+def a_rate_by_command(simulation):
+    rate = {"rate_az_sky_arcsec_s": 12.0, "rate_el_sky_arcsec_s": -9.0}
+    simulation.command(Standby())
+    simulation.run(0.5)
+    for _ in range(2):
+        assert simulation.command(Acquire(**rate)).accepted
+        until(simulation, Mode.VERNIER, limit_s=20.0)
+        simulation.run(1.0)
+        simulation.command(Release())
+
+
 def another_star(simulation):
     hold_a_star(simulation)
     az_px, el_px = simulation.plants["right"].spots_px(simulation.clock.now_s())[0][1].tolist()
@@ -269,6 +280,7 @@ FAINTER = [
 COURSES = {
     "every command": (every_command, [], {"RELEASE", "STOP", "RECOVER", "OFF", "IN_REACH"}),
     "a star that moves": (every_command, MOVING, {"RELEASE", "STOP", "RECOVER", "IN_REACH"}),
+    "the rate of a star by command": (a_rate_by_command, MOVING[1:], {"RELEASE", "IN_REACH"}),
     "experiments on a star that moves": (an_experiment, MOVING, {"EXPERIMENT", "EXPERIMENT_DONE"}),
     "another star": (another_star, [TWO_STARS], {"IN_REACH"}),
     "experiments": (an_experiment, [], {"EXPERIMENT", "EXPERIMENT_DONE", "STOP"}),

@@ -7,10 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, Rig
+from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, AxisPair, Rig
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.spiral import SpiralPlan, plan_spiral
 from fitctl.loop.attribution import Attribution
+from fitctl.loop.sky import sky_rad_s
 from fitctl.loop.spiral_search import SpiralSearch, Wanted, refused_area
 from fitctl.loop.star_finder import StarFinder
 from fitctl.messages.commands import Acquire
@@ -188,11 +189,34 @@ def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
     return ""
 
 
+def _too_fast(rig: Rig, loop_name: str, asked: Acquire) -> str:
+    """Why the siderostat could not follow a star of this rate, or nothing."""
+    rates = (asked.rate_az_sky_arcsec_s, asked.rate_el_sky_arcsec_s)
+    az, el = rates
+    if az is None and el is None:
+        return ""
+    if az is None or el is None:
+        return "rate_az_sky_arcsec_s and rate_el_sky_arcsec_s belong together"
+    loop = rig.stellar_loops[loop_name]
+    scale = scales(rig, loop)
+    motor_rad_s = np.abs(sky_rad_s(AxisPair.model_construct(az=az, el=el), scale)).max()
+    # Written so that what is no number is refused too.
+    if not motor_rad_s <= loop.siderostat.velocity_limit_rad_s:
+        most = loop.siderostat.velocity_limit_rad_s * scale.motor_sky_arcsec_per_rad
+        return (
+            f"the siderostat cannot follow a star at az {az:g}, el {el:g} arcsec/s; velocity_limit_rad_s of "
+            f"loops.{loop_name}.siderostat is {most:.0f} arcsec/s for a motor"
+        )
+    return ""
+
+
 def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
     """Why a search cannot be made as asked, or nothing."""
     overlap = asked.field_overlap
     if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
         return f"field_overlap must lie in {LEAST_OVERLAP:g} to {MOST_OVERLAP:g} (is {overlap:g})"
-    return _too_faint(rig, loop_name, asked.star_flux_dn) or refused_area(
-        rig.stellar_loops[loop_name], loop_name, asked
+    return (
+        _too_faint(rig, loop_name, asked.star_flux_dn)
+        or _too_fast(rig, loop_name, asked)
+        or refused_area(rig.stellar_loops[loop_name], loop_name, asked)
     )

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import AxisPair, Rig
 from fitctl.config import Loop as LoopSettings
-from fitctl.config import Rig
 from fitctl.controllers.centroid import OtherLight, Star
 from fitctl.controllers.design.document import design_json
 from fitctl.controllers.pair import Design, Designer
@@ -96,7 +96,8 @@ class StellarLoop(Loop):
         self.learning = Learning(rig, name)
         self._limits = stellar_limits(rig, name)
         if self.settings.star_rate_sky_arcsec_s is not None:
-            self.sky = Sky(self.settings, scale, rig.camera.period_s)
+            self.sky = Sky(scale, rig.camera.period_s)
+            self.sky.move_at(self.settings.star_rate_sky_arcsec_s)
         self._scale = scale
         self._period_s = rig.camera.period_s
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
@@ -371,7 +372,21 @@ class StellarLoop(Loop):
         flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
         self.star_finder.expect_flux(flux_dn)
         self.quantities.star_flux_dn = flux_dn
+        self._expect_rate(asked)
         self.search.configure(asked)
+
+    def _expect_rate(self, asked: Acquire) -> None:
+        """From now on the star moves as a command says, or as the rig file does."""
+        az, el = asked.rate_az_sky_arcsec_s, asked.rate_el_sky_arcsec_s
+        rate = self.settings.star_rate_sky_arcsec_s
+        if az is not None and el is not None:
+            rate = AxisPair(az=az, el=el)
+        if self.sky is None and rate is not None:
+            now_s = self._clock.now_s()
+            self.sky = Sky(self._scale, self._period_s, now_s)
+            self.sky.begin(now_s)
+        if self.sky is not None:
+            self.sky.move_at(rate)
 
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""

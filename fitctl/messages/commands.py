@@ -44,6 +44,8 @@ class Acquire(Command, frozen=True, kw_only=True):
         Where the star is, from where the encoders read zero; without it, on the target or where it was last.
     star_flux_dn : float, optional
         As the rig file's, until the next time that one is searched for by command.
+    rate_az_sky_arcsec_s, rate_el_sky_arcsec_s : float, optional
+        How fast the star moves with the stages at rest, likewise.
     """
 
     search_radius_sky_arcsec: float | None = None
@@ -51,6 +53,8 @@ class Acquire(Command, frozen=True, kw_only=True):
     expected_az_sky_arcsec: float | None = None
     expected_el_sky_arcsec: float | None = None
     star_flux_dn: float | None = None
+    rate_az_sky_arcsec_s: float | None = None
+    rate_el_sky_arcsec_s: float | None = None
 
 
 class Release(Command, frozen=True, kw_only=True):

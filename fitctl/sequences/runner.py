@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Literal
 
 import msgspec
@@ -15,7 +16,7 @@ from fitctl.sequences.behaviours.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours.stars import evaluate, star_results, steps_of
 from fitctl.sequences.behaviours.table import BEHAVIOURS, loops_of, problems
 from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
-from fitctl.sequences.steps import Collector, Standby, Stars, Step
+from fitctl.sequences.steps import Collector, Standby, Star, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 
 _RETRY_S = 1.0  # between attempts
@@ -85,7 +86,7 @@ class Runner:
         if isinstance(step, Collector) and step.action == "stop":
             self._moves_collector = False
         for loop_name in loop_names:
-            record = self._try(step, loop_name, number)
+            record = self._try(lambda: step, loop_name, number)
         if isinstance(step, Collector) and step.action == "start":
             self._moves_collector = True
         return record
@@ -94,11 +95,16 @@ class Runner:
         """Each star's steps, one star after the other; one that fails is skipped, if the step says so."""
         began_s, first = self._link.now_s(), len(self.attempts)
         # Devices that are not ready are no star's fault, and end the step.
-        self._try(Standby(loop=step.loop), loop_name, number)
+        self._try(lambda: Standby(loop=step.loop), loop_name, number)
+        placed_s = self._link.now_s()
+
+        def made(star: Star, which: int) -> Step:
+            return steps_of(step, star, self._link.now_s() - placed_s)[which]
+
         for star in step.stars or []:
             try:
-                for each in steps_of(step, star):
-                    self._try(each, loop_name, number, star.name)
+                for which in range(len(steps_of(step, star))):
+                    self._try(partial(made, star, which), loop_name, number, star.name)
             except SequenceError:
                 if step.on_failure == "fail":
                     raise
@@ -118,8 +124,13 @@ class Runner:
             message=star,
         )  # fmt: skip
 
-    def _try(self, step: Step, loop_name: str, number: int, star: str = "") -> SequenceAttempt:
-        for attempt in range(1, step.attempts + 1):
+    def _try(
+        self, make: Callable[[], Step], loop_name: str, number: int, star: str = ""
+    ) -> SequenceAttempt:
+        """A step, made anew for each attempt: a star of a list may have moved on."""
+        attempt, step = 0, make()
+        while attempt < step.attempts:
+            attempt, step = attempt + 1, make()
             self._report(step.step, loop_name, number, attempt, star)
             record = self._attempt(step, loop_name)
             if record.outcome == "done":

@@ -63,6 +63,14 @@ StarFluxDn = Annotated[
     ),
 ]
 
+RateSkyArcsecS = Annotated[
+    Finite | None,
+    Field(
+        description="rate of the star with the stages at rest, along the siderostat's axes; the siderostat "
+        "follows it; default: the rig file's"
+    ),
+]
+
 
 class Step(Settings):
     """The common part of all steps."""
@@ -84,8 +92,8 @@ class Standby(Step):
 class Acquire(Step):
     """Power up the devices, search for the star, pull it in and hold it. A loop that holds a star keeps it.
 
-    With an expected position or a flux, the loop stops tracking its star first. A metrology loop acquires its
-    beam. Without a loop, all loops acquire; the step waits first for those that hold a link.
+    With an expected position, a flux or a rate, the loop stops tracking its star first. A metrology loop
+    acquires its beam. Without a loop, all loops acquire; the step waits first for those that hold a link.
     """
 
     step: Literal["acquire"] = "acquire"
@@ -102,6 +110,8 @@ class Acquire(Step):
     expected_az_sky_arcsec: ExpectedSkyArcsec = None
     expected_el_sky_arcsec: ExpectedSkyArcsec = None
     star_flux_dn: StarFluxDn = None
+    rate_az_sky_arcsec_s: RateSkyArcsecS = None
+    rate_el_sky_arcsec_s: RateSkyArcsecS = None
     timeout_s: TimeoutS = 120.0
     attempts: Attempts = 2
 
@@ -117,13 +127,18 @@ class Hold(Step):
 
 
 class Star(Settings):
-    """A star of a list: where it is expected, from where the encoders read zero, and how bright."""
+    """A star of a list: where it is expected, from where the encoders read zero, how bright, and how fast.
+
+    One with a rate is at its place when the step begins, once the devices are on.
+    """
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
     az_sky_arcsec: Finite
     el_sky_arcsec: Finite
     duration_s: DurationS | None = None
     star_flux_dn: Positive | None = None
+    rate_az_sky_arcsec_s: Finite | None = None
+    rate_el_sky_arcsec_s: Finite | None = None
 
 
 class Stars(Step):
@@ -135,8 +150,8 @@ class Stars(Step):
         Field(
             min_length=1,
             max_length=1000,
-            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and optionally `duration_s` "
-            "and `star_flux_dn`",
+            description="each with `name`, `az_sky_arcsec`, `el_sky_arcsec` and optionally `duration_s`, "
+            "`star_flux_dn`, `rate_az_sky_arcsec_s` and `rate_el_sky_arcsec_s`",
         ),
     ] = None
     file: Annotated[

@@ -1,11 +1,13 @@
 """A star that moves at a known rate, on the virtual clock with the full plant."""
 
+import math
+
 import numpy as np
 import pytest
 from simulated import darken, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Experiment, Release
+from fitctl.messages.commands import Acquire, Experiment, Release, Standby
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import Drive
 from fitctl.simulation.simulation import Simulation, simulate
@@ -94,6 +96,56 @@ def test_the_siderostat_stands_in_standby_and_the_next_search_begins_where_the_s
 
     held.run(2.0)
     assert star_is_held(held)
+
+
+def asked_for(simulation, az=RATE_ARCSEC_S[0], el=RATE_ARCSEC_S[1]):
+    return simulation.command(Acquire(rate_az_sky_arcsec_s=az, rate_el_sky_arcsec_s=el))
+
+
+def test_a_command_gives_the_rate_of_a_star_which_holds_until_the_next_search_by_command():
+    simulation = Simulation(rig_with(TRUE), 1, star_offset_px=np.array([10.0, -6.0]))
+    simulation.command(Standby())
+    assert asked_for(simulation).accepted
+    until(simulation, Mode.VERNIER)
+    simulation.run(10.0)
+    assert star_is_held(simulation)
+
+    simulation.command(Release())
+    simulation.run(5.0)
+    assert asked_for(simulation).accepted
+    until(simulation, Mode.VERNIER, limit_s=10.0)
+    simulation.run(5.0)
+    assert star_is_held(simulation)
+
+    simulation.command(Release())
+    simulation.command(Acquire())
+    simulation.run(10.0)
+    assert not star_is_held(simulation)  # the rig file has no rate
+
+
+def test_a_rate_that_is_asked_for_stands_in_place_of_the_rig_files(held):
+    held.command(Release())
+    assert asked_for(held, 0.0, 0.0).accepted
+    held.run(10.0)
+
+    assert not star_is_held(held)
+
+
+@pytest.mark.parametrize(
+    ("rate", "why_not"),
+    [
+        ((12.0, None), "belong together"),
+        ((math.nan, 0.0), "cannot follow a star at az nan"),
+        ((1e6, 0.0), "cannot follow a star at az 1e+06, el 0 arcsec/s"),
+    ],
+)
+def test_a_rate_that_the_siderostat_cannot_follow_is_refused(held, rate, why_not):
+    held.command(Release())
+
+    reply = asked_for(held, *rate)
+
+    assert not reply.accepted
+    assert why_not in reply.text
 
 
 def test_a_star_that_is_dark_for_a_while_is_found_where_it_has_gone(held):

@@ -17,6 +17,18 @@ from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import Behaviour, Result, stop_tracking
 from fitctl.sequences.view import Figures, View
 
+_OF_STARS = (
+    "star_flux_dn",
+    "field_overlap",
+    "rate_az_sky_arcsec_s",
+    "rate_el_sky_arcsec_s",
+)
+_OF_ANOTHER = (
+    "expected_az_sky_arcsec",
+    "star_flux_dn",
+    "rate_az_sky_arcsec_s",
+    "rate_el_sky_arcsec_s",
+)
 _FOUND = ("found_az_sky_arcsec", "found_el_sky_arcsec", "found_flux_dn")
 
 
@@ -34,6 +46,8 @@ def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Ac
         expected_az_sky_arcsec=step.expected_az_sky_arcsec,
         expected_el_sky_arcsec=step.expected_el_sky_arcsec,
         star_flux_dn=step.star_flux_dn,
+        rate_az_sky_arcsec_s=step.rate_az_sky_arcsec_s,
+        rate_el_sky_arcsec_s=step.rate_el_sky_arcsec_s,
     )
 
 
@@ -47,9 +61,10 @@ def _check(step: steps.Acquire, rig: Rig, loop_name: str) -> list[str]:
         ]
     if loop_name not in rig.metrology_loops:
         why_not = refused_search(rig, loop_name, widest)
-    elif step.star_flux_dn is not None or step.field_overlap is not None:
+    elif any(getattr(step, name) is not None for name in _OF_STARS):
         why_not = (
-            f"star_flux_dn and field_overlap are of a star; {loop_name} holds a metrology beam"
+            "star_flux_dn and field_overlap are of a star, as a rate is; "
+            f"{loop_name} holds a metrology beam"
         )
     else:
         why_not = refused_area(rig.metrology_loops[loop_name], loop_name, widest)
@@ -70,8 +85,7 @@ def _own_s(step: steps.Acquire, rig: Rig, loop_name: str) -> float:
 
 
 def _run(step: steps.Acquire, view: View) -> None:
-    another = step.expected_az_sky_arcsec is not None or step.star_flux_dn is not None
-    if another and view.tracking:
+    if view.tracking and any(getattr(step, name) is not None for name in _OF_ANOTHER):
         view.command(Release(loop=view.loop_name))  # another star, or the same anew
     if view.mode is Mode.OFF:
         view.command(Standby(loop=step.loop))

@@ -23,14 +23,18 @@ class StarResult(NamedTuple):
     why_not: str
 
 
-def steps_of(step: steps.Stars, star: steps.Star) -> list[steps.Step]:
-    """What is done with one star."""
+def steps_of(step: steps.Stars, star: steps.Star, moved_s: float = 0.0) -> list[steps.Step]:
+    """What is done with one star, which has moved for so long from its place in the list."""
     limits: dict[str, Any] = {"loop": step.loop, "timeout_s": step.timeout_s}
     return [
         steps.Acquire(
-            expected_az_sky_arcsec=star.az_sky_arcsec,
-            expected_el_sky_arcsec=star.el_sky_arcsec,
+            expected_az_sky_arcsec=star.az_sky_arcsec
+            + (star.rate_az_sky_arcsec_s or 0.0) * moved_s,
+            expected_el_sky_arcsec=star.el_sky_arcsec
+            + (star.rate_el_sky_arcsec_s or 0.0) * moved_s,
             star_flux_dn=star.star_flux_dn,
+            rate_az_sky_arcsec_s=star.rate_az_sky_arcsec_s,
+            rate_el_sky_arcsec_s=star.rate_el_sky_arcsec_s,
             search_radius_sky_arcsec=step.search_radius_sky_arcsec,
             radius_growth=step.radius_growth,
             max_offset_sky_arcsec=step.max_offset_sky_arcsec,

@@ -134,7 +134,7 @@ def star_settings(
             "star_moves": constants.star_rate_px_s.any(),
             "star_rate_px_s": constants.star_rate_px_s,
             "star_is_followed": loop.star_rate_sky_arcsec_s is not None,
-            "sky_rad_s": sky_rad_s(loop, scale),
+            "sky_rad_s": sky_rad_s(loop.star_rate_sky_arcsec_s, scale),
             "sky_px_per_rad": constants.sky_px_per_rad,
             "plays": len(constants.play_half_v),
             "play_half_v": _padded(constants.play_half_v, MOST_PLAYS),

@@ -8,9 +8,9 @@ import pytest
 from fitctl import Instrument
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.model.optics import scales
-from fitctl.sequences.behaviours.stars import star_results
+from fitctl.sequences.behaviours.stars import star_results, steps_of
 from fitctl.sequences.reading import load_sequence, read_stars
-from fitctl.sequences.steps import Star
+from fitctl.sequences.steps import Star, Stars
 from fitctl.sequences.view import SequenceError
 from fitctl.supervisor.device_jobs import Job
 
@@ -64,6 +64,47 @@ def test_a_star_is_taken_for_the_one_that_is_meant_by_its_own_flux():
     assert results["beta"].figures["found_flux_dn"] == pytest.approx(28000.0, rel=0.1)
     for name in ("not so bright", "not so faint"):
         assert "no star within 60 arcsec" in results[name].why_not
+
+
+MOVING_SKY = load_rig(
+    default_rig_path().parent / "star-field.toml",
+    [
+        "supervisor.telemetry_hz=10.0",
+        "plant.loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}",
+        "loops.right.siderostat.travel_sky_arcsec=3000.0",
+        "loops.right.siderostat.device.position_limit_rad=0.0",
+    ],
+)
+
+
+def test_each_star_is_followed_at_its_own_rate_from_where_it_was_as_the_list_began():
+    rate = {"rate_az_sky_arcsec_s": 12.0, "rate_el_sky_arcsec_s": -9.0}
+    with Instrument(MOVING_SKY, simulate=True, seed=3) as instrument:
+        instrument.standby()
+        instrument.stars(
+            [ALPHA | rate, MISSING | rate, BETA | rate, ALPHA | {"name": "at rest"}], **QUICK
+        )
+        results = {result.name: result for result in star_results(instrument.attempts)}
+        passed_s = instrument._link._simulation.clock.now_s()
+
+    assert (
+        15.0 * passed_s > 3 * QUICK["search_radius_sky_arcsec"]
+    )  # it is nowhere near its first place
+    for name in ("alpha", "beta"):
+        assert results[name].why_not == ""
+        assert max(results[name].figures[f"rms_{axis}_px"] for axis in ("az", "el")) < 0.05
+    assert results["nobody"].why_not
+    assert results["at rest"].why_not
+
+
+def test_each_attempt_searches_where_the_star_has_moved_to():
+    star = Star(**BETA, rate_az_sky_arcsec_s=12.0, rate_el_sky_arcsec_s=-9.0)
+
+    acquire, _ = steps_of(Stars(stars=[star]), star, 10.0)
+
+    place = acquire.expected_az_sky_arcsec, acquire.expected_el_sky_arcsec
+    assert place == pytest.approx((720.0, 60.0))
+    assert (acquire.rate_az_sky_arcsec_s, acquire.rate_el_sky_arcsec_s) == (12.0, -9.0)
 
 
 def test_a_list_may_end_with_its_first_failure():
