@@ -73,6 +73,7 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
                 pairs.update(met(plan))
                 if result.violations:
                     found.append(_finding(plan, result))
+                    print(f"\n{json.dumps(found[-1])}", file=sys.stderr, flush=True)
             _progress(simulated_s / 3600, hours, len(found), started_s)
         pool.shutdown(cancel_futures=True)
     took_s = time.monotonic() - started_s
@@ -124,7 +125,7 @@ def _progress(done_h: float, hours: float, found: int, started_s: float) -> None
     line = f"[{bar}] {done_h:8.2f} of {hours:g} h, {found} violated, {time.monotonic() - started_s:.0f} s"
     if sys.stderr.isatty():
         print(f"\r{line}", end="" if part < 1 else "\n", file=sys.stderr, flush=True)
-    elif part >= 1 or found:
+    elif part >= 1:
         print(line, file=sys.stderr, flush=True)
 
 

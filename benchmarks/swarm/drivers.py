@@ -22,13 +22,17 @@ import numpy as np
 from benchmarks.swarm.wires import KINDS, Trouble, Wire, WireTime, virtual
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
+from fitctl.drivers.c887.driver import C887Hexapod
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
-from fitctl.drivers.interface import DeviceError, ServoReading
+from fitctl.drivers.interface import DeviceError, Pose, ServoReading
 from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.drivers.mdt693.driver import Mdt693
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 from fitctl.mocks.bal_analog.station import BalAnalogMockStation
+from fitctl.mocks.c887.controller import Controller as C887Controller
+from fitctl.mocks.c887.platform import Platform
+from fitctl.mocks.c887.server import CommandSplitter
 from fitctl.mocks.cia402.drive import Cia402DriveMock
 from fitctl.mocks.cia402.slcan import CanFrame, decode_frame
 from fitctl.mocks.ensemble.controller import CYCLE_S, EnsembleControllerMock, LineSplitter
@@ -47,6 +51,7 @@ _MDT693_S = 0.02  # from a command to its answer
 _SPEED_RAD_S = 3.0
 _V_PER_S, _AROUND_S = 0.2, 40.0  # slope and period of photodiode voltages that encode the time
 _UNSURE_S = 0.015  # uncertainty of that time
+_NEAR_MM = 1e-4  # and degrees
 _PAUSES_S = (0.0, 0.002, 0.02, 0.3)
 
 
@@ -480,6 +485,82 @@ class LabJackBench(Bench):
             raise Mistaken(msg)
 
 
+class HexapodBench(Bench):
+    """The collector's hexapod on RS-232."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        rig = _rig("fit-testbed.toml", "mocks.hexapod.referenced=true")
+        device: Any = rig.collector.hexapod  # type: ignore[union-attr]
+        settings: Any = rig.mock_parts()[1].hexapod
+        super().__init__(
+            time,
+            troubles,
+            has_numbers=False,
+            is_serial=True,
+            most_late_s=1.9 * device.response_timeout_s,
+        )
+        self._settings = settings
+        self._platform = Platform(settings, time.time)
+        self._start()
+        self._moves = 0
+        self._most_mm_s = device.velocity_limit_mm_s
+        self.driver = C887Hexapod(device)
+        self.calls = [self._pose, self._pose, self._pose, self._move, self._stop, self._reference]
+        self.most_s = 30 * device.response_timeout_s + device.reference_timeout_s
+
+    def _start(self) -> None:
+        self._controller = C887Controller(self._settings, self._platform)
+        self._commands = CommandSplitter()
+        self._answered_s = 0.0
+
+    def hear(self, data: bytes) -> None:
+        """Pass commands to the device, which answers in their order."""
+        for command in self._commands.feed(data):
+            answer = self._controller.answer(command)
+            if answer is not None:
+                at_s = max(self._answered_s, self.time.now_s) + self._settings.reply_s
+                self._answered_s = at_s
+                self.time.call_at(at_s, self.wire.answer, answer)
+
+    def reboot(self) -> None:
+        """Restart where it stands, without a reference."""
+        self._platform.power_up()
+        self._start()
+
+    def _pose(self) -> None:
+        begin_s = self.time.now_s
+        reading = self.driver.pose()
+        if not reading.referenced:  # the platform cannot say where it is
+            return
+        times_s = np.linspace(begin_s, self.time.now_s, 50)
+        near = np.array([self._platform.true_pose_at(time_s) for time_s in times_s])
+        low, high = near.min(axis=0) - _NEAR_MM, near.max(axis=0) + _NEAR_MM
+        if not np.all((low <= reading.pose) & (reading.pose <= high)):
+            msg = f"platform read at {reading.pose}, was within {low} and {high}"
+            raise Mistaken(msg)
+
+    def _move(self) -> None:
+        self._moves += 1
+        pose = Pose(0.01 * (self._moves % 90), -0.01 * (self._moves % 70), 0.0, 0.0, 0.0, 0.0)
+        self.driver.move_to(pose, self._most_mm_s * (0.5 + 0.5 * (self._moves % 2)))
+        target = self._platform.target()
+        if not np.allclose(list(target.values()), pose, atol=_NEAR_MM):
+            msg = f"platform sent to {pose}, goes to {target}"
+            raise Mistaken(msg)
+
+    def _stop(self) -> None:
+        self.driver.stop()
+        if any(self._platform.moving().values()):
+            msg = "platform stopped, moves"
+            raise Mistaken(msg)
+
+    def _reference(self) -> None:
+        self.driver.reference()
+        if not self._platform.referenced:
+            msg = "platform referenced, is not"
+            raise Mistaken(msg)
+
+
 BENCHES: dict[str, Callable[[WireTime, Iterator[Trouble | None]], Bench]] = {
     "D/A over Modbus/TCP": DacBench,
     "D/A over Modbus RTU": RtuBench,
@@ -488,6 +569,7 @@ BENCHES: dict[str, Callable[[WireTime, Iterator[Trouble | None]], Bench]] = {
     "Ensemble": EnsembleBench,
     "CiA 402": Cia402Bench,
     "LabJack T7": LabJackBench,
+    "C-887": HexapodBench,
 }
 """By name of the driver."""
 

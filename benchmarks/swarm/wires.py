@@ -31,6 +31,8 @@ _TIMED = (
     "fitctl.drivers.ensemble.link",
     "fitctl.drivers.bal_analog.driver",
     "fitctl.drivers.labjack_t7.driver",
+    "fitctl.drivers.c887.driver",
+    "fitctl.drivers.c887.link",
     "fitctl.mocks.labjack_t7.server",
     "fitctl.drivers.cia402.bus",
     "fitctl.drivers.cia402.driver",
@@ -251,6 +253,10 @@ class Port:
         """Send."""
         self._check()
         self._wire.send(bytes(data))
+
+    def reset_input_buffer(self) -> None:
+        """Forget what has arrived."""
+        self._wire.arrived.clear()
 
     def close(self) -> None:
         """Let go."""

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from benchmarks.swarm.drivers import BENCHES, Mistaken, drawn_run, run_wire
 from benchmarks.swarm.wires import KINDS, Trouble
+from fitctl.drivers.c887.link import C887Link
 from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.drivers.modbus_dac import link as dac_link
 from fitctl.drivers.modbus_dac.driver import ModbusDac
@@ -69,6 +70,22 @@ def oldest_request(self, _answer):
     return self._outstanding.popleft() if self._outstanding else None
 
 
+class Unread:
+    """A port that never shows what has arrived."""
+
+    def __init__(self, port):
+        self._port = port
+        self.in_waiting = 0
+
+    def __getattr__(self, name):
+        return getattr(self._port, name)
+
+
+def unread(self):
+    """What arrived late is not noticed before the next question."""
+    self._port = Unread(self._port)
+
+
 POP, SEND, NUMBER = dac_link.pop_answer, dac_link.TcpLink.send, [0]
 MISTAKES = {
     "D/A over Modbus/TCP": [
@@ -79,6 +96,7 @@ MISTAKES = {
         (ModbusDac, "confirm", lambda self: setattr(self, "_unconfirmed", None))
     ],
     "LabJack T7": [(LabJackT7, "_request_of", oldest_request)],
+    "C-887": [(C887Link, "resynchronise", unread)],
 }
 
 
