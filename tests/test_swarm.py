@@ -83,7 +83,7 @@ def test_a_plan_is_shrunk_to_what_violates():
 
 
 def test_a_plan_has_commands_and_faults_in_their_order():
-    plan = plan_of(5)
+    plan = plan_of(6)
 
     times_s = [happening.at_s for happening in plan.happenings]
     assert times_s == sorted(times_s)
