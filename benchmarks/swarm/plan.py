@@ -73,10 +73,18 @@ _REPEATED, _REPEATED_S = 0.1, 0.02  # fraction of commands repeated, and mean de
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True, tag="order"):
+class _Happening(msgspec.Struct, frozen=True, kw_only=True):
+    at_s: float
+
+    @property
+    def kind(self) -> str:
+        """The name used in the statistics."""
+        return str(self.__struct_config__.tag)
+
+
+class Order(_Happening, frozen=True, kw_only=True, tag="order"):
     """An operator sends a command; ``None`` is whichever one brings the first loop closer to its star."""
 
-    at_s: float
     who: str
     command: AnyCommand | None = None
 
@@ -86,10 +94,9 @@ class Order(msgspec.Struct, frozen=True, kw_only=True, tag="order"):
         return "onwards" if self.command is None else type(self.command).__name__
 
 
-class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
+class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
     """A fault of one device, and how long it lasts; a reset or a power cut has no duration."""
 
-    at_s: float
     device: str
     fault: str
     lasts_s: float = 0.0
@@ -101,89 +108,46 @@ class Strike(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
         return f"{self.device.rpartition(' ')[2]} {self.fault}"
 
 
-class Stall(msgspec.Struct, frozen=True, kw_only=True, tag="stall"):
+class Stall(_Happening, frozen=True, kw_only=True, tag="stall"):
     """The whole machine stalls for a time."""
 
-    at_s: float
     lasts_s: float
 
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "stall"
 
-
-class Kill(msgspec.Struct, frozen=True, kw_only=True, tag="kill"):
+class Kill(_Happening, frozen=True, kw_only=True, tag="kill"):
     """The supervisor's process is killed, and a new one starts ``back_after_s`` later."""
 
-    at_s: float
     back_after_s: float
 
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "kill"
 
-
-class Cloud(msgspec.Struct, frozen=True, kw_only=True, tag="cloud"):
+class Cloud(_Happening, frozen=True, kw_only=True, tag="cloud"):
     """All stars dim to ``part`` of their light for a time."""
 
-    at_s: float
     lasts_s: float
     part: float
 
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "cloud"
 
-
-class RecorderDeath(msgspec.Struct, frozen=True, kw_only=True, tag="recorder"):
+class RecorderDeath(_Happening, frozen=True, kw_only=True, tag="recorder death"):
     """The recorder is killed; the supervisor starts a new one."""
 
-    at_s: float
 
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "recorder death"
-
-
-class FullDisk(msgspec.Struct, frozen=True, kw_only=True, tag="disk"):
+class FullDisk(_Happening, frozen=True, kw_only=True, tag="full disk"):
     """The log's disk is full for a time."""
 
-    at_s: float
     lasts_s: float
 
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "full disk"
 
-
-class ClockStep(msgspec.Struct, frozen=True, kw_only=True, tag="clock"):
+class ClockStep(_Happening, frozen=True, kw_only=True, tag="clock step"):
     """The computer's wall clock is set forward or back."""
 
-    at_s: float
     by_s: float
 
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "clock step"
 
-
-class Sequence(msgspec.Struct, frozen=True, kw_only=True, tag="sequence"):
+class Sequence(_Happening, frozen=True, kw_only=True, tag="sequence"):
     """An operator starts a sequence of steps from `benchmarks.swarm.clients.STEPS`."""
 
-    at_s: float
     who: str
     steps: list[str]
-
-    @property
-    def kind(self) -> str:
-        """The name used in the statistics."""
-        return "sequence"
 
 
 Happening = Order | Strike | Stall | Kill | Cloud | RecorderDeath | FullDisk | ClockStep | Sequence
