@@ -34,7 +34,7 @@ from fitctl.mocks.c887.controller import Controller as C887Controller
 from fitctl.mocks.c887.platform import Platform
 from fitctl.mocks.c887.server import CommandSplitter
 from fitctl.mocks.cia402.drive import Cia402DriveMock
-from fitctl.mocks.cia402.slcan import CanFrame, decode_frame
+from fitctl.mocks.cia402.slcan import OK, CanFrame, decode_frame
 from fitctl.mocks.ensemble.controller import CYCLE_S, EnsembleControllerMock, LineSplitter
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.amplifier import Amplifier
@@ -421,7 +421,7 @@ class Cia402Bench(AmplifierBench):
             can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
         )
 
-    def hear(self, data: can.Message) -> None:
+    def hear(self, data: Any) -> None:
         """Pass one frame to the device."""
         self._received(CanFrame(data.arbitration_id, bytes(data.data)))
 
@@ -429,6 +429,38 @@ class Cia402Bench(AmplifierBench):
         """Restart without power, as at power-up."""
         self._mock._power_off()
         self._mock._reset_communication()
+
+
+class SlcanBench(Cia402Bench):
+    """A CANopen drive behind an SLCAN adapter: the wire is the adapter's own connection."""
+
+    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
+        self._unfinished = b""
+        self._answers: bytes | None = None
+        super().__init__(time, troubles)
+
+    def settings(self) -> Sequence[str]:
+        """As the rig file has it."""
+        return ()
+
+    def send_line(self, line: bytes) -> None:
+        """A frame of the drive, with the answers of the segment that it comes in."""
+        if self._answers is None:
+            self.wire.answer(line)
+        else:
+            self._answers += line
+
+    def hear(self, data: Any) -> None:
+        """Pass frames on, and answer each line."""
+        *lines, self._unfinished = (self._unfinished + data).split(OK)
+        self._answers = b""
+        for line in lines:
+            self._answers += OK
+            if line[:1] == b"t":
+                frame = decode_frame(line)
+                self._received(frame)
+        answers, self._answers = self._answers, None
+        self.wire.answer(answers)
 
 
 class LabJackBench(Bench):
@@ -568,6 +600,7 @@ BENCHES: dict[str, Callable[[WireTime, Iterator[Trouble | None]], Bench]] = {
     "analogue amplifiers": BalAnalogBench,
     "Ensemble": EnsembleBench,
     "CiA 402": Cia402Bench,
+    "CiA 402 over SLCAN": SlcanBench,
     "LabJack T7": LabJackBench,
     "C-887": HexapodBench,
 }

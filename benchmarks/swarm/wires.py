@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 from typing import Any, NamedTuple
-from unittest.mock import patch
+from unittest.mock import MagicMock, patch
 
 import can
 
@@ -228,6 +228,7 @@ class Port:
 
     def __init__(self, wire: Wire, timeout_s: float) -> None:
         self.timeout = timeout_s
+        self.write_timeout = timeout_s
         self.is_open = True
         self._wire = wire
         wire.connect()
@@ -257,6 +258,13 @@ class Port:
     def reset_input_buffer(self) -> None:
         """Forget what has arrived."""
         self._wire.arrived.clear()
+
+    def flush(self) -> None:
+        """What is written is sent."""
+
+    def fileno(self) -> int:
+        """No descriptor of this process."""
+        return -1
 
     def close(self) -> None:
         """Let go."""
@@ -364,6 +372,15 @@ def virtual(time: WireTime, wire: Wire) -> Iterator[None]:
         socket=Socket,
         **{name: getattr(real_socket, name) for name in dir(real_socket) if name.isupper()},
     )
+    adapter = {  # what an SLCAN bus reads its port by
+        "select": SimpleNamespace(
+            select=lambda ports, _writers, _errors, left_s: (
+                [one for one in ports if wire.wait(left_s)],
+            )
+        ),
+        "os": SimpleNamespace(read=lambda _descriptor, most: wire.take(most)),
+        "socket": MagicMock(),
+    }
     with ExitStack() as stack:
         for module in _TIMED:
             stack.enter_context(patch(f"{module}.time", time))
@@ -376,6 +393,8 @@ def virtual(time: WireTime, wire: Wire) -> Iterator[None]:
         stack.enter_context(
             patch("fitctl.drivers.cia402.link.can.Bus", lambda **_options: Bus(wire))
         )
+        for name, stand_in in adapter.items():
+            stack.enter_context(patch(f"fitctl.drivers.cia402.link.{name}", stand_in))
         before = asyncio._get_running_loop()
         asyncio._set_running_loop(time)  # type: ignore[arg-type]
         try:
