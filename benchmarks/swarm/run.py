@@ -14,6 +14,7 @@ from typing import Any
 from unittest.mock import patch
 
 import msgspec
+import numpy as np
 
 from benchmarks.swarm.clients import SENDERS, Console, Link, RunningSequence, Service
 from benchmarks.swarm.devices import (
@@ -371,10 +372,8 @@ class Instrument:
 
         A star is expected on the other side of where the siderostat goes for it.
         """
-        sky_rad_per_rad = motor_sky_rad_per_rad(self.rig.loops[name].siderostat)
         az_arcsec, el_arcsec = (
-            zero_rad * sky_rad_per_rad * ARCSEC_PER_RAD
-            for zero_rad in self.amplifiers[name].zero_rad
+            zero_rad * self._sky_arcsec_per_rad(name) for zero_rad in self.amplifiers[name].zero_rad
         )
         return Acquire(
             loop=name, expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec
@@ -427,13 +426,28 @@ class Instrument:
                 )
 
     def _cut_power(self, name: str) -> None:
-        """A loop's encoders begin anew at zero: nobody knows any longer where stars are that it turns."""
+        """A loop's encoders begin anew at zero: nobody knows any longer where stars are that it turns.
+
+        Where that would put its star beyond the travel, which takes a person's hand, they keep their zero.
+        """
+        settings = self.rig.loops[name]
+        motor_rad = self.plant.loops[name].state.motor_rad[0]
+        reach_arcsec = (
+            float(np.abs(motor_rad).max()) * self._sky_arcsec_per_rad(name)
+            + settings.acquisition.search_radius_sky_arcsec
+        )
+        if reach_arcsec > settings.siderostat.travel_sky_arcsec:
+            self.amplifiers[name].reset()
+            return
         self.invariants.zero_lost(name)
         self.amplifiers[name].lose_power()
         self.found_s.pop(name, None)
         for linked, loop in self.rig.stellar_loops.items():
             if loop.link == name:
                 self.found_s.pop(linked, None)
+
+    def _sky_arcsec_per_rad(self, name: str) -> float:
+        return motor_sky_rad_per_rad(self.rig.loops[name].siderostat) * ARCSEC_PER_RAD
 
     def _empty_disk(self) -> None:
         self._disk_is_full = False
