@@ -17,6 +17,7 @@ from fitctl.commissioning.asking import PROBES
 from fitctl.config import default_rig_path
 from fitctl.drivers.interface import DeviceIdentity
 from fitctl.drivers.probe import Probe
+from fitctl.messages import endpoints
 from fitctl.messages.commands import Standby
 
 TESTBED = default_rig_path().with_name("fit-testbed.toml")
@@ -61,7 +62,10 @@ def listening(*arguments):
 
 
 @pytest.fixture
-def doctor(capsys):
+def doctor(capsys, monkeypatch, tmp_path):
+    # A demo that runs beside the tests would have the shipped rig's folder.
+    monkeypatch.setattr(endpoints, "_own_folder", lambda: tmp_path)
+
     def run(*arguments):
         with pytest.raises(SystemExit) as end:
             main(["doctor", *arguments])
