@@ -29,9 +29,9 @@ MEANING = {
     Mode.STANDBY: "devices ready, siderostat stands where it is, mirror at its bias",
     Mode.ACQUISITION: "the siderostat searches for the star along a spiral",
     Mode.COARSE: "star found; the siderostat pulls it in",
-    Mode.VERNIER: "the fast steering mirror holds the star, the siderostat takes what lasts",
+    Mode.VERNIER: "the fast steering mirror holds the star; the siderostat takes over lasting offsets",
     Mode.SAFE: "mirror to its bias, siderostat stopped, amplifiers disabled after a time",
-    Mode.EXPERIMENT: "open loop: the stages move as an identification asks, the camera watches",
+    Mode.EXPERIMENT: "open loop: the stages make the motions of an identification, the camera records",
     Mode.LOCKED: "a metrology loop's siderostat holds its beam on the centre of the photodiodes",
 }
 
@@ -130,9 +130,12 @@ _POWERED = (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPE
 
 _BEGIN = (
     *_from((Mode.OFF,), Trigger.STANDBY, Mode.STANDBY, "all devices open, checked and enabled"),
-    *_from((Mode.STANDBY,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for"),
+    *_from((Mode.STANDBY,), Trigger.ACQUIRE, Mode.ACQUISITION, "on command"),
     *_from(
-        (Mode.ACQUISITION,), Trigger.ACQUIRE, Mode.ACQUISITION, "asked for; the search begins anew"
+        (Mode.ACQUISITION,),
+        Trigger.ACQUIRE,
+        Mode.ACQUISITION,
+        "on command; the search starts again",
     ),
 )
 _RECOVER_OFF = (
@@ -143,7 +146,7 @@ _RECOVER_OFF = (
         (Mode.STANDBY, Mode.SAFE),
         Trigger.OFF,
         Mode.OFF,
-        "asked for; amplifiers disabled, devices closed",
+        "on command; amplifiers disabled, devices closed",
     ),
 )
 
@@ -156,7 +159,7 @@ TRANSITIONS: tuple[Transition, ...] = (
         (Mode.ACQUISITION,),
         Trigger.SEARCH_EXHAUSTED,
         Mode.STANDBY,
-        "whole search radius seen; for a star that was lost, search_again_s over",
+        "search radius covered; for a lost star, after search_again_s",
     ),
     *_from(
         (Mode.COARSE,),
@@ -176,15 +179,15 @@ TRANSITIONS: tuple[Transition, ...] = (
         Mode.COARSE,
         "error beyond its range for reach_frames",
     ),
-    *_from((Mode.COARSE, Mode.VERNIER), Trigger.EXPERIMENT, Mode.EXPERIMENT, "asked for"),
+    *_from((Mode.COARSE, Mode.VERNIER), Trigger.EXPERIMENT, Mode.EXPERIMENT, "on command"),
     *_from((Mode.EXPERIMENT,), Trigger.EXPERIMENT_DONE, Mode.COARSE, "all motions done"),
     *_from(
         (Mode.ACQUISITION, Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT),
         Trigger.RELEASE,
         Mode.STANDBY,
-        "asked for",
+        "on command",
     ),
-    *_from(STELLAR_MODES, Trigger.STOP, Mode.SAFE, "asked for, at once"),
+    *_from(STELLAR_MODES, Trigger.STOP, Mode.SAFE, "on command, at once"),
     *_from(_POWERED, Trigger.FAULT, Mode.SAFE, "any device fault"),
     *_RECOVER_OFF,
 )
@@ -202,7 +205,7 @@ METROLOGY_TRANSITIONS: tuple[Transition, ...] = (
         (Mode.ACQUISITION,),
         Trigger.SEARCH_EXHAUSTED,
         Mode.STANDBY,
-        "whole search radius seen; for a beam that was lost, search_again_s over",
+        "search radius covered; for a lost beam, after search_again_s",
     ),
     *_from(
         (Mode.COARSE,),
@@ -220,9 +223,9 @@ METROLOGY_TRANSITIONS: tuple[Transition, ...] = (
         (Mode.COARSE, Mode.LOCKED), Trigger.BEAM_LOST, Mode.ACQUISITION, "no beam for lost_frames"
     ),
     *_from(
-        (Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED), Trigger.RELEASE, Mode.STANDBY, "asked for"
+        (Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED), Trigger.RELEASE, Mode.STANDBY, "on command"
     ),
-    *_from(METROLOGY_MODES, Trigger.STOP, Mode.SAFE, "asked for, at once"),
+    *_from(METROLOGY_MODES, Trigger.STOP, Mode.SAFE, "on command, at once"),
     *_from(
         (Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, Mode.LOCKED),
         Trigger.FAULT,

@@ -130,7 +130,7 @@ def test_people_get_text_that_fits_their_terminal(design, what):
 
 
 BAD_INPUT = {
-    "something that is no design": (["everything"], "there are vernier, coarse, bound"),
+    "something that is no design": (["everything"], "Available: vernier, coarse, bound"),
     "a file that is none": (["none.json"], "none.json: no such design file"),
     "a file of what was saved": (["none.json", "--out", "x.json"], "--out is for a pair"),
     "a loop that is none": (["bound", "--loop", "left"], "has right"),

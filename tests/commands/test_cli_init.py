@@ -299,7 +299,7 @@ def test_nothing_is_overwritten(fitctl, tmp_path):
     status, _, err = fitctl("init", "--mocks")
 
     assert status == 2
-    assert "overwrites nothing" in err
+    assert "never overwrites a file" in err
     assert path.read_text() == "precious"
 
 

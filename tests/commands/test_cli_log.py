@@ -244,7 +244,7 @@ def test_keep_marks_and_unmarks(log, whole):
         (["cut", "LOG", "--to", "1e300"], "--to 1e300: is no time"),
         (["cut", "LOG", "--from", "5", "--to", "5"], "--to 5 is not after --from 5"),
         (["cut", "LOG", "--from", "5000"], "has no record of these topics in that time"),
-        (["cut", "LOG", "--topic", "/fit/left/*"], "no such topic; there are /fit/camera/frame"),
+        (["cut", "LOG", "--topic", "/fit/left/*"], "no such topic. Available: /fit/camera/frame"),
         (
             ["cut", "LOG", "--out", "no/such/folder/x.mcap"],
             "x.mcap: cannot be written: No such file",

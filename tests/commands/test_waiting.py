@@ -103,7 +103,7 @@ def test_what_is_still_under_way_after_the_timeout_has_a_status_of_its_own_and_g
     status, _, err = fitctl("send", "acquire", WIDE, "--timeout", "0.3")
 
     assert status == 4
-    assert "right: acquire is still under way after 0.3 s, and goes on" in err
+    assert "right: acquire is still under way after 0.3 s, and continues" in err
     assert served.simulation.supervisor.loops["right"].mode is Mode.ACQUISITION
 
 
@@ -115,7 +115,7 @@ def test_ctrl_c_ends_the_waiting_and_not_the_command(fitctl, served, meanwhile):
     status, _, err = fitctl("send", "acquire", WIDE, "--wait")
 
     assert status == 130
-    assert "no longer waiting; acquire goes on" in err
+    assert "no longer waiting; acquire continues" in err
     assert served.simulation.supervisor.loops["right"].mode is Mode.ACQUISITION
 
 

@@ -86,7 +86,7 @@ def test_without_a_rig_the_one_that_runs_is_meant(start, said):
     assert said("send", "status") == (
         0,
         "right OFF\n",
-        f"rig night: {night.file} (the one that runs)\n",
+        f"rig night: {night.file} (running)\n",
     )
 
 

@@ -397,7 +397,7 @@ def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:
     for pattern in patterns or ():
         if not any(fnmatchcase(topic, pattern) for topic in found.counts):
             there = ", ".join(sorted(found.counts)) or "none"
-            msg = f"--topic {pattern}: {found.path} has no such topic; there are {there}"
+            msg = f"--topic {pattern}: {found.path} has no such topic. Available: {there}"
             raise ConfigError(msg)
     return [
         topic

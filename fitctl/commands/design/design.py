@@ -94,8 +94,8 @@ def design(
         reports[what] = _saved(what)
     if what not in reports:
         msg = (
-            f"design: {what} is nothing to design; there are {', '.join([*reports, 'learn'])}, files "
-            "(*.json) that --out saved, and Python files (*.py) of your own"
+            f"design: unknown design {what!r}. Available: {', '.join([*reports, 'learn'])}, a file (*.json) "
+            "that --out saved, or a Python file (*.py) of your own"
         )
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what

@@ -90,7 +90,7 @@ def identify(
     from the log of a sequence: name it with --log.
     """
     if what not in EXPERIMENTS:
-        msg = f"identify: {what} cannot be identified; there are {', '.join(EXPERIMENTS)}"
+        msg = f"identify: unknown experiment {what!r}. Available: {', '.join(EXPERIMENTS)}"
         raise ConfigError(msg)
     step = EXPERIMENTS[what].step
     if step and log is None:

@@ -36,20 +36,24 @@ def console(
     overrides: SetOption = None,
     remote: RemoteOption = None,
     quitting_ends_instrument: Annotated[
-        bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Said in its help.")
+        bool, typer.Option("--quitting-ends-instrument", hidden=True, help="Shown in its help.")
     ] = False,
     graphics: Annotated[
         Literal["auto", "half-blocks", "sixel", "kitty"],
         typer.Option(
-            envvar="FITCTL_GRAPHICS", help="How the focal plane is drawn; auto goes by TERM."
+            envvar="FITCTL_GRAPHICS", help="How to draw the focal plane; auto depends on TERM."
         ),
     ] = "auto",
     log: Annotated[
         Path | None,
         typer.Option("--log", metavar="FILE", help="Show a log instead of a running instrument."),
     ] = None,
-    web: Annotated[bool, typer.Option("--web", help="In a browser on this machine.")] = False,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Of --web, on 127.0.0.1.")] = 8000,
+    web: Annotated[
+        bool, typer.Option("--web", help="Open the console in a browser on this machine.")
+    ] = False,
+    port: Annotated[
+        int, typer.Option(min=1, max=65535, help="Port of --web, on 127.0.0.1.")
+    ] = 8000,
 ) -> None:
     """Open the operator console on a running supervisor.
 

@@ -95,7 +95,7 @@ def _print(words: str, result: Rehearsal) -> None:
     for name in result.in_force:
         say(f"▲ tripped on the instrument now, and not in the rehearsal: {name}")
     for difference in result.unlike:
-        say(f"▲ {difference}, so take this with care")
+        say(f"▲ {difference}, so the result may differ")
 
 
 def _end_lines(end: End) -> list[str]:

@@ -58,8 +58,8 @@ def ask_devices(rig: Rig, *, as_json: bool) -> int:
             say(line)
         if running is not None:
             say(
-                f"The supervisor of {rig.name} runs (process {running.pid}). This is its report: doctor has"
-                " not asked the devices, which it would disturb. To have them asked, end it first."
+                f"The supervisor of {rig.name} runs (process {running.pid}). This is its report: doctor did"
+                " not query the devices, because that would disturb it. To query them, shut it down first."
             )
     return FAILED if any(finding.disagreements for finding in findings) else 0
 

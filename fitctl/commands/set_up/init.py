@@ -85,7 +85,7 @@ def init(
     }
     base = TESTBED if testbed else ONE_STAR
     if file.exists():
-        msg = f"{file}: exists already, and init overwrites nothing; name another file"
+        msg = f"{file}: exists already, and init never overwrites a file; name another"
         raise ConfigError(msg)
     for device, text in options.items():
         if text and device not in DEVICES[base]:
@@ -178,8 +178,8 @@ def _next(path: Path, simulated: list[str], *, all_mocks: bool) -> str:
     else:
         steps = [
             (f"edit {path}", "geometry, counts and limits of your rig"),
-            (f"fitctl check --rig {path}", "every mistake in it, by key"),
-            (f"fitctl doctor --rig {path}", "who the devices are, and what disagrees"),
+            (f"fitctl check --rig {path}", "list all its mistakes, by key"),
+            (f"fitctl doctor --rig {path}", "identify the devices and compare them with it"),
             *((f"fitctl mocks --rig {path}", "the simulated devices") for _ in simulated[:1]),
             (f"fitctl run --rig {path}", "supervise it; it begins in OFF"),
             (f"fitctl console --rig {path}", "attach a console, in another terminal"),

@@ -107,7 +107,7 @@ def connect(
     if remote is None:
         found = address(command, path, overrides)
         if found.running is not None:
-            show_rig(found.running.name, f"{found.file} (the one that runs)")
+            show_rig(found.running.name, f"{found.file} (running)")
             return Client(Path(found.running.folder))
         rig = rig_of(found.file, found.settings)
         show_rig(rig.name, str(found.file))
@@ -177,7 +177,7 @@ def _wait_and_print(
         say(f"{sender}: {error}", err=True)
         return FAILED
     except KeyboardInterrupt:
-        say(f"{sender}: no longer waiting; {word} goes on. See: fitctl status", err=True)
+        say(f"{sender}: no longer waiting; {word} continues. See: fitctl status", err=True)
         return INTERRUPTED
     if as_json:
         say(to_json(asdict(reply) | {"outcomes": found}))
@@ -199,7 +199,7 @@ def _outcome_text(loop: str, outcome: CommandOutcome, wait_s: float) -> str:
             return f"{loop} {outcome.text} (after {took_s:.1f} s)"
         case "under way":
             return (
-                f"{loop}: {outcome.command} is still under way after {wait_s:g} s, and goes on. "
+                f"{loop}: {outcome.command} is still under way after {wait_s:g} s, and continues. "
                 "See: fitctl status"
             )
         case "failed":

@@ -14,7 +14,7 @@ def welcome(folder: Path) -> str:
     if rigs:
         rig = rigs[0].name
         steps += [
-            (f"fitctl doctor --rig {rig}", "ask its devices who they are; nothing moves"),
+            (f"fitctl doctor --rig {rig}", "identify its devices; nothing moves"),
             (f"fitctl run --rig {rig}", "supervise it; it begins in OFF"),
             (f"fitctl console --rig {rig}", "attach a console to it, in another terminal"),
         ]

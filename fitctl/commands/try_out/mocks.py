@@ -103,7 +103,7 @@ def _pictures(rig: Rig, log: Path) -> Picture:
         camera.height_px,
         camera.period_s,
         camera.bias_dn,
-        lambda why: say(f"mocks: {why}; it is dark from here on", err=True),
+        lambda why: say(f"mocks: {why}; its picture stays dark from here on", err=True),
     )
 
 
