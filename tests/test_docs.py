@@ -271,6 +271,21 @@ def test_commands_run_in_their_order_and_print_what_the_document_shows(
             json.loads(out)
 
 
+@pytest.mark.long
+def test_the_figures_of_a_controller_of_ones_own_are_those_that_its_page_shows(
+    checkout, monkeypatch, capsys
+):
+    monkeypatch.chdir(checkout)
+    shown = [found for found in ours() if "my_integrator.py" in found.words and found.output]
+    assert {found.words[2] for found in shown} == {"my_integrator.py", "compare"}
+
+    for found in shown:
+        supply(checkout, found.words)
+        status, out, _ = carried_out(found.words, checkout, capsys)
+
+        assert (status, tuple(out.splitlines())) == (0, found.output)
+
+
 def test_what_is_not_run_is_documented_and_the_tests_that_run_it_are_there():
     for pattern, reason in NOT_RUN.items():
         assert any(fnmatchcase(" ".join(found.words), pattern) for found in commands()), pattern
