@@ -37,7 +37,7 @@ class RunInfo(Record, frozen=True, kw_only=True):
 
 
 class Tick(Record, frozen=True, kw_only=True, gc=False):
-    """One tick of one loop: a frame came (or did not), and a command was made from it."""
+    """One tick of one loop: the frame, if one arrived, and the command computed from it."""
 
     loop: str
     number: int
@@ -174,7 +174,7 @@ class FrameRecord(Record, frozen=True, kw_only=True, gc=False):
 
 
 class ModeChange(Record, frozen=True, kw_only=True):
-    """A loop went from one mode to another; the motor angles, its link's too, are those that it then read."""
+    """A loop changed its mode; with the motor angles, also of its link, that it read then."""
 
     loop: str
     source: str
@@ -189,7 +189,7 @@ class ModeChange(Record, frozen=True, kw_only=True):
 
 
 class CommandRecord(Record, frozen=True, kw_only=True):
-    """A command and its answer: who gave it, from where, and its values as JSON; an empty loop is all loops."""
+    """A command and its answer: sender, address, and values as JSON; an empty loop means all loops."""
 
     sender: str
     address: str
@@ -201,7 +201,7 @@ class CommandRecord(Record, frozen=True, kw_only=True):
 
 
 class DevicesOpened(Record, frozen=True, kw_only=True):
-    """A loop's devices were opened: what the D/A was found set to; or why they could not be."""
+    """A loop's devices were opened: the outputs that the D/A had; or why they could not be opened."""
 
     loop: str
     stack1_v: float
@@ -212,7 +212,7 @@ class DevicesOpened(Record, frozen=True, kw_only=True):
 
 
 class OutputsFound(Record, frozen=True, kw_only=True):
-    """The D/A was read after a pause, and its outputs were not those last sent; NaN if it did not answer."""
+    """After a pause, the D/A's outputs differed from those sent last; NaN if it did not answer."""
 
     loop: str
     stack1_v: float
@@ -221,7 +221,7 @@ class OutputsFound(Record, frozen=True, kw_only=True):
 
 
 class StarPlace(Record, frozen=True, kw_only=True):
-    """Where the star of a supervisor that was killed is: on the camera, with the loop's own stages at zero."""
+    """Position of the star that a killed supervisor held: on the camera, with the loop's own stages at zero."""
 
     loop: str
     az_px: float
@@ -231,7 +231,7 @@ class StarPlace(Record, frozen=True, kw_only=True):
 
 
 class DeviceFailure(Record, frozen=True, kw_only=True):
-    """A device failed while it was used; told once, however long it lasts. The kind is the error's class."""
+    """A device failed in use; recorded once, however long it lasts. The kind is the error's class."""
 
     loop: str
     device: FailingDevice
@@ -254,7 +254,7 @@ class ControllerChange(Record, frozen=True, kw_only=True):
 
 
 class QuantityReading(Record, frozen=True, kw_only=True):
-    """What interlocks judge of the computer, about once a second; of all loops."""
+    """A quantity of the computer that interlocks watch, about once a second; for all loops."""
 
     name: str
     value: float
@@ -278,7 +278,7 @@ class InjectionRecord(Record, frozen=True, kw_only=True):
 
 
 class Event(Record, frozen=True, kw_only=True):
-    """Something that an operator should read."""
+    """A message for the operator."""
 
     severity: Severity
     source: str
@@ -286,7 +286,7 @@ class Event(Record, frozen=True, kw_only=True):
 
 
 class DeviceHealth(Record, frozen=True, kw_only=True):
-    """How one device is, about once a second."""
+    """State of one device, about once a second."""
 
     device: str
     endpoint: str
@@ -326,7 +326,7 @@ class LoopTiming(Record, frozen=True, kw_only=True):
 
 
 class RecorderStatus(Record, frozen=True, kw_only=True):
-    """What the recorder has done so far."""
+    """Progress of the recorder: records written and lost, and the present file."""
 
     path: str
     records: int
@@ -335,7 +335,7 @@ class RecorderStatus(Record, frozen=True, kw_only=True):
 
 
 class Losses(Record, frozen=True, kw_only=True):
-    """What was offered to each queue of the supervisor and what it let go, since the start; once a second."""
+    """Records offered to and lost by each queue of the supervisor since the start; once a second."""
 
     records_offered: int
     records_lost: int
@@ -355,7 +355,7 @@ class Losses(Record, frozen=True, kw_only=True):
 
 
 class Snapshot(Record, frozen=True, kw_only=True):
-    """What consoles show and no other record has, about once a second, as MessagePack.
+    """Data that only consoles show, about once a second, as MessagePack.
 
     ``state_msgpack`` is a :class:`fitctl.messages.telemetry.Unlogged`.
     """
