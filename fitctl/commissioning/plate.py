@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fitctl.commissioning.camera import streaming
 from fitctl.commissioning.motors import powered
 from fitctl.commissioning.outcome import Outcome, Site, StepError
-from fitctl.commissioning.sky import Watch, displaced, search
+from fitctl.commissioning.sky import Watch, displaced, search, to_the_star
 from fitctl.config.wiring import STRAIGHT
 from fitctl.controllers.centroid import Star
 from fitctl.model.optics import rotation, scales
@@ -62,7 +62,7 @@ def star_moves(site: Site) -> str:
     if len(site.rig.stellar_loops) > 1:
         first = f"azimuth by {ROUGH_RAD:g} rad, to see which star it moves; if none"
     else:
-        first = "nothing if a star is on the camera; otherwise"
+        first = "nothing if the star is on the camera; otherwise"
     return f"{first} the motors, up to {reach / motor:.1f} rad each way"
 
 
@@ -76,13 +76,18 @@ def check_star(site: Site) -> Outcome:
     """
     stars = len(site.rig.stellar_loops)
     with streaming(site) as camera:
-        spots = Watch(site, camera, None).spots()
+        seen = Watch(site, camera, None)
+        spots = seen.spots()
         moved_rad, looks = 0.0, 0
-        if stars > 1 or not spots:
+        if stars > 1 or not spots or seen.beside(spots[0]):
             with powered(site) as motors:
                 watch = Watch(site, camera, motors)
-                if stars == 1 or not _moves_a_star(watch):
+                if stars == 1:
+                    _, looks = search(site, watch)
+                elif not _moves_a_star(watch):
                     _, looks = search(site, watch, spots)
+                else:
+                    to_the_star(site, watch, watch.spots()[0])
                 spots = watch.spots()
                 moved_rad = motors.furthest_rad
     if not spots:

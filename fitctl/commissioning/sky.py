@@ -22,6 +22,9 @@ _LEAST_FRAMES = 0.6  # of these must show the star
 _A_STAR = 0.5  # of the brightest spot's light
 _STRAY_PX = 6.0  # from where the star is expected, another one's begins
 _STILL_PX = 0.7
+_LIKE = 1.4  # between the light of two spots that may be the same one
+_BESIDE_PX = 2.0  # from where a spot is expected beside its star
+_ASIDE = 1.3  # of the way to a star beyond the edge, whose direction is not known
 
 
 class Watch:
@@ -81,6 +84,28 @@ class Watch:
             if not any(_apart_px(star.position_px, one.position_px) < _STRAY_PX for one in still)
         ]
         return max(found, key=lambda star: star.flux_dn, default=None)
+
+    def beside(self, star: Star, frames: int = 3) -> float:
+        """How far from its star a spot must be that is none itself; 0 if it may be the star.
+
+        Such a spot, as the rig file has it in `other_spots`, has that spot's light and no such spot beside it.
+        """
+        loop = self._site.loop
+        low_dn, high_dn = loop.flux_range_dn
+        if low_dn <= star.flux_dn <= high_dn:
+            return 0.0
+        each = self._spots(frames)
+        for other in loop.other_spots:
+            apart_px = math.hypot(other.offset_px.az, other.offset_px.el)
+            like = 1 / _LIKE < star.flux_dn / other.flux_dn < _LIKE
+            if like and not any(
+                one.flux_dn < _A_STAR * star.flux_dn
+                and abs(_apart_px(one.position_px, star.position_px) - apart_px) < _BESIDE_PX
+                for spots in each
+                for one in spots
+            ):
+                return apart_px
+        return 0.0
 
     def spots(self, frames: int = 10) -> list[Star]:
         """All spots of one frame, brightest first: the frame that has most."""
@@ -189,7 +214,7 @@ def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[
     still = others or []
     star = watch.brightest()
     if star is not None and not still:
-        return star, 0
+        return to_the_star(site, watch, star, still), 0
     scale = scales(site.rig, site.loop)
     camera = site.rig.camera
     step_rad = 0.6 * min(camera.width_px, camera.height_px) / scale.motor_px_per_rad
@@ -201,7 +226,7 @@ def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[
         watch.turn_to(centre_rad + step_rad * np.array([right, up]))
         star = watch.brightest(3, still)
         if star is not None:
-            return star, looks
+            return to_the_star(site, watch, star, still), looks
     watch.turn_to(centre_rad)
     msg = (
         f"no star within {turns * step_rad:.1f} rad of the motors about the start; check "
@@ -216,6 +241,26 @@ def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[
     raise StepError(
         msg, {} if watch.motors is None else {"furthest_rad": watch.motors.furthest_rad}
     )
+
+
+def to_the_star(site: Site, watch: Watch, star: Star, still: Sequence[Star] = ()) -> Star:
+    """The star that a spot belongs to, brought onto the frame if only its other spot was there.
+
+    Where nothing brighter comes onto the frame, the motors go back: the spot is the star itself, and dim.
+    """
+    apart_px = watch.beside(star)
+    if not apart_px:
+        return star
+    site.report("the spot has the light of a spot beside the star: looking for the star around it")
+    aside_rad = _ASIDE * apart_px / scales(site.rig, site.loop).motor_px_per_rad
+    centre_rad = watch.goal_rad.copy()
+    for right, up in square_spiral(1):
+        watch.turn_to(centre_rad + aside_rad * np.array([right, up]) / math.hypot(right, up))
+        brighter = watch.brightest(3, still)
+        if brighter is not None and _A_STAR * brighter.flux_dn > star.flux_dn:
+            return brighter
+    watch.turn_to(centre_rad)
+    return star
 
 
 def square_spiral(turns: int) -> list[tuple[int, int]]:
