@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from fitctl.commissioning.closed import SETTLED_S, STOPPED_S, Loop, judged, supervised
+from fitctl.commissioning.closed import SETTLED_S, STOPPED_S, Loop, judged, supervised, with_link
 from fitctl.commissioning.outcome import Cable, Outcome, Site, StepError
 from fitctl.identify import airpath
 from fitctl.messages.commands import Acquire, Experiment, Jog, Recover, SetTarget, Stop
@@ -29,9 +29,10 @@ _PAUSE_S = 2.0
 def accept_moves(site: Site) -> str:
     """What the step moves."""
     times, hold_s = _amount(site)
-    return (
+    return with_link(
+        site,
         f"siderostat and mirror, as in operation: {times} acquisitions, {hold_s:g} s on the star, "
-        f"steps of {STEP_PX:g} px, and STOP from each mode"
+        f"steps of {STEP_PX:g} px, and STOP from each mode",
     )
 
 

@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.commissioning.outcome import Outcome, Site, StepError
 from fitctl.logging.records import Tick
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Acquire, AnyCommand, Standby, Stop
+from fitctl.messages.commands import Acquire, AnyCommand, Recover, Standby, Stop
 from fitctl.messages.endpoints import make_service_folder
 from fitctl.messages.modes import Mode
 from fitctl.messages.waiting import wait_for_outcomes
@@ -31,6 +32,13 @@ ACQUIRE_S = 120.0
 _AWAY_PX = 4.0
 _STOP_LIMIT_S = 5.0
 STOPPED_S = 1.0
+_NEWS_S = 5.0
+_OF_THE_LINK_TOO: dict[type[AnyCommand], tuple[AnyCommand, Mode]] = {
+    Standby: (Standby(), Mode.OFF),
+    Recover: (Recover(), Mode.SAFE),
+    Acquire: (Acquire(), Mode.STANDBY),
+}
+"""What the loop of the link is commanded before its stellar loop, and in which of its modes."""
 
 
 class Loop:
@@ -46,6 +54,8 @@ class Loop:
         self._site = site
         self.client = client
         self.mode = ""
+        stellar = site.rig.stellar_loops.get(site.name)
+        self._link = (stellar.link if stellar else None) or ""
 
     def ticks(self, until: Callable[[Tick], bool], timeout_s: float) -> list[Tick]:
         """All ticks from now up to the first for which `until` is true.
@@ -83,13 +93,29 @@ class Loop:
         return next((one.reason for one in changes if one is not None), "see the supervisor's log")
 
     def command(self, command: AnyCommand) -> None:
-        """Send a command and wait until it is done.
+        """Send a command to this loop alone, and to that of its link where it needs it; wait until it is done.
 
         Raises
         ------
         StepError
             If it is refused or fails.
         """
+        if self._link and type(command) in _OF_THE_LINK_TOO:
+            first, mode = _OF_THE_LINK_TOO[type(command)]
+            if self.mode_of(self._link) == mode.name:
+                self._command(msgspec.structs.replace(first, loop=self._link))
+        self._command(msgspec.structs.replace(command, loop=self._site.name))
+
+    def mode_of(self, name: str) -> str:
+        """The mode that a loop has now; empty where no telemetry comes."""
+        since_s = time.monotonic()
+        while time.monotonic() < since_s + _NEWS_S:
+            telemetry = self.client.receive(0.5)
+            if telemetry is not None and telemetry.time_s >= since_s:
+                return next((one.mode for one in telemetry.loops if one.name == name), "")
+        return ""
+
+    def _command(self, command: AnyCommand) -> None:
         reply = self.client.send(command)
         if not reply.accepted:
             msg = f"the supervisor refuses {type(command).__name__.lower()}: {reply.text}"
@@ -222,12 +248,19 @@ def supervised(site: Site, *overrides: str) -> Iterator[Loop]:
             end_process(process, _END_S)
 
 
+def with_link(site: Site, text: str) -> str:
+    """What a step moves, and what moves with it where the star comes over a link."""
+    link = site.loop.link
+    return f"{text}; and the siderostat of {link}, which holds the link" if link else text
+
+
 def gentle_moves(site: Site) -> str:
     """What the step moves."""
-    return (
+    return with_link(
+        site,
         "the siderostat, to the star and up to "
         f"{site.loop.acquisition.search_radius_sky_arcsec:g} arcsec on the sky "
-        f"in search of it, with {GENTLE:g} of coarse.gain_rad_per_m; stopped as soon as the star moves away"
+        f"in search of it, with {GENTLE:g} of coarse.gain_rad_per_m; stopped as soon as the star moves away",
     )
 
 
@@ -272,9 +305,10 @@ def check_gentle(site: Site) -> Outcome:
 
 def whole_moves(site: Site) -> str:
     """What the step moves."""
-    return (
+    return with_link(
+        site,
         "siderostat and mirror, as in operation, within "
-        f"{site.loop.siderostat.travel_sky_arcsec:g} arcsec on the sky"
+        f"{site.loop.siderostat.travel_sky_arcsec:g} arcsec on the sky",
     )
 
 

@@ -13,6 +13,7 @@ from fitctl.commissioning import (
     closed,
     devices,
     identified,
+    link,
     mirror,
     plate,
     stacks,
@@ -22,6 +23,8 @@ from fitctl.commissioning.outcome import Outcome, Site
 from fitctl.config import Rig
 
 _NOTHING = "nothing"
+_OVER_A_LINK = {"star": "photodiodes", "gentle": "link"}
+"""What a step needs of the loop that holds the link over which its star comes."""
 
 
 class Step(NamedTuple):
@@ -139,6 +142,15 @@ STEPS: dict[str, Step] = {
         65.0,
         travel.check_travel,
     ),
+    "link": Step(
+        "The link: the loop of its beam holds it on the photodiodes",
+        "beam",
+        link.moves,
+        ("photodiodes", "travel"),
+        60.0,
+        link.check_link,
+        supervised=True,
+    ),
     "gentle": Step(
         "The first closed loop: the siderostat at a tenth of its gain",
         "star",
@@ -225,7 +237,7 @@ class Task(NamedTuple):
     def needs(self) -> Iterator[str]:
         """Names of the tasks that must be done before: over a link, no star comes before its beam does."""
         if self.link:
-            yield f"{self.link}.photodiodes"
+            yield f"{self.link}.{_OVER_A_LINK[self.name.rpartition('.')[2]]}"
         for name in self.step.needs:
             of_rig = STEPS[name].of == "rig"
             yield name if of_rig or not self.loop else f"{self.loop}.{name}"
@@ -247,7 +259,7 @@ def tasks_of(rig: Rig) -> list[Task]:
             f"{loop}.{name}" if loop else name,
             loop,
             step,
-            links[loop] if name == "star" else "",
+            links[loop] if name in _OVER_A_LINK else "",
         )
         for name, step in STEPS.items()
         for loop in loops[step.of]
