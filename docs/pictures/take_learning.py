@@ -54,16 +54,18 @@ def true_px(running: demo.Instrument, start_s: float, end_s: float) -> tuple[flo
 
 
 def draw(rows: np.ndarray, changed_s: float, period_s: float) -> None:
-    """Both axes' error on frames over time, and its spectrum before and after."""
-    figure = new_figure()
-    course, spectrum = figure.subplots(2, 1)
-    for column, (axis, colour) in enumerate((("az", BLUE), ("el", VERMILION)), 1):
-        course.plot(
-            rows[:, 0] - changed_s, rows[:, column], color=colour, linewidth=0.5, label=axis
-        )
-    course.axvline(0.0, color=GREEN)
-    course.set(xlabel="time from the change of design (s)", ylabel="error on frames (px)")
-    course.legend(loc="upper right")
+    """Each axis' error on frames over time, and the spectrum of both before and after."""
+    figure = new_figure(height_in=6.4)
+    az, el, spectrum = figure.subplots(3, 1, height_ratios=(2, 2, 3))
+    el.sharex(az)
+    el.sharey(az)
+    for column, (axis, course) in enumerate((("az", az), ("el", el)), 1):
+        course.plot(rows[:, 0] - changed_s, rows[:, column], color=BLUE, linewidth=0.5)
+        course.axvline(0.0, color=GREEN)
+        course.set(ylabel=f"{axis} (px)")
+    az.set(title="error on frames")
+    az.tick_params(labelbottom=False)
+    el.set(xlabel="time from the change of design (s)")
     parts = (
         (rows[:, 0] < changed_s, VERMILION, "before"),
         (rows[:, 0] > changed_s + 3, GREEN, "after"),
