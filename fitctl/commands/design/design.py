@@ -253,7 +253,8 @@ def _bound(rig: Rig, loop: str) -> Report:
     found = bound(its_basis)
     rate_hz, delay_ms = 1 / its_basis.period_s, its_basis.delay_s * 1e3
     lines = [
-        f"no controller leaves less than {found.residual_px:.4f} px RMS of {found.open_loop_px:.3f} px",
+        f"with this sensor, no controller leaves less than {found.residual_px:.4f} px RMS of "
+        f"{found.open_loop_px:.3f} px",
         f"  at {rate_hz:g} Hz with {delay_ms:g} ms of delay, {its_basis.noise_px:.4f} px of noise,"
         " the mirror held between commands",
         f"  at the frame instants alone: {found.frame_residual_px:.4f} px",

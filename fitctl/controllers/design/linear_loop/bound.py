@@ -54,11 +54,12 @@ def filter_covariance(transition: Floats, noise: Floats, output: Floats, varianc
     return np.asarray(before - np.outer(gain, output @ before))
 
 
-def bound(basis: Basis) -> Bound:
+def bound(basis: Basis, writes: int = 1) -> Bound:
     """The bound of a loop: linear plant, stages that follow exactly, noise and delay as they are.
 
     The best command is the negative mean, over the time for which it acts, of what the Kalman filter
-    expects. What it leaves is the disturbance's variance less that of this prediction.
+    expects. What it leaves is the disturbance's variance less that of this prediction. With more `writes` of
+    the D/A a frame, at equal intervals, each acts for its part of the period.
     """
     moving = disturbance(basis)
     output = moving.seen
@@ -66,9 +67,13 @@ def bound(basis: Basis) -> Bound:
     after = filter_covariance(transition, noise, output, basis.noise_px**2)
     everything = moving.covariance
     open_loop = output @ everything @ output
-    acts = hold(moving, basis.period_s, basis.delay_s)
-    expected = acts.weight @ acts.star
-    residual = open_loop - expected @ (everything - after) @ expected
+    part_s = basis.period_s / writes
+    predicted = 0.0
+    for write in range(writes):
+        acts = hold(moving, part_s, basis.delay_s + write * part_s)
+        expected = acts.weight @ acts.star
+        predicted += float(expected @ (everything - after) @ expected)
+    residual = open_loop - predicted / writes
     frames = timing(basis.period_s, basis.delay_s).frames
     to_frame, new = moving.over(frames * basis.period_s)
     frame_residual = output @ (to_frame @ after @ to_frame.T + new) @ output

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.choose import DESIGNS
 from fitctl.controllers.design.eq20 import design_eq20
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
@@ -31,6 +32,17 @@ def test_it_grows_with_delay_and_with_noise(fit):
     assert delayed == sorted(delayed)
     noisy = [bound(dataclasses.replace(fit, noise_px=px)).residual_px for px in (1e-4, 0.01, 0.1)]
     assert noisy == sorted(noisy)
+
+
+def test_more_writes_of_the_da_hardly_help_against_the_air_and_much_against_a_fast_line(fit):
+    def left_px(basis):
+        return [bound(basis, writes).residual_px for writes in (1, 2, 4, 10)]
+
+    air, line = left_px(fit), left_px(dataclasses.replace(fit, lines=(Line(20.0, 0.005, 0.05),)))
+
+    assert air == sorted(air, reverse=True)
+    assert air[-1] > 0.995 * air[0]
+    assert line == pytest.approx([0.0367, 0.0257, 0.0213, 0.0198], abs=5e-5)
 
 
 def test_behind_a_delay_longer_than_the_air_path_remembers_it_is_the_open_loop(fit):
