@@ -111,7 +111,7 @@ class LaggingMotors:
 
 
 turns = st.lists(
-    st.tuples(st.floats(-6, 6), st.floats(-6, 6), st.integers(1, 12)), min_size=1, max_size=10
+    st.tuples(st.floats(-6, 6), st.floats(-6, 6), st.integers(1, 6)), min_size=1, max_size=6
 )
 
 

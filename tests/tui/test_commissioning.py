@@ -176,7 +176,7 @@ def test_nothing_is_started_while_a_step_runs():
         await pressed(app, pilot, "g")
         await pressed(app, pilot, "y", "d", "g")
         assert running(app)
-        assert "still at work" in notifications(app)
+        assert "still running" in notifications(app)
 
     on_console(scenario)
 
