@@ -283,6 +283,7 @@ class Instrument:
         supervisor.close()
         for thread in self._threads:
             thread.stop()
+        self.service = None
         self._finish_log()
         self.time.kill_process()
         self._places = []

@@ -8,8 +8,9 @@ may take longer than a tick (opening, closing and polling devices) is handed to 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -151,6 +152,7 @@ class Supervisor:
         self.sequences = SequenceBoard(journal)
         self.outcomes = Outcomes(rig.loops, clock)
         self.shutdown_wanted = False
+        self._closed = False
         self._clock = clock
         self._executor = executor
         self._design_executor = design_executor or executor
@@ -200,6 +202,8 @@ class Supervisor:
             for name in self._named(command):
                 self.loops[name].servo.stop()
         self._commands.append(Posted(command, reply, sender, address))
+        if self._closed:  # no step follows; what close() has not answered is answered here
+            self._end_posted()
 
     def report_event(self, severity: Severity, source: str, message: str) -> None:
         """Leave an event for the next step, from any thread."""
@@ -316,11 +320,12 @@ class Supervisor:
         return all(loop.at_rest() for loop in self.loops.values())
 
     def close(self) -> None:
-        """Disable and let go of everything, whatever state it is in; nothing is asked of it any more."""
+        """Disable and let go of everything, whatever state it is in; it obeys nothing any more."""
         self.shutdown_wanted = True
         if self.collector is not None:
             self.collector.close()
         self._device_jobs.close_all()
+        self._closed = True
         self._obey_posted()
         self._record_left()
 
@@ -343,9 +348,14 @@ class Supervisor:
 
     # ------------------------------------------------------------ commands
 
+    def _taken(self) -> Iterator[Posted]:
+        """The commands that wait, each for one thread."""
+        with suppress(IndexError):
+            while True:
+                yield self._commands.popleft()
+
     def _obey_posted(self) -> None:
-        while self._commands:
-            posted = self._commands.popleft()
+        for posted in self._taken():
             reply = self._obey(posted.command)
             if ROWS[type(posted.command)].logged:
                 now_s = self._clock.now_s()
@@ -353,6 +363,12 @@ class Supervisor:
                     command_record(posted.command, reply, posted.sender, posted.address, now_s)
                 )
             posted.reply(reply)
+
+    def _end_posted(self) -> None:
+        """Answer what came after the end: all is stopped already."""
+        for posted in self._taken():
+            stops = isinstance(posted.command, Stop)
+            posted.reply(Reply(accepted=stops, text="shutting down"))
 
     def _named(self, command: AnyCommand) -> list[str]:
         return [name for name in self.loops if command.loop in {"", name}]

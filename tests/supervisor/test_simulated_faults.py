@@ -205,6 +205,18 @@ def test_what_happens_while_the_instrument_is_closed_is_recorded(vernier, monkey
     assert [(reply.accepted, reply.text) for reply in replies] == [(False, "shutting down")]
 
 
+def test_what_comes_after_the_instrument_is_closed_is_answered(vernier):
+    replies = []
+    vernier.supervisor.close()
+    vernier.supervisor.post(Acquire(), replies.append)
+    vernier.supervisor.post(Stop(), replies.append)
+
+    assert [(reply.accepted, reply.text) for reply in replies] == [
+        (False, "shutting down"),
+        (True, "shutting down"),
+    ]
+
+
 def test_two_devices_that_fail_at_once_are_each_told_once(vernier, monkeypatch):
     silent = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
     unplugged = DeviceUnreachable("camera", "127.0.0.1:3956", "an answer", "none")
