@@ -150,7 +150,9 @@ def _followed(
         now_s = time.monotonic()
         if telemetry is None:
             if now_s - heard_s > _SILENCE_S:
-                msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then try again"
+                msg = (
+                    f"the supervisor has been silent for {_SILENCE_S:g} s; check it, then try again"
+                )
                 raise IdentifyError(msg)
             continue
         heard_s = now_s

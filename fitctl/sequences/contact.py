@@ -125,13 +125,13 @@ class Contact:
                 msg = "stopped by its program"
                 raise Stopped(msg, release=True)
             if self.link.now_s() - begun_s > _SILENCE_S:
-                msg = f"the supervisor has been silent for {_SILENCE_S:g} s; look at it, then begin again"
+                msg = f"the supervisor has been silent for {_SILENCE_S:g} s; check it, then start again"
                 raise ConnectionError(msg)
 
     def _obey(self, view: View) -> None:
         if view.mode is Mode.SAFE:
             # Nothing is commanded any more: SAFE has the last word.
-            msg = f"loop {view.loop_name} is SAFE: {view.why}; see to it, then: fitctl send recover"
+            msg = f"loop {view.loop_name} is SAFE: {view.why}; remove the cause, then: fitctl send recover"
             raise Stopped(msg, release=False)
         if self.stop_wanted.is_set():
             msg = "stopped by its program"

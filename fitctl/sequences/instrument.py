@@ -320,7 +320,7 @@ class Instrument(StepMethods[Figures]):
         while True:
             telemetry = self._link.receive(2.0)
             if telemetry is None:
-                msg = "the supervisor has been silent for 2 s; look at it, then try again"
+                msg = "the supervisor has been silent for 2 s; check it, then try again"
                 raise ConnectionError(msg)
             if telemetry.time_s >= since_s:
                 return telemetry

@@ -58,16 +58,12 @@ class Admission:
         """Why this command is not taken; empty when it is, and then the sender has what it needs."""
         needs = ROWS[type(command)].needs
         if needs == "the Unix socket" and not sender.is_local:
-            return f"{type(command).__name__} is for the rig's own machine"
+            return f"{type(command).__name__} is accepted only on the rig's own machine"
         if needs in {"a commander's key", "the instrument"} and sender.role != "commander":
-            return (
-                f"the key {sender.name} may watch and not command; ask the rig's owner for another"
-            )
+            return f"the key {sender.name} can watch but not command; ask the rig's owner for a commander's key"
         holder = self.commander(now_s)
         if needs == "the instrument" and holder not in {"", sender.name}:
-            return (
-                f"{holder} has the instrument; if you mean to take it over: fitctl send take-over"
-            )
+            return f"{holder} has the instrument; to take it over: fitctl send take-over"
         if needs == "the instrument" or isinstance(command, TakeOver):
             self._holder, self._heard_s = sender.name, now_s
         elif holder == sender.name:

@@ -72,7 +72,7 @@ class Door:
         return parcels
 
     def answer(self, identity: bytes, tag: bytes, payload: bytes) -> bool:
-        """Send a reply; False if whoever asked has gone, or does not read."""
+        """Send a reply; False if the client has gone, or does not read its replies."""
         try:
             self.router.send_multipart([identity, tag, payload], zmq.NOBLOCK)
         except zmq.ZMQError as error:

@@ -151,7 +151,9 @@ class Gateway:
                     self._connect()
                     self._keyed.refresh()
                     for whose in self._keyed.end_excessive():
-                        self._intake.drop(whose, "far more than is read: its connection was ended")
+                        self._intake.drop(
+                            whose, "far more than fitctl reads: its connection was closed"
+                        )
                     for line in self._intake.dropped(now_s):
                         self._report_event("warning", line)
                     look_s = now_s + _LOOK_S
@@ -228,7 +230,7 @@ class Gateway:
 
     def _reply(self, identity: bytes, tag: bytes, payload: bytes) -> None:
         if not self._keyed.door.answer(identity, tag, payload):
-            self._intake.drop("replies", "whoever asked has gone, or does not read")
+            self._intake.drop("replies", "the client has gone, or does not read its replies")
 
     def _pass_telemetry(self) -> None:
         for _ in range(QUEUED):

@@ -138,7 +138,7 @@ class KeyedDoor:
         if now_s >= self._banned_until_s.get(key.public, 0.0):
             self._banned_until_s[key.public] = now_s + _BANNED_S
             self._report(
-                f"the key {key.name} sends far more than is read; it cannot connect again for "
+                f"the key {key.name} sends far more than fitctl reads; it cannot connect again for "
                 f"{_BANNED_S:.0f} s. If this is not a mistake of a program: fitctl keys revoke {key.name}"
             )
 

@@ -171,7 +171,7 @@ class Service(threading.Thread):
             return
         self._unmade = ""
         names = ", ".join(path.name for path in gone)
-        text = f"sockets were removed from {folder} and are made anew: {names}"
+        text = f"sockets were removed from {folder} and have been restored: {names}"
         self._supervisor.report_event("warning", SOURCE, text)
 
     # ------------------------------------------------------------ commands

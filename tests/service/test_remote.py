@@ -54,7 +54,7 @@ def test_a_viewer_sees_everything_and_commands_nothing(served):
     for command in (Stop(), Standby(), TakeOver()):
         reply = viewer.send(command)
         assert not reply.accepted
-        assert "may watch and not command" in reply.text
+        assert "can watch but not command" in reply.text
     until(lambda: ("viewer", False) in served.commands("Stop"))
 
 

@@ -113,7 +113,7 @@ def fit_plate_scale(time_s: Floats, star_px: Floats, swings: list[Swing]) -> Pla
     if np.count_nonzero(good) < _LEAST_FRAMES:
         msg = (
             f"{np.count_nonzero(good)} frames show the star in full motion; expected at least "
-            f"{_LEAST_FRAMES}; take a longer duration_s"
+            f"{_LEAST_FRAMES}; use a longer duration_s"
         )
         raise StepFailed(msg)
     part = (time_s[good] - time_s[0]) / (time_s[-1] - time_s[0])
@@ -161,7 +161,7 @@ def refusal(fit: PlateScaleFit, step: steps.PlateScale, scale: Scales) -> str:
         if not deviation.max() <= step.max_error:
             return (
                 f"{name}: a scale is uncertain by {deviation.max():.3f}; max_error is {step.max_error:g}; "
-                "take a longer duration_s or a larger amplitude_px"
+                "use a longer duration_s or a larger amplitude_px"
             )
         if np.linalg.svd(matrix, compute_uv=False)[-1] < _LEAST_GAIN:
             return f"{name}: does not move the star along both axes; look at its wiring and its amplifiers"
@@ -257,9 +257,7 @@ def _calibration(
         found["fsm"]["beam_per_mirror"] = fsm.beam_per_mirror * figures["fsm_scale"]
         lines.append("beam_per_mirror includes the mirror's scale")
     else:
-        lines.append(
-            "the mirror's scale is left alone: identify fsm.hysteresis anew where it is off"
-        )
+        lines.append("the mirror's scale is unchanged; if it is off, identify fsm.hysteresis again")
     fragment = {"loops": {view.loop_name: found}}
     return Calibration(f"{view.loop_name}-plate-scale", lines, fragment, {})
 

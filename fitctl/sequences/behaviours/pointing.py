@@ -82,7 +82,7 @@ def _beam_held(step: steps.Hold, view: View) -> Result | None:
 def _check_hold(step: steps.Hold, rig: Rig, loop_name: str) -> list[str]:
     if loop_name in rig.metrology_loops and step.rms_limit_px is not None:
         return [
-            f"rms_limit_px is of a star; {loop_name} holds a metrology beam, to its requirement_arcsec"
+            f"rms_limit_px is for stars; {loop_name} holds a metrology beam, to its requirement_arcsec"
         ]
     return []
 

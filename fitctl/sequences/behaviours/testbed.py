@@ -27,7 +27,7 @@ def _check_collector(step: steps.Collector, rig: Rig, _loop_name: str) -> list[s
     if rig.collector is None:
         return [f"rig {rig.name} has no collector that moves"]
     if step.motion and step.action != "start":
-        return [f"{', '.join(step.motion)}: only a motion that begins has them: action start"]
+        return [f"{', '.join(step.motion)}: only allowed with action start"]
     if step.action != "start":
         return []
     try:

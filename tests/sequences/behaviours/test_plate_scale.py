@@ -238,7 +238,7 @@ def test_a_known_hysteresis_is_not_corrected_by_a_scale():
     loop = calibration.fragment["loops"]["right"]
     assert "ball_screw_m_per_rad" in loop["siderostat"]
     assert list(loop["fsm"]) == ["rotation_deg"]
-    assert "identify fsm.hysteresis anew" in "\n".join(calibration.lines)
+    assert "identify fsm.hysteresis again" in "\n".join(calibration.lines)
 
 
 @pytest.mark.parametrize(

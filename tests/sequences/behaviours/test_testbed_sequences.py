@@ -101,7 +101,7 @@ def test_what_is_wrong_with_a_motion_is_one_line_before_anything_moves():
         "the motion reaches 50 mm/s; collector.hexapod.velocity_limit_mm_s is 8"
     ]
     assert wrong_with("collector", action="stop", kind="sine") == [
-        "kind: only a motion that begins has them: action start"
+        "kind: only allowed with action start"
     ]
     assert wrong_with("collector", action="start", direction_deg=400.0) == [
         "direction_deg: must be less than or equal to 180 (is 400.0)"
@@ -161,7 +161,7 @@ def test_keys_of_a_star_are_refused_for_a_metrology_loop():
     (flux,) = wrong_with("acquire", loop="metrology", star_flux_dn=1000.0)
     assert flux.startswith("star_flux_dn and field_overlap are of a star")
     (limit,) = wrong_with("hold", loop="metrology", duration_s=1.0, rms_limit_px=0.1)
-    assert limit.startswith("rms_limit_px is of a star")
+    assert limit.startswith("rms_limit_px is for stars")
     (radius,) = wrong_with("acquire", loop="metrology", search_radius_sky_arcsec=1e4)
     assert "travel_sky_arcsec of loops.metrology.siderostat is 1500" in radius
 
