@@ -106,8 +106,9 @@ def _follow_steps(site: Site, loop: Loop) -> dict[str, float]:
     figures = {"step_error_px": worst_px}
     if worst_px > site.loop.requirement_px:
         msg = (
-            f"after a step of the target by {STEP_PX:g} px, the star stayed {worst_px:.3f} px from it, "
-            f"required are {site.loop.requirement_px:g} px; check the siderostat's backlash and the design"
+            f"after a step of the target by {STEP_PX:g} px, the star stayed {worst_px:.3f} px from it; "
+            f"the requirement is {site.loop.requirement_px:g} px; check the siderostat's backlash and "
+            "the design"
         )
         raise StepError(msg, figures)
     return figures
@@ -153,8 +154,8 @@ def cables_moves(site: Site) -> str:
     """What the step moves."""
     named = ", ".join(cable.name for cable in cables_of(site))
     return (
-        "siderostat and mirror, as in operation, until a cable is off. You take these off while the star "
-        f"is held, one after the other: {named}"
+        "siderostat and mirror, as in operation. While the loop holds the star, you disconnect these, one "
+        f"after the other: {named}"
     )
 
 
@@ -189,7 +190,7 @@ def check_cables(site: Site) -> Outcome:
             if math.isnan(took_s):
                 msg = (
                     f"{cable.name} was off for {SAFE_WITHIN_S:g} s and the loop did not go to SAFE; do not "
-                    "operate the instrument, and look at docs/interlocks.md"
+                    "operate the instrument, and see docs/interlocks.md"
                 )
                 raise StepError(msg, figures)
             figures[f"{cable.mock.rpartition('.')[2]}_safe_s"] = took_s
@@ -207,7 +208,7 @@ def _recover(cable: Cable, loop: Loop) -> None:
             loop.command(Recover())
         except StepError as error:
             if time.monotonic() > until_s:
-                msg = f"{cable.name} is on again, and the loop does not recover: {error}"
+                msg = f"{cable.name} is connected again, but the loop does not recover: {error}"
                 raise StepError(msg) from None
         else:
             return

@@ -68,8 +68,8 @@ def _stands(motors: Motors) -> None:
         moved = motors.position_rad[axis] - at_rad[axis]
         if abs(moved) > _STANDS_RAD:
             msg = (
-                f"{axis_name(axis)} moved by {moved:+.3f} rad within {STAND_S:g} s though commanded to stand; "
-                "adjust the amplifier's offset, or check its command line and its encoder's direction"
+                f"{axis_name(axis)} moved by {moved:+.3f} rad within {STAND_S:g} s although commanded to stand "
+                "still; adjust the amplifier's offset, or check its command line and its encoder's direction"
             )
             raise StepError(msg, {"furthest_rad": motors.furthest_rad})
 

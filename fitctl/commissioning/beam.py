@@ -150,7 +150,7 @@ def check_photodiodes(site: Site) -> Outcome:
                 break
             watch.move_m(-beam_m)
         else:
-            msg = "the beam does not come to the photodiodes' middle; check the siderostat's signs and gear"
+            msg = "the beam does not reach the middle of the photodiodes; check the siderostat's signs and gear"
             raise StepError(msg, {"off_m": float(np.max(np.abs(beam_m)))})
         lights_v = watch.lights_v()
     return _photodiodes_outcome(site, places_m - np.mean(places_m, axis=0), lights_v)
@@ -295,7 +295,7 @@ def _go(watch: BeamWatch, hexapod: Hexapod, pose: Pose) -> None:
         if not reading.moving:
             return
         if time.monotonic() > until_s:
-            msg = "the hexapod still moves, though it should have arrived; look at its controller"
+            msg = "the hexapod is still moving; check its controller"
             raise StepError(msg)
 
 

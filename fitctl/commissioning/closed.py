@@ -291,9 +291,9 @@ def check_gentle(site: Site) -> Outcome:
         figures |= {"began_px": distances_px[0], "ended_px": distances_px[-1]}
     if last.mode != Mode.VERNIER.name:
         msg = (
-            f"the star went from {min(distances_px):.1f} to {distances_px[-1]:.1f} px from "
-            "its target, away from it; do "
-            f"the step {site.name}.siderostat again, its signs or rotation are wrong"
+            f"the star moved away from its target, from {min(distances_px):.1f} to "
+            f"{distances_px[-1]:.1f} px; its signs or rotation are wrong: repeat the step "
+            f"{site.name}.siderostat"
         )
         raise StepError(msg, figures)
     if stopped_s > STOPPED_S:
@@ -344,7 +344,7 @@ def judged(site: Site, figures: dict[str, float], what: str) -> Outcome:
     ]
     if rms_px > wanted_px:
         msg = (
-            f"the star is held to {rms_px:.3f} px RMS, required are {wanted_px:g} px; "
+            f"the star is held to {rms_px:.3f} px RMS; the requirement is {wanted_px:g} px; "
             "identify air path, delay and "
             "hysteresis (docs/identifying.md) and choose a design (docs/designing.md)"
         )

@@ -198,9 +198,9 @@ def check_design(site: Site) -> Outcome:
     alike = [name for name in safe if found[name][0].residual_px <= _ALIKE * least_px]
     best = min(alike, key=lambda name: found[name][0].order)
     if here in safe and _WORTH_IT * found[here][0].residual_px <= found[best][0].residual_px:
-        lines.append(f"{here}, the rig file's, is kept")
+        lines.append(f"{here}, the rig file's controller, stays")
         return Outcome(lines, figures)
-    lines.append(f"{best} is taken in place of {here}")
+    lines.append(f"{best} replaces {here}")
     chosen: dict[str, Any] = {"vernier": {"controller": best}}
     return Outcome(lines, figures, site.found(**chosen), estimated=True)
 

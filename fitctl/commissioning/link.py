@@ -49,7 +49,7 @@ def check_link(site: Site) -> Outcome:
     ]
     if rms_arcsec > wanted_arcsec:
         msg = (
-            f"the beam is held to {rms_arcsec:.2f} arcsec RMS, required are {wanted_arcsec:g} arcsec; "
+            f"the beam is held to {rms_arcsec:.2f} arcsec RMS; the requirement is {wanted_arcsec:g} arcsec; "
             "check the laser's power, the photodiodes and the gain of the loop"
         )
         raise StepError(msg, figures)

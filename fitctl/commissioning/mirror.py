@@ -169,8 +169,8 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
     if abs(now.scale - 1) > 2 * SCALE_APART:
         if common := _common_scale(site, now.scale):
             lines.append(
-                "the siderostat moved it by as much: the focal length is taken for the cause of both, and the "
-                "gear is as the rig file said"
+                "the siderostat's scale differs by the same factor: the focal length is assumed to be the "
+                "cause of both, and the gear stays as in the rig file"
             )
             return Outcome(lines, figures, common)
         gains = now.scale * (np.eye(2) if fsm.axis_gains is None else np.array(fsm.axis_gains))

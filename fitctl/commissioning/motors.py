@@ -154,7 +154,7 @@ class Servo:
             self.hold()
             apart_rad = np.max(np.abs(self.goal_rad - motors.position_rad))
             if apart_rad > way_rad + _AWAY_RAD:
-                msg = "a motor goes away from where it is sent; repeat the step amplifiers"
+                msg = "a motor moves away from its set-point; repeat the step amplifiers"
                 raise StepError(msg)
             if self._site.clock.now_s() > until_s:
                 at = ", ".join(f"{one:.2f}" for one in motors.position_rad)

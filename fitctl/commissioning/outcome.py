@@ -75,7 +75,7 @@ def nobody_there(_cable: Cable, _on: bool) -> None:
     StepError
         Always.
     """
-    msg = "nobody is there to take a cable off"
+    msg = "no person is present to disconnect a cable"
     raise StepError(msg)
 
 

@@ -69,7 +69,7 @@ def verdict(record: Commissioning, tasks: Iterable[str]) -> str:
     if left:
         return f"not commissioned yet: {len(left)} of {len(entries)} steps to do, the next is {left[0]}"
     if skipped:
-        return f"commissioned, but for what was skipped: {', '.join(skipped)}"
+        return f"commissioned, except for what was skipped: {', '.join(skipped)}"
     return "commissioned"
 
 
@@ -104,9 +104,9 @@ def page(
         f'<p class="verdict {_colour(conclusion)}">{escape(conclusion[0].upper() + conclusion[1:])}.</p>',
         "<h2>Steps</h2>",
         _table(("step", "result", "ended (UTC)", "took", "what was seen"), _steps(record, titles)),
-        "<h2>What the rig file gets</h2>",
+        "<h2>Changes to the rig file</h2>",
         _table(("key", "the rig file says", "found", "by step"), _found(record, said)),
-        '<table class="sign"><tr><td>Commissioned by</td><td>Date</td><td>Seen by</td></tr></table>',
+        '<table class="sign"><tr><td>Commissioned by</td><td>Date</td><td>Approved by</td></tr></table>',
     ]
     if earlier is not None:
         parts += [

@@ -91,7 +91,7 @@ def check_star(site: Site) -> Outcome:
                 spots = watch.spots()
                 moved_rad = motors.furthest_rad
     if not spots:
-        msg = "a spot was seen once and is gone; repeat the step"
+        msg = "a spot appeared once and disappeared; repeat the step"
         raise StepError(msg)
     loop = site.loop
     figures = {
@@ -117,7 +117,7 @@ def check_star(site: Site) -> Outcome:
         spot.model_dump() | {"flux_dn": round(spot.flux_dn * part, 1)} for spot in loop.other_spots
     ]
     lines.append(
-        f"the star has {part:.2f} of star_flux_dn; its other spots are taken to have so, too"
+        f"the star has {part:.2f} of star_flux_dn; the same factor is assumed for its other spots"
     )
     return Outcome(
         lines, figures, site.found(star_flux_dn=round(spots[0].flux_dn, 1), other_spots=other)
@@ -285,8 +285,8 @@ def _siderostat_outcome(site: Site, seen: Floats, furthest_rad: float) -> Outcom
             travel_arcsec = loop.siderostat.travel_sky_arcsec * relative
             found["travel_sky_arcsec"] = round(travel_arcsec * 0.995, 1)
         lines.append(
-            "the gear is taken for the cause; if it is right by its data sheet, correct ball_screw_m_per_rad, "
-            "lever_arm_m or optics.focal_length_m instead"
+            "the gear is assumed to be the cause; if its data sheet agrees with the rig file, correct "
+            "ball_screw_m_per_rad, lever_arm_m or optics.focal_length_m instead"
         )
     return Outcome(lines, figures, site.found(siderostat=found) if found else {})
 

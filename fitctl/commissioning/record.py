@@ -162,7 +162,9 @@ def load(path: Path, rig_name: str) -> Commissioning:
         return Commissioning(rig_name)
     record = load_any(path)
     if record.rig != rig_name:
-        msg = f"{path}: is of rig {record.rig}, expected {rig_name}; move it away to begin anew"
+        msg = (
+            f"{path}: is of rig {record.rig}, expected {rig_name}; move it elsewhere to start again"
+        )
         raise ConfigError(msg)
     return record
 

@@ -98,7 +98,7 @@ def do(course: Course, task: Task) -> Entry:
         if outcome.estimated:
             break
         if attempt + 1 == _TRIES:
-            what = "what was corrected is still not as expected"
+            what = "the corrected values are still not as expected"
             outcome = Outcome(outcome.lines, outcome.figures, found, what)
     figures = outcome.figures if outcome.estimated else outcome.figures | first
     whole = replace(outcome, lines=lines, figures=figures, found=found)

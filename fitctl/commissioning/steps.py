@@ -204,7 +204,7 @@ STEPS: dict[str, Step] = {
         supervised=True,
     ),
     "cables": Step(
-        "Each cable taken off while the star is held leads to SAFE",
+        "Each cable, disconnected while the star is held, leads to SAFE",
         "star",
         acceptance.cables_moves,
         ("acceptance",),

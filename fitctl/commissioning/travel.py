@@ -99,7 +99,7 @@ def _turn(site: Site, motors: Motors, axis: int, goal_rad: float) -> float:
             )
             raise StepError(msg, {"furthest_rad": motors.furthest_rad})
         if abs(goal_rad - motors.position_rad[axis]) > abs(goal_rad - began_rad[axis]) + _OTHER_RAD:
-            msg = f"{axis_name(axis)} turns away from where it is sent; repeat the step amplifiers"
+            msg = f"{axis_name(axis)} turns away from its set-point; repeat the step amplifiers"
             raise StepError(msg, {"furthest_rad": motors.furthest_rad})
         if now_s - look_s > _LOOK_S:
             if abs(motors.position_rad[axis] - looked_rad) < _PART * wanted_rad:

@@ -84,7 +84,7 @@ def test_a_console_needs_a_terminal(commission):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--only", "nonsense"), "no step 'nonsense'; there are devices"),
+        (("--only", "nonsense"), "unknown step 'nonsense'. Available: devices"),
         (("--skip", "star"), "expected STEP=REASON"),
         (("--compare", "missing.json"), "missing.json"),
         (("--folder", "/nowhere"), "--folder"),
@@ -120,7 +120,7 @@ def test_a_reason_stays_in_the_record(commission, two_steps):
     result = json.loads(text)
     assert result["tasks"]["right.one"]["state"] == "skipped"
     assert result["tasks"]["right.one"]["trouble"] == "no lamp tonight"
-    assert result["verdict"].startswith("commissioned, but for what was skipped")
+    assert result["verdict"].startswith("commissioned, except for what was skipped")
 
 
 def test_what_is_skipped_is_not_done_even_by_its_name(commission, two_steps):

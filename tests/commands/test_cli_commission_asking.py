@@ -128,7 +128,7 @@ def test_each_step_says_what_moves_and_asks_once_and_no_ends_it_there(at_termina
     first.wait_for("Moves: the two motor.")
     first.answer("no")
     assert first.end() == 1
-    assert "the next call goes on here" in first.text
+    assert "the next run continues here" in first.text
     assert first.text.count(ASKS) == 2
     assert "DONE two" not in first.text
     assert tasks(tmp_path) == {"right.one": "passed"}
@@ -190,8 +190,8 @@ def test_a_signal_ends_the_step_whose_motors_then_stand(at_terminal, tmp_path, n
 def test_a_cable_is_taken_off_and_put_on_again_by_a_person(at_terminal, tmp_path):
     terminal = at_terminal("--only", "cable")
     terminal.answer("yes")
-    terminal.answer("", "Take off the camera's cable, then press Enter")
-    terminal.answer("", "Put the camera's cable on again, then press Enter")
+    terminal.answer("", "Disconnect the camera's cable, then press Enter")
+    terminal.answer("", "Reconnect the camera's cable, then press Enter")
     assert terminal.end() == 0
     assert "it came back" in terminal.text
     assert tasks(tmp_path) == {"right.cable": "passed"}
@@ -203,7 +203,7 @@ def test_a_console_answers_through_the_standard_input(tmp_path):
     assert job.returncode == 1
     assert b"Moves: the one motor." in text
     assert f"{ASKS} [no]: yes\n".encode() in text
-    assert b"the next call goes on here" in text
+    assert b"the next run continues here" in text
     assert tasks(tmp_path) == {"right.one": "passed"}
 
 

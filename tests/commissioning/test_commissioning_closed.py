@@ -117,7 +117,7 @@ def test_a_beam_is_held_to_the_requirement(held):
 
 
 def test_a_beam_that_wanders_is_named_with_the_requirement(held):
-    with pytest.raises(StepError, match=r"held to 3\.00 arcsec RMS, required are 1 arcsec"):
+    with pytest.raises(StepError, match=r"held to 3\.00 arcsec RMS; the requirement is 1 arcsec"):
         held(FakeClient(beam_arcsec=3.0, metrology="LOCKED"))
 
 

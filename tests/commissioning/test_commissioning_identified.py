@@ -49,7 +49,7 @@ def test_a_design_without_margins_gives_way_to_the_best_that_has_them():
 def test_a_design_with_margins_that_leaves_as_little_is_kept():
     outcome = check_design(with_settings(controller("minimum-variance")))
     assert outcome.state == "passed"
-    assert "minimum-variance, the rig file's, is kept" in outcome.lines
+    assert "minimum-variance, the rig file's controller, stays" in outcome.lines
 
 
 def test_without_a_design_that_keeps_its_margins_the_step_fails(monkeypatch):

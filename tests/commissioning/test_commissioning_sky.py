@@ -29,7 +29,7 @@ def test_motors_get_where_they_are_sent():
 @pytest.mark.parametrize(
     ("wiring", "named"),
     [
-        ({"gains": ((-1, 0), (0, 1))}, "goes away"),
+        ({"gains": ((-1, 0), (0, 1))}, "moves away"),
         ({"gains": ((0, 0), (0, 1))}, "does not follow"),
     ],
 )

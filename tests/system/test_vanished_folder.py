@@ -46,7 +46,9 @@ def test_a_vanished_folder_is_made_anew_and_everything_works_again(rig, tmp_path
 
     assert reply.text == "right OFF"
     assert back_s < 5.0
-    while not any("have been restored" in e.message for e in rig.client.send(RecentEvents()).events):
+    while not any(
+        "have been restored" in e.message for e in rig.client.send(RecentEvents()).events
+    ):
         assert time.monotonic() < removed_s + START_S
     log_grows(rig)
     # A second supervisor is kept out all the same, and so it is by another folder: by the devices.

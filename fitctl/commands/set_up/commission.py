@@ -44,7 +44,9 @@ def commission(
     ] = False,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="STEP", help="Do this step, also if it was done; may be repeated."),
+        typer.Option(
+            metavar="STEP", help="Do only this step, even if it was done; may be repeated."
+        ),
     ] = None,
     until: Annotated[str, typer.Option(metavar="STEP", help="Stop when this step is done.")] = "",
     skipped: Annotated[
@@ -61,7 +63,9 @@ def commission(
     ] = False,
     folder: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="For record and rig file; without it, the rig file's."),
+        typer.Option(
+            metavar="FOLDER", help="Folder of record and rig file. [default: the rig file's]"
+        ),
     ] = None,
     compare: Annotated[
         Path | None,
@@ -136,7 +140,7 @@ def _interrupt_once() -> None:
 
 def _by_hand(cable: Cable, on: bool) -> None:
     _ask(
-        f"{'Put' if on else 'Take off'} {cable.name}{' on again' if on else ''}, then press Enter",
+        f"{'Reconnect' if on else 'Disconnect'} {cable.name}, then press Enter",
         default="",
         show_default=False,
     )
@@ -191,7 +195,7 @@ def _known(tasks: list[Task], names: list[str]) -> list[str]:
     for name in names:
         if not chosen(tasks, [name]):
             there_are = ", ".join(task.name for task in tasks)
-            msg = f"commission: no step {name!r}; there are {there_are}"
+            msg = f"commission: unknown step {name!r}. Available: {there_are}"
             raise ConfigError(msg)
     return names
 
@@ -223,7 +227,7 @@ def _do_all(course: Course, wanted: list[Task], *, again: bool, yes: bool) -> No
                 skip(course, task, _ask("Reason for the record"))
                 continue
             if answer not in {"y", "yes"}:
-                course.report("stopped; the next call goes on here")
+                course.report("stopped; the next run continues here")
                 return
         entry = do(course, task)
         for line in _entry_lines(task.name, entry):
