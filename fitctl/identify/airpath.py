@@ -20,7 +20,7 @@ from fitctl.learn.fit_test import FitTest, fit_test
 from fitctl.learn.opened import Series, periodograms
 from fitctl.learn.spectrum import air_of, air_px2_per_hz, white_px2_per_hz
 from fitctl.model.air_path import rms_px, state_space
-from fitctl.model.drives import Drive
+from fitctl.model.drives import Drive, standstill
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,16 +145,8 @@ class AirPathResult:
 
 
 def plan(_rig: Rig, _loop_name: str) -> list[Drive]:
-    """Nothing moves, for a little longer than a minute: a motion of no amplitude."""
-    return [
-        Drive(
-            channel="fsm_az",
-            shape="sine",
-            amplitude=0.0,
-            frequency_hz=1.0,
-            duration_s=RECOMMENDED_S + 4,
-        )
-    ]
+    """Nothing moves, for a little longer than a minute."""
+    return standstill(RECOMMENDED_S + 4)
 
 
 def analyse(rig: Rig, loop_name: str, tracks: Tracks) -> AirPathResult:

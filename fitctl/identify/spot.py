@@ -22,7 +22,7 @@ from fitctl.controllers.spot_fit import gaussian_shape
 from fitctl.identify.drawing import BLACK, BLUE, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.frames import TimedImage
-from fitctl.model.drives import Drive
+from fitctl.model.drives import Drive, standstill
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -114,16 +114,8 @@ class SpotResult:
 
 
 def plan(_rig: Rig, _loop_name: str) -> list[Drive]:
-    """Nothing moves, for a little longer than is needed: a motion of no amplitude."""
-    return [
-        Drive(
-            channel="fsm_az",
-            shape="sine",
-            amplitude=0.0,
-            frequency_hz=1.0,
-            duration_s=RECOMMENDED_S + 2.0,
-        )
-    ]
+    """Nothing moves, for a little longer than is needed."""
+    return standstill(RECOMMENDED_S + 2.0)
 
 
 def analyse(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> SpotResult:

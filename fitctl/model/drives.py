@@ -46,6 +46,15 @@ class Drive(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     end_frequency_hz: float | None = None
 
 
+def standstill(duration_s: float) -> list[Drive]:
+    """Nothing moves for a time: a motion of no amplitude."""
+    return [
+        Drive(
+            channel="fsm_az", shape="sine", amplitude=0.0, frequency_hz=1.0, duration_s=duration_s
+        )
+    ]
+
+
 def drive_value(drive: Drive, time_s: float) -> float:
     """What the drive adds at `time_s` from the experiment's start."""
     since_s = time_s - drive.start_s

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.clock import VirtualClock
-from fitctl.commissioning.outcome import Site
+from fitctl.commissioning import motors
+from fitctl.commissioning.outcome import Site, StepError
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import ServoReading
 
@@ -73,3 +74,18 @@ class BenchAmplifiers:
 
 def site_of(rig=RIG, clock=None, name="right"):
     return Site(rig, name, lambda _line: None, Path("rig.toml"), (), clock=clock or VirtualClock())
+
+
+def step_on_bench(monkeypatch, check):
+    """Runs a step on amplifiers wired as told: gives the bench, the outcome, and why the step stopped."""
+
+    def run(**wiring):
+        clock = VirtualClock()
+        bench = BenchAmplifiers(clock, **wiring)
+        monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
+        try:
+            return bench, check(site_of(RIG, clock)), ""
+        except StepError as error:
+            return bench, None, str(error)
+
+    return run

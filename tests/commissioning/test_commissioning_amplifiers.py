@@ -1,26 +1,16 @@
 """The step `amplifiers`: what each pulse says, and that a motor never turns further than stated."""
 
 import pytest
-from commissioning.motor_bench import RIG, BenchAmplifiers, site_of
+from commissioning.motor_bench import RIG, BenchAmplifiers, site_of, step_on_bench
 
 from fitctl.clock import VirtualClock
 from fitctl.commissioning import motors
 from fitctl.commissioning.amplifiers import BOUND_RAD, check_amplifiers
-from fitctl.commissioning.outcome import StepError
 
 
 @pytest.fixture
 def step(monkeypatch):
-    def run(**wiring):
-        clock = VirtualClock()
-        bench = BenchAmplifiers(clock, **wiring)
-        monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
-        try:
-            return bench, check_amplifiers(site_of(RIG, clock)), ""
-        except StepError as error:
-            return bench, None, str(error)
-
-    return run
+    return step_on_bench(monkeypatch, check_amplifiers)
 
 
 def test_motors_that_do_as_commanded_pass(step):

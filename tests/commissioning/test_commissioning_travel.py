@@ -1,11 +1,8 @@
 """The step `travel`: to both ends and back, and where a motor stops before them."""
 
 import pytest
-from commissioning.motor_bench import RIG, BenchAmplifiers, site_of
+from commissioning.motor_bench import RIG, step_on_bench
 
-from fitctl.clock import VirtualClock
-from fitctl.commissioning import motors
-from fitctl.commissioning.outcome import StepError
 from fitctl.commissioning.travel import FAST_RAD_S, OF_TRAVEL, check_travel
 
 TRAVEL_RAD = RIG.loops["right"].siderostat.travel_rad
@@ -13,16 +10,7 @@ TRAVEL_RAD = RIG.loops["right"].siderostat.travel_rad
 
 @pytest.fixture
 def step(monkeypatch):
-    def run(**wiring):
-        clock = VirtualClock()
-        bench = BenchAmplifiers(clock, **wiring)
-        monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
-        try:
-            return bench, check_travel(site_of(RIG, clock)), ""
-        except StepError as error:
-            return bench, None, str(error)
-
-    return run
+    return step_on_bench(monkeypatch, check_travel)
 
 
 def test_both_motors_go_to_both_ends_and_back_and_never_beyond(step):
