@@ -23,7 +23,7 @@ from fitctl.messages.modes import (
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.service.metrics import InstrumentCollector
-from fitctl.tui.commands import OPERATOR_COMMANDS, VIEWS, keys_of
+from fitctl.tui.commands import OPERATOR_COMMANDS, SCREENS, keys_of
 from tests.fake_supervisor import FakeSupervisor
 
 
@@ -61,13 +61,13 @@ def test_the_diagram_of_modes_is_that_of_the_code():
 
 def test_the_console_keys_are_those_of_the_console():
     rows = [[f"`{command.key}`", command.label, command.help] for command in OPERATOR_COMMANDS]
-    rows += [[f"`{view.key}`", view.label, f"screen: {view.help}"] for view in VIEWS]
+    rows += [[f"`{view.key}`", view.label, f"screen: {view.help}"] for view in SCREENS]
 
     assert between("console.md", "keys") == table(["key", "command", "what it does"], rows)
 
 
 def test_the_other_keys_of_the_console_are_those_of_its_screens():
-    screens = {"": "every screen"} | {view.name: view.label for view in VIEWS}
+    screens = {"": "every screen"} | {view.name: view.label for view in SCREENS}
     rows = [
         [screen, f"`{key.shown}`", key.label, key.help]
         for name, screen in screens.items()

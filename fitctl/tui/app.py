@@ -30,7 +30,7 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, VIEWS, keys_of
+from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, SCREENS, keys_of
 from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader, Running, events_text
 from fitctl.tui.graphics import Graphics, PictureSender
 from fitctl.tui.jobs import Job
@@ -110,7 +110,7 @@ class ConsoleApp(App[None]):
             for command in OPERATOR_COMMANDS
             if command.name != "Stop"
         ),
-        *(Binding(view.key, f"view('{view.name}')", view.label, show=False) for view in VIEWS),
+        *(Binding(view.key, f"view('{view.name}')", view.label, show=False) for view in SCREENS),
         *(key.binding() for key in keys_of("") if key.label != "Palette"),
         # What a shell's user expects, also over a dialog.
         Binding("ctrl+c,ctrl+q", "quit", "Quit", priority=True, show=False),
@@ -459,7 +459,7 @@ class ConsoleApp(App[None]):
         for trip in self.state.loop.state.interlocks if self.state.loop else ():
             reset = partial(self.send, Reset(name=trip.name))
             yield SystemCommand(f"reset {trip.name}", trip.reason, reset)
-        for view in VIEWS:
+        for view in SCREENS:
             yield SystemCommand(
                 f"Screen: {view.label}", view.help, partial(self.action_view, view.name)
             )

@@ -31,10 +31,12 @@ VIEWS = (
     ViewName("4", "sequences", "Sequences", "list, edit, rehearse, run, stop"),
     ViewName("5", "logs", "Logs", "list, keep, verify, report, replay"),
     ViewName("6", "help", "Help", "every key, mode and sign"),
-    ViewName(
-        "7", "commissioning", "Commissioning", "its steps and results; run, repeat, skip them"
-    ),
 )
+COMMISSIONING = ViewName(
+    "7", "commissioning", "Commissioning", "its steps and results; run, repeat, skip them"
+)
+SCREENS = (*VIEWS, COMMISSIONING)
+"""All screens; the header has those of the night's work, and the last one where it is of use."""
 
 
 def _always(_state: ConsoleState, _alarms: AlarmBook) -> bool:

@@ -22,7 +22,8 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.tui.app import ConsoleApp
-from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS
+from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS
+from fitctl.tui.commands import SCREENS as ALL_SCREENS
 from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader, Running
 from fitctl.tui.jog import JogPad
 from fitctl.tui.state import WINDOWS
@@ -32,7 +33,7 @@ from fitctl.tui.widgets.focalplane import FocalPlane
 from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs
 
-SCREENS = [ConsoleApp.MODES[view.name] for view in VIEWS]
+SCREENS = [ConsoleApp.MODES[view.name] for view in ALL_SCREENS]
 BOUND = (ConsoleApp, Choice, *SCREENS, Reader, Alarms, Running, Confirm, Ask)
 OF_ITS_OWN_ACCORD = (["sequence", "list"], ["log", "summary"], ["commission", "--list"])
 LOG = "fit-mock_20261132T031500Z.mcap"
@@ -102,7 +103,7 @@ EVERYWHERE = lines(
     ConsoleApp,
     [
         ("1", "2", {"view": "operate"}),
-        *((view.key, "", {"view": view.name}) for view in VIEWS[1:]),
+        *((view.key, "", {"view": view.name}) for view in ALL_SCREENS[1:]),
         ("question_mark", "", {"view": "help"}),
         ("f1", "", {"view": "help"}),
         ("k", "", {"unseen": False, "loud": False}),
@@ -346,7 +347,7 @@ def test_every_key_has_its_row():
 
 def test_every_key_that_is_told_to_people_is_bound():
     everywhere = keys_bound(ConsoleApp) | {ConsoleApp.COMMAND_PALETTE_BINDING}
-    told = {row.key for row in (*OPERATOR_COMMANDS, *VIEWS)}
+    told = {row.key for row in (*OPERATOR_COMMANDS, *ALL_SCREENS)}
     told |= {key for row in KEYS if not row.view for key in row.keys.split(",")}
     assert told <= everywhere
     for row in KEYS:

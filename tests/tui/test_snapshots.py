@@ -9,7 +9,7 @@ import pytest
 from pytest_textual_snapshot import SVGImageExtension
 
 from fitctl.messages.telemetry import LearningState
-from fitctl.tui.commands import VIEWS
+from fitctl.tui.commands import COMMISSIONING, VIEWS
 from tests.fake_supervisor import MODE_NUMBERS, TESTBED, FakeSupervisor
 from tests.learner_reports import LINE, learnt_json, report
 from tests.tui.commissioned import OUTPUT, commissioning
@@ -24,7 +24,7 @@ from tests.tui.wrong import (
 
 SIZES = [(80, 24), (120, 40), (200, 60)]
 SMALL = SIZES[:1]
-OF_NO_MODE = {"sequences", "logs", "commissioning"}  # which look the same in every mode
+OF_NO_MODE = {"sequences", "logs"}  # which look the same in every mode
 
 
 @pytest.fixture
@@ -66,6 +66,10 @@ def changed(snapshot):
 def test_every_screen_in_every_mode(changed, mode):
     views = [view for view in VIEWS if mode == "VERNIER" or view.name not in OF_NO_MODE]
     assert changed(FixedApp(FakeSupervisor(mode)), views=views) == []
+
+
+def test_the_steps_on_a_console_of_operation(changed):
+    assert changed(FixedApp(FakeSupervisor()), views=[COMMISSIONING]) == []
 
 
 def test_a_step_of_the_commissioning_asks(changed):

@@ -9,7 +9,7 @@ import scipy.special
 from fitctl.messages.telemetry import FringeOptics, Telemetry
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.commands import VIEWS
+from fitctl.tui.commands import SCREENS
 from fitctl.tui.loops.band import loop_rows
 from fitctl.tui.loops.fringes import expected_visibility, fringe_line
 from fitctl.tui.state import Rms
@@ -63,7 +63,7 @@ def test_the_telemetry_carries_the_ticks_of_metrology_and_the_overlap(recorded):
     assert newest.overlaps[-1].visibility > 0.8
 
 
-@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.label)
+@pytest.mark.parametrize("view", SCREENS, ids=lambda view: view.label)
 def test_every_screen_shows_every_loop(recorded, view):
     shown = []
 

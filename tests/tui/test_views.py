@@ -3,7 +3,7 @@
 import pytest
 
 from fitctl.messages.commands import Release, Stop
-from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS, keys_of
+from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, SCREENS, keys_of
 from fitctl.tui.widgets.keys import Keys
 from tests.tui.fixed import settle
 from tests.tui.piloted import pressed, run, sent
@@ -13,11 +13,11 @@ from tests.tui.piloted import pressed, run, sent
 
 def test_every_screen_is_a_key_a_click_and_a_palette_entry_away():
     async def scenario(app, pilot):
-        for view in VIEWS:
+        for view in SCREENS:
             await pressed(app, pilot, view.key)
             assert app.view.view_name == view.name
         named = {command.title for command in app.get_system_commands(app.screen)}
-        assert {f"Screen: {view.label}" for view in VIEWS} <= named
+        assert {f"Screen: {view.label}" for view in SCREENS} <= named
         await pressed(app, pilot, "1")
         tabs = app.view.query_one("#header").render_line(2).text
         await pilot.click("#header", offset=(tabs.index("Devices"), 2))
@@ -27,7 +27,7 @@ def test_every_screen_is_a_key_a_click_and_a_palette_entry_away():
     run(scenario)
 
 
-@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+@pytest.mark.parametrize("view", SCREENS, ids=lambda view: view.name)
 @pytest.mark.parametrize("key", ["s", "space", "ctrl+s"])
 def test_stop_is_one_key_on_every_screen(view, key):
     async def scenario(app, pilot):
@@ -38,12 +38,12 @@ def test_stop_is_one_key_on_every_screen(view, key):
 
 def test_stop_is_one_click_on_every_screen():
     async def scenario(app, pilot):
-        for view in VIEWS:
+        for view in SCREENS:
             await pressed(app, pilot, view.key)
             await pilot.click("#keys", offset=(3, 0))
             await pilot.pause()
 
-    assert sent(run(scenario)) == [Stop()] * len(VIEWS)
+    assert sent(run(scenario)) == [Stop()] * len(SCREENS)
 
 
 @pytest.mark.parametrize("opening", [("1", "o"), ("v",), ("4", "g"), ("4", "f")])
@@ -58,19 +58,19 @@ def test_stop_reaches_through_every_dialog(opening):
 
 def test_commands_work_on_every_screen():
     async def scenario(app, pilot):
-        for view in VIEWS:
+        for view in SCREENS:
             await pressed(app, pilot, view.key)
             await pilot.press("h")
 
-    assert sent(run(scenario)) == [Release(loop="right")] * len(VIEWS)
+    assert sent(run(scenario)) == [Release(loop="right")] * len(SCREENS)
 
 
 def test_no_key_means_two_things_on_one_screen():
-    for view in VIEWS:
+    for view in SCREENS:
         keys = [
             *(command.key for command in OPERATOR_COMMANDS),
             "space",
-            *(each.key for each in VIEWS),
+            *(each.key for each in SCREENS),
             *(key for each in (*keys_of(view.name), *keys_of("")) for key in each.keys.split(",")),
         ]
         assert len(keys) == len(set(keys)), view.name
@@ -94,7 +94,7 @@ def test_every_key_is_in_the_help():
 @pytest.mark.parametrize("size", [(80, 24), (480, 130)])
 def test_the_smallest_and_the_largest_terminal_show_every_screen(size):
     async def scenario(app, pilot):
-        for view in VIEWS:
+        for view in SCREENS:
             await pressed(app, pilot, view.key)
             assert "STOP" in app.view.query_one(Keys).render_line(0).text
 

@@ -14,7 +14,7 @@ from textual.widgets import Input, Static
 
 from fitctl.messages.modes import MEANING
 from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, VIEWS, keys_of
+from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, SCREENS, keys_of
 from fitctl.tui.inks import INK, SKY, WHITE
 from fitctl.tui.look import MODES
 from fitctl.tui.state import ConsoleState
@@ -139,7 +139,7 @@ def all_sections(*, quit_shuts_down: bool) -> list[Section]:
             "Commands, on every screen",
             [*commands, *((key, meaning, SKY) for key, meaning in _ALWAYS)],
         ),
-        Section("Screens", [(view.key, f"{view.label}: {view.help}", SKY) for view in VIEWS]),
+        Section("Screens", [(view.key, f"{view.label}: {view.help}", SKY) for view in SCREENS]),
         Section(
             "Everywhere",
             [
@@ -148,7 +148,7 @@ def all_sections(*, quit_shuts_down: bool) -> list[Section]:
             ],
         ),
     ]
-    for view in VIEWS:
+    for view in SCREENS:
         own = keys_of(view.name)
         if own:
             rows = [(key.shown, f"{key.label}: {key.help}", SKY) for key in own]

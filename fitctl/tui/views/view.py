@@ -29,7 +29,7 @@ class View(Screen[None]):
     Attributes
     ----------
     view_name : str
-        As :data:`fitctl.tui.commands.VIEWS` has it.
+        As :data:`fitctl.tui.commands.SCREENS` has it.
     """
 
     view_name: ClassVar[str]

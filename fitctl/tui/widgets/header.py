@@ -10,7 +10,7 @@ from rich.segment import Segment
 
 from fitctl.messages.modes import KIND_MODES
 from fitctl.tui.alarms import AlarmBook
-from fitctl.tui.commands import VIEWS
+from fitctl.tui.commands import COMMISSIONING, VIEWS
 from fitctl.tui.inks import DIM, FAINT, GREEN, INK, ORANGE, PAPER, RED, SKY, WHITE
 from fitctl.tui.look import (
     MODES,
@@ -189,9 +189,8 @@ class Header(Panel):
 
     def _screens(self) -> Line:
         line: Line = []
-        for key, name, label, _ in VIEWS:
-            if name == "commissioning" and self.state.waits_for_supervisor and name != self._view:
-                continue  # of no use at night
+        commissions = not self.state.waits_for_supervisor or self._view == COMMISSIONING.name
+        for key, name, label, _ in (*VIEWS, *([COMMISSIONING] if commissions else [])):
             if name == self._view:
                 piece = [text(f" {key} {label} ", PAPER, on=INK, bold=True)]
             else:
