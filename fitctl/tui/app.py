@@ -256,6 +256,12 @@ class ConsoleApp(App[None]):
         loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
         self._wire.send(msgspec.structs.replace(command, loop=loop))
 
+    @property
+    def _nothing_runs(self) -> bool:
+        """Whether this console does a commissioning, and neither a step nor a supervisor is there."""
+        over = self.step_job is None or self.step_job.status is not None
+        return self.commissioning is not None and self.state.stale and over
+
     def end_step(self) -> None:
         """End the running step of the commissioning."""
         if self.step_job is not None and self.step_job.status is None:
@@ -294,8 +300,8 @@ class ConsoleApp(App[None]):
             self._recall(reply)
             return
         if reply is None:
-            if name == "Stop" and self.commissioning is not None and self.state.stale:
-                self.notify("no supervisor runs now", title="■ STOP", timeout=5)
+            if name == "Stop" and self._nothing_runs:
+                self.notify("no step and no supervisor runs now", title="■ STOP", timeout=5)
                 return
             if name == "Stop":
                 problem += "\nThe instrument may still move. Press STOP again, or cut its power."

@@ -164,6 +164,21 @@ def test_stop_ends_the_step_also_over_its_question_and_on_another_screen(key):
     assert sent(app) == ([] if key == "z" else [Stop()])
 
 
+def test_a_stop_without_reply_is_an_error_unless_nothing_runs():
+    async def scenario(app, pilot):
+        app._handle_reply(Stop(), None, "no reply")
+        await pilot.pause()
+        assert "no step and no supervisor runs" in notifications(app)
+        assert "may still move" not in notifications(app)
+        await pressed(app, pilot, "g")
+        await pressed(app, pilot, "y")
+        app._handle_reply(Stop(), None, "no reply")
+        await pilot.pause()
+        assert "may still move" in notifications(app)
+
+    on_console(scenario)
+
+
 def test_when_a_step_ends_its_question_goes_and_the_record_is_read_again():
     async def scenario(app, pilot):
         await pressed(app, pilot, "g")
