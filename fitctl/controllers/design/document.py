@@ -13,6 +13,16 @@ FORMAT = "fitctl design 1"
 MATRICES = ("a", "b", "c", "d")
 
 
+def matrix_shapes(states: int) -> dict[str, tuple[int, int]]:
+    """Of the matrices of a design with so many states."""
+    return {
+        "a": (states, states),
+        "b": (states, len(INPUTS)),
+        "c": (len(OUTPUTS), states),
+        "d": (len(OUTPUTS), len(INPUTS)),
+    }
+
+
 def design_json(design: Design) -> str:
     """A design with everything needed to make it again, as its file has it."""
     document = {
@@ -50,13 +60,7 @@ def design_from_json(text: str) -> Design:
     """
     document = json.loads(text)
     # A law without states has matrices of no rows, whose columns JSON does not keep.
-    states = len(document["a"])
-    shapes = {
-        "a": (states, states),
-        "b": (states, len(INPUTS)),
-        "c": (len(OUTPUTS), states),
-        "d": (len(OUTPUTS), len(INPUTS)),
-    }
+    shapes = matrix_shapes(len(document["a"]))
     a, b, c, d = (np.array(document[name], dtype=float).reshape(shapes[name]) for name in MATRICES)
     return Design(
         document["name"],

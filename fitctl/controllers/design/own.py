@@ -15,6 +15,7 @@ import numpy as np
 
 from fitctl.config import CONTROLLERS, ConfigError, is_name
 from fitctl.controllers.design.basis import Basis
+from fitctl.controllers.design.document import MATRICES, matrix_shapes
 from fitctl.controllers.pair import INPUTS, LEARNT, OUTPUTS, Design
 
 SUFFIX = ".py"
@@ -91,19 +92,12 @@ def checked(design: Design, its_basis: Basis, origin: str) -> Design:
     """
     try:
         matrices: dict[str, Any] = {
-            key: np.array(getattr(design, key), dtype=float) for key in "abcd"
+            key: np.array(getattr(design, key), dtype=float) for key in MATRICES
         }
     except (TypeError, ValueError) as error:
         msg = f"controller {origin}: a, b, c, d must be matrices of numbers: {error}"
         raise ConfigError(msg) from None
-    states = len(matrices["a"])
-    shapes = {
-        "a": (states, states),
-        "b": (states, len(INPUTS)),
-        "c": (len(OUTPUTS), states),
-        "d": (len(OUTPUTS), len(INPUTS)),
-    }
-    for key, shape in shapes.items():
+    for key, shape in matrix_shapes(len(matrices["a"])).items():
         if matrices[key].size == 0 == np.prod(shape):
             matrices[key] = matrices[key].reshape(shape)
         if matrices[key].shape != shape or not np.isfinite(matrices[key]).all():

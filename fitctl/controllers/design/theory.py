@@ -49,10 +49,8 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
             link.backlash_sky_arcsec, motor_sky_rad_per_rad(link) * ARCSEC_PER_RAD
         )
     sensitivity = 1 / (1 + sampled_response(design, its_basis)(omega_rad_s))
-    undelayed = np.abs(
-        sensitivity
-    )  # of matrices without a maker: what delay and hold cost counts as air
-    if not design.own:
+    undelayed = np.abs(sensitivity)
+    if not design.own:  # of matrices without a maker, what delay and hold cost counts as air
         quick_basis = basis_of(design.parameters, quick)
         quick_design = DESIGNS[design.name](
             dataclasses.replace(quick_basis, noise_px=quick.noise_px)
