@@ -64,7 +64,7 @@ def test_the_step_of_figure_3_stays_within_the_converter():
 
 
 def test_the_paper_s_own_equations_give_less_than_its_text_says(loops):
-    assert value(loops, "bandwidth") == pytest.approx(3.7, abs=0.1)
+    assert value(loops, "crossover (not bandwidth)") == pytest.approx(3.7, abs=0.1)
     assert value(loops, "attenuation at 1 Hz") == pytest.approx(6.5, abs=0.2)
     assert value(loops, "LQG/LTR anew: distance from Eq. 20, dB") < 0.5
 
