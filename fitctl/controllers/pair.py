@@ -92,6 +92,12 @@ class Design:
         """What people call it: its name, or `LEARNT`."""
         return LEARNT if self.learnt else self.name
 
+    @property
+    def uses_noise(self) -> bool:
+        """Another noise of the sensor makes another design: of the shipped ones, those that predict."""
+        by_itself = not (self.learnt or self.own or self.file)
+        return by_itself and self.name in {"minimum-variance", "fslq"}
+
 
 class Designer(Protocol):
     """Makes designs of a rig's loops."""

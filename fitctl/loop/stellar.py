@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import AxisPair, Rig
 from fitctl.config import Loop as LoopSettings
-from fitctl.controllers.centroid import OtherLight, Star
+from fitctl.controllers.centroid import OtherLight, Star, sensor_noise_px
 from fitctl.controllers.design.document import design_json
 from fitctl.controllers.pair import Design, Designer
 from fitctl.controllers.spiral import plan_spiral
@@ -105,7 +105,7 @@ class StellarLoop(Loop):
         self._flattened = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
         self._has_held = False  # since the devices were opened
-        self.noise_px: float | None = None
+        self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None
         self._is_recalled = False  # what the star finder expects, and no search has begun there yet
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
@@ -541,6 +541,13 @@ class StellarLoop(Loop):
         """The design at work in VERNIER."""
         return self.pointing.design.title
 
+    @property
+    def noise_px(self) -> float | None:
+        """The sensor's noise that the design was made for, where it is not the one of the rig file's light."""
+        design = self.pointing.design
+        noise_px: float | None = design.parameters.get("noise_px")
+        return noise_px if design.uses_noise and noise_px != self._rig_noise_px else None
+
     def use(
         self,
         design: Design,
@@ -548,14 +555,11 @@ class StellarLoop(Loop):
         *,
         report: LearnerReport | None = None,
         by_itself: bool = False,
-        noise_px: float | None = None,
     ) -> None:
         """Work with another design from the next tick on; in VERNIER the mirror goes on where it is.
 
-        A learnt design comes with its report, one for another noise than the rig file's with that noise;
-        `by_itself` is without an operator's command.
+        A learnt design comes with its report; `by_itself` is without an operator's command.
         """
-        self.noise_px = noise_px
         self.learning.changed(
             self.pointing.design, design, report, self.pointing.recent, by_itself=by_itself
         )

@@ -15,12 +15,6 @@ FIRST_S, EVERY_S = 1.0, 20.0
 """The light is the mean of so long: once the star is found or the design changes, and from then on."""
 MOST_RATIO = 1.1
 """A noise that differs by less is not worth another design: minimum-variance leaves 0.3 % more at most."""
-_USE_NOISE = frozenset({"minimum-variance", "fslq"})
-
-
-def uses_noise(design: Design) -> bool:
-    """Whether another noise makes another design: a shipped one that was not made for another purpose."""
-    return design.name in _USE_NOISE and not (design.learnt or design.own or design.file)
 
 
 def noise_ratio(design: Design, noise_px: float) -> float:
@@ -60,7 +54,7 @@ class Starlight:
             self._begin()
             return None
         star = loop.observation.star
-        if star is None or self._busy or not uses_noise(self._design):
+        if star is None or self._busy or not self._design.uses_noise:
             return None
         self._frames += 1
         self._sum_dn += star.flux_dn
@@ -83,4 +77,4 @@ class Starlight:
         elif self.loop.pointing.design is before:
             was_px = float(before.parameters["noise_px"])
             why = f"the star's light gives {noise_px:.4f} px of noise, not {was_px:.4f}"
-            self.loop.use(future.result(), why, by_itself=True, noise_px=noise_px)
+            self.loop.use(future.result(), why, by_itself=True)

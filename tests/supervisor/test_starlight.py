@@ -1,6 +1,7 @@
 """A design follows the star's measured light: on the virtual clock with the full plant."""
 
 from concurrent.futures import Future
+from dataclasses import replace
 
 import pytest
 from simulated import darken, events_of, until
@@ -122,6 +123,18 @@ def test_a_design_chosen_by_hand_is_for_the_light_too():
     first, second = changes_of(simulation)
     assert (first.target, first.reason) == ("minimum-variance", "")
     assert "0.0401 px" in second.reason
+
+
+def test_after_the_way_back_from_a_learnt_design_consoles_know_its_noise():
+    simulation = held(rig_of(FAINT_DN), FAINT_DN)
+    loop = loop_of(simulation)
+    for_the_light = loop.pointing.design
+
+    loop.use(replace(for_the_light, learnt=True))
+    assert loop.state(0.0).noise_px is None
+    loop.use(for_the_light, by_itself=True)
+
+    assert loop.state(0.0).noise_px == for_the_light.parameters["noise_px"]
 
 
 def test_a_design_from_a_file_stays_as_it_is(tmp_path):

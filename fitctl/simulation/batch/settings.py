@@ -55,7 +55,7 @@ from fitctl.simulation.statistics import SETTLE_S, TILT_EVERY, motion_start_s
 from fitctl.stages.injector import PERIOD_S
 from fitctl.stages.mirror import HISTORY_S as MIRROR_HISTORY_S
 from fitctl.stages.servo import FOLLOWING_S, HISTORY_S
-from fitctl.supervisor.starlight import MOST_RATIO, noise_ratio, uses_noise
+from fitctl.supervisor.starlight import MOST_RATIO, noise_ratio
 
 Floats = NDArray[np.float64]
 _NO_FIT = np.zeros((PLACES, PLACES, 3, SIDE_PX**2))
@@ -89,7 +89,7 @@ def star_settings(
     pair = pointing.pair
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     noise_px = sensor_noise_px(rig.camera, loop, plant.spots[0].flux_dn)
-    if uses_noise(pointing.design) and noise_ratio(pointing.design, noise_px) > _MOST_NOISE_RATIO:
+    if pointing.design.uses_noise and noise_ratio(pointing.design, noise_px) > _MOST_NOISE_RATIO:
         msg = f"the star of loop {loop_name} has another light, and the batch's designs stay as they are"
         raise BatchRefusalError(msg)
     writes = math.ceil(MIRROR_HISTORY_S / min(camera.period_s, PERIOD_S))
