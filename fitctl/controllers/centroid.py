@@ -119,6 +119,10 @@ class StarSensor:
             self._camera, star_flux_dn, _LEVER_PX.size, self._loop.spot_diameter_px
         )
 
+    def noise_px(self, star_flux_dn: float) -> float:
+        """As :func:`sensor_noise_px`, of the fit that is at hand: another one would take milliseconds."""
+        return _noise_px(self.fit, self._camera, self._loop, star_flux_dn)
+
     def measure(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
     ) -> Star | None:
@@ -217,7 +221,10 @@ def fit_for(camera: Camera, loop: Loop, star_flux_dn: float) -> SpotFit | None:
 
 def sensor_noise_px(camera: Camera, loop: Loop, star_flux_dn: float) -> float:
     """One standard deviation of where a loop's sensor finds a star of this flux, along one axis."""
-    fit = fit_for(camera, loop, star_flux_dn)
+    return _noise_px(fit_for(camera, loop, star_flux_dn), camera, loop, star_flux_dn)
+
+
+def _noise_px(fit: SpotFit | None, camera: Camera, loop: Loop, star_flux_dn: float) -> float:
     if fit is None:
         return centroid_noise_px(
             camera, star_flux_dn, 2 * HALF_WINDOW_PX + 1, loop.spot_diameter_px

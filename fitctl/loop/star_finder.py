@@ -66,6 +66,10 @@ class StarFinder:
         """What the star's light is to be from now on."""
         self._sensor.expect(flux_dn)
 
+    def noise_px(self, flux_dn: float) -> float:
+        """One standard deviation of where the star is found, if its light is this."""
+        return self._sensor.noise_px(flux_dn)
+
     def exclude(
         self, followed: Iterable[list[OtherLight]], candidates: Iterable[list[OtherLight]]
     ) -> None:

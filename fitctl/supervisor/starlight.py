@@ -5,7 +5,6 @@ from __future__ import annotations
 from concurrent.futures import Future
 
 from fitctl.config import Rig
-from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.controllers.pair import Design
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.modes import WITH_WINDOW
@@ -35,7 +34,6 @@ class Starlight:
 
     def __init__(self, rig: Rig, loop: StellarLoop, journal: Journal) -> None:
         self.loop = loop
-        self._camera, self._settings = rig.camera, rig.stellar_loops[loop.name]
         self._journal = journal
         self._first = round(FIRST_S / rig.camera.period_s)
         self._every = round(EVERY_S / rig.camera.period_s)
@@ -62,7 +60,7 @@ class Starlight:
             return None
         flux_dn = self._sum_dn / self._frames
         self._frames, self._needed, self._sum_dn = 0, self._every, 0.0
-        noise_px = sensor_noise_px(self._camera, self._settings, flux_dn)
+        noise_px = loop.star_finder.noise_px(flux_dn)
         self._busy = noise_ratio(self._design, noise_px) > MOST_RATIO
         return noise_px if self._busy else None
 

@@ -7,7 +7,7 @@ import pytest
 from simulated import darken, events_of, until
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.controllers.centroid import sensor_noise_px
+from fitctl.controllers.centroid import StarSensor, sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import save_design
 from fitctl.logging.records import ControllerChange
@@ -22,7 +22,7 @@ from fitctl.supervisor.starlight import Starlight
 FAINT_DN = 7000.0  # 0.04 px of noise, as the rig file's 28000 DN have 0.01
 
 
-def rig_of(flux_dn, controller="minimum-variance"):
+def rig_of(flux_dn, controller="minimum-variance", more=()):
     """Its star has a light that the rig file does not know."""
     spot = f"{{name='star', offset_px={{az=0.0, el=0.0}}, flux_dn={flux_dn}, diameter_px=3.0}}"
     return load_rig(
@@ -31,6 +31,7 @@ def rig_of(flux_dn, controller="minimum-variance"):
             f"plant.loops.right.spots=[{spot}]",
             "loops.right.other_spots=[]",
             f"loops.right.vernier.controller={controller}",
+            *more,
         ],
     )
 
@@ -99,6 +100,19 @@ def test_the_light_is_that_which_is_measured_whatever_the_rig_file_expects():
 
     design = loop_of(simulation).pointing.design
     assert design.parameters["noise_px"] == pytest.approx(0.014, rel=0.01)
+
+
+@pytest.mark.parametrize("electrons", [[], ["camera.electrons_per_dn=1.0"]])
+def test_the_fits_noise_is_told_within_what_matters_and_without_another_fit(electrons):
+    rig = rig_of(28000.0, more=["loops.right.sensor=fit", *electrons])
+    camera, loop = rig.camera, rig.loops["right"]
+    sensor = StarSensor(camera, loop)
+    fit = sensor.fit
+
+    for flux_dn in (17000.0, 28000.0, 44000.0):
+        exact_px = sensor_noise_px(camera, loop, flux_dn)
+        assert sensor.noise_px(flux_dn) == pytest.approx(exact_px, rel=0.02)
+    assert sensor.fit is fit
 
 
 def test_a_star_that_fades_later_gets_its_design_within_a_minute():
