@@ -214,7 +214,7 @@ def test_the_fringe_line_has_visibility_expectation_and_tilt():
 
 def test_without_both_stars_there_is_no_visibility():
     state = shown(stopped_testbed(), 50)
-    assert "both stars must be followed" in plain([fringe_line(state, 80)])[0]
+    assert "both loops must hold a star" in plain([fringe_line(state, 80)])[0]
 
 
 @pytest.mark.parametrize("rms_px", [0.02, 0.05, 0.07])
