@@ -27,7 +27,7 @@ from fitctl.report.fringes import FringeFindings, density
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TOO_SHORT = "no stretch that counts is as long as a segment of 8 s."
+TOO_SHORT = "no evaluated stretch is as long as a segment of 8 s."
 _POINTS = 900  # of a path in the plane
 _DIRECTIONS = (
     (1, "^", AZ, "came from below"),
@@ -50,7 +50,7 @@ def spectra(loop: StarFindings) -> Plot:
             sums.semilogx(frequency_hz, total, line, color=color)
     sums.axhline(loop.requirement, color=INK, linestyle=":")
     densities.set(title="Power spectral density", xlabel="Hz", ylabel="px²/Hz")
-    sums.set(title="Cumulative RMS: of all below a frequency", xlabel="Hz", ylabel="px")
+    sums.set(title="Cumulative RMS: of all lower frequencies", xlabel="Hz", ylabel="px")
     sums.set_yscale("log")
     for axis in (densities.xaxis, densities.yaxis, sums.xaxis, sums.yaxis):
         decimal(axis)
@@ -68,7 +68,7 @@ def beam_spectrum(loop: LoopFindings, period_s: float) -> Plot:
     errors = np.column_stack([loop.error(axis) for axis in AXES]).astype(float)
     found = density(loop.ticks["time_s"], errors, loop.selection.rows, period_s)
     caption = (
-        "Welch's method, segments of 8 s. The error is that of the samples: the photodiodes' noise is in it. "
+        "Welch's method, segments of 8 s. The error is measured, so it includes the photodiodes' noise. "
         "Dotted: the requirement."
     )
     if not len(found[0]):
@@ -79,10 +79,7 @@ def beam_spectrum(loop: LoopFindings, period_s: float) -> Plot:
 
 def tilt_spectrum(fringes: FringeFindings) -> Plot:
     """Spectral density of the tilt between two stars."""
-    caption = (
-        "Welch's method, segments of 8 s. Both stars are measured, so both stars' noise of the camera is in "
-        "the tilt."
-    )
+    caption = "Welch's method, segments of 8 s. The measured tilt includes the camera noise of both stars."
     if not len(fringes.frequency_hz):
         return Plot("fringes-psd", "Spectrum of the tilt", TOO_SHORT, None)
     figure = _axes_spectra(fringes.frequency_hz, fringes.density, math.nan)
@@ -99,7 +96,7 @@ def _axes_spectra(
         total = np.sqrt(np.cumsum(power[:, number]) * frequency_hz[0])
         sums.loglog(frequency_hz, total, color=COLORS[axis], label=axis)
     densities.set(title="Power spectral density", xlabel="Hz", ylabel="arcsec²/Hz")
-    sums.set(title="Cumulative RMS: of all below a frequency", xlabel="Hz", ylabel="arcsec")
+    sums.set(title="Cumulative RMS: of all lower frequencies", xlabel="Hz", ylabel="arcsec")
     if not math.isnan(requirement):
         sums.axhline(requirement, color=INK, linestyle=":")
     densities.legend(loc="lower left")
@@ -122,7 +119,7 @@ def rejection(loop: StarFindings) -> Plot:
             axes.loglog(frequency_hz, predicted, "--", color=color, label=f"design, {name}")
     axes.axhline(1.0, color=FAINT, linewidth=0.9)
     axes.set(
-        title="Disturbance rejection: above 1 the loop helps, below it makes worse",
+        title="Disturbance rejection: the loop helps above 1 and amplifies below",
         xlabel="Hz",
         ylabel="disturbance over error",
     )
@@ -131,7 +128,7 @@ def rejection(loop: StarFindings) -> Plot:
     axes.legend(loc="upper right")
     caption = (
         "Root of the ratio of both spectra, beside the sensitivity of the linear sampled loop of the logged "
-        "design. Eq. 20 knows nothing of the stacks' hysteresis, which takes from its gain."
+        "design. Eq. 20 does not include the stacks' hysteresis, which lowers its gain."
     )
     return Plot(f"{loop.name}-rejection", "Rejection against the design", caption, figure)
 
@@ -196,17 +193,15 @@ def _gap_text(loop: StarFindings) -> str:
         if not math.isnan(gap.px)
     ]
     found = (
-        "Difference of the commands at one place of the target, come from below less come from above: "
+        "Difference of the commands at one place of the target, reached from below less from above: "
         f"{', '.join(gaps)}."
         if gaps
-        else "The target did not come to one place from both sides, so the commands cannot show hysteresis."
+        else "The target did not reach one place from both sides, so the commands cannot show hysteresis."
     )
     of_commands = (
-        "The commands are those of both stages, in the mean while the target stood still. If they depend on "
-        f"where the target came from, that is hysteresis and backlash, within what the air adds. {found}"
+        "Mean commands to both stages while the target stood still. If they depend on the direction from which "
+        f"the target came, the cause is hysteresis and backlash, apart from the motion of the air. {found}"
     )
-    of_stacks = (
-        "The stacks are as their model has them for the voltages; a path's width is its hysteresis."
-    )
+    of_stacks = "Positions of the stacks by their model of the voltages; the width of a path is its hysteresis."
     moved = any(dwell.direction for gap in loop.stages.gaps for dwell in gap.dwells)
     return " ".join([of_commands] * moved + [of_stacks] * (loop.stacks is not None) or [found])

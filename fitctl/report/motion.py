@@ -41,7 +41,7 @@ def mirror(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
     following = np.isin(ticks["mode_number"], sorted(FOLLOWING))
     name, title = f"{loop.name}-mirror", "Mirror: range and piston"
     if not following.any():
-        return Plot(name, title, "the loop never followed its star.", None)
+        return Plot(name, title, "the loop never held its star.", None)
     figure, axes = panels(1 if found is None else 2, 2.2 if found is None else 3.8)
     at_s = ticks["time_s"][following]
     trace(axes[0], time, at_s, 100 * ticks["fsm_range_fraction"][following], AZ, "range")
@@ -51,7 +51,7 @@ def mirror(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
         ylabel="% of the diamond",
         ylim=(0, 105),
     )
-    source = " Piston is not known: no hysteresis is in the rig file."
+    source = " Piston is not known: the rig file has no hysteresis."
     if found is not None:
         piston_nm = 1e9 * found.piston_m
         trace(axes[1], time, at_s, piston_nm[following], PURPLE, "piston")
@@ -64,8 +64,8 @@ def mirror(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
         room_nm = max(1.0, 0.15 * (high_nm - low_nm))
         axes[1].set_ylim(low_nm - room_nm, high_nm + room_nm)
         source = (
-            f" Piston is by {found.source}, from the logged voltages, on the scale of the part that counts."
-            " Ideal stacks have none; the middle does not matter, changes do."
+            f" Piston is by {found.source}, from the logged voltages, on the scale of the evaluated part."
+            " Ideal stacks have no piston. Only its changes matter, not its mean."
         )
     axes[-1].set_xlabel(time.label)
     span(axes[-1:], time, findings.run.duration_s)
@@ -101,9 +101,8 @@ def siderostat(findings: Findings, loop: StarFindings, time: TimeAxis) -> Plot:
     offload[-1].set_xlabel(time.label)
     span(offload[-1:], time, findings.run.duration_s)
     caption = (
-        "What lasts goes from the mirror to the siderostat, and the mirror returns to its bias (0). The "
-        "siderostat's own way is from where it was when each stretch of VERNIER began; its play is not in its "
-        "encoders."
+        "The siderostat takes over lasting offsets from the mirror, which returns to its bias (0). The "
+        "siderostat's own motion begins at 0 in each stretch of VERNIER; its encoders do not show its play."
     )
     return Plot(f"{loop.name}-siderostat", "Siderostat and offload", caption, figure)
 
@@ -132,8 +131,8 @@ def tilt(findings: Findings, fringes: FringeFindings, time: TimeAxis) -> Plot:
     span([visibility], time, findings.run.duration_s)
     caption = (
         "Each star from its loop's target in the rig file, on every frame on which both loops follow their "
-        "stars, in COARSE too. The tilt is measured, so the camera's noise is in it and lowers the visibility "
-        "a little."
+        "stars, in COARSE too. The tilt is measured, so it includes camera noise, which lowers the "
+        "visibility a little."
     )
     return Plot("fringes-tilt", "Tilt and visibility", caption, figure)
 
@@ -173,8 +172,8 @@ def timing(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
     decimal(distribution.yaxis)
     distribution.legend(loc="upper right")
     caption = (
-        "Controllers are designed for one fixed age of the frames. Where the machine stood still, all rise "
-        "together."
+        "Controllers are designed for one fixed age of the frames. All of them rise together "
+        "when the machine stalls."
     )
     return Plot(name, title, caption, figure)
 

@@ -18,12 +18,12 @@ from fitctl.simulation.statistics import SETTLE_S
 
 SIGNS: dict[Word, str] = {"met": "✓", "not met": "✗", "not known": "?"}
 EVALUATION = (
-    f"Judged is VERNIER (LOCKED for a metrology loop), from {SETTLE_S:g} s after it began and "
+    f"Evaluated: VERNIER (LOCKED for a metrology loop), from {SETTLE_S:g} s after it began and "
     f"{TARGET_SETTLE_S:g} s after the target last moved, on frames with a star or samples with a beam. "
-    "The error is the measured one: the sensor's noise is in it. The interval "
-    "knows that neighbouring frames are alike: so many independent values would leave the RMS as uncertain. "
-    "Met: all of both axes' intervals is within the requirement. Not met: all of one is above. Else, or where "
-    "the record is too short: not known."
+    "The error is measured, so it includes the sensor's noise. The interval allows for the correlation of "
+    "neighbouring frames, by the number of independent values. Met: the intervals of both axes are within "
+    "the requirement. Not met: the whole interval of one axis is above it. Otherwise, or if the record is too "
+    "short: not known."
 )
 
 

@@ -132,25 +132,25 @@ def verdict(
     `mode` is the mode in which a loop is evaluated, and `of` is what the loop holds: for the text.
     """
     if evaluated_s <= 0:
-        return Verdict("not known", f"no time in {mode} counts")
+        return Verdict("not known", f"no time in {mode} can be evaluated")
     above = [axis for axis, found in axes.items() if found.known and found.low > requirement]
     if above:
         return Verdict("not met", f"the whole interval of {' and '.join(above)} is above it")
     if measured_fraction < LEAST_MEASURED_FRACTION:
         missing = 100 * (1 - measured_fraction)
         return Verdict(
-            "not known", f"the {of} is missing on {missing:.1f} % of the frames that count"
+            "not known", f"the {of} is missing on {missing:.1f} % of the evaluated frames"
         )
     few = [axis for axis, found in axes.items() if not found.known]
     if few:
         return Verdict(
             "not known",
-            f"too short to judge: the {evaluated_s:.0f} s that count hold too few independent values of the "
+            f"too short to judge: the {evaluated_s:.0f} s evaluated have too few independent values of the "
             f"error in {' and '.join(few)} for an interval",
         )
     if all(found.high <= requirement for found in axes.values()):
         return Verdict("met", "the whole intervals of both axes are within it")
-    return Verdict("not known", "the interval holds the requirement; more data would tell")
+    return Verdict("not known", "the interval contains the requirement; more data are needed")
 
 
 def night_verdict(words: Sequence[Word]) -> Word:

@@ -189,9 +189,9 @@ def test_a_plot_without_data_is_a_line_that_says_why(rig, tmp_path):
 
     text = " ".join(" ".join(Reader(page).text).split())
     for line in (
-        "Before and after: no stretch that counts is as long as a segment of 8 s.",
-        "Rejection against the design: no stretch that counts",
-        "Mirror: range and piston: the loop never followed its star.",
+        "Before and after: no evaluated stretch is as long as a segment of 8 s.",
+        "Rejection against the design: no evaluated stretch",
+        "Mirror: range and piston: the loop never held its star.",
         "Hysteresis in the commands: the target did not move",
     ):
         assert line in text

@@ -123,8 +123,8 @@ GOOD, BAD, BETWEEN = (
     [
         (GOOD, GOOD, 60.0, 1.0, "met", "both axes"),
         (GOOD, BAD, 60.0, 1.0, "not met", "the whole interval of el is above it"),
-        (GOOD, BETWEEN, 60.0, 1.0, "not known", "holds the requirement"),
-        (GOOD, UNKNOWN, 6.0, 1.0, "not known", "too short to judge: the 6 s that count"),
+        (GOOD, BETWEEN, 60.0, 1.0, "not known", "contains the requirement"),
+        (GOOD, UNKNOWN, 6.0, 1.0, "not known", "too short to judge: the 6 s evaluated"),
         (GOOD, GOOD, 60.0, 0.9, "not known", "star is missing on 10.0 %"),
         (BAD, GOOD, 60.0, 0.9, "not met", "az"),
         (UNKNOWN, UNKNOWN, 0.0, math.nan, "not known", "no time in VERNIER"),
