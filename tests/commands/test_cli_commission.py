@@ -87,7 +87,10 @@ def test_a_console_needs_a_terminal(commission):
         (("--only", "nonsense"), "unknown step 'nonsense'. Available: devices"),
         (("--skip", "star"), "expected STEP=REASON"),
         (("--compare", "missing.json"), "missing.json"),
-        (("--folder", "/nowhere"), "--folder"),
+        (
+            ("--folder", "/nowhere"),
+            "/nowhere: no such folder; make it, or choose another with --folder",
+        ),
     ],
 )
 def test_a_wrong_option_is_named(commission, arguments, named):

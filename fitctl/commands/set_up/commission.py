@@ -181,7 +181,10 @@ def _require_permission(real: list[str], *, yes: bool, by_console: bool) -> None
 
 def _folder(path: Path, folder: Path | None, *, reads_only: bool) -> Path:
     wanted = folder or (Path.cwd() if path == default_rig_path() else path.parent)
-    if not wanted.is_dir() or not (reads_only or writable(wanted)):
+    if not wanted.is_dir():
+        msg = f"commission: {wanted}: no such folder; make it, or choose another with --folder"
+        raise ConfigError(msg)
+    if not (reads_only or writable(wanted)):
         msg = f"commission: {wanted}: nothing can be written there; choose another with --folder"
         raise ConfigError(msg)
     return wanted
