@@ -65,6 +65,8 @@ _VALUES = {
     "expected_az_sky_arcsec": 20.0,
     "expected_el_sky_arcsec": -20.0,
     "star_flux_dn": 30_000.0,
+    "rate_az_sky_arcsec_s": 0.3,
+    "rate_el_sky_arcsec_s": -0.2,
     "name": "flux_low",
     "drives": [_DRIVE],
     "action": "pause",

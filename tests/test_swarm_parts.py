@@ -237,6 +237,23 @@ def test_a_console_that_shows_another_mode_is_noticed(monkeypatch):
     assert "the console shows what is" in {one.invariant for one in result.violations}
 
 
+@pytest.mark.long
+def test_the_testbed_goes_back_to_its_stars_though_two_supervisors_are_killed_before_a_search():
+    result = run_plan(
+        plan(
+            *[gives(at_s, None) for at_s in (0.1, 1.5, 3.0, 5.0, 8.0)],
+            Kill(at_s=26.0, back_after_s=0.5),
+            gives(28.0, Standby()),
+            Kill(at_s=32.0, back_after_s=0.5),
+            duration_s=34.0,
+            rig="fit-testbed.toml",
+        )
+    )
+
+    assert result.violations == []
+    assert result.modes["VERNIER"] >= 2
+
+
 POWER_CUT = plan(
     gives(0.1, Standby()),
     gives(2.0, Acquire(expected_az_sky_arcsec=400.0, expected_el_sky_arcsec=0.0)),

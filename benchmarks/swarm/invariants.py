@@ -32,6 +32,7 @@ _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
 _MOST_STEP_S = 1.0  # and as much for each loop with a D/A, which is read after a pause
 _MOST_PERIODS = 2.0  # a frame on which a tick acts is no older than that and its delay
 _WELL_S = 2.0
+_LEFT_S = 2.0  # a supervisor leaves where its stars are once a second
 _JUMP_RAD = 1.0  # what motors may coast unseen, and somewhat more
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
@@ -88,9 +89,14 @@ class Invariants:
         self._lease = "", -math.inf
         self._opened: set[str] = set()
         self._zeros_lost_rad: dict[str, float] = {}
+        self._zeros_noticed_s: dict[str, float] = {}
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
+        for name, noticed_s in self._zeros_noticed_s.items():
+            # A killed supervisor may have left the star's place from before it noticed.
+            if self._clock.now_s() - noticed_s < _LEFT_S:
+                self._zeros_lost_rad.setdefault(name, 0.0)
         self._supervisor = supervisor
         self._lease = "", -math.inf
         self._opened.clear()
@@ -194,6 +200,8 @@ class Invariants:
     def _encoders_read(self, opened: DevicesOpened) -> None:
         name = opened.loop
         lost_rad = self._zeros_lost_rad.pop(name, None)
+        if lost_rad is not None:
+            self._zeros_noticed_s[name] = self._clock.now_s()
         if opened.encoders_jumped and lost_rad is None:
             self.violated("encoders that count on keep the star's place", name)
         is_far = lost_rad is not None and lost_rad > _JUMP_RAD and name in self._opened

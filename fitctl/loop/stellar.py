@@ -676,7 +676,9 @@ class StellarLoop(Loop):
         if self._recalled is not None or estimator.origin_px is None:
             return self._recalled  # what has not come to use yet is not forgotten
         az_rad, el_rad = self.servo.position_rad.tolist()
-        link_rad = np.zeros(2) if self.link is None else self.link.turned_rad
+        # A recalled place is with the link as it was then: what it turns counts from the first search on.
+        link = None if self._is_recalled else self.link
+        link_rad = np.zeros(2) if link is None else link.turned_rad
         link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))
         return StarPlace(
             time_s=self._clock.now_s(),
