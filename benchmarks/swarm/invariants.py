@@ -202,11 +202,18 @@ class Invariants:
         lost_rad = self._zeros_lost_rad.pop(name, None)
         if lost_rad is not None:
             self._zeros_noticed_s[name] = self._clock.now_s()
-        if opened.encoders_jumped and lost_rad is None:
+        if opened.encoders_jumped and lost_rad is None and not self._reads_zero(name):
             self.violated("encoders that count on keep the star's place", name)
         is_far = lost_rad is not None and lost_rad > _JUMP_RAD and name in self._opened
         if is_far and not opened.encoders_jumped:
             self.violated("encoders that count from elsewhere are noticed", name)
+
+    def _reads_zero(self, name: str) -> bool:
+        """As after a loss of power, which nobody can tell from motors that were on their way there."""
+        supervisor = self._supervisor
+        return supervisor is not None and bool(
+            np.abs(supervisor.loops[name].servo.position_rad).max() < _JUMP_RAD / 2
+        )
 
     def _acted_on(self, tick: Tick) -> None:
         camera = self._rig.camera
