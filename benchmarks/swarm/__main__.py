@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import time
 from collections import Counter
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from itertools import count, repeat
 from random import Random
+from threading import Event as Flag
 
 import msgspec
 
@@ -50,16 +52,18 @@ def met(plan: Plan) -> Iterator[tuple[str, str]]:
 
 
 def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
-    """Run until so many hours are simulated, or a thing was violated in ten runs."""
+    """Run until so many hours are simulated, a thing was violated in ten runs, or somebody presses Ctrl-C."""
     started_s, simulated_s, cpu_s, runs = time.monotonic(), 0.0, 0.0, 0
     kinds: Counter[str] = Counter()
     modes: Counter[str] = Counter()
     pairs: Counter[tuple[str, str]] = Counter()
     found: list[dict[str, object]] = []
     seeds = (seed * _RUNS_A_SEED + number for number in count())
+    ending = Flag()
+    signal.signal(signal.SIGINT, lambda *_: ending.set())  # the processes inherit it, and go on
     with ProcessPoolExecutor(jobs) as pool:
         running: set[Future[tuple[Plan, Result]]] = set()
-        while simulated_s < 3600 * hours and len(found) < _SHOWN:
+        while simulated_s < 3600 * hours and len(found) < _SHOWN and not ending.is_set():
             while len(running) < 2 * jobs:
                 running.add(pool.submit(run_seed, next(seeds)))
             done, running = wait(running, return_when=FIRST_COMPLETED)
