@@ -314,6 +314,7 @@ def test_the_mocks_print_the_endpoints_that_the_documents_show():
     assert masked(printed) == masked(documented)
 
 
+@pytest.mark.long
 def test_the_session_in_operating_is_what_the_supervisor_answers():
     simulation = Simulation(load_rig(default_rig_path()), seed=0, star_offset_px=NEARBY_PX)
     for found in ours():

@@ -17,6 +17,7 @@ from fitctl.identify.record import tick_columns
 from fitctl.logging.reading import log_info, read_records, tick_arrays
 from fitctl.logging.records import AnyRecord, FrameRecord, Tick
 from fitctl.logging.schemas import TOPICS
+from fitctl.messages.modes import Mode
 
 Floats = NDArray[np.float64]
 
@@ -25,13 +26,8 @@ _MOST_SPOTS = 6
 _MOST_FILLED = 0.02  # of all frames; more, and what is filled in would show in the spectra
 _SETTLE_S = 0.2  # from the last command until the stages have followed it
 _CLOCK_S = 1e-5  # the log rounds times since 1970; frames are much farther apart
-_STAGES = (
-    "stack1_v",
-    "stack2_v",
-    "stack3_v",
-    "siderostat_setpoint_az_rad",
-    "siderostat_setpoint_el_rad",
-)
+_STACKS = ("stack1_v", "stack2_v", "stack3_v")
+_SETPOINTS = ("siderostat_setpoint_az_rad", "siderostat_setpoint_el_rad")
 
 
 class TimedImage(NamedTuple):
@@ -167,19 +163,26 @@ def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[
 def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:
     """First and last mid-exposure of the longest stretch without a new command to either stage.
 
+    Over a link, the siderostat always undoes what the link turns: in open loop it counts as standing still.
+
     Raises
     ------
     IdentifyError
         If the stages never stood still with frames coming.
     """
-    commands = np.column_stack([ticks[name] for name in _STAGES])
+    is_linked = bool(np.isfinite(ticks["link_az_rad"]).any())
+    names = (*_STACKS, "mode_number") if is_linked else (*_STACKS, *_SETPOINTS)
+    commands = np.column_stack([ticks[name] for name in names])
     moved = np.flatnonzero(np.any(np.diff(commands, axis=0) != 0, axis=1)) + 1
     edges = np.concatenate([[0], moved, [len(commands)]])
-    longest = int(np.argmax(np.diff(edges)))
+    lengths = np.diff(edges)
+    if is_linked:
+        lengths = lengths * (ticks["mode_number"][edges[:-1]] == Mode.EXPERIMENT)
+    longest = int(np.argmax(lengths))
     stretch = slice(edges[longest], edges[longest + 1])
     exposed_s = ticks["mid_exposure_s"][stretch]
     still_s = exposed_s[exposed_s > ticks["time_s"][stretch][:1] + _SETTLE_S]
-    if len(still_s) == 0:
+    if lengths[longest] == 0 or len(still_s) == 0:
         msg = (
             "the stages never stood still with frames coming; expected a minute in open loop: "
             "`fitctl identify airpath` on a running rig records one"

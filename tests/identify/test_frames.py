@@ -14,8 +14,10 @@ from fitctl.identify.frames import (
     longest_rest,
     track_spots,
 )
+from fitctl.identify.record import tick_columns
 from fitctl.logging.records import FrameRecord, RunInfo, Tick
 from fitctl.logging.writer import LogWriter
+from fitctl.messages.modes import Mode
 from fitctl.model.scene import Scene
 
 NOWHERE = AxisPair(az=0.0, el=0.0)
@@ -123,7 +125,14 @@ def still_from(first, last, ticks=500):
     stack_v = np.linspace(0, 1, ticks)
     stack_v[first:last] = 5.0
     return [
-        tick(time_s=time + 0.035, mid_exposure_s=time, number=k, stack1_v=float(stack_v[k]))
+        tick(
+            time_s=time + 0.035,
+            mid_exposure_s=time,
+            number=k,
+            stack1_v=float(stack_v[k]),
+            link_az_rad=np.nan,
+            link_el_rad=np.nan,
+        )
         for k, time in enumerate(time_s.tolist())
     ]
 
@@ -134,6 +143,30 @@ def test_the_longest_rest_begins_after_the_stages_have_settled():
     start_s, end_s = longest_rest(arrays)
     assert start_s == pytest.approx(100 + 2.0 + 0.235, abs=0.021)
     assert end_s == pytest.approx(100 + 7.98)
+
+
+def test_over_a_link_the_siderostat_may_move_in_open_loop():
+    """From tick 100 to 300 the loop is open; before and after, the mirror stands still in a search."""
+    modes = [Mode.EXPERIMENT if 100 <= k < 300 else Mode.ACQUISITION for k in range(500)]
+    ticks = [
+        tick(
+            time_s=100 + 0.02 * k + 0.035,
+            mid_exposure_s=100 + 0.02 * k,
+            number=k,
+            mode=mode.name,
+            mode_number=mode,
+            siderostat_setpoint_az_rad=0.01 * k,
+            link_az_rad=0.02 * k,
+            link_el_rad=0.0,
+        )
+        for k, mode in enumerate(modes)
+    ]
+    start_s, end_s = longest_rest(tick_columns(ticks))
+
+    assert start_s == pytest.approx(100 + 2.0 + 0.235, abs=0.021)
+    assert end_s == pytest.approx(100 + 5.98)
+    with pytest.raises(IdentifyError, match="never stood still"):
+        longest_rest(tick_columns(ticks[:100]))
 
 
 def test_stages_that_always_move_give_no_rest():

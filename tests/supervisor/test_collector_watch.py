@@ -221,6 +221,8 @@ def test_a_stop_ends_a_reference_move(watched):
     watch.stop()
     reported(watch, "all axes referenced")
     assert watch.error
+    # The reference move may have reported its end before the stop has: a thread of its own checks that.
+    until(lambda: not watch._stopping, "the end of the stop")
     assert watch.obey(MoveCollector(action="reference")) == ""
     reported(watch, "referenced: all axes are at zero")
     assert not watch.error

@@ -295,6 +295,7 @@ class KeyApp(FixedApp):
         self.left = False
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", PARTS)
 def test_every_key_does_what_its_row_says_and_nothing_else(part, tmp_path):
     mode, rows = PARTS[part]

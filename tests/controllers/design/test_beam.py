@@ -33,11 +33,13 @@ def test_without_a_second_integrator_there_is_no_slow_swing():
     assert slow_swing(LOOP.hold.crossover_hz, 0.0, *TIMES) is None
 
 
+@pytest.mark.long
 def test_a_slower_second_integrator_makes_a_smaller_swing():
     swings = [slow_swing(2.0, second_hz, *TIMES).beam_half_widths for second_hz in (0.05, 0.1, 0.2)]
     assert swings == sorted(swings)
 
 
+@pytest.mark.long
 def test_the_loop_swings_at_rest_as_its_describing_function_says():
     bench = Bench("loops.metrology.sensor.noise_v=1e-6", offset_arcsec=(5.0, 3.0)).held()
     bench.run(20.0)

@@ -88,6 +88,7 @@ A_SESSION = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("dialect", "wire", "echo"),
     [

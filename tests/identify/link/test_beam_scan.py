@@ -126,6 +126,7 @@ def test_the_delay_counts_from_when_a_sample_was_truly_taken():
     assert "link delay" in found.lines()[0]
 
 
+@pytest.mark.long
 def test_the_fragment_has_the_scale():
     sensor = results()[0].fragment()["loops"]["metrology"]["sensor"]
     assert sensor["beam_radius_m"] == pytest.approx(0.0262, abs=2e-5)
