@@ -192,7 +192,7 @@ def test_a_testbed_that_was_off_makes_a_page_without_fringes(testbed, tmp_path):
     page = make_report(findings, tmp_path).read_text()
 
     assert findings.word == "not known"
-    assert "no time in LOCKED counts" in page
+    assert "no time in LOCKED can be evaluated" in page
     assert Reader(page).open == []
 
 
