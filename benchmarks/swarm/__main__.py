@@ -9,15 +9,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from itertools import count, repeat
 from random import Random
-from threading import Event as Flag
 
 import msgspec
 
@@ -27,6 +26,7 @@ from benchmarks.swarm.plan import Plan, plan_of
 from benchmarks.swarm.run import Result, run_plan
 from benchmarks.swarm.shrink import shrunk
 from fitctl.logging.records import AnyRecord, Event
+from fitctl.processes import ended_by_signals
 
 _RUNS_A_SEED = 1_000_000
 _MET_S = 1.0
@@ -59,9 +59,9 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
     pairs: Counter[tuple[str, str]] = Counter()
     found: list[dict[str, object]] = []
     seeds = (seed * _RUNS_A_SEED + number for number in count())
-    ending = Flag()
-    signal.signal(signal.SIGINT, lambda *_: ending.set())  # the processes inherit it, and go on
-    with ProcessPoolExecutor(jobs) as pool:
+    ending = threading.Event()
+    # Its processes inherit the handler, and finish their runs.
+    with ended_by_signals(ending.set), ProcessPoolExecutor(jobs) as pool:
         running: set[Future[tuple[Plan, Result]]] = set()
         while simulated_s < 3600 * hours and len(found) < _SHOWN and not ending.is_set():
             while len(running) < 2 * jobs:

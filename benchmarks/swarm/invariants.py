@@ -209,7 +209,7 @@ class Invariants:
             self.violated("encoders that count from elsewhere are noticed", name)
 
     def _reads_zero(self, name: str) -> bool:
-        """As after a loss of power, which nobody can tell from motors that were on their way there."""
+        """Encoders near zero: motors that passed there look the same as a loss of power."""
         supervisor = self._supervisor
         return supervisor is not None and bool(
             np.abs(supervisor.loops[name].servo.position_rad).max() < _JUMP_RAD / 2

@@ -427,9 +427,10 @@ class Instrument:
                 )
 
     def _cut_power(self, name: str) -> None:
-        """A loop's encoders begin anew at zero: nobody knows any longer where stars are that it turns.
+        """Restart a loop's encoders at zero; the places of the stars that it turns are unknown from then on.
 
-        Where that would put its star beyond the travel, which takes a person's hand, they keep their zero.
+        If the star would then be beyond the siderostat's travel, which takes a person to mend, the encoders
+        keep their zero.
         """
         settings = self.rig.loops[name]
         motor_rad = self.plant.loops[name].state.motor_rad[0]

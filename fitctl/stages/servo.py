@@ -123,9 +123,8 @@ class SiderostatServo:
         self._followed_s = 0.0
         self.encoders_jumped = False  # until the loop has concluded from it
         self.turned_on_rad = 0.0
-        self._unread_rad_s: list[
-            AzEl
-        ] = []  # commands since the last reading, and the one before it
+        # Commands since the last reading, and the one before it.
+        self._unread_rad_s: list[AzEl] = []
         self._recalled_rad: AzEl | None = None
         self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         self._disabling = False

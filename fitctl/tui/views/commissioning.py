@@ -68,7 +68,7 @@ class CommissioningView(View):
             self._read()
 
     def on_unmount(self) -> None:
-        """What was asked for is not waited for."""
+        """End the process that reads the record, if it still runs."""
         if self._list is not None:
             self._list.end()
 
