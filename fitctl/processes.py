@@ -96,6 +96,18 @@ def signals_ignored() -> Iterator[None]:
             signal.signal(number, action)
 
 
+def give_way(niceness: int) -> None:
+    """Let all other processes run first, as far as `niceness`, 1 to 19, says.
+
+    Where Linux has autogroups, it shares the processor between sessions first, and niceness counts only within
+    one: the leader of a session lowers the whole session.
+    """
+    os.nice(niceness)
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError):  # no autogroups
+            Path("/proc/self/autogroup").write_text(str(niceness))
+
+
 @contextmanager
 def lock_held(path: Path) -> Iterator[None]:
     """Hold a lock file, with our process id in it, for as long as we live at the most.

@@ -8,7 +8,6 @@ what is too much, is turned back.
 
 from __future__ import annotations
 
-import os
 import resource
 import signal
 import threading
@@ -26,6 +25,7 @@ from fitctl.logging.records import Severity
 from fitctl.messages.commands import Reply
 from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, SocketFolder
 from fitctl.messages.keys import AllowedKey
+from fitctl.processes import give_way
 from fitctl.service.doors import QUEUED, Parcel, frame_property
 from fitctl.service.envelope import Passed, Report
 from fitctl.service.intake import Intake, Limit
@@ -58,7 +58,7 @@ def be_modest() -> None:
 
     Of threads that exist already it speaks to this one alone, so it is for the beginning of a process.
     """
-    os.nice(_NICENESS)
+    give_way(_NICENESS)
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard == resource.RLIM_INFINITY or hard > _MOST_BYTES:
         resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))

@@ -1,7 +1,6 @@
 """`fitctl keys`, and commands that go by a key file."""
 
 import asyncio
-import os
 import signal
 
 import pytest
@@ -111,7 +110,7 @@ def console(monkeypatch, capsys):
         shown.append(app)
 
     monkeypatch.setattr(ConsoleApp, "run", show)
-    monkeypatch.setattr(os, "nice", lambda _by: 0)
+    monkeypatch.setattr("fitctl.commands.operate.console.give_way", lambda _niceness: None)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     monkeypatch.setattr("fitctl.commands.operate.console.has_terminal", lambda: True)
 

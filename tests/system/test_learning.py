@@ -12,6 +12,10 @@ from .conftest import NEAR, running
 LEARNS = "loops.right.learn=on"
 FIRST_REPORT_S = 130.0  # a minute of undisturbed frames, estimate and design, on a busy machine
 
+pytestmark = pytest.mark.timeout(
+    FIRST_REPORT_S + 60.0
+)  # so that a late report is told with its events
+
 
 @pytest.fixture
 def rig(tmp_path):

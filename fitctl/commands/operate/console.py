@@ -18,7 +18,7 @@ from fitctl.commands.shared.supervisor import address, client_of, connect
 from fitctl.commands.shared.terminal import has_terminal
 from fitctl.config import ConfigError
 from fitctl.logging.errors import LogError
-from fitctl.processes import rig_arguments
+from fitctl.processes import give_way, rig_arguments
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.graphics import Graphics, graphics_of
 from fitctl.tui.rewind.logged import LoggedRun
@@ -147,5 +147,5 @@ def _run(app: ConsoleApp, niceness: int = _NICENESS) -> None:
     signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
     # Whatever points the star goes first. What the console starts gives way as well: a sequence, too, only
     # asks the supervisor for what that then does in its own time.
-    os.nice(niceness)
+    give_way(niceness)
     app.run()

@@ -1,0 +1,49 @@
+"""fitctl's processes share the processor: those that point the star go first."""
+
+import subprocess
+import sys
+
+GIVES_WAY = """
+import os
+from fitctl.processes import give_way
+give_way(7)
+print(os.nice(0))
+"""
+SHOWS_SESSION = "cat /proc/self/autogroup 2>&1 || true"
+LOWERS_SESSION = "(echo 7 > /proc/self/autogroup) 2>&1 || true"
+
+
+def output(*command, leads_a_session=False):
+    return subprocess.run(
+        command, start_new_session=leads_a_session, capture_output=True, check=True, text=True
+    ).stdout
+
+
+def niceness_of_session(said):
+    """The last word of ``/autogroup-12 nice 7``; whatever else a machine without autogroups says."""
+    return said.split()[-1:]
+
+
+def test_a_process_that_gives_way_is_niced():
+    assert output(sys.executable, "-c", GIVES_WAY) == "7\n"
+
+
+def test_a_session_of_its_own_gives_way_as_a_whole():
+    ours = f"""{GIVES_WAY}
+import subprocess
+subprocess.run(["sh", "-c", {SHOWS_SESSION!r}])
+"""
+    shell = f"{LOWERS_SESSION}; {SHOWS_SESSION}"
+
+    lowered = output(sys.executable, "-uc", ours, leads_a_session=True)
+    expected = output("sh", "-c", shell, leads_a_session=True)
+
+    assert niceness_of_session(lowered) == niceness_of_session(expected)
+
+
+def test_the_session_of_others_is_left_alone():
+    before = output("sh", "-c", SHOWS_SESSION)
+
+    output(sys.executable, "-c", GIVES_WAY)
+
+    assert output("sh", "-c", SHOWS_SESSION) == before
