@@ -9,6 +9,7 @@ import serial
 
 from fitctl.drivers.interface import DeviceError, DeviceUnreachable
 
+_NOTHING_LISTENS = "nothing listens there: start what serves it (mocks: fitctl mocks), or"
 _Error = TypeVar("_Error", bound=DeviceError)
 
 
@@ -51,4 +52,6 @@ class Endpoint:
                 exclusive=True,
             )
         except (OSError, ValueError) as error:
+            if isinstance(error.__context__, ConnectionRefusedError):
+                hint = f"{_NOTHING_LISTENS} {hint}"
             raise self.error(DeviceUnreachable, expected, str(error), hint) from error

@@ -4,6 +4,7 @@ import fcntl
 import os
 import pty
 import select
+import socket
 
 import pytest
 
@@ -62,3 +63,12 @@ def test_a_port_that_is_free_again_is_asked(driver):
     finally:
         os.close(slave)
         os.close(master)
+
+
+@pytest.mark.parametrize("driver", ["mdt693", "c887"])
+def test_an_address_where_nothing_listens_says_what_serves_it(driver):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+
+    with pytest.raises(DeviceUnreachable, match="start what serves it .mocks: fitctl mocks"):
+        PROBES[driver](settings_of(driver, f"socket://127.0.0.1:{port}"))

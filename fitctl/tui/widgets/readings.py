@@ -254,7 +254,7 @@ def _allowed(row: Watched) -> str:
     low, high = in_units(row.quantity, row.low), in_units(row.quantity, row.high)
     if low and high:
         return f"{low.partition(' ')[0]} to {high}"
-    return f"≤ {high}" if high else f"≥ {low}" if low else "only not stale"
+    return f"≤ {high}" if high else f"≥ {low}" if low else f"age ≤ {row.stale_s:g} s"
 
 
 def limit_used(row: Watched) -> float:
