@@ -70,5 +70,5 @@ def test_an_address_where_nothing_listens_says_what_serves_it(driver):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
 
-    with pytest.raises(DeviceUnreachable, match="start what serves it .mocks: fitctl mocks"):
+    with pytest.raises(DeviceUnreachable, match=r"start what serves it \(mocks: fitctl mocks\)"):
         PROBES[driver](settings_of(driver, f"socket://127.0.0.1:{port}"))
