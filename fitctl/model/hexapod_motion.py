@@ -34,6 +34,7 @@ _REMEMBERED = 100
 _TRANSLATIONS, _ROTATIONS = slice(0, 3), slice(3, 6)
 _STRAIGHT = 1e-9  # sine of the angle between velocity and way within which they are one line
 _NO_WAY = 1e-13  # mm or degrees: below, rounding decides
+_NO_VELOCITY = 1e-290  # mm/s or degrees/s: below, floats have no digits left for a direction
 _LEAST_PART = 1e-12  # of the line, so that no axis has an acceleration of zero
 
 
@@ -207,8 +208,9 @@ def _axis_limits(way: Floats, velocity: Floats, limits: MotionLimits) -> tuple[F
     speed = _least(limits.velocity_mm_s, mm, limits.velocity_deg_s, deg)
     rate = _least(limits.acceleration_mm_s2, mm, limits.acceleration_deg_s2, deg)
     # Rounding can leave an axis a velocity that its way does not ask for: it is braked with the others.
-    parts = np.maximum(np.abs(line), np.abs(velocity) / (math.hypot(*velocity) or 1.0))
-    parts = np.maximum(parts, _LEAST_PART)
+    moves = math.hypot(*velocity)
+    along = np.abs(velocity) / moves if moves > _NO_VELOCITY else np.zeros(AXES)
+    parts = np.maximum(np.maximum(np.abs(line), along), _LEAST_PART)
     return speed * parts, rate * parts
 
 

@@ -92,6 +92,9 @@ def test_pose_and_velocity_are_continuous_where_a_move_is_planned_anew(moves):
         ((0, 0, 0, 0, 28.82334187045789, 0), 5.143638933526166),
     ]
 )
+@example(  # planned anew when its velocity is too small to have a direction
+    moves=[((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0), ((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), 5e-324)]
+)
 @given(moves=courses)
 def test_no_axis_passes_its_velocity_or_acceleration(moves):
     for began_s, trajectory in course(moves):
