@@ -86,8 +86,8 @@ test-faults: $(READY)  ## Run the fault catalogue on the instrument, in real tim
 
 # As many as fit into continuous integration; `make test-faults-part FAULT_SEED=...` repeats a run.
 test-faults-part: FAULT_SEED ?= $(shell od -An -N2 -tu2 /dev/urandom | tr -d ' ')
-test-faults-part: $(READY)  ## Run 100 entries of the whole fault catalogue, drawn at random
-	FITCTL_FAULT_COUNT=100 FITCTL_FAULT_SEED=$(FAULT_SEED) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
+test-faults-part: $(READY)  ## Run 80 entries of the whole fault catalogue, drawn at random
+	FITCTL_FAULT_COUNT=80 FITCTL_FAULT_SEED=$(FAULT_SEED) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
 
 test-faults-testbed: $(READY)  ## Run the fault catalogue's entries for the whole testbed
 	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)

@@ -45,6 +45,7 @@ def panels(app):
     return shown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("view", VIEWS[:4], ids=lambda view: view.label)
 @pytest.mark.parametrize("mode", ["VERNIER", "ACQUISITION"])
 def test_every_panel_is_as_it_was(view, mode):

@@ -91,6 +91,7 @@ def test_every_key_is_in_the_help():
     run(scenario, size=(120, 150))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [(80, 24), (480, 130)])
 def test_the_smallest_and_the_largest_terminal_show_every_screen(size):
     async def scenario(app, pilot):

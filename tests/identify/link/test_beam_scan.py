@@ -143,6 +143,7 @@ def test_a_saturated_photodiode_does_not_count():
     assert found.found.on_axis_v == pytest.approx(7.0, abs=0.01)
 
 
+@pytest.mark.long
 def test_it_is_plotted(tmp_path):
     results()[0].plot(tmp_path / "beam.png")
     assert (tmp_path / "beam.png").stat().st_size > 10_000

@@ -123,6 +123,7 @@ def test_too_few_frames_are_refused():
         fit_plate_scale(TIME_S, star_px, swings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.8, 1.25])
 def test_a_rig_file_that_is_wrong_is_found_out(tried, scale):
     """The siderostat truly moves the star `scale` times as far as the rig file says."""
@@ -144,6 +145,7 @@ def test_a_rig_file_that_is_wrong_is_found_out(tried, scale):
     assert abs(found["siderostat_rotation_deg"]) < 1.0
 
 
+@pytest.mark.long
 def test_the_scales_that_are_measured_correct_the_rig_file(tmp_path):
     loop = RIG.loops["right"]
     fsm = loop.fsm.model_copy(update={"hysteresis": None})
@@ -229,6 +231,7 @@ def test_axes_of_one_gain_have_none_in_the_fragment():
     assert axis_gains(even @ np.diag([1.1, 1.0]), 10 * deviation) is None
 
 
+@pytest.mark.long
 def test_a_known_hysteresis_is_not_corrected_by_a_scale():
     with Instrument(RIG, simulate=True, seed=1) as instrument:
         instrument.acquire()
