@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import ConfigError
-from fitctl.controllers.design.basis import LEAST_GAIN, Basis, Line
+from fitctl.controllers.design.basis import LEAST_GAIN, Basis
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, left_on_paper
@@ -21,8 +21,14 @@ from fitctl.controllers.design.margins import (
     frequencies_hz,
     margins,
 )
-from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.pair import Design
+from fitctl.learn.aliases import (
+    MOST_IF_ALIAS,
+    can_be_alias,
+    expecting,
+    if_aliases,
+    safe_parts,
+)
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night, estimate
 from fitctl.learn.opened import LEAST_S, Series, periodograms
@@ -39,9 +45,6 @@ WORTH_IT = 0.98
 BETTER_LATELY = 0.995
 """On the last frames it must leave at most this part: what is only true of the mean of minutes is past."""
 LATELY_S = 60.0
-MOST_IF_ALIAS = 1.02
-"""If lines are aliases of faster ones, a design may leave so much of what it would leave without them, or of
-what the present design leaves: on frames both cases look the same."""
 TOLERATED_GAIN = 0.15
 """A mirror's gain so far from 1 is left to the margins."""
 _AXES = ("az", "el")
@@ -53,8 +56,8 @@ class LineAdvice(NamedTuple):
     Attributes
     ----------
     found : LearntLine
-    counteracted : bool
-        The learnt design knows it.
+    part : float
+        Of the line's RMS that the learnt design expects: 1 counteracts the line in full, 0 leaves it alone.
     can_be_alias : bool
         The rig may have vibrations as fast as its aliases.
     present_px, learnt_px : float
@@ -62,10 +65,20 @@ class LineAdvice(NamedTuple):
     """
 
     found: LearntLine
-    counteracted: bool
+    part: float
     can_be_alias: bool
     present_px: float
     learnt_px: float
+
+    @property
+    def counteracted(self) -> bool:
+        """At least in part."""
+        return self.part > 0
+
+    @property
+    def how_far(self) -> str:
+        """Empty for a line that is counteracted in full."""
+        return {0.0: "left alone", 1.0: ""}.get(self.part, "counteracted in part")
 
 
 class Standing(NamedTuple):
@@ -239,11 +252,11 @@ def advise(
         If there is too little of it, or no design has the margins.
     """
     night, truth = estimated(series, rig_basis)
-    suspects = tuple(line for line in truth.lines if _can_be_alias(line, truth))
-    wanted = tuple(line for line in truth.lines if _worth_counteracting(line, truth))
-    design = design_with_margins(dataclasses.replace(truth, lines=wanted), required)
+    suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
+    parts = safe_parts(truth, present)
+    design = design_with_margins(expecting(parts, truth), required)
     both = present, design
-    present_px, learnt_px = (_if_aliases(one, truth, suspects) for one in both)
+    present_px, learnt_px = (if_aliases(one, truth, suspects) for one in both)
     return Advice(
         night=night,
         measured_px=measured_px,
@@ -253,11 +266,11 @@ def advise(
         lines=tuple(
             LineAdvice(
                 found,
-                line in wanted,
+                part,
                 line in suspects,
-                *(_if_aliases(one, truth, (line,)) for one in both),
+                *(if_aliases(one, truth, (line,)) for one in both),
             )
-            for found, line in zip(night.lines, truth.lines, strict=True)
+            for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
         ),
         design=design,
         lately_px=_lately_px(series, truth, present, design),
@@ -357,48 +370,13 @@ def _camera_px(design: Design, truth: Basis) -> float:
     return math.sqrt(float(np.trapezoid(sensitivity**2 * density, hz)))
 
 
-def _can_be_alias(line: Line, truth: Basis) -> bool:
-    """Whether the rig may have a vibration as fast as the slowest that looks like this line."""
-    return 1 / truth.period_s - line.frequency_hz <= truth.fastest_line_hz
-
-
-def _without(lines: tuple[Line, ...], truth: Basis) -> Basis:
-    return dataclasses.replace(
-        truth, lines=tuple(line for line in truth.lines if line not in lines)
-    )
-
-
-def _worth_counteracting(line: Line, truth: Basis) -> bool:
-    """Whether a line is better counteracted, also while nobody knows if it is one of its aliases.
-
-    On frames an alias looks the same, but what the mirror does about it only adds to it. Most designs answer to
-    a line in either case. One that counteracts it may answer more only as far as that does no harm.
-    """
-    knows = design_minimum_variance(truth)
-    does_not = design_minimum_variance(_without((line,), truth))
-    if linear_residual(knows, truth) >= linear_residual(does_not, truth):
-        return False
-    if not _can_be_alias(line, truth):
-        return True
-    knows_px, does_not_px = (_if_aliases(one, truth, (line,)) for one in (knows, does_not))
-    return knows_px <= MOST_IF_ALIAS * does_not_px
-
-
-def _if_aliases(design: Design, truth: Basis, lines: tuple[Line, ...]) -> float:
-    """Residual if lines are truly their aliases: they stay, and the mirror's answer to them comes on top."""
-    power_px2 = linear_residual(design, _without(lines, truth)) ** 2
-    for line in lines:
-        omega_rad_s = np.array([2 * math.pi * line.frequency_hz])
-        loop = sampled_response(design, truth)(omega_rad_s)[0]
-        power_px2 += line.rms_px**2 * (1 + abs(loop / (1 + loop)) ** 2)
-    return math.sqrt(power_px2)
-
-
 def _line_text(line: LineAdvice) -> str:
     found = line.found
     sizes = ", ".join(f"{axis} {rms}" for axis, rms in zip(_AXES, found.rms_px, strict=True))
     fast = " or ".join(f"{hz:.1f}" for hz in found.aliases_hz)
-    done = "" if line.counteracted else "; left alone"
+    done = f"; {line.how_far}" if line.how_far else ""
+    if 0 < line.part < 1:
+        done += f", as {line.part:.0%} of its RMS"
     if_alias = (
         f"\n             if it is at {fast} Hz instead: present {line.present_px:.4f}, "
         f"learnt {line.learnt_px:.4f} px"
@@ -431,6 +409,7 @@ def _line_numbers(line: LineAdvice) -> dict[str, Any]:
         "rms_px": {axis: size._asdict() for axis, size in sizes.items()},
         "aliases_hz": list(found.aliases_hz),
         "counteracted": line.counteracted,
+        "part": line.part,
         "can_be_alias": line.can_be_alias,
         "residual_if_alias_px": {"present": line.present_px, "learnt": line.learnt_px},
     }

@@ -153,7 +153,7 @@ def _text(advice: Advice) -> str:
     night = advice.night
     lines = ", ".join(
         f"{line.found.frequency_hz.value:.2f} Hz {max(rms.value for rms in line.found.rms_px):.3f} px"
-        f"{'' if line.counteracted else ' (left alone)'}"
+        f"{f' ({line.how_far})' if line.how_far else ''}"
         for line in advice.lines
     )
     return (
