@@ -131,6 +131,9 @@ bench-learn: $(READY)  ## Measure learnt designs on nights that differ from the 
 bench-learn-online: $(READY)  ## Measure loops that learn while they observe (half an hour)
 	$(BIN)/python -m benchmarks.learn_online $(ARGS)
 
+bench-margins: $(READY)  ## Compute the least residual that the margins allow, beside the learner's design (two minutes)
+	$(BIN)/python -m benchmarks.least_with_margins $(ARGS)
+
 bench-testbed: $(READY)  ## Measure the testbed while its collector moves, and compare with its goals (ten minutes)
 	$(BIN)/python -m benchmarks.testbed $(ARGS)
 
