@@ -46,7 +46,7 @@ class Runner:
         self.contact = contact
         self._link = contact.link
         self._rig = contact.rig
-        self._loops: set[str] = set()
+        self._loops: dict[str, None] = {}  # in their order
         self._star = ""  # of a list, that the step is for
         self._moves_collector = False  # by a step of this sequence
         self._motion_goes_on = motion_goes_on
@@ -80,7 +80,7 @@ class Runner:
             raise SequenceError(msg)
         loop_names = loops_of(step, self._rig)
         if BEHAVIOURS[step.step].loops != "none" or len(self._rig.loops) == 1:
-            self._loops.update(loop_names)
+            self._loops.update(dict.fromkeys(loop_names))
         if isinstance(step, Stars):
             return self._run_stars(step, loop_names[0], number)
         if isinstance(step, Collector) and step.action == "stop":

@@ -172,6 +172,19 @@ def test_the_operator_stops_it_and_the_stages_are_held(tried):
     assert run.link.mode() == "STANDBY"
 
 
+def test_loops_are_released_in_the_order_in_which_they_had_steps(tried):
+    run = tried(rig="fit-testbed.toml")
+    run.link.meddling = [(5.0, SequenceControl(action="end"))]
+
+    run(
+        *({"step": "standby", "loop": name} for name in ("left", "metrology", "right")),
+        {"step": "wait", "duration_s": 60.0},
+    )
+
+    released = [command.loop for command in run.link.commands if isinstance(command, Release)]
+    assert released == ["left", "metrology", "right"]
+
+
 @pytest.mark.parametrize("when_s", [0.5, 15.0])
 def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
     def interrupt(_link):
