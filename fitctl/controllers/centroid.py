@@ -153,7 +153,7 @@ class StarSensor:
         """All spots that could be this loop's star, brightest first."""
         search = self._dark.light(image, 0, 0, *image.shape)
         for _ in range(MAX_CANDIDATES):
-            el_px, az_px = divmod(int(np.argmax(search)), search.shape[1])
+            el_px, az_px = divmod(int(search.argmax()), search.shape[1])
             if search[el_px, az_px] < self.threshold_dn:
                 return
             star = self.find_at(image, az_px, el_px)
@@ -169,10 +169,18 @@ class StarSensor:
         candidate = self._centroid(image, az_px, el_px)
         if candidate is not None:
             # Once more about its own centre, so that the window does not cut the spot.
-            candidate = self._centroid(image, candidate.az_px, candidate.el_px)
+            candidate = self._centred(image, candidate)
         star = self._accepted(candidate)
         # A spot cut by the frame's edge has its centre of gravity away from the window's centre.
         return star if star is not None and star.off_centre_px <= 1.0 else None
+
+    def _centred(self, image: NDArray[np.uint16], star: Star) -> Star | None:
+        """The centroid about a star's own centre, which often is where its window is."""
+        az = window_centre(star.az_px, self.largest_az_px)
+        el = window_centre(star.el_px, self.largest_el_px)
+        if az == star.window_az_px and el == star.window_el_px:
+            return star
+        return self._centroid(image, az, el)
 
     def _centroid(
         self, image: NDArray[np.uint16], window_az_px: float, window_el_px: float
@@ -234,8 +242,7 @@ def _noise_px(fit: SpotFit | None, camera: Camera, loop: Loop, star_flux_dn: flo
 
 def spot_light(spot: OtherLight, az_px: int, el_px: int) -> NDArray[np.float64]:
     """What a spot leaves on each pixel of the window about a place, shape (7, 7), in DN."""
-    across, down = (
-        np.diff(light_below((centre + _EDGES_PX - place) / (spot.diameter_px / 4)))
-        for centre, place in ((az_px, spot.az_px), (el_px, spot.el_px))
-    )
-    return spot.flux_dn * np.outer(down, across)
+    centres_px, places_px = np.array((((az_px,), (el_px,)), ((spot.az_px,), (spot.el_px,))))
+    below = light_below((centres_px + _EDGES_PX - places_px) / (spot.diameter_px / 4))
+    across, down = below[:, 1:] - below[:, :-1]
+    return spot.flux_dn * (down[:, None] * across)
