@@ -27,6 +27,13 @@ class Mirror:
     Parameters
     ----------
     fsm : Fsm
+
+    Attributes
+    ----------
+    stack_v : array, shape (3,)
+        As last written.
+    angles_rad : array, shape (2,)
+        Where the mirror is; replaced as a whole.
     """
 
     def __init__(self, fsm: Fsm) -> None:
@@ -61,10 +68,15 @@ class Mirror:
     def assume(self, stack_v: Floats) -> None:
         """Take the stacks, shape (3,), to have come up to these voltages from zero."""
         self._plays_v = np.zeros_like(self.gains_m_per_v)
+        self._written_v: list[float] = []
         self.written(stack_v)
 
     def written(self, stack_v: Floats) -> None:
         """These voltages, shape (3,), are on the D/A now."""
+        written_v = stack_v.tolist()
+        if written_v == self._written_v:  # a play that meets the same again stays where it is
+            return
+        self._written_v = written_v
         self.stack_v = np.array(stack_v, dtype=float)
         if self.hysteresis_known:
             self._plays_v = play(self._plays_v, self.stack_v[:, None], self.half_width_v)
@@ -72,15 +84,14 @@ class Mirror:
                 self._inverts
             ):  # here, after the D/A has its voltages, and not between a frame and them
                 self._prepare_inverse()
+        self.angles_rad = self._find_angles()
 
     def _prepare_inverse(self) -> None:
         self._inverse_plays_m = inverse_state(
             self._plays_v, self.gains_m_per_v, self._slopes_m_per_v
         )
 
-    @property
-    def angles_rad(self) -> Floats:
-        """Where the mirror is, shape (2,)."""
+    def _find_angles(self) -> Floats:
         if not self.hysteresis_known:
             return self.rad_per_stack_v @ (self.stack_v - self._fsm.bias_v)
         return self._rad_per_play_v.dot(self._plays_v.ravel()) - self._zero_rad

