@@ -97,7 +97,7 @@ class SwarmAmplifiers:
         )
         self.powered = False
         self.fault = ""
-        self.zero_rad: AzEl = (0.0, 0.0)  # motor angles at which the encoders read zero
+        self.zero_rad: AzEl = _STILL  # motor angles at which the encoders read zero
         _, mocks = rig.mock_parts()
         mock = mocks.loops[loop_name]
         self._enables = False  # last state requested of the analogue amplifiers' enable lines
@@ -269,6 +269,8 @@ class SwarmAmplifiers:
     def _as_driver_has_it(self, reading: ServoReading) -> ServoReading:
         # Analogue amplifiers have no line that reports an enabled axis.
         has_power = self._enables and not self.fault if self._enables_by_line else self.powered
+        if has_power is reading.enabled and self.zero_rad is _STILL and not self.fault:
+            return reading  # as at nearly every period
         (az_rad, el_rad), (zero_az_rad, zero_el_rad) = reading.position_rad, self.zero_rad
         position_rad = az_rad - zero_az_rad, el_rad - zero_el_rad
         return ServoReading(reading.time_s, position_rad, has_power, self.fault)
@@ -547,6 +549,7 @@ class SwarmCamera(SimulatedCamera):
         device = rig.camera.device
         self.line = Line("camera", device.endpoint, time, random, 0.002, device.response_timeout_s)
         self._time = time
+        self._period_s = rig.camera.period_s
         self._streams = False
         self._lost = 0
         self._clear_dn = self._scene._flux_dn
@@ -574,13 +577,13 @@ class SwarmCamera(SimulatedCamera):
         if not self.line.connected or "unplugged" in faults or "garbled" in faults:
             self._time.sleep(min(timeout_s, 0.01))
             raise self.line.broken()
-        exposed_s = self._start_s + self._frames * self._camera.period_s
+        exposed_s = self._start_s + self._frames * self._period_s
         late_s = 0.002 * faults.get("slow", 0.0)
         arrives_s = exposed_s + self._camera.frame_delay_s + late_s
-        if not self._streams or {"deaf", "mute", "refuses"} & faults.keys():
+        if not self._streams or (faults and {"deaf", "mute", "refuses"} & faults.keys()):
             self._time.sleep_until(now_s + timeout_s)
             return None
-        behind = int((now_s - arrives_s) / self._camera.period_s)
+        behind = int((now_s - arrives_s) / self._period_s)
         if behind > _MOST_LATE_FRAMES:  # no buffer keeps more
             self._frames += behind
             self._lost += behind

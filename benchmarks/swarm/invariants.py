@@ -74,6 +74,17 @@ class Invariants:
         self._amplifiers = amplifiers
         self._lines = lines
         self._supervisor: Supervisor | None = None
+        # What every tick needs, once.
+        self._stellar_loops = rig.stellar_loops
+        self._most_rad_s = {
+            name: loop.siderostat.velocity_limit_rad_s * _SLACK for name, loop in rig.loops.items()
+        }
+        self._three_periods_s = {
+            name: 3 / loop.siderostat.servo.rate_hz for name, loop in rig.loops.items()
+        }
+        camera = rig.camera
+        self._oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
+        self._most_step_s = _MOST_STEP_S * (1 + len(self._stellar_loops))
         self._resting_since_s = dict.fromkeys(rig.loops, 0.0)
         self._slowly: dict[str, bool] = {}
         self._powerless_since_s: dict[str, float] = {}
@@ -183,6 +194,9 @@ class Invariants:
     def record(self, record: AnyRecord) -> None:
         """The supervisor makes a record."""
         match record:
+            case Tick(number=number):  # the most frequent first
+                if number >= 0:
+                    self._acted_on(record)
             case ModeChange():
                 self._mode_changed(record)
             case Event():
@@ -194,8 +208,6 @@ class Invariants:
                     self._opened.add(record.loop)
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
-            case Tick(number=number) if number >= 0:
-                self._acted_on(record)
 
     def _encoders_read(self, opened: DevicesOpened) -> None:
         name = opened.loop
@@ -216,9 +228,8 @@ class Invariants:
         )
 
     def _acted_on(self, tick: Tick) -> None:
-        camera = self._rig.camera
-        oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
-        if self._camera_well() and tick.frame_age_s > oldest_s:
+        oldest_s = self._oldest_s
+        if tick.frame_age_s > oldest_s and self._camera_well():
             self.violated(
                 "a tick acts on the newest frame",
                 f"{tick.loop}: one of {tick.frame_age_s:.3f} s, at most {oldest_s:.3f} s",
@@ -255,23 +266,22 @@ class Invariants:
 
     def velocity(self, name: str, velocity_rad_s: AzEl) -> None:
         """A velocity is sent to a loop's motors."""
-        siderostat = self._rig.loops[name].siderostat
         fastest_rad_s = max(abs(velocity_rad_s[0]), abs(velocity_rad_s[1]))
-        if not fastest_rad_s <= siderostat.velocity_limit_rad_s * _SLACK:
+        if not fastest_rad_s <= self._most_rad_s[name]:
             self.violated("velocity within its limit", f"{name}: {velocity_rad_s} rad/s")
         supervisor = self._supervisor
         if supervisor is None or fastest_rad_s == 0.0:
             return
-        loop = supervisor.loops[name]
+        loop, three_periods_s = supervisor.loops[name], self._three_periods_s[name]
         since_stop_s = self._clock.now_s() - self._stopped_s.get(name, math.inf)
-        if since_stop_s > 3 / siderostat.servo.rate_hz:
+        if since_stop_s > three_periods_s:
             self.violated(
                 "a stop is obeyed at once",
                 f"{name}: {velocity_rad_s} rad/s {since_stop_s:.3f} s after it",
             )
         if loop.mode in _AT_REST:
             at_rest_s = self._clock.now_s() - loop.mode_since_s
-            if at_rest_s > 3 / siderostat.servo.rate_hz:
+            if at_rest_s > three_periods_s:
                 self.violated(
                     "no stage moves in OFF or SAFE",
                     f"{name}: {velocity_rad_s} rad/s after {at_rest_s:.3f} s in {loop.mode.name}",
@@ -283,17 +293,21 @@ class Invariants:
 
     def volts(self, name: str, volts: Floats, before_v: Floats) -> None:
         """Voltages are sent to a loop's mirror, whose D/A has others until they arrive."""
-        fsm = self._rig.stellar_loops[name].fsm
-        if not (np.all(volts >= 0.0) and np.all(volts <= fsm.dac.full_scale_v)):
+        fsm = self._stellar_loops[name].fsm
+        wanted_v = volts.tolist()  # floats, for arrays of three take ten times as long
+        full_scale_v = fsm.dac.full_scale_v
+        if not all(0.0 <= volt <= full_scale_v for volt in wanted_v):
             self.violated("voltages within their limits", f"{name}: {volts} V")
         if self._supervisor is None:
             return
         # The first write in a mode was decided in the one before.
         slowly = self._supervisor.loops[name].mode in _SLOWLY
         was_slow, self._slowly[name] = self._slowly.get(name, False), slowly
-        step_v = float(np.abs(volts - before_v).max())
+        if not (slowly and was_slow):
+            return
+        step_v = max(abs(v - b) for v, b in zip(wanted_v, before_v.tolist(), strict=True))
         most_v = fsm.slew_v_per_s * self._rig.camera.period_s * _SLACK + fsm.dac.step_v
-        if slowly and was_slow and step_v > most_v:
+        if not step_v <= most_v:
             self.violated(
                 "the mirror rests no faster than its slew",
                 f"{name}: {step_v:.3f} V in one write, at most {most_v:.3f} V",
@@ -308,7 +322,7 @@ class Invariants:
             return
         now_s = self._clock.now_s()
         took_s, self._stepped_s = now_s - self._stepped_s, now_s
-        if took_s > _MOST_STEP_S * (1 + len(supervisor.stellar_loops)):
+        if took_s > self._most_step_s:
             self.violated("a step ends", f"one took {took_s:.2f} s")
         jobs = supervisor._device_jobs
         self._busy_since_s = min(self._busy_since_s, now_s) if jobs.busy else math.inf

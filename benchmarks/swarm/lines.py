@@ -131,10 +131,10 @@ class Line:
             )
         if self.faults:
             return self._ask_badly(act)
-        delay_s = self.delay_s()
-        self._sleep(delay_s / 2)
+        half_s = self.delay_s() / 2
+        self._sleep(half_s)
         result = act()
-        self._sleep(delay_s / 2)
+        self._sleep(half_s)
         if not self.connected:  # closed, or reset, meanwhile
             raise self._unreachable("a broken connection")
         return result
@@ -165,7 +165,10 @@ class Line:
         return result
 
     def _sleep(self, duration_s: float) -> None:
-        self._sleep_until(self._time.now_s() + duration_s)
+        if self.bus is None:
+            self._time.sleep(duration_s)
+        else:
+            self._sleep_until(self._time.now_s() + duration_s)
 
     def _sleep_until(self, deadline_s: float) -> None:
         """Wait, and meanwhile let the bus's other drives run."""
