@@ -201,7 +201,8 @@ class SimulatedPhotodiodes:
         self._samples += 1
         noise = pixel_normals(self._plant.noise_keys[0], self._samples, 4)
         volts = self._plant.diode_volts(time_s)[0] + self._plant.sensor.noise_v * noise
-        steps = np.rint(np.clip(volts, -self._range_v, self._range_v) / self._step_v)
+        within_v = np.minimum(np.maximum(volts, -self._range_v), self._range_v)
+        steps = np.rint(within_v / self._step_v)
         az_plus, az_minus, el_plus, el_minus = (steps * self._step_v).tolist()
         return az_plus, az_minus, el_plus, el_minus
 

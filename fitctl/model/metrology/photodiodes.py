@@ -42,7 +42,8 @@ def diode_volts(sensor: BeamSensor, offset_m: ArrayLike, laser: ArrayLike = 1.0)
         Power of the laser over its nominal power; 0 is off.
     """
     offset_m = np.asarray(offset_m, dtype=float)
-    along_m = np.stack([offset_m, -offset_m], axis=-1).reshape(*offset_m.shape[:-1], 4)
-    squared_m2 = np.sum(offset_m**2, axis=-1)[..., None]
+    along_m = np.empty((*offset_m.shape[:-1], 4))
+    along_m[..., ::2], along_m[..., 1::2] = offset_m, -offset_m
+    squared_m2 = offset_m[..., :1] ** 2 + offset_m[..., 1:] ** 2
     lit_v = light_v(sensor, along_m, squared_m2) * np.asarray(laser)[..., None]
     return np.asarray(lit_v + np.asarray(sensor.ambient_v))
