@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+from textual.events import Key
 from textual.pilot import Pilot
 
 from tests.fake_supervisor import FakeSupervisor
@@ -47,4 +48,11 @@ def sent(app: FixedApp):
 
 async def pressed(app: FixedApp, pilot: Pilot, *keys: str) -> None:
     await pilot.press(*keys)
+    await settle(app, pilot)
+
+
+async def typed_at_once(app: FixedApp, pilot: Pilot, *keys: str) -> None:
+    """Keys that a busy console finds all together in its terminal."""
+    for key in keys:
+        app.post_message(Key(key, None))
     await settle(app, pilot)

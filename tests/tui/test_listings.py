@@ -15,7 +15,7 @@ from fitctl.tui.widgets.sequencing import Parameters, SequenceList
 from tests.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FakeJob, make_logs, settle
 from tests.tui.live import notifications
-from tests.tui.piloted import pressed, run, sent
+from tests.tui.piloted import pressed, run, sent, typed_at_once
 
 # ---------------------------------------------------------------- devices
 
@@ -35,6 +35,21 @@ def test_an_interlock_is_reset_from_its_row():
     async def scenario(app, pilot):
         await pressed(app, pilot, "2", "n")  # no reading is chosen yet
         await pressed(app, pilot, "tab", "down", "down", "n")
+
+    assert sent(run(scenario)) == [Reset(loop="right", name="dac_slow")]
+
+
+def test_keys_typed_faster_than_drawn_go_to_the_list_that_tab_chose():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down")
+        await typed_at_once(app, pilot, "tab", "pagedown", "enter")
+        assert isinstance(app.screen, Ask)
+        await pressed(app, pilot, "escape", "2")
+        await typed_at_once(app, pilot, "tab", "down", "down", "n")
+        await pressed(app, pilot, "1", "2")
+        await typed_at_once(app, pilot, "shift+tab", "enter")
+        assert isinstance(app.screen, Reader)
+        assert app.screen._title == "camera"
 
     assert sent(run(scenario)) == [Reset(loop="right", name="dac_slow")]
 

@@ -38,15 +38,15 @@ class DevicesView(View):
         devices, readings = self.query_one(DeviceList), self.query_one(Readings)
         loop, row = self.state.loop, readings.now()
         device = devices.now()
-        if devices.has_focus and device is not None:
+        if devices.takes_keys and device is not None:
             self.app.push_screen(Reader(device.device, _table(device_lines(devices, device))))
-        elif readings.has_focus and loop is not None and row is not None:
+        elif readings.takes_keys and loop is not None and row is not None:
             self.app.push_screen(Reader(row.name, _table(reading_lines(loop, row))))
 
     def action_reset(self) -> None:
         """Let the chosen interlock go."""
         row = self.query_one(Readings).now()
-        if row is None or not self.query_one(Readings).has_focus:
+        if row is None or not self.query_one(Readings).takes_keys:
             self.notify("choose an interlock first: tab, then up and down", timeout=3)
         else:
             self.console.send(Reset(name=row.name))

@@ -110,7 +110,7 @@ class SequencesView(View):
         document = self._chosen()
         if document is None:
             return
-        if parameter is None or not self.query_one(Parameters).has_focus:
+        if parameter is None or not self.query_one(Parameters).takes_keys:
             self.notify("choose a parameter first: tab, then up and down", timeout=3)
             return
         step = document["steps"][parameter.step]

@@ -45,6 +45,14 @@ class Choice(Panel, can_focus=True):
         self._count = 0
         self._names: list[str] = []  # as they were drawn last
 
+    @property
+    def takes_keys(self) -> bool:
+        """Whether keys go to this list.
+
+        `has_focus` becomes true only a message later, when a key that was typed fast may have been handled.
+        """
+        return self.screen.focused is self
+
     def names(self) -> list[str]:
         """The names of the rows, where rows change places; empty where they do not."""
         return []
