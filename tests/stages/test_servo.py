@@ -174,6 +174,26 @@ def test_motors_that_turned_on_while_this_computer_stood_still_are_no_following_
     assert amplifiers.position_rad[0] == pytest.approx(6.0, abs=2e-3)
 
 
+def test_late_readings_of_motors_that_turned_on_are_no_following_error(servo, amplifiers):
+    """A busy computer: commands and readings come late, one after the other, for 100 ms."""
+    servo.hold(servo.position_rad)
+    servo.move_to(np.array([6.0, 0.0]))
+    run(servo, 20)
+    assert amplifiers.commands[-1][0] > 50.0
+    amplifiers.clock.sleep_until(amplifiers.clock.now_s() + 0.03)
+    amplifiers.position_rad = (amplifiers.position_rad[0] + 1.7, 0.0)
+    amplifiers.late_s = 0.02
+    run(servo, 50)
+    assert servo.fault is None
+    assert set(amplifiers.commands[-49:]) == {(0.0, 0.0)}
+
+    amplifiers.late_s = 0.0
+    run(servo, 200)
+
+    assert servo.fault is None
+    assert amplifiers.position_rad[0] == pytest.approx(6.0, abs=2e-3)
+
+
 @pytest.mark.parametrize(("late_s", "period_s"), [(0.1, 0.002), (0.2, 0.5)])
 def test_readings_too_old_to_servo_by_are_no_readings(servo, amplifiers, late_s, period_s):
     """Late on a wire that is asked again meanwhile, or on one whose every answer is waited for."""
