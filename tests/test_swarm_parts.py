@@ -306,6 +306,15 @@ FOUND = {
         plan(gives(0.1, Standby()), gives(2.0, FAR), Stall(at_s=2.2, lasts_s=0.15)),
         "an axis that is not stuck is not called so",
     ),
+    "late-is-stuck": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            Strike(at_s=2.2, device="right siderostat", fault="slow", size=80.0, lasts_s=0.18),
+            Stall(at_s=2.2, lasts_s=0.06),
+        ),
+        "an axis that is not stuck is not called so",
+    ),
     "star-forgotten": (
         plan(
             gives(0.1, Standby()),

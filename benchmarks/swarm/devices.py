@@ -12,6 +12,7 @@ Known limitations: a drive without its master stops at once, without a ramp; a r
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from random import Random
@@ -120,7 +121,7 @@ class SwarmAmplifiers:
         self._last_master_s = -math.inf
         self._heard_s = 0.0
         self._watched = False
-        self._late: ServoReading | None = None
+        self._on_the_way: deque[tuple[float, ServoReading]] = deque()  # with its time of arrival
         self._staged_rad_s: AzEl | None = None
         self._sync: tuple[float, float, ServoReading | None] | None = None
 
@@ -133,7 +134,8 @@ class SwarmAmplifiers:
         for _ in range(20):
             self.line.ask(self._nothing)
         self._heard_s = self._time.now_s()
-        self._late = self._staged_rad_s = self._sync = None
+        self._on_the_way.clear()
+        self._staged_rad_s = self._sync = None
         self._inner.open()
         return _identity("amplifiers")
 
@@ -194,12 +196,13 @@ class SwarmAmplifiers:
                 self._time.sleep_until(sent_s + min(delay_s, self._period_s))
                 raise line.garbled()
             reading = None
-        late, self._late = self._late, None
-        if reading is None or delay_s > self._period_s:
-            self._time.sleep_until(sent_s + self._period_s)
-            self._late, reading = reading, late
-        else:
-            self._time.sleep_until(sent_s + delay_s)
+        late, on_the_way = self._arrived(), self._on_the_way
+        if reading is not None:
+            arrives_s = max(sent_s + delay_s, on_the_way[-1][0] if on_the_way else 0.0)
+            on_the_way.append((arrives_s, reading))
+        within_s = sent_s + self._period_s
+        self._time.sleep_until(min(within_s, on_the_way[0][0]) if on_the_way else within_s)
+        reading = self._arrived() or late
         if not line.connected:
             raise line.broken()
         if reading is not None:
@@ -208,6 +211,13 @@ class SwarmAmplifiers:
         elif self._time.now_s() - self._heard_s > self._alive_s:
             raise line.timeout()
         return reading
+
+    def _arrived(self) -> ServoReading | None:
+        """The newest reading that has arrived."""
+        newest = None
+        while self._on_the_way and self._on_the_way[0][0] <= self._time.now_s():
+            _, newest = self._on_the_way.popleft()
+        return newest
 
     def close(self) -> None:
         """Disable if possible, and disconnect."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 from fitctl.controllers.position_servo import PositionServo
-from fitctl.drivers.interface import AzEl, Frame
+from fitctl.drivers.interface import AzEl, Frame, ServoReading
 from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Reply
@@ -116,6 +116,17 @@ def _go_on_as_before(self: SiderostatServo, _position_rad: AzEl) -> None:
     self._blind = False
 
 
+def _judges_late_readings(
+    self: SiderostatServo, reading: ServoReading | None, asked_s: float
+) -> None:
+    is_late = reading is not None and self._clock.now_s() - reading.time_s > self._blind_s
+    blind, self._blind = self._blind, self._blind and not is_late
+    try:
+        _SERVO_BY(self, reading, asked_s)
+    finally:
+        self._blind = self._blind or (blind and is_late)
+
+
 def _designs_with_devices(self: Supervisor, *arguments: Any, **options: Any) -> None:
     options["design_executor"] = None
     _SUPERVISOR_INIT(self, *arguments, **options)
@@ -143,6 +154,7 @@ def _find_nothing(self: MirrorStage) -> None:
 _ASK = PiezoWatch.ask
 _SERVO_INIT = SiderostatServo.__init__
 _FIND_POSITION = SiderostatServo._find_position
+_SERVO_BY = SiderostatServo._servo_by
 _POSITION_SERVO_INIT = PositionServo.__init__
 _FAIL = SiderostatServo._fail
 _ENTER = Loop._enter
@@ -193,6 +205,11 @@ DEFECTS = {
         "f6dc181",
         "motors that turned on while the computer stood still are a following error",
         [(SiderostatServo, "_go_on_from", _go_on_as_before)],
+    ),
+    "late-is-stuck": Defect(
+        "86e6328",
+        "motors that turned on while readings came late are a following error",
+        [(SiderostatServo, "_servo_by", _judges_late_readings)],
     ),
     "star-forgotten": Defect(
         "f9f5b71",
