@@ -189,4 +189,4 @@ def _message(error: TyperException) -> str:
     """The error as one line, with the option that it is about."""
     format_message = getattr(error, "format_message", None)
     text = str(error) if format_message is None else format_message()
-    return text.replace("\n", " ").rstrip(".")
+    return text.replace("\n", " ").replace("Input should be", "expected").rstrip(".")

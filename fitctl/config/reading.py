@@ -62,7 +62,9 @@ def read_parts(path: Path, overrides: Sequence[str] = ()) -> LaidOver:
     ConfigError
         If a file is missing or is not TOML, or an override has no value's key.
     """
-    missing = "no such rig file; copy rigs/fit-mock.toml or name another with --rig"
+    missing = (
+        "no such rig file; name another with --rig, or write one with: fitctl init my-rig.toml"
+    )
     return lay_parts(path, read_toml(path, missing), overrides)
 
 

@@ -51,7 +51,7 @@ def write_performance(
         rough_hysteresis=ROUGH_HYSTERESIS,
         rough_backlash_times=ROUGH_BACKLASH_TIMES,
         far_step_px=FAR_STEP_PX,
-        dither_px=JOG_PX,
+        jog_px=JOG_PX,
         paper_rms_px=PAPER_RMS_PX,
         paper_attenuation=PAPER_ATTENUATION,
     )

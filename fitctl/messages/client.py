@@ -210,7 +210,10 @@ class Client:
     def _why_silent(self, timeout_s: float) -> str:
         where = self._where
         if not isinstance(where, RemoteKey):
-            return f"no supervisor answers at {where.path} within {timeout_s:g} s; start one with: fitctl run"
+            return (
+                f"no supervisor answers at {where.path} within {timeout_s:g} s; start one with fitctl run and "
+                "the same --rig"
+            )
         place = f"{where.host} port {where.command_port}"
         if self._is_refused():
             return (

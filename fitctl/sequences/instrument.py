@@ -37,8 +37,8 @@ from fitctl.sequences.view import Figures, SequenceError
 
 NAME = "python"  # under which consoles see steps that a program runs
 _NONE_RUNS = (
-    "no supervisor of yours runs on this machine; start one with fitctl demo or fitctl run, name a rig file, "
-    "or try Instrument(simulate=True)"
+    "you have no supervisor running on this machine; start one with fitctl demo or fitctl run, name a rig "
+    "file, or try Instrument(simulate=True)"
 )
 
 T = TypeVar("T")

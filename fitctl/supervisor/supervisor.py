@@ -448,6 +448,8 @@ class Supervisor:
 
     def _why_not(self, trigger: Trigger, names: list[str]) -> str:
         loop = self.loops[names[0]]
+        if self._device_jobs.opens(loop.name):
+            return f"{trigger.name.lower()} is not available while devices are opened; wait for STANDBY"
         mode, can = loop.mode, ", ".join(t.name.lower() for t in loop.usable_commands)
         return f"{trigger.name.lower()} is not available in {mode.name}. Available: {can}"
 

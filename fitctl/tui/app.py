@@ -139,6 +139,7 @@ class ConsoleApp(App[None]):
         self.remote_arguments = list(remote_arguments)
         self.commissioning = commissioning
         self.step_job: Job | None = None
+        self.view_before = self.DEFAULT_MODE
         self.log_folder = log_folder
         self.start_job = start_job
         self.pictures: PictureSender | None = None
@@ -341,6 +342,8 @@ class ConsoleApp(App[None]):
 
     def action_view(self, name: str) -> None:
         """Show a screen."""
+        if name != self.current_mode:
+            self.view_before = self.current_mode
         self.switch_mode(name)
         self.call_after_refresh(self.draw_all)
 

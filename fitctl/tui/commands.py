@@ -225,6 +225,9 @@ KEYS = (
     Key(
         "slash", "/", "Find", "screen.filter", "show only rows with the words that you type", "help"
     ),
+    Key(
+        "escape", "esc", "Leave", "screen.leave", "every row again; then the screen before", "help"
+    ),
     *ALARM_KEYS,
     *TIME_KEYS,
     Key("e", "e", "Events", "app.events", "all events at full length"),

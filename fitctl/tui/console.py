@@ -29,6 +29,10 @@ class Console(Protocol):
     log_folder: Path | None
     start_job: Callable[..., Job]
     playback: Playback
+    view_before: str
+
+    def action_view(self, name: str) -> None:
+        """Show a screen."""
 
     def send(self, command: AnyCommand) -> None:
         """Send a command for the shown loop."""

@@ -116,7 +116,7 @@ def test_where_none_runs_there_is_one_line(night, fitctl, command):
 
     assert (status, out) == (3, "")
     assert len(err.splitlines()) == 1
-    assert f"{command[0]}: no supervisor of yours runs" in err
+    assert f"{command[0]}: you have no supervisor running" in err
 
 
 def test_the_environment_names_the_rig_before_the_one_that_runs(
@@ -262,7 +262,7 @@ def test_an_instrument_without_a_rig_names_those_that_run(night):
 def test_an_instrument_without_a_rig_where_none_runs_says_so(night):
     night()
 
-    with pytest.raises(ConnectionError, match="no supervisor of yours runs"):
+    with pytest.raises(ConnectionError, match="you have no supervisor running"):
         Instrument()
 
 

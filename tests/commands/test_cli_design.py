@@ -132,11 +132,11 @@ def test_people_get_text_that_fits_their_terminal(design, what):
 BAD_INPUT = {
     "something that is no design": (["everything"], "Available: vernier, coarse, bound"),
     "a file that is none": (["none.json"], "none.json: no such design file"),
-    "a file of what was saved": (["none.json", "--out", "x.json"], "--out is for a pair"),
+    "a file of what was saved": (["none.json", "--out", "x.json"], "--out is for a design"),
     "a loop that is none": (["bound", "--loop", "left"], "has right"),
     "a plot of another kind": (["vernier", "--plot", "fig9.bmp"], ".png or .svg"),
     "a plot of what has none": (["bound", "--plot", "bound.png"], "use it with vernier"),
-    "a file of what is no pair": (["compare", "--out", "all.json"], "--out is for a pair"),
+    "a file of what is no pair": (["compare", "--out", "all.json"], "--out is for a design"),
     "a file that cannot be": (["eq20", "--out", "/dev/null/x.json"], "/dev/null/x.json"),
     "a file that no rig could name": (["eq20", "--out", "eq20.txt"], "must end in .json"),
     "a design for no disturbance": (
@@ -163,7 +163,8 @@ def test_what_cannot_be_is_one_line_and_status_2(design, arguments, said):
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        (["learn"], "expected a log; name one"),
+        (["learn"], "expected a LOG; name one"),
+        (["compare", "--latest"], "only fitctl design learn --latest does"),
         (["learn", "missing.mcap"], "missing.mcap"),
         (["learn", "night.mcap", "--out", "learnt.toml"], "must end in .json"),
         (["bound", "night.mcap"], "reads no log, got night.mcap"),

@@ -124,7 +124,7 @@ def test_a_target_without_room_on_either_side_is_refused(rig):
         far_step(changed(rig, middle), "right")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_everything_is_made_at_once(rig, tmp_path):
     progress = []
     amount = Amount(Effort(2, 40.0, 25.0, 1), step_s=10.0, minutes=1)

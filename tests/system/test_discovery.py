@@ -79,7 +79,7 @@ def mode(rig):
 def test_without_a_rig_the_one_that_runs_is_meant(start, said):
     status, _, err = said("send", "status")
     assert status == 3
-    assert "no supervisor of yours runs" in err
+    assert "you have no supervisor running" in err
 
     (night,) = start("night")
 

@@ -165,7 +165,11 @@ LISTS = [
     *lines(ConsoleApp.MODES["loop"], [("w", "3", {"window_s": 60.0})]),
     *lines(
         ConsoleApp.MODES["help"],
-        [("slash", "6", {"finds": True}), ("escape", "6 slash", {"finds": False})],
+        [
+            ("slash", "6", {"finds": True}),
+            ("escape", "6 slash", {"finds": False}),
+            ("question_mark", "2 6", {"view": "devices"}),
+        ],
     ),
     *lines(
         ConsoleApp.MODES["sequences"],

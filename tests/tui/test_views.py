@@ -76,6 +76,39 @@ def test_no_key_means_two_things_on_one_screen():
         assert len(keys) == len(set(keys)), view.name
 
 
+def test_help_is_left_for_the_screen_before():
+    async def scenario(app, pilot):
+        for key in ("escape", "question_mark"):
+            await pressed(app, pilot, "2", "question_mark")
+            assert app.view.view_name == "help"
+            await pressed(app, pilot, key)
+            assert app.view.view_name == "devices"
+
+    run(scenario)
+
+
+def test_escape_in_a_filtered_help_shows_everything_first():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3", "question_mark", "slash", *"jog", "escape")
+        assert app.view.view_name == "help"
+        await pressed(app, pilot, "escape")
+        assert app.view.view_name == "loop"
+
+    run(scenario)
+
+
+def test_the_past_is_left_from_the_help_too():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "question_mark", "comma")
+        assert not app.state.live
+        await pressed(app, pilot, "home")
+        assert not app.state.live
+        await pressed(app, pilot, "end")
+        assert app.state.live
+
+    run(scenario)
+
+
 def test_every_key_is_in_the_help():
     async def scenario(app, pilot):
         await pressed(app, pilot, "6")

@@ -12,6 +12,7 @@ import typer
 from numpy.typing import ArrayLike
 
 from fitctl.commands.design.learn import learn
+from fitctl.commands.shared.logs import LatestOption, chosen_logs
 from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
@@ -42,7 +43,7 @@ def design(
     what: Annotated[
         str,
         typer.Argument(
-            help="vernier, coarse, bound, compare, learn, or a pair: eq20, lqg-ltr, minimum-variance, "
+            help="vernier, coarse, bound, compare, learn, or a design: eq20, lqg-ltr, minimum-variance, "
             "fslq, a saved file (*.json), or a Python file of your own (*.py)."
         ),
     ],
@@ -50,12 +51,13 @@ def design(
         list[Path] | None,
         typer.Argument(
             metavar="FILE...",
-            help="learn: logs of one run, or a folder, which means its newest run. compare: further pairs.",
+            help="learn: logs of one run, or a folder, which means its newest run. compare: further designs.",
         ),
     ] = None,
     rig: RigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",
+    latest: LatestOption = False,
     as_json: JsonOption = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw Fig. 9 (vernier), PNG or SVG.")
@@ -69,15 +71,19 @@ def design(
 ) -> None:
     """Design the controllers of a loop: margins, residual, and the theoretical minimum of the residual.
 
-    vernier designs the paper's LQG/LTR; compare shows all pairs side by side. learn estimates air path, noise
-    and vibrations of a night from a log, and designs a pair for that night.
+    vernier designs the paper's LQG/LTR; compare shows all designs side by side. learn estimates air path, noise
+    and vibrations of a night from a log, and makes a design for that night.
     """
     if out is not None and out.suffix != ".json":
         msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
         raise ConfigError(msg)
     if what == "learn":
-        learn(logs or [], rig, overrides, loop, out, as_json=as_json)
+        chosen = chosen_logs("design learn", logs, rig, latest=latest)
+        learn(chosen, rig, overrides, loop, out, as_json=as_json)
         return
+    if latest:
+        msg = f"design {what}: reads no log; only fitctl design learn --latest does"
+        raise ConfigError(msg)
     if logs and what != "compare":
         msg = f"design {what}: reads no log, got {logs[0]}; only fitctl design learn LOG does"
         raise ConfigError(msg)
@@ -100,7 +106,7 @@ def design(
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what
     if out is not None and name not in DESIGNS and not name.endswith(".py"):
-        msg = f"design {what}: --out is for a pair: {', '.join(['vernier', *DESIGNS])}"
+        msg = f"design {what}: --out is for a design: {', '.join(['vernier', *DESIGNS])}"
         raise ConfigError(msg)
     if plot is not None and name != "lqg-ltr":
         msg = f"design {what}: --plot draws Fig. 9: use it with vernier"

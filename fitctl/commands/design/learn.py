@@ -7,7 +7,6 @@ from pathlib import Path
 from fitctl.commands.shared.opened import opened_loop
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
-from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import solving
 from fitctl.controllers.design.files import save_design
@@ -34,9 +33,6 @@ def learn(
     LogError
         If the log cannot be read.
     """
-    if not logs:
-        msg = "design learn: expected a log; name one: fitctl design learn night.mcap"
-        raise ConfigError(msg)
     run = find_run(logs, rig_of(rig, overrides) if rig or overrides else None)
     require_loop("design learn", run.rig, loop)
     with solving("design learn", loop):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -78,38 +79,46 @@ def status_document(telemetry: Telemetry, found: list[str]) -> dict[str, Any]:
 
 def status_lines(telemetry: Telemetry, found: list[str]) -> list[str]:
     """The same for people."""
-    lines = [f"{telemetry.rig_name}: {'not well' if found else 'well'}"]
-    lines += [f"  ! {trouble}" for trouble in found]
+    rows = list(_rows(telemetry))
+    columns = max(len(what) for what, _ in rows)
+    return [
+        f"{telemetry.rig_name}: {'not well' if found else 'well'}",
+        *(f"  ! {trouble}" for trouble in found),
+        *(f"  {what:<{columns}}  {text}" for what, text in rows),
+    ]
+
+
+def _rows(telemetry: Telemetry) -> Iterator[tuple[str, str]]:
+    """What each line is about, and what it says."""
     for loop in telemetry.loops:
         text = f"{loop.mode} for {duration(telemetry.time_s - loop.since_s)}"
         text += f", controller {loop.controller}" if loop.controller else ""
-        lines.append(_line(loop.name, text + _beam(telemetry, loop.name)))
+        yield loop.name, text + _beam(telemetry, loop.name)
     if telemetry.overlaps and not math.isnan(telemetry.overlaps[-1].visibility):
         overlap = telemetry.overlaps[-1]
         tilt = f"{overlap.tilt_az_arcsec:+.3f} {overlap.tilt_el_arcsec:+.3f} arcsec"
-        lines.append(_line("fringes", f"tilt {tilt}, visibility {overlap.visibility:.3f}"))
+        yield "fringes", f"tilt {tilt}, visibility {overlap.visibility:.3f}"
     for device in telemetry.devices:
         known = f" ({device.identity})" if device.identity else ""
         text = f"{device.state}{known} at {device.endpoint}, {device.detail}"
-        lines.append(_line(device.device, text))
+        yield device.device, text
     for timing in telemetry.timing:
         text = (
             f"{timing.ticks} ticks, {timing.late_ticks} late, computed in "
             f"{timing.compute_worst_s * 1e3:.1f} ms at worst, {timing.stalls} stalls of the machine"
         )
-        lines.append(_line(f"{timing.loop} last second", text))
+        yield f"{timing.loop} last second", text
     if telemetry.recorder is not None:
         text = f"{telemetry.recorder.path}, {telemetry.recorder.records} records"
-        lines.append(_line("log", f"{text}, {telemetry.records_lost} lost"))
+        yield "log", f"{text}, {telemetry.records_lost} lost"
     unsent = ", ".join(f"{count} {name}" for name, count in telemetry.losses.unsent.items())
-    lines.append(_line("unsent", unsent.replace("_", " ")))
+    yield "unsent", unsent.replace("_", " ")
     running = telemetry.running_sequence
     if running is not None:
         text = f"{running.name} {running.state}, step {running.step_number} of {running.steps}"
-        lines.append(_line("sequence", f"{text} ({running.step})"))
-    lines.append(_line("commander", telemetry.commander or "none"))
-    lines.append(_line("supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"))
-    return lines
+        yield "sequence", text + (f" ({running.step})" if running.step else "")
+    yield "commander", telemetry.commander or "none"
+    yield "supervisor", f"process {telemetry.pid}, {telemetry.scheduling}"
 
 
 def _beam(telemetry: Telemetry, loop_name: str) -> str:
@@ -118,10 +127,6 @@ def _beam(telemetry: Telemetry, loop_name: str) -> str:
     if not ticks or math.isnan(ticks[-1].beam_az_arcsec):
         return ""
     return f", beam {ticks[-1].beam_az_arcsec:+.2f} {ticks[-1].beam_el_arcsec:+.2f} arcsec"
-
-
-def _line(what: str, text: str) -> str:
-    return f"  {what:<17}  {text}"
 
 
 def duration(seconds: float) -> str:

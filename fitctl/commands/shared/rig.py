@@ -32,7 +32,12 @@ def with_controller(
     if controller is None:
         return overrides or []
     loops = rig_of(path, overrides).stellar_loops
-    return [*(overrides or []), *controller_overrides(loops, controller)]
+    changed = [*(overrides or []), *controller_overrides(loops, controller)]
+    try:
+        rig_of(path, changed)
+    except ConfigError as error:  # the rig was well without it
+        raise ConfigError(str(error).replace("--set: ", "--controller: ", 1)) from None
+    return changed
 
 
 def controller_overrides(loops: Iterable[str], controller: str) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, cast
 
 from rich.table import Table
 from rich.text import Text
@@ -48,13 +48,33 @@ class Section(NamedTuple):
     rows: list[tuple[str, str, str]]
 
 
+class HelpSheet(VerticalScroll):
+    """The text, in which home and end keep their meaning for the past while that is shown."""
+
+    def action_scroll_home(self) -> None:
+        """Go to the oldest moment, or to the first line."""
+        view = cast("HelpView", self.screen)
+        if view.state.live:
+            super().action_scroll_home()
+        else:
+            view.console.playback.oldest()
+
+    def action_scroll_end(self) -> None:
+        """Go to now, or to the last line."""
+        view = cast("HelpView", self.screen)
+        if view.state.live:
+            super().action_scroll_end()
+        else:
+            view.console.playback.now()
+
+
 class HelpView(View):
     """What can be done now, then everything; a filter shows the rows that have its words."""
 
     view_name = "help"
     BINDINGS: ClassVar[list[BindingType]] = [
         *(key.binding() for key in keys_of("help")),
-        Binding("escape", "clear", show=False),
+        Binding("question_mark", "leave", show=False),
     ]
 
     def __init__(self) -> None:
@@ -66,7 +86,7 @@ class HelpView(View):
         yield Input(
             placeholder="words to find; enter keeps the filter, esc shows everything", id="filter"
         )
-        with VerticalScroll(id="sheet"):
+        with HelpSheet(id="sheet"):
             yield Static("", id="help")
 
     def on_mount(self) -> None:
@@ -96,9 +116,11 @@ class HelpView(View):
         field.display = True
         field.focus()
 
-    def action_clear(self) -> None:
-        """Show everything."""
+    def action_leave(self) -> None:
+        """Show everything again; what is shown whole is left for the screen before."""
         field = self.query_one("#filter", Input)
+        if not field.display:
+            self.console.action_view(self.console.view_before)
         field.value = ""
         field.display = False
         self.query_one("#sheet").focus()
