@@ -13,8 +13,8 @@ def test_no_such_file(tmp_path):
     path = tmp_path / "gone.toml"
     with pytest.raises(ConfigError) as caught:
         load_rig(path)
-    expected = f"{path}: no such rig file; copy rigs/fit-mock.toml or name another with --rig"
-    assert str(caught.value) == expected
+    what_to_do = "name another with --rig, or write one with: fitctl init my-rig.toml"
+    assert str(caught.value) == f"{path}: no such rig file; {what_to_do}"
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ from fitctl.supervisor.supervisor import Supervisor
 
 RIGS = Path(__file__).parents[2] / "rigs"
 HEAL_S = 60.0  # within which a loop must hold its star again
-_HISTORY_S = 5.0  # a frame may come so late
+_HISTORY_S = 20.0  # a frame may come so late, after several stalls in a row
 _ANSWER_S = 5.0
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0

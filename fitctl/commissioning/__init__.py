@@ -1,1 +1,1 @@
-"""From a cabinet of hardware to a star held: the steps of `fitctl commission`, and their record."""
+"""Bring a new instrument from its wiring to a held star: the steps of `fitctl commission`, and their record."""

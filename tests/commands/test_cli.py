@@ -99,6 +99,10 @@ BAD_INPUT = {
     "an option that is none": (["demo", "--fast"], "--fast"),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
+    "a controller that is none": (
+        ["simulate", "--controller", "minvar"],
+        "--controller: loops.right.vernier.controller: must be one of",
+    ),
 }
 
 

@@ -98,6 +98,7 @@ def test_latest_goes_before_the_topics_of_a_plot(fitctl, logs):
         ("log", "summary"),
         ("replay",),
         ("report",),
+        ("design", "learn"),
     ],
 )
 def test_without_log_and_without_latest_the_error_names_both(fitctl, logs, arguments):

@@ -161,6 +161,16 @@ def test_opening_that_is_stopped_fails_and_says_so(fresh, monkeypatch):
     assert state(fresh).last_failure.text == found.text
 
 
+def test_while_devices_are_opened_a_command_is_refused_with_what_to_wait_for(fresh, monkeypatch):
+    monkeypatch.setattr(fresh.supervisor._device_jobs, "_executor", SlowExecutor())
+    fresh.command(Standby())
+
+    refused = fresh.command(Acquire())
+
+    assert not refused.accepted
+    assert refused.text == "acquire is not available while devices are opened; wait for STANDBY"
+
+
 def test_a_star_that_is_not_found_fails_acquire(no_star):
     found = ended(no_star, no_star.command(Acquire()))
 
