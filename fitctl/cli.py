@@ -167,7 +167,8 @@ def main(arguments: list[str] | None = None) -> None:
         status = app(given, prog_name="fitctl", standalone_mode=False)
     except TyperException as error:
         context = getattr(error, "ctx", None)
-        command = "fitctl" if context is None else context.command_path
+        named = f"fitctl {given[0]}" if given[:1] and given[0] in COMMANDS else "fitctl"
+        command = named if context is None else context.command_path
         say(f"{command}: {_message(error)} (see {command} --help)", err=True)
         status = UNUSABLE
     except (KeyboardInterrupt, typer.Abort):

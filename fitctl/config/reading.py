@@ -357,7 +357,7 @@ def _said(problem: Any, location: list[str], *, missing: bool) -> str:
         hint = f"; did you mean {near[0]}?" if near else ""
         return f"unknown key{hint} (allowed here: {', '.join(allowed)})"
     if missing:
-        return "is missing; rigs/fit-mock.toml shows every key with its unit"
+        return "is missing; a rig file that fitctl init writes has every key with its unit"
     message = str(problem["msg"])
     message = message.removeprefix("Value error, ").replace("Input should be", "must be")
     given = problem.get("input")

@@ -52,6 +52,7 @@ class Endpoint:
                 exclusive=True,
             )
         except (OSError, ValueError) as error:
+            got = str(error)
             if isinstance(error.__context__, ConnectionRefusedError):
-                hint = f"{_NOTHING_LISTENS} {hint}"
-            raise self.error(DeviceUnreachable, expected, str(error), hint) from error
+                got, hint = "connection refused", f"{_NOTHING_LISTENS} {hint}"
+            raise self.error(DeviceUnreachable, expected, got, hint) from error

@@ -99,6 +99,7 @@ BAD_INPUT = {
     "an option that is none": (["demo", "--fast"], "--fast"),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
+    "an option without its value": (["console", "--log"], "fitctl console: Option '--log'"),
     "a controller that is none": (
         ["simulate", "--controller", "minvar"],
         "--controller: loops.right.vernier.controller: must be one of",

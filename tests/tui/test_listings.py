@@ -112,6 +112,30 @@ def test_a_parameter_is_edited_checked_and_used():
     assert not Path(edited[0]).exists()
 
 
+def test_the_file_of_an_edited_sequence_is_written_once():
+    """Whoever was started with it may still have to read it when the next one is written."""
+
+    async def edited(app, pilot, value):
+        await pressed(app, pilot, "enter")
+        app.screen.query_one(Input).value = value
+        await pressed(app, pilot, "enter")
+        return Path(app.jobs[-1].arguments[2])
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "tab", *["down"] * 6)
+        first = await edited(app, pilot, "0.5")
+        written = first.stat()
+        for _ in range(20):
+            app.draw_all()
+        second = await edited(app, pilot, "0.25")
+        assert first.stat().st_mtime_ns == written.st_mtime_ns
+        assert "dither_px = 0.5," in first.read_text()
+        assert "dither_px = 0.25," in second.read_text()
+        assert first.name == second.name == "dither.toml"
+
+    run(scenario)
+
+
 def test_editing_is_left_by_escape_and_s_is_a_letter_there():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "down", "tab", "down", "enter", "s", "escape")

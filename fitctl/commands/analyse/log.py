@@ -172,8 +172,8 @@ def summary(
         else:
             start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(line.start_s or 0.0))
             rms = ", ".join(f"{name} {text}" for name, text in line.rms.items())
-            words = f"{start}, {line.duration_s or 0.0:.0f} s, requirement {line.verdict}: {rms}"
-            say(f"{log}: {line.error or words}")
+            words = f"{start}, {line.duration_s or 0.0:.0f} s, requirement {line.verdict}"
+            say(f"{log}: {line.error or words}" + (f": {rms}" if rms else ""))
 
 
 class LogSummary(msgspec.Struct, kw_only=True):

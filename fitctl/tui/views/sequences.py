@@ -45,6 +45,7 @@ class SequencesView(View):
     def __init__(self) -> None:
         super().__init__()
         self._folder = tempfile.TemporaryDirectory(prefix="fitctl-console-")
+        self._editions: dict[str, str] = {}  # file of each edited sequence, by content
         self._list: Job | None = None
         self._estimates = Estimates()
 
@@ -180,13 +181,19 @@ class SequencesView(View):
         return document
 
     def _file(self, document: dict[str, Any]) -> str:
-        """A sequence's own file, or, once it was edited, one of ours."""
+        """A sequence's own file, or, once it was edited, one of ours.
+
+        Each edition has its own, which is written once: the process that was started with it may read it later.
+        """
         sequences = self.query_one(SequenceList)
         if document["file"] not in sequences.edited:
             return document["file"]
-        path = Path(self._folder.name) / f"{document['name']}.toml"
-        path.write_text(tomli_w.dumps({k: v for k, v in document.items() if k != "file"}))
-        return str(path)
+        content = tomli_w.dumps({k: v for k, v in document.items() if k != "file"})
+        if content not in self._editions:
+            path = Path(tempfile.mkdtemp(dir=self._folder.name)) / f"{document['name']}.toml"
+            path.write_text(content)
+            self._editions[content] = str(path)
+        return self._editions[content]
 
     def _start(self, word: str, *more: str, outlives: bool = False) -> None:
         """Do something with the chosen sequence; never with the file of another rig."""
