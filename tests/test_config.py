@@ -102,7 +102,10 @@ def test_the_period_follows_from_the_rate(rig):
 def test_every_key_is_required(path):
     document = copy.deepcopy(DOCUMENT)
     del value_at(document, path[:-1])[path[-1]]
-    assert f"my.toml: {dotted(path)}: is missing; rigs/fit-mock.toml shows" in complaint(document)
+    assert (
+        f"my.toml: {dotted(path)}: is missing; a rig file that fitctl init writes has"
+        in complaint(document)
+    )
 
 
 @pytest.mark.parametrize("path", FLOATS, ids=dotted)
