@@ -237,10 +237,7 @@ class Invariants:
 
     def _camera_well(self) -> bool:
         """Nothing has been wrong with the camera's line for a while."""
-        return self._line_well("camera")
-
-    def _line_well(self, device: str) -> bool:
-        line = self._lines[device]
+        line = self._lines["camera"]
         return not line.faults and self._clock.now_s() - line.healed_s > _WELL_S
 
     def _mode_changed(self, change: ModeChange) -> None:

@@ -50,11 +50,14 @@ def safe_parts(truth: Basis, present: Design) -> tuple[float, ...]:
     parts = [_safe_part(line, truth) for line in truth.lines]
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     limit_px = MOST_IF_ALIAS * if_aliases(present, truth, suspects)
-    for most in PARTS:
-        reduced = tuple(
+    reductions = dict.fromkeys(  # each once: a limit above all parts changes none
+        tuple(
             min(part, most) if line in suspects else part
             for line, part in zip(truth.lines, parts, strict=True)
         )
+        for most in PARTS
+    )
+    for reduced in reductions:
         design = design_minimum_variance(expecting(reduced, truth))
         if if_aliases(design, truth, suspects) <= limit_px:
             break

@@ -297,7 +297,7 @@ class SiderostatServo:
             return
         if self._blind:
             if now_s - reading.time_s > self._blind_s:
-                return  # motors that have turned on meanwhile have nothing to follow
+                return  # motors that went on turning unseen have nothing to follow
             self._go_on_from(reading.position_rad)
         following_rad = self._servo.following_error_rad(reading.position_rad)
         self._following_rad.append(following_rad)

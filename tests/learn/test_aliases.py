@@ -5,8 +5,7 @@ import math
 
 import pytest
 
-from fitctl.config import default_rig_path, load_rig
-from fitctl.controllers.design.basis import Line, basis
+from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import linear_residual
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.learn.aliases import MOST_IF_ALIAS, PARTS, expecting, if_aliases, safe_parts
@@ -14,16 +13,6 @@ from fitctl.learn.aliases import MOST_IF_ALIAS, PARTS, expecting, if_aliases, sa
 FOUR_HZ = Line(4.0, 0.005, 0.02)
 FOURTEEN_HZ = Line(14.0, 0.005, 0.03)
 TWENTY_HZ = Line(20.0, 0.005, 0.08)
-
-
-@pytest.fixture(scope="module")
-def paper():
-    return basis(load_rig(default_rig_path()), "right")
-
-
-@pytest.fixture(scope="module")
-def fixed(paper):
-    return design_minimum_variance(paper)
 
 
 def knowing(paper, *lines):

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.linear_loop import course_px, held
-from fitctl.config import ConfigError, default_rig_path, load_rig
-from fitctl.controllers.design.basis import Line, basis
+from fitctl.config import ConfigError
+from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.margins import Required, margins
-from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.learn.advice import advise
 from fitctl.learn.fit_test import fit_test
 from fitctl.learn.night import estimate
@@ -23,17 +22,6 @@ from fitctl.learn.whittle import Guess, LineGuess, _Problem, likeliest
 TWO_MINUTES_S = 120.0
 THREE_HZ = Line(frequency_hz=3.1, damping=0.005, rms_px=0.05)
 SIX_HZ = Line(frequency_hz=6.0, damping=0.005, rms_px=0.05)
-
-
-@pytest.fixture(scope="module")
-def paper():
-    return basis(load_rig(default_rig_path()), "right")
-
-
-@pytest.fixture(scope="module")
-def fixed(paper):
-    """The design for the paper's night."""
-    return design_minimum_variance(paper)
 
 
 @pytest.fixture(scope="module")

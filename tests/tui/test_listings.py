@@ -113,7 +113,7 @@ def test_a_parameter_is_edited_checked_and_used():
 
 
 def test_the_file_of_an_edited_sequence_is_written_once():
-    """Whoever was started with it may still have to read it when the next one is written."""
+    """A process that was started with it may read it only after the next edit."""
 
     async def edited(app, pilot, value):
         await pressed(app, pilot, "enter")

@@ -51,21 +51,10 @@ class Section(NamedTuple):
 class HelpSheet(VerticalScroll):
     """The text, in which home and end keep their meaning for the past while that is shown."""
 
-    def action_scroll_home(self) -> None:
-        """Go to the oldest moment, or to the first line."""
-        view = cast("HelpView", self.screen)
-        if view.state.live:
-            super().action_scroll_home()
-        else:
-            view.console.playback.oldest()
-
-    def action_scroll_end(self) -> None:
-        """Go to now, or to the last line."""
-        view = cast("HelpView", self.screen)
-        if view.state.live:
-            super().action_scroll_end()
-        else:
-            view.console.playback.now()
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool:
+        """Whether it scrolls: not where the console has the key for the past."""
+        is_past = not cast("HelpView", self.screen).state.live
+        return not (is_past and action in {"scroll_home", "scroll_end"})
 
 
 class HelpView(View):
@@ -121,6 +110,7 @@ class HelpView(View):
         field = self.query_one("#filter", Input)
         if not field.display:
             self.console.action_view(self.console.view_before)
+            return
         field.value = ""
         field.display = False
         self.query_one("#sheet").focus()
