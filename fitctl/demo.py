@@ -356,13 +356,21 @@ def _since(running: Instrument, course: Course, loop_name: str, mode: Mode) -> f
     return course.reached_s.get((loop_name, mode.name), math.nan) - running.started_s
 
 
-def newest_telemetry(folder: Path) -> Telemetry | None:
-    """What the supervisor says now, or None if it says nothing for a second."""
-    client = Client(folder)
+def log_path(running: Instrument) -> str:
+    """The file that the recorder writes, empty if it says none within the time that it has to start.
+
+    A console can be left before the recorder, a process of its own, has begun its file.
+    """
+    client = Client(running.sockets)
+    deadline_s = time.monotonic() + HELLO_S
     try:
-        return client.receive(1.0)
+        while time.monotonic() < deadline_s and running.supervisor.poll() is None:
+            telemetry = client.receive(0.5)
+            if telemetry is not None and telemetry.recorder is not None:
+                return telemetry.recorder.path
     finally:
         client.close()
+    return ""
 
 
 # ---------------------------------------------------------------- parts

@@ -15,6 +15,7 @@ from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
 FIND_STAR = "check shutter and clouds; release, stop or acquire ends the search"
 RECORDER_SILENT_S = 10.0  # it reports about once a second
+RECORDER_STARTS_S = 5.0  # records wait for it meanwhile
 
 _DID = {
     "warn": "nothing was changed",
@@ -284,10 +285,13 @@ def _of_recording(telemetry: Telemetry) -> Iterator[Trouble]:
     recorder, lost = telemetry.recorder, telemetry.records_lost
     go_on = "the loop goes on"
     if recorder is None:
-        is_off = all(loop.mode == Mode.OFF.name for loop in telemetry.loops)
+        starts = all(
+            loop.mode == Mode.OFF.name or telemetry.time_s - loop.since_s < RECORDER_STARTS_S
+            for loop in telemetry.loops
+        )
         yield Trouble(
             "recorder",
-            "note" if is_off else "warning",
+            "note" if starts else "warning",
             "nothing is being recorded",
             telemetry.time_s,
             f"{go_on}, the supervisor tries again",

@@ -12,7 +12,7 @@ from fitctl.commands.operate.status import duration, status_document, status_lin
 from fitctl.commands.shared.printing import to_json, utc
 from fitctl.logging.records import Event
 from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
-from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
+from fitctl.messages.troubles import RECORDER_SILENT_S, RECORDER_STARTS_S, troubles
 from tests.fake_supervisor import STAR_LOST, FakeSupervisor
 
 TRIPPED = TrippedInterlock(
@@ -64,6 +64,18 @@ def test_what_is_not_well_is_one_line_each(trouble, expected):
     (line,) = lines(trouble())
 
     assert expected in line
+
+
+def test_a_recorder_has_a_few_seconds_to_start_before_anyone_is_warned():
+    message = told(recorder=None)
+    since_s = message.loops[0].since_s
+
+    def severity(after_s):
+        (trouble,) = troubles(msgspec.structs.replace(message, time_s=since_s + after_s))
+        return trouble.severity
+
+    assert severity(0.9 * RECORDER_STARTS_S) == "note"
+    assert severity(1.1 * RECORDER_STARTS_S) == "warning"
 
 
 def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():

@@ -47,6 +47,18 @@ def end(process, number=signal.SIGTERM, timeout_s=20.0):
         raise
 
 
+def child(pid, command):
+    """The process of ``fitctl COMMAND`` below another; one that is being started is waited for."""
+    end_s = time.monotonic() + START_S
+    while time.monotonic() < end_s:
+        for process in psutil.Process(pid).children(recursive=True):
+            with suppress(psutil.Error):  # it ends at this moment
+                if command in process.cmdline():
+                    return process
+        time.sleep(0.05)
+    raise AssertionError(f"no fitctl {command} within {START_S} s")
+
+
 def absent_devices():
     """Addresses of the mock rig's devices where nothing listens, and which no other test's supervisor has."""
     return {
@@ -155,14 +167,7 @@ class Rig:
 
     def child(self, command):
         """The process of ``fitctl COMMAND`` beside the supervisor; one that is being started is waited for."""
-        end_s = time.monotonic() + START_S
-        while time.monotonic() < end_s:
-            for child in psutil.Process(self.supervisor.pid).children(recursive=True):
-                with suppress(psutil.Error):  # it ends at this moment
-                    if command in child.cmdline():
-                        return child
-            time.sleep(0.05)
-        raise AssertionError(f"no fitctl {command} within {START_S} s")
+        return child(self.supervisor.pid, command)
 
     def close(self):
         if self.client is not None:

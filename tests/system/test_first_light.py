@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -17,7 +18,7 @@ from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Recover
 
-from .conftest import Rig, end, fitctl
+from .conftest import Rig, child, end, fitctl
 
 pytestmark = pytest.mark.timeout(300)
 SUMMARY_KEYS = {
@@ -195,7 +196,9 @@ def test_other_commands_find_a_running_demo_and_a_second_keeps_out_of_its_way(tm
         rig.close()
 
 
-def test_on_a_terminal_the_demo_shows_its_instrument_and_ends_with_q(tmp_path):
+@contextmanager
+def demo_on_a_terminal(tmp_path):
+    """A demo with a console, and the other side of its terminal."""
     ours, theirs = os.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "fitctl", "demo", "--set", f"logging.folder={tmp_path}"],
@@ -207,22 +210,42 @@ def test_on_a_terminal_the_demo_shows_its_instrument_and_ends_with_q(tmp_path):
     )
     os.close(theirs)
     try:
-        assert "live" in shown_until("live", ours)
-        os.write(ours, b"q")
-        assert f"log: {tmp_path}" in shown_until("log: ", ours)
-        assert process.wait(30) == 0
+        yield process, ours
     finally:
         end(process)
         os.close(ours)
 
 
+def test_on_a_terminal_the_demo_shows_its_instrument_and_ends_with_q(tmp_path):
+    with demo_on_a_terminal(tmp_path) as (process, terminal):
+        assert "live" in shown_until("live", terminal)
+        os.write(terminal, b"q")
+        assert f"log: {tmp_path}" in shown_until("log: ", terminal)
+        assert process.wait(30) == 0
+
+
+def test_a_demo_that_is_left_before_its_recorder_has_begun_still_names_its_log(tmp_path):
+    with demo_on_a_terminal(tmp_path) as (process, terminal):
+        recorder = child(process.pid, "record")
+        recorder.suspend()
+        assert "live" in shown_until("live", terminal)
+        os.write(terminal, b"q")
+        while_it_stands = shown_until("log: ", terminal, limit_s=3.0)
+        recorder.resume()
+
+        assert "log: " not in while_it_stands
+        assert f"log: {tmp_path}" in shown_until("log: ", terminal)
+        assert process.wait(30) == 0
+
+
 def shown_until(text, terminal, limit_s=60.0):
-    """What a program writes to its terminal, up to the piece that has `text`."""
+    """What a program writes to its terminal, up to the piece that has `text` or until it ends."""
     seen = b""
     end_s = time.monotonic() + limit_s
-    while text.encode() not in seen and time.monotonic() < end_s:
-        if select.select([terminal], [], [], 0.5)[0]:
-            seen += os.read(terminal, 65536)
+    with suppress(OSError):  # its end of the terminal is closed
+        while text.encode() not in seen and time.monotonic() < end_s:
+            if select.select([terminal], [], [], 0.5)[0]:
+                seen += os.read(terminal, 65536)
     return seen.decode(errors="replace")
 
 

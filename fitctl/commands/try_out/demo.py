@@ -114,9 +114,8 @@ def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.
     finally:
         end_process(console, _CONSOLE_END_S)
     thread.join(timeout=5.0)
-    newest = demos.newest_telemetry(running.sockets)
-    if newest is not None and newest.recorder is not None:
-        say(f"log: {newest.recorder.path}")
+    log = demos.log_path(running)
+    say(f"log: {log}" if log else "no log: the recorder began no file")
     return 0 if console.returncode == 0 else FAILED
 
 
