@@ -33,6 +33,7 @@ from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import Event, RecorderStatus
 from fitctl.messages.commands import (
     Acquire,
+    Jog,
     Off,
     RecorderReport,
     Recover,
@@ -352,6 +353,15 @@ FOUND = {
             duration_s=84.0,
         ),
         "healed, every star is held within 60 s",
+    ),
+    "jog-in-off": (
+        plan(
+            gives(0.1, Standby()),
+            Strike(at_s=1.0, device="right piezo", fault="mute", lasts_s=6.0),
+            gives(3.0, Jog(az_sky_arcsec=60.0, el_sky_arcsec=0.0)),  # while the piezo is asked
+            gives(3.005, Off()),
+        ),
+        "no stage moves in OFF or SAFE",
     ),
     "powered-unread": (
         plan(gives(0.1, Standby())),

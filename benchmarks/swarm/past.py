@@ -147,6 +147,11 @@ def _safe_and_go_on(self: Loop, source: Mode, motor_rad: Any) -> None:
         _ENTER(self, source, motor_rad)
 
 
+def _off_and_go_on(self: Loop, source: Mode, motor_rad: Any) -> None:
+    if self.mode is not Mode.OFF:
+        _ENTER(self, source, motor_rad)
+
+
 def _find_nothing(self: MirrorStage) -> None:
     self._known_s = self._clock.now_s()
 
@@ -254,6 +259,11 @@ DEFECTS = {
             (SiderostatServo, "_fail", _fail_and_go_on),
             (Loop, "_enter", _safe_and_go_on),
         ],
+    ),
+    "jog-in-off": Defect(
+        "COMMIT",
+        "a jog goes on in OFF until the amplifiers have lost their power",
+        [(Loop, "_enter", _off_and_go_on)],
     ),
 }
 """By name."""

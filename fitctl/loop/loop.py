@@ -250,7 +250,7 @@ class Loop(ABC):
 
     def _enter(self, source: Mode, motor_rad: Floats) -> None:
         """Do what a change from `source` to the mode needs, with the motors at `motor_rad`, shape (2,)."""
-        if self.mode is Mode.SAFE:
+        if self.mode in {Mode.SAFE, Mode.OFF}:  # in OFF, before the amplifiers lose their power
             self.servo.stop()
         elif self.mode is Mode.STANDBY:
             self.siderostat.hold(motor_rad)
