@@ -261,7 +261,7 @@ DEFECTS = {
         ],
     ),
     "jog-in-off": Defect(
-        "COMMIT",
+        "ac43419",
         "a jog goes on in OFF until the amplifiers have lost their power",
         [(Loop, "_enter", _off_and_go_on)],
     ),
