@@ -42,24 +42,26 @@ def held(
     seed: int,
     *,
     mirror_gain: float = 1.0,
+    overshoot: float = 0.0,
     star_px: Floats | None = None,
 ) -> tuple[Floats, Series]:
     """Error on frames, shape (frames, axes), and the loop as its own records open it.
 
-    The mirror moves by `mirror_gain` times what the loop believes.
+    The mirror moves by `mirror_gain` times what the loop believes, and is beyond its last step by `overshoot` of it.
     """
     random = np.random.default_rng([seed, 1])
     if star_px is None:
         star_px = course_px(truth, round(seconds / truth.period_s), seed)
     seen_px = star_px + truth.noise_px * random.standard_normal(star_px.shape)
     loop, (behind, walked) = sampled_loop(design, truth), timing(truth.period_s, truth.delay_s)
-    mirror, motor = np.zeros(len(loop.a)), np.zeros(len(loop.a))
-    mirror[behind - 1] = 1.0
+    mirror, motor, last = (np.zeros(len(loop.a)) for _ in range(3))
+    mirror[behind - 1], last[2 * behind + 1] = 1.0, 1.0
     motor[2 * behind], motor[2 * behind - 1] = 1.0 - walked, walked
     states = np.zeros((len(loop.a), AXES))
     error_px, mirror_px, motor_px = (np.empty_like(star_px) for _ in range(3))
     for frame, seen in enumerate(seen_px):
         mirror_px[frame], motor_px[frame] = mirror @ states, motor @ states
-        error_px[frame] = seen + mirror_gain * mirror_px[frame] + motor_px[frame]
+        ringing_px = overshoot * (mirror - last) @ states
+        error_px[frame] = seen + mirror_gain * mirror_px[frame] + ringing_px + motor_px[frame]
         states = loop.a @ states + np.outer(loop.b, error_px[frame])
     return error_px, Series(error_px - mirror_px - motor_px, mirror_px)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import ConfigError
-from fitctl.controllers.design.basis import LEAST_GAIN, Basis
+from fitctl.controllers.design.basis import LEAST_GAIN, MOST_OVERSHOOT, Basis
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, left_on_paper
@@ -303,6 +303,7 @@ def estimated(series: list[Series], rig_basis: Basis) -> tuple[Night, Basis]:
         air_path=night.air_path,
         lines=tuple(line.for_design for line in night.lines),
         mirror_gain=_gain_for_design(night),
+        overshoot=_overshoot_for_design(night),
     )
     return night, truth
 
@@ -316,6 +317,8 @@ def _lately_px(
         one for one in reversed(series) if len(one.disturbance_px) * truth.period_s >= LEAST_S
     )
     disturbance_px = last.disturbance_px + (1 - truth.mirror_gain) * last.mirror_px
+    step_px = np.diff(last.mirror_px, axis=0, prepend=last.mirror_px[:1])
+    disturbance_px -= truth.overshoot * step_px
     present_px, learnt_px = (
         math.sqrt(left_on_paper(design, truth, disturbance_px[-frames:]).max())
         for design in (present, learnt)
@@ -343,6 +346,14 @@ def _gain_for_design(night: Night) -> float:
             f"{1 / LEAST_GAIN:g}; look at its amplifiers, then measure it with fitctl identify hysteresis"
         )
         raise ConfigError(msg)
+    return found.value
+
+
+def _overshoot_for_design(night: Night) -> float:
+    """Of the mirror, where it is known to differ from 0; one that is too large is a delay for people to mend."""
+    found = night.overshoot
+    if found.covers(0.0) or abs(found.value) > MOST_OVERSHOOT:
+        return 0.0
     return found.value
 
 

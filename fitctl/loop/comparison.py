@@ -47,7 +47,7 @@ class Comparison:
         loop_basis = on_its_mirror(basis(rig, loop_name), learnt.parameters)
         self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
         self._scale = scales(rig, rig.stellar_loops[loop_name])
-        self._mirror_gain = loop_basis.mirror_gain
+        self._mirror_gain, self._overshoot = loop_basis.mirror_gain, loop_basis.overshoot
         self._settle_frames = round(SETTLE_S / loop_basis.period_s)
         self._over_frames = round(OVER_S / loop_basis.period_s)
         self.restart()
@@ -59,11 +59,15 @@ class Comparison:
         self.before_error_px: AzEl = (0.0, 0.0)
         self._frames = 0
         self._first_px: Floats | None = None
+        self._mirror_px: Floats | None = None
         self._means_px2 = np.zeros((3, 2))
 
     def observe(self, error_px: AzEl, mirror_rad: Floats, motor_rad: Floats) -> None:
         """One frame: the star's error, and where mirror and motors were, shapes (2,)."""
-        mirror_px = self._mirror_gain * self._scale.mirror_px(mirror_rad)
+        mirror_px = np.asarray(self._scale.mirror_px(mirror_rad))
+        last_px = mirror_px if self._mirror_px is None else self._mirror_px
+        self._mirror_px = mirror_px
+        mirror_px = self._mirror_gain * mirror_px + self._overshoot * (mirror_px - last_px)
         motor_px = self._scale.motor_px_per_rad * motor_rad.dot(self._scale.siderostat_turn.T)
         disturbance_px = np.array(error_px) - mirror_px - motor_px
         if self._first_px is None:

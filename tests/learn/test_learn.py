@@ -11,7 +11,7 @@ from benchmarks.linear_loop import course_px, held
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
-from fitctl.controllers.design.margins import Required, margins
+from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.learn.advice import advise
 from fitctl.learn.fit_test import fit_test
 from fitctl.learn.night import estimate
@@ -274,3 +274,23 @@ def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed)
     assert linear_residual(advice.design, truth) < 1.02 * least_px
     assert linear_residual(fixed, truth) > 1.1 * least_px
     assert margins(advice.design, truth).excess(Required()) < 1.02
+
+
+def test_a_mirror_that_rings_gets_a_design_whose_margins_hold_on_it(paper, fixed):
+    """With the noise of the fit: with that of the centroid, margins are ample anyway."""
+    night = dataclasses.replace(paper, noise_px=0.0024, lines=(SIX_HZ,))
+    truth = dataclasses.replace(night, overshoot=0.09)
+    _, series = held(night, fixed, TWO_MINUTES_S, 2, overshoot=0.09)
+    advice = advise([series], (0.0, 0.0), night, fixed)
+
+    assert advice.night.overshoot.covers(0.09)
+    assert margins(advice.design, truth).excess(Required()) < 1.02
+    assert margins(design_with_margins(night), truth).excess(Required()) > 1.15
+
+
+def test_an_overshoot_that_is_not_known_to_be_one_is_not_designed_for(paper, fixed):
+    _, series = held(paper, fixed, TWO_MINUTES_S, 5)
+    advice = advise([series], (0.0, 0.0), paper, fixed)
+
+    assert advice.night.overshoot.covers(0.0)
+    assert "overshoot" not in advice.design.parameters

@@ -14,6 +14,8 @@ from fitctl.model.optics import scales
 
 LEAST_GAIN = 0.4
 """Of a mirror: one that moves less, or more than its inverse, has another fault than its calibration."""
+MOST_OVERSHOOT = 0.5
+"""Of a mirror: one that is farther beyond its last step, or short of it, has another delay than the rig file says."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,9 @@ class Basis:
         margins (:mod:`fitctl.controllers.design.margins`).
     mirror_gain : float
         How far the mirror moves the star, in what the rig file says; `fitctl design learn` measures it.
+    overshoot : float
+        At mid-exposure, how far the mirror is beyond its last step, as a part of it, since its mount still
+        rings; `fitctl design learn` measures it.
     fastest_line_hz : float
         No vibration is faster.
     """
@@ -87,6 +92,7 @@ class Basis:
     lines: tuple[Line, ...] = ()
     guard: Line | None = None
     mirror_gain: float = 1.0
+    overshoot: float = 0.0
     fastest_line_hz: float = math.inf
 
 
@@ -134,12 +140,18 @@ def design_parameters(basis: Basis, *sections: str) -> dict[str, Any]:
         parameters["guard"] = dataclasses.asdict(basis.guard)
     if basis.mirror_gain != 1.0:
         parameters["mirror_gain"] = basis.mirror_gain
+    if basis.overshoot != 0.0:
+        parameters["overshoot"] = basis.overshoot
     return parameters
 
 
 def on_its_mirror(basis: Basis, parameters: Mapping[str, Any]) -> Basis:
-    """A rig's basis, but with the mirror's gain that a design of these parameters was made for."""
-    return replace(basis, mirror_gain=float(parameters.get("mirror_gain", 1.0)))
+    """A rig's basis, but with the mirror's gain and overshoot that a design of these parameters was made for."""
+    return replace(
+        basis,
+        mirror_gain=float(parameters.get("mirror_gain", 1.0)),
+        overshoot=float(parameters.get("overshoot", 0.0)),
+    )
 
 
 def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
@@ -151,9 +163,12 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         If these are no :func:`design_parameters`.
     """
     settings = rig_basis.settings
-    mirror_gain = float(parameters.get("mirror_gain", 1.0))
-    if not LEAST_GAIN <= mirror_gain <= 1 / LEAST_GAIN:
-        msg = f"mirror_gain: expected {LEAST_GAIN:g} to {1 / LEAST_GAIN:g}, got {mirror_gain:g}"
+    mirror = on_its_mirror(rig_basis, parameters)
+    if not LEAST_GAIN <= mirror.mirror_gain <= 1 / LEAST_GAIN:
+        msg = f"mirror_gain: expected {LEAST_GAIN:g} to {1 / LEAST_GAIN:g}, got {mirror.mirror_gain:g}"
+        raise ValueError(msg)
+    if not abs(mirror.overshoot) <= MOST_OVERSHOOT:
+        msg = f"overshoot: expected at most {MOST_OVERSHOOT:g} either way, got {mirror.overshoot:g}"
         raise ValueError(msg)
     sections = {
         name: type(getattr(settings, name)).model_validate(values)
@@ -161,12 +176,11 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         if name in type(settings).model_fields
     }
     return replace(
-        rig_basis,
+        mirror,
         noise_px=float(parameters["noise_px"]),
         air_path=AirPathModel.model_validate(parameters["air_path"]),
         coarse_per_s=float(parameters["coarse_per_s"]),
         settings=settings.model_copy(update=sections),
         lines=tuple(Line(**line) for line in parameters.get("lines", ())),
         guard=Line(**parameters["guard"]) if "guard" in parameters else None,
-        mirror_gain=mirror_gain,
     )

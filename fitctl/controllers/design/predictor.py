@@ -110,6 +110,8 @@ def predicting_design(
     # So far in the star's true motion; the mirror's input and output count what the rig file says of it.
     c[0], d[0] = c[0] / basis.mirror_gain, d[0] / basis.mirror_gain
     b[:, mirror], d[:, mirror] = b[:, mirror] * basis.mirror_gain, d[:, mirror] * basis.mirror_gain
+    if basis.overshoot:
+        a, b, c, d = _with_overshoot(a, b, c, d, basis.overshoot / basis.mirror_gain)
     return Design(
         name=name,
         period_s=basis.period_s,
@@ -121,3 +123,17 @@ def predicting_design(
         hysteresis_inverse=True,
         parameters=parameters,
     )
+
+
+def _with_overshoot(
+    a: Floats, b: Floats, c: Floats, d: Floats, overshoot: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """The same pair for a mirror that is beyond its last step: one more state, the mirror of the frame before."""
+    mirror = 2
+    n = len(a)
+    a, c = np.pad(a, ((0, 1), (0, 1))), np.pad(c, ((0, 0), (0, 1)))
+    b, d = np.pad(b, ((0, 1), (0, 0))), d.copy()
+    a[:, n], c[:, n] = -overshoot * b[:, mirror], -overshoot * d[:, mirror]
+    b[:, mirror], d[:, mirror] = (1 + overshoot) * b[:, mirror], (1 + overshoot) * d[:, mirror]
+    b[n, mirror] = 1.0
+    return a, b, c, d

@@ -72,18 +72,22 @@ class SampledLoop(NamedTuple):
 def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
     """A design, which may have been made for another delay, on the stages of a loop."""
     frames, walked = timing(basis.period_s, basis.delay_s)
-    # The stages' memory: mirror commands 1 to `frames` frames old, siderostat positions 0 to `frames`.
-    size = 2 * frames + 1
+    # The stages' memory: mirror commands 1 to `frames` frames old, siderostat positions 0 to `frames`, and the
+    # mirror's command before its last.
+    size = 2 * frames + 2
     newest_motor = frames
     advance = np.zeros((size, size))
     advance[1:frames, : frames - 1] = np.eye(frames - 1)
     advance[newest_motor, newest_motor] = 1.0
-    advance[newest_motor + 1 :, newest_motor:-1] = np.eye(frames)
+    advance[newest_motor + 1 : -1, newest_motor:-2] = np.eye(frames)
+    advance[-1, frames - 1] = 1.0
     drive = np.zeros((size, 2))
     drive[0, 0] = drive[newest_motor, 1] = 1.0
     mirror, motor = np.zeros(size), np.zeros(size)
     mirror[frames - 1] = 1.0
-    motor[-1], motor[-2] = 1.0 - walked, walked
+    motor[-2], motor[-3] = 1.0 - walked, walked
+    moved = (basis.mirror_gain + basis.overshoot) * mirror
+    moved[-1] = -basis.overshoot
     # Within the design: its inputs are the error, and what the stages had done (see `Design`).
     from_stages = np.zeros((5, size))
     from_stages[2], from_stages[3] = mirror, motor
@@ -97,7 +101,7 @@ def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
     return SampledLoop(
         a=a,
         b=np.concatenate([drive @ command_error, design.b[:, 0]]),
-        star=np.concatenate([basis.mirror_gain * mirror + motor, np.zeros(n)]),
+        star=np.concatenate([moved + motor, np.zeros(n)]),
         command=command,
         command_error=command_error,
         motor_held=np.eye(size + n)[newest_motor],

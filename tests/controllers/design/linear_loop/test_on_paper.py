@@ -25,13 +25,17 @@ def night(paper):
     return dataclasses.replace(paper, lines=(Line(6.0, 0.005, 0.05),))
 
 
-@pytest.mark.parametrize("mirror_gain", [1.0, 0.8])
-def test_a_design_on_the_disturbance_of_its_own_frames_makes_the_same_errors(paper, mirror_gain):
+@pytest.mark.parametrize(("mirror_gain", "overshoot"), [(1.0, 0.0), (0.8, 0.0), (0.9, 0.1)])
+def test_a_design_on_the_disturbance_of_its_own_frames_makes_the_same_errors(
+    paper, mirror_gain, overshoot
+):
     design = design_minimum_variance(paper)
-    error_px, series = held(paper, design, 10.0, seed=1, mirror_gain=mirror_gain)
-    truth = dataclasses.replace(paper, mirror_gain=mirror_gain)
-    on_paper = OnPaper(design, truth)
+    mirror = {"mirror_gain": mirror_gain, "overshoot": overshoot}
+    error_px, series = held(paper, design, 10.0, seed=1, **mirror)
+    on_paper = OnPaper(design, dataclasses.replace(paper, **mirror))
+    step_px = np.diff(series.mirror_px, axis=0, prepend=0.0)
     disturbance_px = series.disturbance_px + (1 - mirror_gain) * series.mirror_px
+    disturbance_px -= overshoot * step_px
     made_px = [on_paper.step(row) for row in disturbance_px]
 
     np.testing.assert_allclose(made_px, error_px, atol=1e-12)
