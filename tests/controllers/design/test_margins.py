@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
-from fitctl.controllers.design.basis import Line, basis, basis_of
+from fitctl.controllers.design.basis import Line, basis, basis_of, design_parameters
 from fitctl.controllers.design.choose import DESIGNS
 from fitctl.controllers.design.files import load_design, save_design
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
@@ -97,8 +97,11 @@ def test_margins_that_no_design_can_have_are_an_error(fit, monkeypatch):
         design_with_margins(fit, Required(peak_sensitivity=1.01))
 
 
-def test_a_design_with_lines_and_guard_is_made_again_from_its_file(six_hz, fit, tmp_path):
-    design = design_with_margins(six_hz)
+@pytest.mark.parametrize("overshoot", [0.0, 0.09])
+def test_a_design_with_lines_and_guard_is_made_again_from_its_file(
+    six_hz, fit, tmp_path, overshoot
+):
+    design = design_with_margins(dataclasses.replace(six_hz, overshoot=overshoot))
     save_design(design, tmp_path / "six.json")
 
     again = load_design(tmp_path / "six.json", fit, DESIGNS)
@@ -107,3 +110,12 @@ def test_a_design_with_lines_and_guard_is_made_again_from_its_file(six_hz, fit, 
     assert np.array_equal(again.a, design.a)
     assert made_for.lines == (SIX_HZ,)
     assert made_for.guard is not None
+    assert made_for.overshoot == overshoot
+
+
+@pytest.mark.parametrize(("name", "value"), [("mirror_gain", 0.2), ("overshoot", -0.6)])
+def test_parameters_of_a_mirror_that_cannot_be_are_refused(fit, name, value):
+    parameters = design_parameters(dataclasses.replace(fit, **{name: value}))
+
+    with pytest.raises(ValueError, match=f"{name}: expected .*, got {value:g}"):
+        basis_of(parameters, fit)
