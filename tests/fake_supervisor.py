@@ -69,7 +69,7 @@ CHANGES = {
     "STANDBY": ("OFF", "STANDBY", "all devices open, checked and enabled"),
     "ACQUISITION": ("STANDBY", "ACQUIRE", "operator"),
     "COARSE": ("ACQUISITION", "STAR_FOUND", "star on 3 frames in a row"),
-    "VERNIER": ("COARSE", "IN_REACH", "error needs 4% of the mirror's range"),
+    "VERNIER": ("COARSE", "IN_REACH", "the mirror needs 4% of its range"),
     "LOCKED": ("COARSE", "IN_REACH", "beam near the centre on 5 samples in a row"),
     "SAFE": ("VERNIER", "STOP", "operator"),
     "EXPERIMENT": ("VERNIER", "EXPERIMENT", "operator"),

@@ -49,7 +49,7 @@ class Following:
         if self.lost >= self._lost_frames:
             return Finding(Trigger.STAR_LOST, f"no star on {self.lost} frames in a row")
         if mode is Mode.COARSE and self.in_reach >= self._reach_frames:
-            return Finding(Trigger.IN_REACH, f"error needs {need:.0%} of the mirror's range")
+            return Finding(Trigger.IN_REACH, f"the mirror needs {need:.0%} of its range")
         if mode is Mode.VERNIER and self.out_of_reach >= self._reach_frames:
-            return Finding(Trigger.OUT_OF_REACH, f"error needs {need:.0%} of the mirror's range")
+            return Finding(Trigger.OUT_OF_REACH, f"the mirror needs {need:.0%} of its range")
         return None

@@ -43,7 +43,7 @@ STAR_FAULTS = (
     Entry("", "star_dim 0.3", SEARCHES, "no star on"),
     *held("star_jump 2", "star_double"),
     # As far as the whole frame shows it: the siderostat brings it back.
-    Entry("", "star_jump 12", ("COARSE",), "of the mirror's range"),
+    Entry("", "star_jump 12", ("COARSE",), "the mirror needs"),
     # What lies above the bias is light: a spot of far more than flux_range.high is no star.
     Entry("", "background_jump", SEARCHES, "no star on"),
     # Without its brightest pixels the spot has two thirds of its light, which is above flux_range.low.
