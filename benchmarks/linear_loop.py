@@ -47,7 +47,8 @@ def held(
 ) -> tuple[Floats, Series]:
     """Error on frames, shape (frames, axes), and the loop as its own records open it.
 
-    The mirror moves by `mirror_gain` times what the loop believes, and is beyond its last step by `overshoot` of it.
+    The mirror moves by `mirror_gain` times what the loop believes; it is beyond its last step by `overshoot` of
+    that step.
     """
     random = np.random.default_rng([seed, 1])
     if star_px is None:

@@ -350,7 +350,7 @@ def _gain_for_design(night: Night) -> float:
 
 
 def _overshoot_for_design(night: Night) -> float:
-    """Of the mirror, where it is known to differ from 0; one that is too large is a delay for people to mend."""
+    """Of the mirror, where it is known to differ from 0; a large one means that the delay is wrong."""
     found = night.overshoot
     if found.covers(0.0) or abs(found.value) > MOST_OVERSHOOT:
         return 0.0

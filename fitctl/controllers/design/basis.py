@@ -15,7 +15,7 @@ from fitctl.model.optics import scales
 LEAST_GAIN = 0.4
 """Of a mirror: one that moves less, or more than its inverse, has another fault than its calibration."""
 MOST_OVERSHOOT = 0.5
-"""Of a mirror: one that is farther beyond its last step, or short of it, has another delay than the rig file says."""
+"""Of a mirror: with more, or less than its opposite, the delay is not the rig file's."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def design_parameters(basis: Basis, *sections: str) -> dict[str, Any]:
 
 
 def on_its_mirror(basis: Basis, parameters: Mapping[str, Any]) -> Basis:
-    """A rig's basis, but with the mirror's gain and overshoot that a design of these parameters was made for."""
+    """A rig's basis, but with the mirror's gain and overshoot for which a design was made."""
     return replace(
         basis,
         mirror_gain=float(parameters.get("mirror_gain", 1.0)),

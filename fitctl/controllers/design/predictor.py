@@ -128,7 +128,7 @@ def predicting_design(
 def _with_overshoot(
     a: Floats, b: Floats, c: Floats, d: Floats, overshoot: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """The same pair for a mirror that is beyond its last step: one more state, the mirror of the frame before."""
+    """The same pair for a mirror that is beyond its last step; one more state: the last frame's mirror."""
     mirror = 2
     n = len(a)
     a, c = np.pad(a, ((0, 1), (0, 1))), np.pad(c, ((0, 0), (0, 1)))
