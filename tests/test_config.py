@@ -195,6 +195,18 @@ def test_an_unknown_key_is_named_with_the_likely_one(key, hint):
     assert f"my.toml: {key}: unknown key; did you mean {hint}? (allowed here: " in text
 
 
+def test_a_key_that_is_misspelt_is_not_also_said_to_be_missing():
+    document = changed(("camera", "frame_rate_Hz"), 50.0)
+    del document["camera"]["frame_rate_hz"]
+    del document["camera"]["bias_dn"]
+
+    lines = complaint(document).splitlines()
+
+    assert len(lines) == 2
+    assert "camera.frame_rate_Hz: unknown key; did you mean frame_rate_hz?" in "".join(lines)
+    assert "camera.bias_dn: is missing" in "".join(lines)
+
+
 def test_an_unknown_key_in_a_list_of_tables_is_named_too():
     text = complaint(changed(("plant", "loops", "right", "spots", 1, "flux"), 1.0))
     assert "plant.loops.right.spots.1.flux: unknown key; did you mean flux_dn?" in text

@@ -207,7 +207,14 @@ def _valid(laid: LaidOver, origin: str) -> Rig:
     try:
         return Rig.model_validate(laid.document)
     except ValidationError as error:
-        lines = [line for problem in error.errors() for line in _explain(laid, origin, problem)]
+        problems = error.errors()
+        misspelt = {_meant(problem) for problem in problems if problem["type"] == "extra_forbidden"}
+        lines = [
+            line
+            for problem in problems
+            if problem["type"] != "missing" or problem["loc"] not in misspelt
+            for line in _explain(laid, origin, problem)
+        ]
         raise ConfigError("\n".join(map(plain, lines))) from None
 
 
@@ -353,8 +360,8 @@ def _said(problem: Any, location: list[str], *, missing: bool) -> str:
         return f"must be one of {context['expected_tags']} (is {context['tag']!r})"
     if problem["type"] == "extra_forbidden":
         allowed = _allowed_keys([str(part) for part in problem["loc"][:-1]])
-        near = difflib.get_close_matches(location[-1], allowed, 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        meant = _meant(problem)
+        hint = f"; did you mean {meant[-1]}?" if meant else ""
         return f"unknown key{hint} (allowed here: {', '.join(allowed)})"
     if missing:
         return "is missing; a rig file that fitctl init writes has every key with its unit"
@@ -365,6 +372,13 @@ def _said(problem: Any, location: list[str], *, missing: bool) -> str:
     now = RENAMED_ACTIONS.get(str(given)) if location[-1:] == ["action"] else None
     hint = f"; {given} is now {now}" if now else ""
     return f"{message} (is {given!r}){hint}" if is_value else message
+
+
+def _meant(problem: Any) -> tuple[Any, ...]:
+    """The place of the key that an unknown one is most like; empty if it is like none."""
+    *table, key = problem["loc"]
+    near = difflib.get_close_matches(str(key), _allowed_keys([str(part) for part in table]), 1)
+    return (*table, *near) if near else ()
 
 
 def _blamed(laid: LaidOver, origin: str, conflicts: Sequence[Conflict], under: str) -> list[str]:
