@@ -212,6 +212,19 @@ def test_a_second_has_the_rms_of_its_own_ticks(monkeypatch):
     assert loop.ticks == len(of_first)
 
 
+def test_every_frame_is_in_one_line_however_messages_are_spaced(monkeypatch):
+    """Also those of the last, unfinished second."""
+    messages = FakeSupervisor().messages(100)
+    late = [
+        msgspec.structs.replace(m, time_s=m.time_s + 0.03 * (i % 3)) for i, m in enumerate(messages)
+    ]
+    found = list(watched(monkeypatch, late, duration_s=4.88))
+
+    ticks = [entry.loops[0].ticks for entry in found if isinstance(entry, watch.Second)]
+    assert len(ticks) == 5
+    assert sum(ticks) == sum(len(m.ticks) for m in late[:98])
+
+
 def test_events_come_at_once_and_in_order(monkeypatch):
     message = FakeSupervisor().message()
     found = list(watched(monkeypatch, [message]))

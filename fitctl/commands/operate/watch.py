@@ -46,7 +46,7 @@ class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Second(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", tag="second"):
-    """All loops over a second; ``time`` is its end, ISO 8601."""
+    """All loops over a second, the last one cut off by the end; ``time`` is its end, ISO 8601."""
 
     time: str
     rig: str
@@ -117,6 +117,7 @@ def entries(
     begun_s = quiet_since_s = time.monotonic()
     due_s = math.inf
     tallies: dict[str, Tally] = {}
+    newest: Telemetry | None = None
     while duration_s is None or time.monotonic() - begun_s < duration_s:
         why = _SILENCE
         try:
@@ -141,8 +142,11 @@ def entries(
         if telemetry.time_s >= due_s:
             yield _second(telemetry, tallies)
             tallies = {}
-            due_s = math.inf
+            due_s += _LINE_S * (1 + (telemetry.time_s - due_s) // _LINE_S)
         due_s = min(due_s, telemetry.time_s + _LINE_S)  # a supervisor's clock may have begun anew
+        newest = telemetry
+    if newest is not None and tallies:
+        yield _second(newest, tallies)
 
 
 def _second(telemetry: Telemetry, tallies: dict[str, Tally]) -> Second:
