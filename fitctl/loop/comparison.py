@@ -20,11 +20,14 @@ from fitctl.model.optics import AzEl, scales
 Floats = NDArray[np.float64]
 OVER_S = 30.0
 """Time constant of the comparison."""
-MOST_ON_PAPER = 1.02
-"""The learnt design may leave so much of what the design before would have left, both on paper,"""
+MOST_ON_PAPER = 1.03
+"""The learnt design may leave so much of the residual that the design before would have left, both on paper,"""
 MOST_MEASURED = 1.1
 """and so much on frames, where hysteresis and backlash add to it."""
-_MEASURED, _BEFORE, _LEARNT = range(3)
+_MOST_NOISE = (
+    0.8  # of what the design before leaves on frames: the rest is told from it by frames enough
+)
+_BEFORE = 1  # of what is measured, what the design before leaves, and what the learnt one leaves
 
 
 class Comparison:
@@ -36,6 +39,8 @@ class Comparison:
     loop_name : str
     learnt, before : Design
         The one at work, and the one before it.
+    noise_px2 : float
+        Variance of the noise on a frame, which both leave alike.
 
     Attributes
     ----------
@@ -43,7 +48,10 @@ class Comparison:
         What the design before would have left on the last frame.
     """
 
-    def __init__(self, rig: Rig, loop_name: str, learnt: Design, before: Design) -> None:
+    def __init__(
+        self, rig: Rig, loop_name: str, learnt: Design, before: Design, noise_px2: float
+    ) -> None:
+        self._noise_px2 = noise_px2
         loop_basis = on_its_mirror(basis(rig, loop_name), learnt.parameters)
         self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
         self._scale = scales(rig, rig.stellar_loops[loop_name])
@@ -85,24 +93,26 @@ class Comparison:
     def before_px(self) -> float:
         """RMS on frames that the design before would have left, worst axis; NaN until it has settled."""
         settled = self._frames > 2 * self._settle_frames
-        return float(self._rms_px()[_BEFORE]) if settled else math.nan
+        return math.sqrt(self._means_px2[_BEFORE].max()) if settled else math.nan
 
     @property
     def why_back(self) -> str:
         """Why the design before is the better one; empty as long as it is not known to be."""
         if self._frames < self._settle_frames + self._over_frames:
             return ""
-        measured_px, before_px, learnt_px = self._rms_px().tolist()
-        if learnt_px > MOST_ON_PAPER * before_px:
-            left = f"would leave {learnt_px:.4f}"
-        elif measured_px > MOST_MEASURED * before_px:
-            left = f"leaves {measured_px:.4f}"
+        measured_px2, before_px2, learnt_px2 = self._means_px2.max(axis=1).tolist()
+        noise_px2 = min(self._noise_px2, _MOST_NOISE * before_px2)
+        if learnt_px2 - noise_px2 > MOST_ON_PAPER**2 * (before_px2 - noise_px2):
+            left, where = (
+                f"would leave {math.sqrt(learnt_px2 - noise_px2):.4f}",
+                "besides the noise",
+            )
+            before_px2 -= noise_px2
+        elif measured_px2 > MOST_MEASURED**2 * before_px2:
+            left, where = f"leaves {math.sqrt(measured_px2):.4f}", "on frames"
         else:
             return ""
         return (
-            f"the learnt design {left} px on frames over {OVER_S:g} s; the design before would have left "
-            f"{before_px:.4f} of the same disturbance"
+            f"the learnt design {left} px {where} over {OVER_S:g} s; the design before would have left "
+            f"{math.sqrt(before_px2):.4f} of the same disturbance"
         )
-
-    def _rms_px(self) -> Floats:
-        return np.asarray(np.sqrt(self._means_px2.max(axis=1)))

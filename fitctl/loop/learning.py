@@ -135,7 +135,8 @@ class Learning:
         if not before.learnt:
             self.before = before
         if self.before is not None:
-            self._comparison = Comparison(self._rig, self._loop_name, now, self.before)
+            noise_px2 = max(0.0, report.learnt_camera_px**2 - report.learnt_px**2)
+            self._comparison = Comparison(self._rig, self._loop_name, now, self.before, noise_px2)
             for seen in recent:
                 self._comparison.observe(seen.error_px, seen.mirror_rad, seen.motor_rad)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
