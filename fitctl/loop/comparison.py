@@ -24,9 +24,8 @@ MOST_ON_PAPER = 1.03
 """The learnt design may leave so much of the residual that the design before would have left, both on paper,"""
 MOST_MEASURED = 1.1
 """and so much on frames, where hysteresis and backlash add to it."""
-_MOST_NOISE = (
-    0.8  # of what the design before leaves on frames: the rest is told from it by frames enough
-)
+MOST_NOISE = 0.8
+"""At most so much of what the design before would have left on frames counts as noise."""
 _BEFORE = 1  # of what is measured, what the design before leaves, and what the learnt one leaves
 
 
@@ -101,7 +100,7 @@ class Comparison:
         if self._frames < self._settle_frames + self._over_frames:
             return ""
         measured_px2, before_px2, learnt_px2 = self._means_px2.max(axis=1).tolist()
-        noise_px2 = min(self._noise_px2, _MOST_NOISE * before_px2)
+        noise_px2 = min(self._noise_px2, MOST_NOISE * before_px2)
         if learnt_px2 - noise_px2 > MOST_ON_PAPER**2 * (before_px2 - noise_px2):
             left, where = (
                 f"would leave {math.sqrt(learnt_px2 - noise_px2):.4f}",
