@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,7 @@ class Instrument:
     started_s: float
     supervisor: subprocess.Popen[bytes]
     mocks: subprocess.Popen[bytes]
+    log: str = ""  # that the recorder begins first, once it is known to `acquire_in_background`
 
     def check(self) -> None:
         """Raise DemoError if a part of it has ended."""
@@ -192,12 +193,12 @@ def acquire_in_background(running: Instrument) -> threading.Thread:
 
     def work() -> None:
         beside = Client(running.sockets)
-        try:
+        # The console shows the supervisor's own event, or that it does not answer.
+        with suppress(DemoError, ConnectionError):
             acquire(Instrument(**{**vars(running), "client": beside}))
-        except (DemoError, ConnectionError):
-            return  # the console shows the supervisor's own event, or that it does not answer
-        finally:
-            beside.close()
+        beside.close()
+        with suppress(ConnectionError):
+            running.log = log_path(running)
 
     thread = threading.Thread(target=work, name="demo-acquire", daemon=True)
     thread.start()
@@ -214,6 +215,11 @@ class Course:
     held_since_s: dict[str, float] = field(default_factory=dict)
     timing: dict[tuple[str, float], LoopTiming] = field(default_factory=dict)
     last: Telemetry | None = None
+
+    @property
+    def log(self) -> str:
+        """What the recorder writes now; empty until it has named it."""
+        return "" if self.last is None or self.last.recorder is None else self.last.recorder.path
 
     def add(self, telemetry: Telemetry) -> None:
         """Take one telemetry message."""
@@ -256,7 +262,7 @@ def watch(
 
 
 def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> dict[str, Any]:
-    """How one loop did: the keys of ``fitctl demo --json``.
+    """How one loop did: the keys of ``fitctl demo --json``, but for ``log``.
 
     ``judged_s`` is zero unless the loop holds its star or its beam at the end.
     """
@@ -271,7 +277,6 @@ def summary(rig: Rig, running: Instrument, course: Course, loop_name: str) -> di
         "machine_stalls": sum(t.stalls for t in timing),
         "worst_stall_s": max((t.worst_stall_s for t in timing), default=0.0),
         "records_lost": 0 if last is None else last.records_lost,
-        "log": "" if last is None or last.recorder is None else last.recorder.path,
     }
 
 
@@ -357,9 +362,14 @@ def _since(running: Instrument, course: Course, loop_name: str, mode: Mode) -> f
 
 
 def log_path(running: Instrument) -> str:
-    """The file that the recorder writes, empty if it says none within the time that it has to start.
+    """The file that the recorder writes; empty if it names none while the supervisor runs, and in a minute.
 
-    A console can be left before the recorder, a process of its own, has begun its file.
+    A demo can be over before the recorder, a process of its own, has begun its file.
+
+    Raises
+    ------
+    ConnectionError
+        If what the supervisor says cannot be read.
     """
     client = Client(running.sockets)
     deadline_s = time.monotonic() + HELLO_S

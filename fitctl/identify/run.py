@@ -13,7 +13,7 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.logging.folder import log_name
 from fitctl.logging.records import AnyRecord
 from fitctl.messages.client import Client
-from fitctl.messages.commands import AnyCommand, Experiment, Release, Status
+from fitctl.messages.commands import AnyCommand, Experiment, Release, Reply, Status
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.model.drives import Drive, experiment_s
@@ -87,10 +87,12 @@ def on_rig(
     ConnectionError
         If no supervisor answers.
     """
-    _command(client, Experiment(loop=loop_name, name=name, drives=drives))
+    accepted_s = _command(client, Experiment(loop=loop_name, name=name, drives=drives)).time_s
     paths: dict[Path, None] = {}  # in the order in which they were begun
     try:
-        telemetry = _followed(client, loop_name, experiment_s(drives), on_progress, paths)
+        telemetry = _followed(
+            client, loop_name, accepted_s, experiment_s(drives), on_progress, paths
+        )
     except KeyboardInterrupt:
         client.send(Release(loop=loop_name))  # nobody waits for it any more
         raise
@@ -139,11 +141,12 @@ def _hear(client: Client, paths: dict[Path, None]) -> Telemetry | None:
 def _followed(
     client: Client,
     loop_name: str,
+    accepted_s: float,
     duration_s: float,
     on_progress: Progress,
     paths: dict[Path, None],
 ) -> Telemetry:
-    """Wait until the loop is out of its experiment; the message that says so."""
+    """Wait until the loop is out of the experiment that the supervisor accepted; the message that says so."""
     start_s = heard_s = time.monotonic()
     while True:
         telemetry = _hear(client, paths)
@@ -157,8 +160,9 @@ def _followed(
             continue
         heard_s = now_s
         on_progress(min(1.0, (now_s - start_s) / duration_s))
-        # A message from before the experiment may still be under way.
-        if now_s - start_s > 1.0 and _mode(telemetry, loop_name) != Mode.EXPERIMENT.name:
+        # Messages from before the experiment may still be under way.
+        since_s = telemetry.time_s - accepted_s
+        if since_s >= 0.0 and _mode(telemetry, loop_name) != Mode.EXPERIMENT.name:
             return telemetry
 
 
@@ -180,10 +184,11 @@ def require_vernier(client: Client, loop_name: str) -> None:
         raise IdentifyError(msg)
 
 
-def _command(client: Client, command: AnyCommand) -> None:
+def _command(client: Client, command: AnyCommand) -> Reply:
     reply = client.send(command)
     if not reply.accepted:
         raise IdentifyError(reply.text)
+    return reply
 
 
 def _mode(telemetry: Telemetry, loop_name: str) -> str:

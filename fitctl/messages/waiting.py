@@ -74,7 +74,8 @@ def _of_number(telemetry: Telemetry, number: int) -> dict[str, CommandOutcome]:
 def wait_for_end(client: Client, timeout_s: float) -> bool:
     """Wait until a supervisor that was told to end has ended; whether it has, after `timeout_s` at the latest.
 
-    On this machine, its process has ended; a supervisor elsewhere has sent no telemetry for 2 s.
+    On this machine, its locks are free, so that another can start; a supervisor elsewhere has sent no telemetry
+    for 2 s.
     """
     end_s = time.monotonic() + timeout_s
     while True:

@@ -72,22 +72,30 @@ def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp
 
 
 def experimented(rig, logs):
-    """What is found by a rig that names these logs, two of them while the experiment goes on."""
+    """What is found by a rig that names these logs, two of them while the experiment goes on.
+
+    Its first message is from before the experiment, and comes late.
+    """
     first, second, third = logs
-    moments = [("EXPERIMENT", first), ("EXPERIMENT", second), ("COARSE", second), ("COARSE", third)]
+    moments = [
+        (99.9, "VERNIER", first),
+        (100.1, "EXPERIMENT", first),
+        (101.0, "EXPERIMENT", second),
+        (109.0, "COARSE", second),
+        (109.1, "COARSE", third),
+    ]
 
     class Rigged:
-        began_s = time.monotonic()
-
         def send(self, _command):
-            return Reply(accepted=True)
+            return Reply(accepted=True, time_s=100.0)
 
         def receive(self, _timeout_s):
-            mode, log = moments.pop(0) if len(moments) > 1 else moments[0]
-            if mode == "COARSE":  # not one from before the experiment
-                time.sleep(max(0.0, self.began_s + 1.1 - time.monotonic()))
+            time_s, mode, log = moments.pop(0) if len(moments) > 1 else moments[0]
+            if mode == "VERNIER":
+                time.sleep(1.1)
             loop = SimpleNamespace(name="right", mode=mode, last_change=None)
-            return SimpleNamespace(loops=[loop], recorder=SimpleNamespace(path=str(log)))
+            recorder = SimpleNamespace(path=str(log))
+            return SimpleNamespace(time_s=time_s, loops=[loop], recorder=recorder)
 
     drive = Drive(channel="fsm_az", shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=9.0)
     return runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)

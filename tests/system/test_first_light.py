@@ -3,9 +3,11 @@
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,9 +18,10 @@ from stalls import stalls
 
 from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Recover
+from fitctl.messages.commands import Recover, Shutdown
+from fitctl.messages.waiting import wait_for_end
 
-from .conftest import Rig, child, end, fitctl
+from .conftest import START_S, Rig, child, end, fitctl, nothing_was_lost_without_a_stall
 
 pytestmark = pytest.mark.timeout(300)
 SUMMARY_KEYS = {
@@ -63,12 +66,6 @@ def quiet_demo(tmp_path):
     )
 
 
-def nothing_was_lost_without_a_stall(summary):
-    """A machine that stood still excuses the frames of that time, and no more."""
-    excused = summary["machine_stalls"] * (1 + summary["worst_stall_s"] * 50)
-    return summary["frames_lost"] <= excused
-
-
 def test_the_demo_acquires_holds_and_sums_up(tmp_path):
     summary = demo(tmp_path, "--duration", 35, "--seed", 3)
 
@@ -97,19 +94,32 @@ def test_killing_the_mocks_leads_to_safe_at_once_and_one_command_recovers(rig):
     rig.mocks.kill()
     rig.mocks.wait()
 
-    seen = rig.follow_to("SAFE", limit_s=5.0)
+    seen = []
 
-    change = next(c for t in seen for c in t.mode_changes if c.target == "SAFE")
+    def told(telemetry):  # the mode, its change and the error may come in three messages
+        seen.append(telemetry)
+        return changes_to_safe(seen) and errors(seen)
+
+    rig.follow(told, limit_s=5.0)
+
+    change = changes_to_safe(seen)[0]
     timing = [t for telemetry in seen for t in telemetry.timing]
     stalled_s = max((t.worst_stall_s for t in timing), default=0.0)
     assert change.time_s - killed_s < 0.2 + stalled_s
-    errors = [e for t in seen for e in t.events if e.severity == "error"]
-    assert any("127.0.0.1" in e.message and "expected" in e.message for e in errors)
+    assert any("127.0.0.1" in e.message and "expected" in e.message for e in errors(seen))
 
     rig.mocks.stdout.close()
     rig.restart_mocks()
     assert rig.client.send(Recover()).accepted
     rig.follow_to("STANDBY")
+
+
+def changes_to_safe(seen):
+    return [change for t in seen for change in t.mode_changes if change.target == "SAFE"]
+
+
+def errors(seen):
+    return [event for t in seen for event in t.events if event.severity == "error"]
 
 
 def with_frame(seen):
@@ -126,9 +136,9 @@ def unstruck(rig, count=100):
 
 
 def test_killing_the_recorder_costs_no_tick_and_its_file_stays_readable(rig):
-    seen = rig.to_vernier()
-    rig.follow(lambda t: t.recorder is not None and t.recorder.records > 500)
-    path = rig.client.receive(1.0).recorder.path
+    rig.to_vernier()
+    seen = rig.follow(lambda t: t.recorder is not None and t.recorder.records > 500)
+    path = seen[-1].recorder.path
     recorder = rig.recorder()
     usual = unstruck(rig)
     recorder.kill()
@@ -159,21 +169,28 @@ def test_killing_the_recorder_costs_no_tick_and_its_file_stays_readable(rig):
     assert not log_info(Path(path)).finished
 
 
-def test_a_demo_that_ends_without_its_star_says_so_by_its_status(tmp_path):
+def test_a_demo_that_ends_without_its_star_says_so_by_its_status_and_names_its_log(tmp_path):
+    """Also where its recorder is still being started at its end."""
     process = fitctl(
         "demo",
         "--headless",
         "--json",
         "--duration",
-        3,
+        1,
         "--set",
         f"logging.folder={tmp_path}",
         stdout=subprocess.PIPE,
     )
+    recorder = child(process.pid, "record")
+    recorder.suspend()
+    psutil.wait_procs([psutil.Process(process.pid)], timeout=4.0)
+    recorder.resume()
     output, _ = process.communicate(timeout=60)
 
     assert process.returncode == 1
-    assert json.loads(output.splitlines()[-1])["judged_s"] == 0.0
+    summary = json.loads(output.splitlines()[-1])
+    assert summary["judged_s"] == 0.0
+    assert Path(summary["log"]).parent == tmp_path
 
 
 def test_other_commands_find_a_running_demo_and_a_second_keeps_out_of_its_way(tmp_path):
@@ -197,11 +214,14 @@ def test_other_commands_find_a_running_demo_and_a_second_keeps_out_of_its_way(tm
 
 
 @contextmanager
-def demo_on_a_terminal(tmp_path):
+def demo_on_a_terminal(tmp_path, *settings):
     """A demo with a console, and the other side of its terminal."""
     ours, theirs = os.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "fitctl", "demo", "--set", f"logging.folder={tmp_path}"],
+        [
+            *(sys.executable, "-m", "fitctl", "demo"),
+            *(part for s in (f"logging.folder={tmp_path}", *settings) for part in ("--set", s)),
+        ],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
@@ -236,6 +256,22 @@ def test_a_demo_that_is_left_before_its_recorder_has_begun_still_names_its_log(t
         assert "log: " not in while_it_stands
         assert f"log: {tmp_path}" in shown_until("log: ", terminal)
         assert process.wait(30) == 0
+
+
+def test_a_demo_whose_supervisor_was_shut_down_still_names_its_log(tmp_path):
+    """In sockets of its own, so that no other demo has them."""
+    sockets = Path(tempfile.mkdtemp(prefix="fitctl-test-"))
+    with demo_on_a_terminal(tmp_path, f"service.folder={sockets}") as (_, terminal):
+        assert "live" in shown_until("live", terminal)
+        client = Client(sockets)
+        while (seen := client.receive(START_S)).loops[0].mode != "VERNIER":
+            assert seen.loops[0].mode != "SAFE"
+        assert client.send(Shutdown()).accepted
+        assert wait_for_end(client, START_S)
+        client.close()
+        os.write(terminal, b"q")
+        assert f"log: {tmp_path}" in shown_until("log: ", terminal)
+    shutil.rmtree(sockets, ignore_errors=True)
 
 
 def shown_until(text, terminal, limit_s=60.0):

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from .conftest import fitctl
+from .conftest import fitctl, nothing_was_lost_without_a_stall
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_three_loops_hold_over_wires_while_the_collector_moves(demo):
     assert max(loops["metrology"]["rms_arcsec"].values()) < 1.0
     assert whole["visibility"] > 0.95
     assert whole["frames"] > 3000
-    assert whole["frames_lost"] == 0
+    assert nothing_was_lost_without_a_stall(whole)
 
 
 def test_the_testbed_is_a_rig_of_its_own(tmp_path):

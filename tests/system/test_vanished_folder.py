@@ -22,12 +22,13 @@ def rig(tmp_path):
     rig.close()
 
 
-def log_grows(rig):
-    """The recorder's status comes by a command, and says that it writes."""
+def log_grows(rig, after_s=0.0):
+    """The recorder's status comes by a command, and says that it writes; after a time of the supervisor's."""
     reports = []
     rig.follow(
         lambda t: (
             t.recorder is not None
+            and t.recorder.time_s > after_s
             and (reports.append((t.recorder.path, t.recorder.records)) or True)
             and any(path == reports[-1][0] and n < reports[-1][1] for path, n in reports)
         )
@@ -64,6 +65,7 @@ def test_a_vanished_folder_is_made_anew_and_everything_works_again(rig, tmp_path
     # The recorder can be started again, although the folder of its error output was gone.
     shutil.rmtree(rig.sockets)
     recorder.kill()
-    rig.client.send(Status(), timeout_s=START_S)
-    log_grows(rig)
+    recorder.wait()
+    killed_s = rig.client.send(Status(), timeout_s=START_S).time_s
+    log_grows(rig, after_s=killed_s)
     assert rig.recorder().pid != recorder.pid

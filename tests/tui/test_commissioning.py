@@ -251,8 +251,8 @@ signal.signal(signal.SIGTERM, signal.default_int_handler)
 def main():
     print("moves: a motor", flush=True)
     answer = input("Go? [no]: ")
-    print(f"answer {answer}", flush=True)
     try:
+        print(f"answer {answer}", flush=True)
         time.sleep(60)
     except KeyboardInterrupt:
         time.sleep(0.3)

@@ -28,6 +28,6 @@ def test_a_job_is_ended_with_the_console_unless_it_is_to_outlive_it():
     job, other = Job(["mocks", "--free-ports"]), Job(["check", "no-such.toml"], outlives=True)
     assert job.status is None
     job.end()
-    assert job.status not in {None, 0}
+    assert job.status is not None  # its own status, or that of a signal that came before it was up
     other.end()
     assert finished(other) == 2

@@ -1,5 +1,6 @@
 """The screens with lists: devices and readings, sequences, logs."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -110,6 +111,33 @@ def test_a_parameter_is_edited_checked_and_used():
     edited: list[str] = []
     run(scenario)
     assert not Path(edited[0]).exists()
+
+
+@pytest.mark.parametrize(("status", "stays"), [(None, True), (0, False)])
+def test_a_run_that_goes_on_without_the_console_keeps_its_file(status, stays):
+    """It may not have read the file yet."""
+
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down", "tab", *["down"] * 6, "enter")
+        app.screen.query_one(Input).value = "0.5"
+        await pressed(app, pilot, "enter")
+        start = app.start_job
+
+        def started(arguments, **options):
+            job = start(arguments, **options)
+            job.status = None
+            return job
+
+        app.start_job = started
+        await pressed(app, pilot, "g", "y")
+        app.jobs[-1].status = status
+
+    run_job = run(scenario).jobs[-1]
+    assert run_job.arguments[:2] == ["sequence", "run"]
+    edition = Path(run_job.arguments[2])
+    assert edition.exists() is stays
+    if stays:
+        shutil.rmtree(edition.parent.parent)
 
 
 def test_the_file_of_an_edited_sequence_is_written_once():

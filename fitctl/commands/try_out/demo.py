@@ -114,8 +114,8 @@ def _demo_with_console(rig_path: Path, overrides: Sequence[str], running: demos.
     finally:
         end_process(console, _CONSOLE_END_S)
     thread.join(timeout=5.0)
-    log = demos.log_path(running)
-    say(f"log: {log}" if log else "no log: the recorder began no file")
+    log = demos.log_path(running) or running.log
+    say(f"log: {log}" if log else f"no log is known; look in {running.rig.logging.folder}")
     return 0 if console.returncode == 0 else FAILED
 
 
@@ -127,13 +127,17 @@ def _demo_headless(rig: Rig, running: demos.Instrument, duration_s: float, *, as
             duration_s,
             lambda gone_s, telemetry: progress(gone_s, _progress_text(telemetry)),
         )
-    results = {name: demos.summary(rig, running, course, name) for name in rig.loops}
+    log = course.log or demos.log_path(running)
+    results = {name: demos.summary(rig, running, course, name) | {"log": log} for name in rig.loops}
     visibility = demos.visibility(rig, running, course)
     if as_json:
         # One loop: its summary. Several: one for each, by name, beside what they have in common.
         whole = {"loops": results, "visibility": visibility} | {
             key: max(result[key] for result in results.values())
-            for key in ("frames", "frames_lost", "late_ticks", "records_lost")
+            for key in (
+                *("frames", "frames_lost", "late_ticks", "records_lost"),
+                *("machine_stalls", "worst_stall_s"),
+            )
         }
         say(to_json(next(iter(results.values())) if len(results) == 1 else whole))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 import tomllib
 from pathlib import Path
@@ -44,9 +45,10 @@ class SequencesView(View):
 
     def __init__(self) -> None:
         super().__init__()
-        self._folder = tempfile.TemporaryDirectory(prefix="fitctl-console-")
+        self._folder = tempfile.mkdtemp(prefix="fitctl-console-")
         self._editions: dict[str, str] = {}  # file of each edited sequence, by content
         self._list: Job | None = None
+        self._run: Job | None = None
         self._estimates = Estimates()
 
     def parts(self) -> ComposeResult:
@@ -68,7 +70,9 @@ class SequencesView(View):
         if self._list is not None:
             self._list.end()
         self._estimates.end()
-        self._folder.cleanup()
+        # A run goes on without the console, and may not have read its edition yet: that stays.
+        if self._run is None or self._run.status is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     def before_drawing(self) -> None:
         """Show the list of sequences once it has come."""
@@ -190,7 +194,7 @@ class SequencesView(View):
             return document["file"]
         content = tomli_w.dumps({k: v for k, v in document.items() if k != "file"})
         if content not in self._editions:
-            path = Path(tempfile.mkdtemp(dir=self._folder.name)) / f"{document['name']}.toml"
+            path = Path(tempfile.mkdtemp(dir=self._folder)) / f"{document['name']}.toml"
             path.write_text(content)
             self._editions[content] = str(path)
         return self._editions[content]
@@ -201,7 +205,9 @@ class SequencesView(View):
         document = self.query_one(SequenceList).document
         if rig_arguments is not None and document is not None:
             arguments = ["sequence", word, self._file(document), *rig_arguments, *more]
-            self.query_one(Printed).start(self.console.start_job, *arguments, outlives=outlives)
+            printed = self.query_one(Printed)
+            printed.start(self.console.start_job, *arguments, outlives=outlives)
+            self._run = printed.moving
 
 
 def parsed(value: str) -> Any:
