@@ -55,7 +55,7 @@ class VirtualTime:
         self._threads: list[greenlet] = []
         self._killed: set[greenlet] = set()
         self._process: list[greenlet] = []
-        self._stalled_until_s = 0.0
+        self._stalled_until_s = self._stalled_s = 0.0
         self._over = False
 
     # ------------------------------------------------------------ the clock
@@ -125,7 +125,14 @@ class VirtualTime:
 
     def stall(self, duration_s: float) -> None:
         """No thread goes on for a while, as on a machine that stands still; what is no thread does."""
-        self._stalled_until_s = max(self._stalled_until_s, self._now_s + duration_s)
+        before_s = max(self._stalled_until_s, self._now_s)
+        self._stalled_until_s = max(before_s, self._now_s + duration_s)
+        self._stalled_s += self._stalled_until_s - before_s
+
+    def awake_s(self) -> float:
+        """For how long the machine has not stood still."""
+        still_s = max(0.0, self._stalled_until_s - self._now_s)
+        return self._now_s - (self._stalled_s - still_s)
 
     def park(self, timeout_s: float | None = None) -> None:
         """Wait to be woken, no longer than a time limit."""
