@@ -55,14 +55,15 @@ def held(
         star_px = course_px(truth, round(seconds / truth.period_s), seed)
     seen_px = star_px + truth.noise_px * random.standard_normal(star_px.shape)
     loop, (behind, walked) = sampled_loop(design, truth), timing(truth.period_s, truth.delay_s)
-    mirror, motor, last = (np.zeros(len(loop.a)) for _ in range(3))
-    mirror[behind - 1], last[2 * behind + 1] = 1.0, 1.0
+    mirror, motor = np.zeros(len(loop.a)), np.zeros(len(loop.a))
+    mirror[behind - 1] = 1.0
     motor[2 * behind], motor[2 * behind - 1] = 1.0 - walked, walked
     states = np.zeros((len(loop.a), AXES))
     error_px, mirror_px, motor_px = (np.empty_like(star_px) for _ in range(3))
     for frame, seen in enumerate(seen_px):
         mirror_px[frame], motor_px[frame] = mirror @ states, motor @ states
-        ringing_px = overshoot * (mirror - last) @ states
-        error_px[frame] = seen + mirror_gain * mirror_px[frame] + ringing_px + motor_px[frame]
+        step_px = mirror_px[frame] - mirror_px[max(frame - 1, 0)]
+        moved_px = mirror_gain * mirror_px[frame] + overshoot * step_px
+        error_px[frame] = seen + moved_px + motor_px[frame]
         states = loop.a @ states + np.outer(loop.b, error_px[frame])
     return error_px, Series(error_px - mirror_px - motor_px, mirror_px)

@@ -11,8 +11,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ class Instrument:
     started_s: float
     supervisor: subprocess.Popen[bytes]
     mocks: subprocess.Popen[bytes]
-    log: str = ""  # that the recorder begins first, once it is known to `acquire_in_background`
+    log: str = ""  # the first log file, once `acquire_in_background` has heard of it
 
     def check(self) -> None:
         """Raise DemoError if a part of it has ended."""
@@ -192,11 +192,9 @@ def acquire_in_background(running: Instrument) -> threading.Thread:
     """The same beside a console, with a telemetry connection of its own; failures show as events there."""
 
     def work() -> None:
-        beside = Client(running.sockets)
         # The console shows the supervisor's own event, or that it does not answer.
-        with suppress(DemoError, ConnectionError):
-            acquire(Instrument(**{**vars(running), "client": beside}))
-        beside.close()
+        with suppress(DemoError, ConnectionError), closing(Client(running.sockets)) as beside:
+            acquire(replace(running, client=beside))
         with suppress(ConnectionError):
             running.log = log_path(running)
 
@@ -362,7 +360,7 @@ def _since(running: Instrument, course: Course, loop_name: str, mode: Mode) -> f
 
 
 def log_path(running: Instrument) -> str:
-    """The file that the recorder writes; empty if it names none while the supervisor runs, and in a minute.
+    """The file that the recorder writes; empty if the supervisor ends, or a minute passes, before it names one.
 
     A demo can be over before the recorder, a process of its own, has begun its file.
 
@@ -371,15 +369,12 @@ def log_path(running: Instrument) -> str:
     ConnectionError
         If what the supervisor says cannot be read.
     """
-    client = Client(running.sockets)
     deadline_s = time.monotonic() + HELLO_S
-    try:
+    with closing(Client(running.sockets)) as client:
         while time.monotonic() < deadline_s and running.supervisor.poll() is None:
             telemetry = client.receive(0.5)
             if telemetry is not None and telemetry.recorder is not None:
                 return telemetry.recorder.path
-    finally:
-        client.close()
     return ""
 
 

@@ -358,7 +358,9 @@ FOUND = {
         plan(
             gives(0.1, Standby()),
             Strike(at_s=1.0, device="right piezo", fault="mute", lasts_s=6.0),
-            gives(3.0, Jog(az_sky_arcsec=60.0, el_sky_arcsec=0.0)),  # while the piezo is asked
+            gives(
+                3.0, Jog(az_sky_arcsec=60.0, el_sky_arcsec=0.0)
+            ),  # the device thread waits for it
             gives(3.005, Off()),
         ),
         "no stage moves in OFF or SAFE",

@@ -90,7 +90,7 @@ class Invariants:
         self._powerless_since_s: dict[str, float] = {}
         self._unneeded_since_s: dict[str, float] = {}
         self._busy_since_s = math.inf
-        self._stepped_s = self._stalled_until_s = 0.0
+        self._stepped_s = 0.0
         self.nothing_fails = False
         self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
         self._power_up_s: dict[str, float] = {}
@@ -129,17 +129,14 @@ class Invariants:
         if not known and len(self.violations) < _MOST_VIOLATIONS:
             self.violations.append(Violation(invariant, self._clock.now_s(), detail))
 
-    def stalled(self, duration_s: float) -> None:
-        """The machine stands still for so long from now on, and nothing can be expected of it."""
-        now_s = self._clock.now_s()
-        before_s = max(now_s, self._stalled_until_s)
-        self._stalled_until_s = max(before_s, now_s + duration_s)
-        self._stepped_s = max(self._stepped_s, self._stalled_until_s)
+    def stalled(self, until_s: float, added_s: float) -> None:
+        """The machine stands still, `added_s` longer than was known, and nothing can be expected of it."""
+        self._stepped_s = max(self._stepped_s, until_s)
         for name in self._stopped_s:
             self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
         for since_s in (self._powerless_since_s, self._unneeded_since_s):
             for name in since_s:
-                since_s[name] += self._stalled_until_s - before_s
+                since_s[name] += added_s
 
     def zero_lost(self, name: str) -> None:
         """A loop's encoders begin anew at zero."""

@@ -142,14 +142,14 @@ def _fail_and_go_on(self: SiderostatServo, error: Exception) -> None:
     self._stopped = stopped
 
 
-def _safe_and_go_on(self: Loop, source: Mode, motor_rad: Any) -> None:
-    if self.mode is not Mode.SAFE:
-        _ENTER(self, source, motor_rad)
+def _goes_on_in(mode: Mode) -> Callable[[Loop, Mode, Any], None]:
+    """Entering a mode leaves the motors as they are."""
 
+    def enter(self: Loop, source: Mode, motor_rad: Any) -> None:
+        if self.mode is not mode:
+            _ENTER(self, source, motor_rad)
 
-def _off_and_go_on(self: Loop, source: Mode, motor_rad: Any) -> None:
-    if self.mode is not Mode.OFF:
-        _ENTER(self, source, motor_rad)
+    return enter
 
 
 def _find_nothing(self: MirrorStage) -> None:
@@ -257,13 +257,13 @@ DEFECTS = {
         [
             (SiderostatServo, "_wanted_rad_s", _goes_on_in_a_fault),
             (SiderostatServo, "_fail", _fail_and_go_on),
-            (Loop, "_enter", _safe_and_go_on),
+            (Loop, "_enter", _goes_on_in(Mode.SAFE)),
         ],
     ),
     "jog-in-off": Defect(
         "ac43419",
         "a jog goes on in OFF until the amplifiers have lost their power",
-        [(Loop, "_enter", _off_and_go_on)],
+        [(Loop, "_enter", _goes_on_in(Mode.OFF))],
     ),
 }
 """By name."""

@@ -400,8 +400,7 @@ class Instrument:
             case Order(command=command) if command is not None:
                 self.give(happening.who, command)
             case Stall():
-                self.time.stall(happening.lasts_s)
-                self.invariants.stalled(happening.lasts_s)
+                self.invariants.stalled(*self.time.stall(happening.lasts_s))
             case Kill():
                 self.kill(happening.back_after_s)
             case RecorderDeath():

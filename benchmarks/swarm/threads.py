@@ -123,11 +123,19 @@ class VirtualTime:
         """No thread of the process ever goes on."""
         self._killed.update(self._process)
 
-    def stall(self, duration_s: float) -> None:
-        """No thread goes on for a while, as on a machine that stands still; what is no thread does."""
+    def stall(self, duration_s: float) -> tuple[float, float]:
+        """No thread goes on for a while, as on a machine that stands still; what is no thread does.
+
+        Returns
+        -------
+        tuple of float
+            Until when it stands still, and by how much that is longer than before.
+        """
         before_s = max(self._stalled_until_s, self._now_s)
         self._stalled_until_s = max(before_s, self._now_s + duration_s)
-        self._stalled_s += self._stalled_until_s - before_s
+        added_s = self._stalled_until_s - before_s
+        self._stalled_s += added_s
+        return self._stalled_until_s, added_s
 
     def awake_s(self) -> float:
         """For how long the machine has not stood still."""

@@ -1,8 +1,8 @@
 """`fitctl identify` as a stranger meets it: what is wrong is said before anything moves."""
 
 import os
-import time
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import pytest
 
@@ -85,20 +85,22 @@ def experimented(rig, logs):
         (109.1, "COARSE", third),
     ]
 
+    clock = SimpleNamespace(now_s=0.0, monotonic=lambda: clock.now_s)
+
     class Rigged:
         def send(self, _command):
             return Reply(accepted=True, time_s=100.0)
 
         def receive(self, _timeout_s):
             time_s, mode, log = moments.pop(0) if len(moments) > 1 else moments[0]
-            if mode == "VERNIER":
-                time.sleep(1.1)
+            clock.now_s += 1.1 if mode == "VERNIER" else 0.1
             loop = SimpleNamespace(name="right", mode=mode, last_change=None)
             recorder = SimpleNamespace(path=str(log))
             return SimpleNamespace(time_s=time_s, loops=[loop], recorder=recorder)
 
     drive = Drive(channel="fsm_az", shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=9.0)
-    return runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
+    with patch.object(runs, "time", clock):
+        return runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
 
 
 @pytest.fixture

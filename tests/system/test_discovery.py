@@ -76,7 +76,7 @@ def start(alone, tmp_path):
 
 
 def mode(rig):
-    """Now: telemetry that came while nobody looked is older."""
+    """As the supervisor answers: queued telemetry may be older."""
     return rig.client.send(Status()).text.removeprefix("right ")
 
 
