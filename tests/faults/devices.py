@@ -56,7 +56,6 @@ STAR_AWAY = Entry(
 DAC_FAULTS = (
     *made_safe("drop", "corrupt", "disconnect", "freeze", "reboot", "watchdog_trip", says=DAC),
     # An answer that could be overtaken comes 0.1 s late instead, for nothing is asked before it is there.
-    # Between the two the interlock lets go, so that it is a new trip that is seen.
     *held("delay 0.1", says="dac_slow"),
     *held("duplicate"),
     *held("reorder", says="dac_slow"),

@@ -79,6 +79,7 @@ def attempted(rig, entry, home, stalled):
     if entry.struck in PROCESSES:
         rig.process(entry.struck)  # a console is opened, a recorder may just be starting
     hold_first(rig, entry)
+    wait_until_over(rig, entry.says)
     deaf = entry.struck == "supervisor" and entry.how != "slowed"
     del rig.telemetry[:-1], rig.places[:], rig.heard[:]
     struck_s = time.monotonic()
@@ -108,6 +109,14 @@ def hold_first(rig, entry):
     while away := [name for name in rig.stellar_loops if not holds(rig, name)]:
         assert time.monotonic() < end_s, f"{away} do not hold their stars within {HOLDS_WITHIN_S} s"
         rig.receive(0.1)
+
+
+def wait_until_over(rig, interlock):
+    """Wait until what an earlier entry tripped is over: a row that is still tripped does not trip again."""
+    rig.follow(
+        lambda t: interlock not in {trip.name for loop in t.loops for trip in loop.interlocks},
+        HOLDS_WITHIN_S,
+    )
 
 
 def holds(rig, name):
