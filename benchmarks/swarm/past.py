@@ -260,6 +260,11 @@ DEFECTS = {
             (Loop, "_enter", _goes_on_in(Mode.SAFE)),
         ],
     ),
+    "follows-what-rests": Defect(
+        "09991ea",
+        "a loop drives its siderostat on after another loop's star, which it cannot move",
+        [(StellarLoop, "_find_unmoved", lambda _self, _star: None)],
+    ),
     "jog-in-off": Defect(
         "ac43419",
         "a jog goes on in OFF until the amplifiers have lost their power",

@@ -314,8 +314,21 @@ class StellarLoop(Loop):
         if self.mode is Mode.ACQUISITION:
             return self.search.evaluate(star, frame.mid_exposure_s)
         if self.mode in FOLLOWING:
-            return self.following.evaluate(self.mode, star, self.pointing.command_px)
+            return self._find_unmoved(star) or self.following.evaluate(
+                self.mode, star, self.pointing.command_px
+            )
         return None
+
+    def _find_unmoved(self, star: Star | None) -> Finding | None:
+        """What the stages do not move is not the loop's star; that is expected where it last was for sure."""
+        if self.mode is Mode.EXPERIMENT:  # moves the star off its target
+            return None
+        estimator, observation = self.star_finder.estimator, self.observation
+        stages_px = estimator.stages_px(observation.beam_rad, observation.mirror_rad)
+        found = self.following.unmoved(star, stages_px, self.pointing.command_px)
+        if found is not None and self.following.off_target is not None:
+            estimator.observe(*self.following.off_target)
+        return found
 
     # ------------------------------------------------------------ modes
 

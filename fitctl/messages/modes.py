@@ -171,7 +171,7 @@ TRANSITIONS: tuple[Transition, ...] = (
         (Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT),
         Trigger.STAR_LOST,
         Mode.ACQUISITION,
-        "no star for lost_frames",
+        "no star for lost_frames, or a spot that the stages do not move",
     ),
     *_from(
         (Mode.VERNIER,),

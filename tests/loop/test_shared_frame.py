@@ -119,6 +119,31 @@ def test_a_star_that_vanishes_is_lost_though_another_is_on_the_frame(held):
     assert held.star_px(RIGHT) == pytest.approx(TARGET_PX[RIGHT], abs=0.5)
 
 
+def test_another_loops_star_that_rests_does_not_draw_the_siderostat_away(held):
+    held.command(Release(loop=LEFT))
+    held.run(1.0)
+    az_px, el_px = held.star_px(LEFT).tolist()
+    held.command(SetTarget(loop=RIGHT, az_px=az_px + 4.0, el_px=el_px))
+    held.run(20.0)
+    held.light(right=0.0, left=1.0)  # what is left beside its target is the other star
+    begun_rad = held.loop(RIGHT).servo.position_rad
+    farthest_px = 0.0
+    for _ in range(60):
+        held.run(0.5)
+        moved_rad = held.loop(RIGHT).servo.position_rad - begun_rad
+        if held.loop(RIGHT).mode in {Mode.COARSE, Mode.VERNIER}:
+            moved_px = abs(held.loop(RIGHT)._scale.motor_px_per_rad * moved_rad).max()
+            farthest_px = max(farthest_px, moved_px)
+    assert farthest_px < 15.0
+    assert "did not move with them" in " ".join(c.reason for c in held.mode_changes)
+
+    held.command(SetTarget(loop=RIGHT, az_px=28.0, el_px=20.0))
+    held.light(right=1.0, left=1.0)
+    held.until(RIGHT, Mode.VERNIER)
+    held.run(5.0)
+    assert held.star_px(RIGHT) == pytest.approx(TARGET_PX[RIGHT], abs=0.5)
+
+
 @pytest.mark.parametrize("dark_s", [2.0, 8.0])
 def test_both_are_found_again_after_both_were_lost_at_once(held, dark_s):
     held.light(right=0.0, left=0.0)
