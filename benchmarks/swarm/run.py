@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -505,7 +506,8 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
         time.end()
     violations = instrument.invariants.violations
     violations += [
-        Violation("no exception escapes", 0.0, f"{name}: {error!r}") for name, error in time.escaped
+        Violation("no exception escapes", 0.0, f"{name}: {_told(error)}")
+        for name, error in time.escaped
     ]
     return Result(
         digest=instrument.digest,
@@ -514,6 +516,13 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
         violations=violations,
         cpu_s=process_time() - began_s,
     )
+
+
+def _told(error: Exception) -> str:
+    """What an exception says, and where it was raised: a replay may not show it again."""
+    at = traceback.extract_tb(error.__traceback__)[-4:]
+    where = ", ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in at)
+    return f"{type(error).__name__}: {error} ({where})"
 
 
 def _recover(instrument: Instrument) -> None:

@@ -369,7 +369,9 @@ def installed(time: VirtualTime) -> Iterator[None]:
         for module in _WITH_THREADS:
             stack.enter_context(patch(f"{module}.threading", threading))
         runs = (SimpleNamespace(hex=f"{number:032x}") for number in count())
-        stack.enter_context(patch("fitctl.sequences.contact.uuid.uuid4", lambda: next(runs)))
+        # That module's name alone: numba names its files by uuid4, and two runs must not write the same one.
+        ids = SimpleNamespace(uuid4=lambda: next(runs))
+        stack.enter_context(patch("fitctl.sequences.contact.uuid", ids))
         stack.enter_context(patch("fitctl.stages.servo.Future", future_on(time)))
         stack.enter_context(patch("fitctl.stages.periodic.become_realtime", lambda **_: None))
         yield
