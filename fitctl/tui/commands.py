@@ -141,8 +141,8 @@ TIME_KEYS = (
     Key(
         "end", "end", "Now", "app.now", "follow the instrument again; of a log, its end", "", _past
     ),
-    Key("comma", ",", "Back", "app.rewind(-1)", "the console as it was 1 s earlier"),
-    Key("full_stop", ".", "Forward", "app.rewind(1)", "1 s later", "", _past),
+    Key("comma", ",", "Back 1 s", "app.rewind(-1)", "the console as it was 1 s earlier"),
+    Key("full_stop", ".", "Forward 1 s", "app.rewind(1)", "1 s later", "", _past),
     Key("less_than_sign", "<", "Back 10 s", "app.rewind(-10)", "10 s earlier", "", _past),
     Key("greater_than_sign", ">", "Forward 10 s", "app.rewind(10)", "10 s later", "", _past),
     Key("left_curly_bracket", "{", "Back 1 min", "app.rewind(-60)", "1 min earlier", "", _past),
