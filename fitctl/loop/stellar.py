@@ -104,7 +104,9 @@ class StellarLoop(Loop):
         self._tick_records = TickRecords(rig, name)
         self._flattened = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
-        self._has_held = False  # since the devices were opened
+        self._link_counts = (
+            False  # what the link's siderostat turns moves the star that is expected
+        )
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None
         self._is_recalled = False  # what the star finder expects, and no search has begun there yet
@@ -325,9 +327,12 @@ class StellarLoop(Loop):
             return None
         estimator, observation = self.star_finder.estimator, self.observation
         stages_px = estimator.stages_px(observation.beam_rad, observation.mirror_rad)
-        found = self.following.unmoved(star, stages_px, self.pointing.command_px)
-        if found is not None and self.following.off_target is not None:
-            estimator.observe(*self.following.off_target)
+        following = self.following
+        found = following.unmoved(star, stages_px, self.pointing.command_px)
+        if found is not None:
+            az_px, el_px = following.off_star_px
+            stages_az_px, stages_el_px = following.off_stages_px
+            estimator.observe((az_px, el_px), (stages_az_px, stages_el_px))
         return found
 
     # ------------------------------------------------------------ modes
@@ -342,7 +347,6 @@ class StellarLoop(Loop):
             if not self._why_wait(self._clock.now_s()):
                 self._start_search(motor_rad)
         elif self.mode is Mode.COARSE:
-            self._has_held = True
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
             if self.backlash is not None:
@@ -404,12 +408,12 @@ class StellarLoop(Loop):
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""
         again, self._search_due = bool(self._search_due), None
-        if self.link is not None and not self._has_held:
+        if self.link is not None and not self._link_counts:
             # What the link's siderostat turned before, to find its beam, moved no star that was known.
             self.link.set_origin()
             if not self._is_recalled:
                 self.star_finder.estimator.forget()
-        self._is_recalled = False
+        self._link_counts, self._is_recalled = True, False
         self.star_finder.estimator.expect(self.target_px, self._beam_rad(motor_rad), np.zeros(2))
         self.search.start_where_expected(again=again)
 
@@ -456,7 +460,7 @@ class StellarLoop(Loop):
     def _evaluate_waiting(self, observation: Observation) -> None:
         """Wait where the stages are, or go on, and report which."""
         if self.link is not None and self.link.zero_was_lost():
-            self._has_held = False
+            self._link_counts = False
             self.link.set_origin()
             self.star_finder.estimator.forget()
         before, waits_for = self.waits_for, self._why_wait(observation.now_s)
@@ -667,7 +671,7 @@ class StellarLoop(Loop):
         jumped, self.servo.encoders_jumped = self.servo.encoders_jumped, False
         recalled, self._recalled = self._recalled, None
         if jumped:
-            self._has_held = False
+            self._link_counts = False
             self.star_finder.estimator.forget()
             self._report_event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"

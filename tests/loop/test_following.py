@@ -40,7 +40,7 @@ def test_a_spot_that_stands_still_while_the_stages_move_is_not_the_loops_star(fo
     assert found.trigger is Trigger.STAR_LOST
     assert "moved the star by 9 px, but this spot did not move with them" in found.reason
     assert number == 90
-    assert following.off_target == ((24.0, 20.0), (0.0, 0.0))  # where it was last for sure
+    assert (following.off_star_px, following.off_stages_px) == ([24.0, 20.0], [0.0, 0.0])
 
 
 def test_a_spot_that_runs_away_from_the_stages_is_not_the_loops_star(following):

@@ -9,7 +9,13 @@ import numpy as np
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.controllers.attribution import MOST_STRANGERS, is_within, second_look
-from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, count_frame, look_again
+from fitctl.controllers.frame_counts import (
+    CONFIRMED,
+    REJECTED,
+    count_frame,
+    is_unmoved,
+    look_again,
+)
 from fitctl.controllers.search_rounds import round_fraction
 from fitctl.messages.modes import STELLAR_MODES, Mode, Trigger, transition
 from fitctl.model.compiled import compilable
@@ -47,13 +53,12 @@ def fire(ss: Any, rr: Any, i: int, trigger: int) -> None:
     read_link(s, r, rr)
     count_mode_time(r)
     r.mode, r.mode_since_s = _TARGETS[r.mode, trigger], r.now_s
-    r.lost = r.in_reach = r.out_of_reach = 0
+    begin_following(r)
     if r.mode == ACQUISITION:
         r.search_due = AGAIN if trigger == STAR_LOST else ANEW
         if not must_wait(ss, rr, i):
             start_search(s, r, rr, r.position_rad[0], r.position_rad[1])
     elif r.mode == COARSE:
-        r.has_held = 1
         rest_prefilter(s, r)
         if math.isnan(r.acquired_s):
             r.acquired_s = r.now_s
@@ -82,9 +87,10 @@ def begin_residual(ss: Any, r: Any) -> None:
 def start_search(s: Any, r: Any, rr: Any, motor_az_rad: float, motor_el_rad: float) -> None:
     """``StellarLoop._start_search`` with the motors as given, and ``Search.begin``."""
     again, r.search_due = r.search_due == AGAIN, NOT_DUE
-    if s.link >= 0 and not r.has_held:
+    if s.link >= 0 and not r.link_counts:
         set_link_origin(s, r, rr)
         r.star_known = 0
+    r.link_counts = 1
     if not r.star_known:
         az_rad, el_rad = linked_rad(s, r, motor_az_rad, motor_el_rad)
         az_px, el_px = motor_px(s, az_rad, el_rad)
@@ -225,7 +231,7 @@ def evaluate_waiting(ss: Any, rr: Any, i: int) -> None:
     if r.waits or r.mode not in (ACQUISITION, COARSE, VERNIER):
         return
     if waited:
-        r.lost = r.in_reach = r.out_of_reach = 0
+        begin_following(r)
         if r.mode == COARSE:
             rest_prefilter(s, r)
         elif r.mode == VERNIER:
@@ -272,6 +278,8 @@ def reject(r: Any) -> None:
 def evaluate_search(ss: Any, rr: Any, i: int, exposed_s: float) -> bool:
     """``Search.evaluate``; False where the search has ended without a star."""
     s, r = ss.stars[i], rr.stars[i]
+    if not r.has_arrived:
+        return True
     if math.isnan(r.search_since_s):
         r.search_since_s = exposed_s
     if r.has_candidate:
@@ -297,9 +305,31 @@ def evaluate_search(ss: Any, rr: Any, i: int, exposed_s: float) -> bool:
 
 
 @compilable()
+def begin_following(r: Any) -> None:
+    """``Following.begin``."""
+    r.lost = r.in_reach = r.out_of_reach = r.off_target = 0
+
+
+@compilable()
+def has_lost_unmoved(s: Any, r: Any) -> bool:
+    """``StellarLoop._find_unmoved``."""
+    if not r.star_visible:
+        return False
+    star_px = (r.star_px[0], r.star_px[1])
+    if not is_unmoved(r, star_px, stages_px(s, r), r.command_px):
+        return False
+    for axis in range(2):
+        r.star_origin_px[axis] = r.off_star_px[axis] - r.off_stages_px[axis]
+    return True
+
+
+@compilable()
 def evaluate_following(ss: Any, rr: Any, i: int) -> None:
-    """``Following.evaluate``."""
+    """``Following.evaluate``, after ``StellarLoop._find_unmoved``."""
     s, r = ss.stars[i], rr.stars[i]
+    if has_lost_unmoved(s, r):
+        fire(ss, rr, i, STAR_LOST)
+        return
     # The diamond lies along the mirror's axes.
     az_px, el_px = turned(
         s.scale.mirror_back, r.star_px[0] - r.command_px[0], r.star_px[1] - r.command_px[1]

@@ -93,6 +93,10 @@ STAR = np.dtype(
         ("star_visible", "i8"),
         ("star_px", "f8", (2,)),
         ("flux_dn", "f8"),
+        # Following
+        ("off_target", "i8"),
+        ("off_star_px", "f8", (2,)),
+        ("off_stages_px", "f8", (2,)),
         # Attribution
         ("seen_stages_px", "f8", (2,)),
         ("candidate_px", "f8", (2,)),
@@ -103,7 +107,7 @@ STAR = np.dtype(
         # the link, and waiting for it or for other loops
         ("waits", "i8"),
         ("search_due", "i8"),
-        ("has_held", "i8"),
+        ("link_counts", "i8"),
         ("beam_rad", "f8", (2,)),
         ("link_motor_rad", "f8", (2,)),
         ("link_origin_rad", "f8", (2,)),
