@@ -75,6 +75,8 @@ class SwarmAmplifiers:
         Called with the loop's name and each velocity sent.
     powered_unread : callable
         Called with the loop's name if the driver powers the motors before it has read an encoder since opening.
+    encoders_read : callable
+        Called with the loop's name when the driver reads the encoders for the first time since opening.
     """
 
     def __init__(
@@ -86,6 +88,7 @@ class SwarmAmplifiers:
         random: Random,
         commanded: Callable[[str, AzEl], None],
         powered_unread: Callable[[str], None],
+        encoders_read: Callable[[str], None],
     ) -> None:
         siderostat = rig.loops[loop_name].siderostat
         device: Any = siderostat.device
@@ -116,6 +119,7 @@ class SwarmAmplifiers:
         self._time = time
         self._commanded = commanded
         self._powered_unread = powered_unread
+        self._encoders_read = encoders_read
         self._was_read = False
         self._inner = SimulatedAmplifiers(plant, time, siderostat.encoder_counts_per_rev)  # type: ignore[arg-type]
         self._last_master_s = -math.inf
@@ -206,7 +210,9 @@ class SwarmAmplifiers:
         if not line.connected:
             raise line.broken()
         if reading is not None:
-            self._was_read = True
+            if not self._was_read:
+                self._was_read = True
+                self._encoders_read(self.name)
             self._heard_s = self._time.now_s()
         elif self._time.now_s() - self._heard_s > self._alive_s:
             raise line.timeout()

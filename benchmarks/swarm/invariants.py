@@ -99,11 +99,14 @@ class Invariants:
         self._piezo_read_s: dict[str, float] = {}
         self._lease = "", -math.inf
         self._opened: set[str] = set()
-        self._zeros_lost_rad: dict[str, float] = {}
+        self._zeros_lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
+        self._zeros_read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
         self._zeros_noticed_s: dict[str, float] = {}
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
+        self._zeros_lost_rad = self._zeros_read_rad | self._zeros_lost_rad
+        self._zeros_read_rad.clear()
         for name, noticed_s in self._zeros_noticed_s.items():
             # A killed supervisor may have left the star's place from before it noticed.
             if self._clock.now_s() - noticed_s < _LEFT_S:
@@ -144,6 +147,12 @@ class Invariants:
         if self._supervisor is not None:
             position_rad = float(np.abs(self._supervisor.loops[name].servo.position_rad).max())
         self._zeros_lost_rad[name] = max(position_rad, self._zeros_lost_rad.get(name, 0.0))
+
+    def encoders_read(self, name: str) -> None:
+        """A loop's encoders are read for the first time since its amplifiers were opened."""
+        lost_rad = self._zeros_lost_rad.pop(name, None)
+        if lost_rad is not None:
+            self._zeros_read_rad[name] = max(lost_rad, self._zeros_read_rad.get(name, 0.0))
 
     # ------------------------------------------------------------ commands and records
 
@@ -201,14 +210,15 @@ class Invariants:
             case DevicesOpened():
                 self._texts.clear()
                 if not record.error:
-                    self._encoders_read(record)
+                    self._opened_well(record)
                     self._opened.add(record.loop)
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
 
-    def _encoders_read(self, opened: DevicesOpened) -> None:
+    def _opened_well(self, opened: DevicesOpened) -> None:
         name = opened.loop
-        lost_rad = self._zeros_lost_rad.pop(name, None)
+        # Encoders that lost their zero after this opening had read them are noticed by the next.
+        lost_rad = self._zeros_read_rad.pop(name, None)
         if lost_rad is not None:
             self._zeros_noticed_s[name] = self._clock.now_s()
         if opened.encoders_jumped and lost_rad is None and not self._reads_zero(name):
@@ -266,6 +276,10 @@ class Invariants:
         supervisor = self._supervisor
         if supervisor is None or fastest_rad_s == 0.0:
             return
+        if name in self._zeros_lost_rad or name in self._zeros_read_rad:
+            self.violated(
+                "no stage moves by a zero that is lost", f"{name}: {velocity_rad_s} rad/s"
+            )
         loop, three_periods_s = supervisor.loops[name], self._three_periods_s[name]
         since_stop_s = self._clock.now_s() - self._stopped_s.get(name, math.inf)
         if since_stop_s > three_periods_s:

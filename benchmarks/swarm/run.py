@@ -194,6 +194,7 @@ class Instrument:
             random,
             self.invariants.velocity,
             self.invariants.powered_unread,
+            self.invariants.encoders_read,
         )
         self._add(f"{name} siderostat", amplifiers)
         bus = None
