@@ -692,6 +692,8 @@ class StellarLoop(Loop):
         estimator = self.star_finder.estimator
         if self._recalled is not None or estimator.origin_px is None:
             return self._recalled  # what has not come to use yet is not forgotten
+        if self.servo.encoders_jumped:  # since the star was seen: the place has another zero
+            return None
         az_rad, el_rad = self.servo.position_rad.tolist()
         # A recalled place is with the link as it was then: what it turns counts from the first search on.
         link = None if self._is_recalled else self.link

@@ -1,14 +1,16 @@
 """A supervisor that follows one that was killed goes back to the star that was known then."""
 
 import math
+from unittest.mock import patch
 
 import msgspec
 import numpy as np
 import pytest
-from simulated import darken, events_of, mode_of, until
+from simulated import darken, events_of, failing, mode_of, until
 
 from fitctl.controllers.design.choose import design_for
-from fitctl.messages.commands import Acquire, Standby
+from fitctl.drivers.interface import DeviceFault
+from fitctl.messages.commands import Acquire, Off, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.simulation.devices import InlineExecutor
@@ -106,11 +108,9 @@ def test_without_it_the_search_begins_where_the_siderostat_stands(simulate_with)
     assert search_from_arcsec(simulation, held_arcsec) > 80.0
 
 
-def test_encoders_that_lost_their_zero_lead_nowhere(simulate_with):
-    simulation = simulate_with(star_offset_px=(10.0, -6.0))
-    searches_elsewhere(simulation)
+def lose_zero(simulation):
+    """From now on the encoders count from zero where the motors are."""
     at_rad = simulation.supervisor.servos["right"].position_rad
-    killed(simulation)
     amplifiers = simulation.devices.loops["right"].amplifiers
     exchange = amplifiers.exchange
 
@@ -120,12 +120,40 @@ def test_encoders_that_lost_their_zero_lead_nowhere(simulate_with):
         return reading._replace(position_rad=now_rad)
 
     amplifiers.exchange = from_zero
+
+
+def test_encoders_that_lost_their_zero_lead_nowhere(simulate_with):
+    simulation = simulate_with(star_offset_px=(10.0, -6.0))
+    searches_elsewhere(simulation)
+    lose_zero(simulation)
+    killed(simulation)
     simulation.command(Standby())
 
     texts = [event.message for event in events_of(simulation)]
     assert any(FORGOTTEN in text for text in texts)
     assert not any(KNOWN in text for text in texts)
     assert simulation.supervisor.star_places == []
+
+
+def test_encoders_that_lost_their_zero_lead_nowhere_though_opening_failed_after_they_were_read(
+    simulate_with,
+):
+    simulation = simulate_with(star_offset_px=(10.0, -6.0))
+    searches_elsewhere(simulation)
+    simulation.command(Stop())
+    simulation.command(Off())
+    lose_zero(simulation)
+    amplifiers = simulation.devices.loops["right"].amplifiers
+    fault = DeviceFault("siderostat", "here", "both axes enabled", "a fault")
+    with patch.object(amplifiers, "enable", failing(fault)):
+        simulation.command(Standby())
+    assert mode_of(simulation) is Mode.OFF
+
+    killed(simulation)
+    simulation.command(Standby())
+
+    assert mode_of(simulation) is Mode.STANDBY
+    assert not any(KNOWN in event.message for event in events_of(simulation))
 
 
 def test_nothing_is_known_of_a_star_that_was_never_searched_for(simulate_with):
