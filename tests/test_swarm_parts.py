@@ -380,6 +380,16 @@ FOUND = {
         ),
         "encoders that count on keep the star's place",
     ),
+    "slow-turn": (
+        plan(
+            gives(0.1, Standby()),
+            gives(0.5, FAR),
+            Strike(at_s=2.25, device="right siderostat", fault="slow", size=45.0, lasts_s=0.7),
+            gives(4.2, Recover()),
+            rig="ensemble.toml",
+        ),
+        "encoders that count on keep the star's place",
+    ),
     "turn-is-stuck": (
         plan(gives(0.1, Standby()), gives(2.0, FAR), gives(2.2, BACK)),
         "an axis that is not stuck is not called so",

@@ -84,7 +84,12 @@ def _find_position_as_a_jump(self: SiderostatServo) -> None:
 
 
 def _find_position_by_answers(self: SiderostatServo) -> None:
-    del self._unread_rad_s[1:]
+    del self._unread[1:]
+    _FIND_POSITION(self)
+
+
+def _find_position_by_newest_command(self: SiderostatServo) -> None:
+    del self._unread[:-1]
     _FIND_POSITION(self)
 
 
@@ -225,6 +230,11 @@ DEFECTS = {
         "069db82",
         "motors that turned on at a command whose answer never came are encoders with another zero",
         [(SiderostatServo, "_find_position", _find_position_by_answers)],
+    ),
+    "slow-turn": Defect(
+        "183d275",
+        "motors that turned on at commands which a slow line held back are encoders with another zero",
+        [(SiderostatServo, "_find_position", _find_position_by_newest_command)],
     ),
     "turn-is-stuck": Defect(
         "069db82",

@@ -123,8 +123,8 @@ class SiderostatServo:
         self._followed_s = 0.0
         self.encoders_jumped = False  # until the loop has concluded from it
         self.turned_on_rad = 0.0
-        # Commands since the last reading, and the one before it.
-        self._unread_rad_s: list[AzEl] = []
+        # When each was sent: the commands that the last reading may not show yet, and the one before them.
+        self._unread: list[tuple[float, AzEl]] = []
         self._recalled_rad: AzEl | None = None
         self._velocity_limit_rad_s = siderostat.velocity_limit_rad_s
         self._disabling = False
@@ -268,7 +268,7 @@ class SiderostatServo:
             with suppress(Exception):
                 self._amplifiers.exchange(velocity_rad_s)
             return
-        self._unread_rad_s.append(velocity_rad_s)
+        self._unread.append((asked_s, velocity_rad_s))
         try:
             self._servo_by(self._amplifiers.exchange(velocity_rad_s), asked_s)
         except Exception as error:
@@ -281,7 +281,10 @@ class SiderostatServo:
             self._missed_readings += 1
         else:
             self._accept_reading(reading, now_s)
-            del self._unread_rad_s[:-1]
+            # On a slow line a command arrives as late as a reading does.
+            shown_s = 2 * reading.time_s - now_s
+            while len(self._unread) > 1 and self._unread[1][0] <= shown_s:
+                del self._unread[0]
         if now_s - self._timely_s > self._settings.reading_timeout_s:
             raise self._no_reading()
         if reading is None:
@@ -393,7 +396,7 @@ class SiderostatServo:
         self._accept_reading(reading, self._clock.now_s())
         self._servo.reset(reading.position_rad)
         for_s = _SPEED_MARGIN * (reading.time_s - last_s)
-        by_axis = list(zip(_STILL, *self._unread_rad_s, strict=True))
+        by_axis = list(zip(_STILL, *(rad_s for _, rad_s in self._unread), strict=True))
         least_rad, most_rad = ([for_s * limit(rad_s) for rad_s in by_axis] for limit in (min, max))
         if recalled_rad is not None:
             knew, last_rad = True, recalled_rad
@@ -407,7 +410,7 @@ class SiderostatServo:
             least - _ENCODER_JUMP_RAD <= rad <= most + _ENCODER_JUMP_RAD
             for rad, least, most in zip(turned_rad, least_rad, most_rad, strict=True)
         )
-        self._unread_rad_s.clear()
+        self._unread.clear()
         self.encoders_jumped = self.encoders_jumped or (far and not turned_on)
         self.turned_on_rad = max(map(abs, turned_rad)) if far and turned_on else 0.0
 
