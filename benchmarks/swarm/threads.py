@@ -355,6 +355,8 @@ class VirtualExecutor(Executor):
             self._some.clear()
             while self._work:
                 future, work = self._work.popleft()
+                if not future.set_running_or_notify_cancel():
+                    continue
                 try:
                     future.set_result(work())
                 except Exception as error:

@@ -164,6 +164,9 @@ class Supervisor:
         self._left: deque[AnyRecord] = deque()
         self._quantities: deque[QuantityReading] = deque()
         self._designs: deque[Job] = deque()
+        self._wanted_designs: dict[
+            str, Future
+        ] = {}  # of each loop, by its last `controller` command
         self._starlight = [Starlight(rig, loop, journal) for loop in self.stellar_loops.values()]
         self._reported_s = clock.now_s()
         self.piezos = {
@@ -469,7 +472,12 @@ class Supervisor:
             # A design takes longer than a tick.
             report = learnt.get(name)
             chosen = command.name if report is None else report.design_json
+            if name in self._wanted_designs:
+                self._wanted_designs[
+                    name
+                ].cancel()  # designs that nobody waits for hold up those that follow
             future = self._design_executor.submit(self._design, self.rig, name, chosen)
+            self._wanted_designs[name] = future
             ended = partial(self.outcomes.end, number, [name])
             done = partial(self._designed, name, command.name, report, ended)
             self._designs.append(Job(future, done))
@@ -515,6 +523,8 @@ class Supervisor:
         ended: Ended,
         future: Future,
     ) -> None:
+        if self._wanted_designs[name] is not future:
+            return  # another command replaced it
         error = future.exception()
         if error is None:
             self.stellar_loops[name].use(future.result(), report=report)

@@ -1,9 +1,10 @@
 """Every accepted command that takes time ends once in each loop, and a failure stays until another command."""
 
-from concurrent.futures import Future
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
-from simulated import NEAR, darken, failing, until
+from simulated import NEAR, darken, events_of, failing, until
 
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.command_table import COMMANDS
@@ -232,6 +233,35 @@ def test_a_design_that_cannot_be_made_fails_and_the_old_one_stays(fresh, monkeyp
     assert "no design lqg-ltr: ValueError('no such plant')" in found.text
     assert state(fresh).last_failure.what == "controller"
     assert state(fresh).controller == before
+
+
+def test_a_newer_controller_command_replaces_one_whose_design_is_not_there_yet(fresh, monkeypatch):
+    made, may_go_on = [], threading.Event()
+    design = fresh.supervisor._design
+
+    def slow(rig, name, controller):
+        assert may_go_on.wait(10.0)
+        made.append(controller)
+        return design(rig, name, controller)
+
+    monkeypatch.setattr(fresh.supervisor, "_design", slow)
+    before = state(fresh).controller
+    with ThreadPoolExecutor(1) as executor:
+        monkeypatch.setattr(fresh.supervisor, "_design_executor", executor)
+        names = ["lqg-ltr", "minimum-variance", "lqg-ltr", "eq20", "minimum-variance"]
+        replies = [fresh.command(SetController(name=name)) for name in names]
+        may_go_on.set()
+
+    fresh.run(0.1)
+
+    assert len(made) == 2  # the first had begun
+    texts = [outcome(fresh, reply.number).text for reply in replies[1:]]
+    assert texts == [
+        *["another controller replaced it"] * 3,
+        "controller minimum-variance is in force",
+    ]
+    changed = [event.message for event in events_of(fresh) if "controller" in event.message]
+    assert changed == [f"controller {before} -> minimum-variance"]
 
 
 def test_amplifiers_that_do_not_close_well_fail_off(fresh, monkeypatch):
