@@ -205,7 +205,7 @@ class Supervisor:
             for name in self._named(command):
                 self.loops[name].servo.stop()
         self._commands.append(Posted(command, reply, sender, address))
-        if self._closed:  # no step follows; what close() has not answered is answered here
+        if self._closed:  # no step follows
             self._end_posted()
 
     def report_event(self, severity: Severity, source: str, message: str) -> None:
@@ -325,11 +325,12 @@ class Supervisor:
     def close(self) -> None:
         """Disable and let go of everything, whatever state it is in; it obeys nothing any more."""
         self.shutdown_wanted = True
+        self._obey_posted()
+        self._closed = True  # devices that answer slowly keep nobody waiting for an answer
+        self._end_posted()
         if self.collector is not None:
             self.collector.close()
         self._device_jobs.close_all()
-        self._closed = True
-        self._obey_posted()
         self._record_left()
 
     def _stop_collector(self) -> None:
@@ -359,19 +360,19 @@ class Supervisor:
 
     def _obey_posted(self) -> None:
         for posted in self._taken():
-            reply = self._obey(posted.command)
-            if ROWS[type(posted.command)].logged:
-                now_s = self._clock.now_s()
-                self._record(
-                    command_record(posted.command, reply, posted.sender, posted.address, now_s)
-                )
-            posted.reply(reply)
+            self._answer(posted, self._obey(posted.command), self._record)
 
     def _end_posted(self) -> None:
-        """Answer what came after the end: all is stopped already."""
+        """Answer what came after the end, on any thread: all is stopped already."""
         for posted in self._taken():
             stops = isinstance(posted.command, Stop)
-            posted.reply(Reply(accepted=stops, text="shutting down"))
+            self._answer(posted, Reply(accepted=stops, text="shutting down"), self.leave)
+
+    def _answer(self, posted: Posted, reply: Reply, record: Callable[[AnyRecord], None]) -> None:
+        if ROWS[type(posted.command)].logged:
+            now_s = self._clock.now_s()
+            record(command_record(posted.command, reply, posted.sender, posted.address, now_s))
+        posted.reply(reply)
 
     def _named(self, command: AnyCommand) -> list[str]:
         return [name for name in self.loops if command.loop in {"", name}]

@@ -5,7 +5,7 @@ import pytest
 from simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
-from fitctl.logging.records import DeviceHealth, FrameRecord, PiezoReading, Tick
+from fitctl.logging.records import CommandRecord, DeviceHealth, FrameRecord, PiezoReading, Tick
 from fitctl.messages.commands import Acquire, Off, Recover, Release, SetBiasOffset, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.devices import InlineExecutor
@@ -203,6 +203,24 @@ def test_what_happens_while_the_instrument_is_closed_is_recorded(vernier, monkey
 
     assert any("right piezo did not close well" in e.message for e in events_of(vernier))
     assert [(reply.accepted, reply.text) for reply in replies] == [(False, "shutting down")]
+
+
+def test_what_comes_while_slow_devices_are_closed_is_answered_at_once(vernier, monkeypatch):
+    answered, recorded = [], []
+
+    def slow():
+        replies = []
+        vernier.supervisor.post(Recover(), replies.append, "ada")
+        answered.append([(reply.accepted, reply.text) for reply in replies])
+
+    monkeypatch.setattr(vernier.devices.loops["right"].piezo, "close", slow)
+    monkeypatch.setattr(vernier.supervisor, "_record", recorded.append)
+    vernier.supervisor.close()
+
+    assert answered
+    assert all(replies == [(False, "shutting down")] for replies in answered)
+    commands = [record for record in recorded if isinstance(record, CommandRecord)]
+    assert [record.text for record in commands] == ["shutting down"] * len(answered)
 
 
 def test_what_comes_after_the_instrument_is_closed_is_answered(vernier):
