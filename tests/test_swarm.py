@@ -142,6 +142,19 @@ def test_a_lock_has_one_holder_at_a_time(time):
     assert seen == [("a", 1.0), ("b", 2.0), ("c", 3.0)]
 
 
+def test_an_executor_leaves_out_what_was_cancelled_before_it_began(time):
+    executor, seen = VirtualExecutor(time, "design"), []
+    begun = executor.submit(time.sleep, 1.0)
+    waiting = [executor.submit(seen.append, number) for number in (1, 2)]
+    time.run_until(0.5)
+
+    assert not begun.cancel()
+    assert waiting[0].cancel()
+    time.run_until(2.0)
+    assert begun.done()
+    assert seen == [2]
+
+
 def test_an_executor_does_one_thing_after_the_other(time):
     executor, seen = VirtualExecutor(time, "devices"), []
 

@@ -436,6 +436,9 @@ class LoggedExecutor(Executor):
         return future
 
     def _end_what_ends(self) -> None:
+        self._designs = [
+            (key, waiting) for key, waiting in self._designs if not waiting.future.cancelled()
+        ]
         while self._openings and all(self._opened[loop] for loop in self._openings[0].loops):
             _end(self._openings.pop(0))
         while any(key in self._designed for key, _ in self._designs):

@@ -1,12 +1,16 @@
 """A log through today's code is the same to the last bit."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 from replay_courses import COURSES, hold_a_star, replayed, two_loops
 
-from fitctl.logging.records import ModeChange
+from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.logging.records import ControllerChange, ModeChange
 from fitctl.messages.commands import Acquire, Standby, Stop
+from fitctl.replay.devices import LoggedExecutor
 
 
 @pytest.mark.parametrize(("course", "overrides", "happens"), COURSES.values(), ids=COURSES.keys())
@@ -48,3 +52,21 @@ def test_every_mode_change_of_the_log_says_where_the_motors_were(logged):
 
     assert len(found) == 4
     assert not any(math.isnan(change.siderostat_az_rad) for change in found)
+
+
+def test_a_design_that_another_command_replaced_is_not_made_again():
+    rig, executor = load_rig(default_rig_path()), LoggedExecutor()
+    names = ["minimum-variance", "eq20", "minimum-variance"]
+    replaced, another, used = (
+        executor.submit(design_for, rig, "right", controller) for controller in names
+    )
+    replaced.cancel()
+    another.cancel()
+    change = SimpleNamespace(loop="right", target="minimum-variance")
+    executor.load_step(
+        SimpleNamespace(of=lambda kind: [change] if kind is ControllerChange else [])
+    )
+
+    assert used.result(0).title == "minimum-variance"
+    assert replaced.cancelled()
+    assert another.cancelled()
