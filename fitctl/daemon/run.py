@@ -22,7 +22,7 @@ from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.dark import dark_bytes
 from fitctl.controllers.design.document import design_json
-from fitctl.controllers.design.own_process import design_in_own_process
+from fitctl.controllers.design.own_process import design_in_own_process, end_designs
 from fitctl.controllers.pair import Design
 from fitctl.daemon.children import PATIENCE_S, Child
 from fitctl.daemon.devices import rig_devices
@@ -265,6 +265,7 @@ def _designer() -> Iterator[ThreadPoolExecutor]:
         yield designer
     finally:
         designer.shutdown(wait=False, cancel_futures=True)
+        end_designs()  # the process waits for its threads when it ends
 
 
 def _loop(

@@ -19,6 +19,7 @@ _UNUSABLE = 2
 _TIMEOUT_S = (
     60.0  # it needs two seconds, mostly for its imports; longer on a machine that is starting up
 )
+_running: set[subprocess.Popen[str]] = set()
 
 
 def design_in_own_process(
@@ -40,32 +41,45 @@ def design_in_own_process(
     asked = {"loop": loop_name, "controller": chosen, "noise_px": noise_px}
     request = json.dumps({"rig": rig.model_dump_json(), **asked})
     try:
-        done = subprocess.run(
+        process = subprocess.Popen(
             [sys.executable, "-m", __name__],
-            input=request,
-            capture_output=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             encoding="utf-8",
-            timeout=timeout_s,
-            check=False,
             start_new_session=True,  # Ctrl-C is for its parent
         )
-    except subprocess.TimeoutExpired:
-        msg = f"controller {chosen}: the process that designs it was not ready within {timeout_s:g} s; {remedy}"
-        raise ConfigError(msg) from None
     except OSError as error:
         msg = (
             f"controller {chosen}: the process that designs it cannot be started: {error.strerror}"
         )
         raise ConfigError(msg) from None
-    if done.returncode == _UNUSABLE:
-        raise ConfigError(done.stderr.strip())
-    if done.returncode != 0:
-        how = f"status {done.returncode}" if done.returncode > 0 else f"signal {-done.returncode}"
-        why = done.stderr.strip().rpartition("\n")[2] or "it left no message"
+    _running.add(process)
+    try:
+        answer, complaint = process.communicate(request, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        msg = f"controller {chosen}: the process that designs it was not ready within {timeout_s:g} s; {remedy}"
+        raise ConfigError(msg) from None
+    finally:
+        _running.discard(process)
+    status = process.returncode
+    if status == _UNUSABLE:
+        raise ConfigError(complaint.strip())
+    if status != 0:
+        how = f"status {status}" if status > 0 else f"signal {-status}"
+        why = complaint.strip().rpartition("\n")[2] or "it left no message"
         msg = f"controller {chosen}: the process that designs it ended with {how}: {why}; {remedy}"
         raise ConfigError(msg)
-    answer = json.loads(done.stdout)
-    return dataclasses.replace(design_from_json(answer["design"]), file=answer["file"])
+    made = json.loads(answer)
+    return dataclasses.replace(design_from_json(made["design"]), file=made["file"])
+
+
+def end_designs() -> None:
+    """Kill the processes that design, whatever thread waits for them: nobody needs their designs any more."""
+    for process in list(_running):
+        process.kill()
 
 
 def _main() -> int:

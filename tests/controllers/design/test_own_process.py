@@ -3,6 +3,8 @@
 import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.controllers.design.choose import DESIGNS, design_for
 from fitctl.controllers.design.document import MATRICES, design_from_json, design_json
 from fitctl.controllers.design.files import save_design
-from fitctl.controllers.design.own_process import design_in_own_process
+from fitctl.controllers.design.own_process import design_in_own_process, end_designs
 
 RIG = load_rig(default_rig_path())
 
@@ -84,6 +86,21 @@ def test_a_process_that_is_not_ready_in_time_is_killed(another_python, monkeypat
         design_in_own_process(RIG, "right", "eq20", timeout_s=0.5)
     (process,) = started
     assert process.returncode == -signal.SIGKILL
+
+
+def test_at_the_end_of_a_supervisor_a_process_that_designs_is_killed(another_python, tmp_path):
+    begun = tmp_path / "begun"
+    another_python(f"touch {begun}; exec sleep 30")
+    with ThreadPoolExecutor(1) as executor:
+        design = executor.submit(design_in_own_process, RIG, "right", "eq20")
+        end_s = time.monotonic() + 20.0
+        while not begun.exists():
+            assert time.monotonic() < end_s, "it does not begin"
+            time.sleep(0.01)
+        end_designs()
+        error = design.exception(20.0)
+
+    assert "ended with signal 9" in str(error)
 
 
 @pytest.mark.parametrize(
