@@ -94,6 +94,8 @@ def shaken(*frequencies_hz: float, rms_px: float, damping: float = 0.005) -> tup
 
 
 SIX = lines(6.0, rms_px=0.05)
+THREE = lines(3.1, 8.7, 14.0, rms_px=0.02)
+WRITES = f"loops.{LOOP}.fsm.dac.writes_per_frame={{}}"
 NIGHTS = [
     Night("the paper's, centroid", "1.08"),
     Night("the paper's, fit", "1.05", FIT),
@@ -119,8 +121,25 @@ NIGHTS = [
         "3.1, 8.7, 14 Hz, 0.02 px",
         "1.15",
         (),
-        (lines(3.1, 8.7, 14.0, rms_px=0.02),),
+        (THREE,),
         shaken(3.1, 8.7, 14.0, rms_px=0.02),
+    ),
+    # The bound is that of one write, as in the rows above.
+    Night(
+        "6 Hz, 0.05 px, fit, 5 writes",
+        "1.15",
+        (*FIT, WRITES.format(5)),
+        (SIX,),
+        shaken(6.0, rms_px=0.05),
+        (WRITES.format(1),),
+    ),
+    Night(
+        "3.1, 8.7, 14 Hz, 0.02 px, 5 writes",
+        "1.15",
+        (WRITES.format(5),),
+        (THREE,),
+        shaken(3.1, 8.7, 14.0, rms_px=0.02),
+        (WRITES.format(1),),
     ),
     Night(
         "48.9 Hz, 0.05 px",

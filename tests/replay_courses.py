@@ -277,6 +277,10 @@ FAINTER = [
     "plant.loops.right.spots=[{name='a', offset_px={az=0.0, el=0.0}, flux_dn=20000.0, diameter_px=3.0}]",
     "loops.right.vernier.controller=minimum-variance",
 ]
+SEVERAL_WRITES = [
+    "loops.right.fsm.dac.writes_per_frame=5",
+    "loops.right.vernier.controller=minimum-variance",
+]
 COURSES = {
     "every command": (every_command, [], {"RELEASE", "STOP", "RECOVER", "OFF", "IN_REACH"}),
     "a star that moves": (every_command, MOVING, {"RELEASE", "STOP", "RECOVER", "IN_REACH"}),
@@ -295,6 +299,13 @@ COURSES = {
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
     "a learnt design": (a_learnt_design, [*SHAKEN, "loops.right.learn=on"], {"IN_REACH"}),
     "a star of another light": (hold_a_star, FAINTER, {"IN_REACH"}),
+    "several writes a frame": (every_command, SEVERAL_WRITES, {"STOP", "RECOVER", "IN_REACH"}),
+    "several writes a frame, and a lost star": (
+        a_star_that_is_lost,
+        SEVERAL_WRITES,
+        {"STAR_LOST", "STAR_FOUND", "IN_REACH"},
+    ),
+    "the D/A fails between frames": (_fails("dac", "confirm"), SEVERAL_WRITES, FAULT),
     "a stall": (a_stall, [], {"IN_REACH"}),
     "the D/A's own watchdog": (a_mirror_that_the_watchdog_moves, [SOON], {"FAULT", "IN_REACH"}),
     "a star of a killed supervisor": (a_star_of_a_killed_supervisor, [], {"IN_REACH"}),

@@ -91,6 +91,8 @@ IMPOSSIBLE = [
     (f"{DAC}.baud_rate", 11520),
     (f"{DAC}.full_scale_v", 100.0),
     (f"{DAC}.bits", 24),
+    (f"{DAC}.writes_per_frame", 0),
+    (f"{DAC}.writes_per_frame", 11),
     (f"{PIEZO}.limit_v", 120.0),
     (f"{PIEZO}.limit_v", 0.0),
     (f"{PIEZO}.port", "10.0.0.5"),
@@ -215,6 +217,7 @@ CONTRADICTIONS = [
     ({f"{DAC}.transport": "rtu"}, f"{DAC}.serial_port"),
     ({f"{DAC}.baud_rate": 9600, f"{DAC}.transport": "rtu", f"{DAC}.serial_port": "/dev/ttyS0"},
      "camera.frame_rate_hz"),
+    ({f"{DAC}.writes_per_frame": 4}, "camera.frame_delay_s"),
     ({f"{PIEZO}.poll_s": 20.0}, "interlocks.piezo_limit.stale_s"),
     # pointing
     ({f"{SEARCH}.confirm_timeout_s": 0.08}, f"{SEARCH}.found_frames"),

@@ -293,10 +293,15 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
 AnySiderostat = Siderostat[SiderostatDevice]
 
 
+MOST_WRITES = 10
+"""Of a D/A in a frame period."""
+
+
 class ModbusDacDevice(Settings):
     """A Modbus D/A converter: consecutive holding registers, one a channel.
 
     ``channels`` names the channels of stack 1 to 3, from 1 to 3; without it, they are in this order.
+    ``writes_per_frame`` is how often designs that predict may write it in a frame period.
     """
 
     driver: Literal["modbus_dac"]
@@ -311,6 +316,7 @@ class ModbusDacDevice(Settings):
     full_scale_v: OutputV
     bits: Annotated[int, Field(ge=8, le=16)]
     response_timeout_s: TimeoutS
+    writes_per_frame: Annotated[int, Field(ge=1, le=MOST_WRITES)] = 1
     channels: Channels | None = None
 
     @model_validator(mode="after")

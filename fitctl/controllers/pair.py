@@ -41,8 +41,9 @@ class Design:
     - ``motor_px``: where the siderostat's encoders had, from where the pair was started;
     - ``target_px``: the target, from where it was when the pair was started.
 
-    Outputs y: ``mirror_px``, where the mirror shall move the star until the next command, and
-    ``motor_step_px``, by how much the siderostat's set-point moves it.
+    Outputs y: ``mirror_px``, where the mirror shall move the star until the next write of the D/A;
+    ``motor_step_px``, by how much the siderostat's set-point moves it; then ``mirror_px`` of each further write
+    before the next frame's command, if there are any. Writes are at equal intervals.
 
     Attributes
     ----------
@@ -50,7 +51,7 @@ class Design:
         eq20, lqg-ltr, minimum-variance, fslq, or that of a file of the user's.
     period_s, delay_s : float
         Of the loop that it was made for: frame period, and mid-exposure to command.
-    a, b, c, d : arrays, shapes (n, n), (n, 5), (2, n), (2, 5)
+    a, b, c, d : arrays, shapes (n, n), (n, 5), (1 + writes, n), (1 + writes, 5)
     hysteresis_inverse : bool
         Whether stack voltages go through the inverse of the identified hysteresis.
     parameters : dict
@@ -88,6 +89,11 @@ class Design:
     own: bool = False
 
     @property
+    def writes(self) -> int:
+        """Of the D/A, in a frame period."""
+        return len(self.d) - 1
+
+    @property
     def title(self) -> str:
         """What people call it: its name, or `LEARNT`."""
         return LEARNT if self.learnt else self.name
@@ -97,6 +103,11 @@ class Design:
         """Another noise of the sensor makes another design: of the shipped ones, those that predict."""
         by_itself = not (self.learnt or self.own or self.file)
         return by_itself and self.name in {"minimum-variance", "fslq"}
+
+
+def mirror_outputs(writes: int) -> list[int]:
+    """Which outputs of a design with so many writes are the mirror's, in their order in time."""
+    return [0, *range(len(OUTPUTS), writes + 1)]
 
 
 class Designer(Protocol):
@@ -122,10 +133,19 @@ class Measurement(NamedTuple):
 
 
 class PairCommand(NamedTuple):
-    """Mirror angles on the diamond, and the step of the motors' set-point, each shape (2,)."""
+    """What both stages shall do until the next frame's command.
+
+    Attributes
+    ----------
+    mirror_rad, motor_step_rad : arrays, shape (2,)
+        Mirror angles on the diamond, and the step of the motors' set-point.
+    later_rad : tuple of array, shape (2,)
+        Mirror angles of the writes that follow, on the diamond too.
+    """
 
     mirror_rad: Floats
     motor_step_rad: Floats
+    later_rad: tuple[Floats, ...] = ()
 
 
 class Pair:
@@ -145,10 +165,11 @@ class Pair:
         self._range_rad = range_rad
         self.at_rest = rest_state(design)
         self.left_at_rest = left_at_rest(design, self.at_rest)
+        self._later = len(OUTPUTS) + len(design.a) + 1  # the first row of the writes that follow
         self.system = self._in_rad()
         self._mirror_turn = rows(scale.mirror_turn)
         self._siderostat_turn = rows(scale.siderostat_turn)
-        self._given = np.zeros((len(self.system) + 3, 2))
+        self._given = np.zeros((self.system.shape[1], 2))
         self._inputs = self._given[: len(INPUTS)].reshape(-1)  # a view: az and el of each
         self.start(np.zeros(2), np.zeros(2), (0.0, 0.0))
 
@@ -195,10 +216,14 @@ class Pair:
         # had the mirror followed.
         within = mirror_rad is wanted_rad
         self.excess_px = _NO_EXCESS if within else scale.mirror_px(wanted_rad - mirror_rad)
-        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_back.T))
+        later_rad = tuple(
+            saturate_diamond(row.dot(scale.mirror_back.T), self._range_rad)
+            for row in made[self._later :]
+        )
+        return PairCommand(mirror_rad, made[1].dot(scale.siderostat_back.T), later_rad)
 
     def _advance(self, measured: Measurement) -> Floats:
-        """One period of the linear system: its outputs, and its next state below them."""
+        """One period of the linear system: the first outputs, its next state, and the other writes' outputs."""
         given = self._given
         # The design's axes are the camera's; the stages' may be turned from them.
         motor_az_rad, motor_el_rad = measured.motor_rad.tolist()
@@ -216,7 +241,7 @@ class Pair:
             target_el_px - origin_el_px,
         )
         made = self.system.dot(given)  # `@` takes twice as long
-        given[len(INPUTS) :] = made[len(OUTPUTS) :]
+        given[len(INPUTS) :] = made[len(OUTPUTS) : self._later]
         return np.asarray(made)
 
     def _in_rad(self) -> Floats:
@@ -226,19 +251,23 @@ class Pair:
         system[:, INPUTS.index("motor_px")] *= scale.motor_px_per_rad
         system[OUTPUTS.index("mirror_px")] /= scale.mirror_px_per_rad
         system[OUTPUTS.index("motor_step_px")] /= scale.motor_px_per_rad
+        system[self._later :] /= scale.mirror_px_per_rad
         return system
 
     def _with_hand_over(self) -> Floats:
         """The design and, as one more state, what it found held: in a tick one product costs least."""
         design, kept = self.design, math.exp(-self.design.period_s / HAND_OVER_S)
         none = np.zeros((len(design.a), 1))
-        return np.block(
+        first = len(OUTPUTS)
+        system = np.block(
             [
-                [design.d, design.c, np.array([[1.0], [1.0 - kept]])],
+                [design.d[:first], design.c[:first], np.array([[1.0], [1.0 - kept]])],
                 [design.b, design.a, none],
                 [np.zeros((1, len(INPUTS))), none.T, np.full((1, 1), kept)],
             ]
         )
+        later = np.hstack([design.d[first:], design.c[first:], np.ones((design.writes - 1, 1))])
+        return np.vstack([system, later])
 
 
 def rest_state(design: Design) -> Floats:

@@ -13,7 +13,9 @@ import msgspec
 
 RECORD_VERSION = 1
 Severity = Literal["info", "warning", "error"]
-FailingDevice = Literal["camera", "siderostat", "D/A", "injector", "piezo", "photodiodes"]
+FailingDevice = Literal[
+    "camera", "siderostat", "D/A", "D/A between frames", "injector", "piezo", "photodiodes"
+]
 CAMERA: Final = "camera"
 
 

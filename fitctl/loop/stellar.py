@@ -99,7 +99,7 @@ class StellarLoop(Loop):
             self.sky = Sky(scale, rig.camera.period_s)
             self.sky.move_at(self.settings.star_rate_sky_arcsec_s)
         self._scale = scale
-        self._period_s = rig.camera.period_s
+        self._period_s, self._delay_s = rig.camera.period_s, rig.camera.frame_delay_s
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
         self._tick_records = TickRecords(rig, name)
         self._flattened = False
@@ -127,6 +127,7 @@ class StellarLoop(Loop):
         """Find the star, and where the stages were when the frame was exposed; without one, where they are."""
         servo = self.servo.read_state()
         begun_s = self._clock.now_s()
+        self.mirror.drop_later()
         self._experiments.record_injections(self.mirror)
         if self._writes_dac:
             self._use_dac(self._find_mirror)
@@ -305,6 +306,9 @@ class StellarLoop(Loop):
         elif self.mode is Mode.EXPERIMENT and injector.fault is not None:
             self.mirror.ready = False
             self.device_failed("injector", injector.fault)
+        elif self.mirror.fault is not None:
+            fault, self.mirror.fault = self.mirror.fault, None
+            self.device_failed("D/A between frames", fault)
         elif (frame := observation.frame) is not None and not self.waits_for:
             found = self._find_trigger(frame, observation.star)
             if found is not None and found.trigger is None:
@@ -528,13 +532,19 @@ class StellarLoop(Loop):
         command = self.pointing.step_pair(observation, self.target_px)
         if command is not None:
             self.siderostat.move_by(command.motor_step_rad)
-            mirror_rad = command.mirror_rad
+            mirror_rad, *later_rad = command.mirror_rad, *command.later_rad
             if self.backlash is not None:
                 self.backlash.update(observation.now_s, observation.servo)
-                mirror_rad = saturate_diamond(
-                    mirror_rad + self.backlash.offset_rad, self.settings.fsm.range_rad
+                mirror_rad, *later_rad = (
+                    saturate_diamond(each + self.backlash.offset_rad, self.settings.fsm.range_rad)
+                    for each in (mirror_rad, *later_rad)
                 )
-            self.mirror.move_to(mirror_rad, hysteresis_inverse=self._inverts_hysteresis)
+            inverts = self._inverts_hysteresis
+            self.mirror.move_to(mirror_rad, hysteresis_inverse=inverts)
+            if later_rad and observation.frame is not None:
+                every_s = self._period_s / (1 + len(later_rad))
+                first_s = observation.frame.mid_exposure_s + self._delay_s + every_s
+                self.mirror.move_later(later_rad, first_s, every_s, hysteresis_inverse=inverts)
 
     def _run_experiment(self, observation: Observation) -> None:
         setpoint_rad = self._experiments.setpoint_rad(observation.now_s)

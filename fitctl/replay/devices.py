@@ -321,6 +321,8 @@ class LoggedMirror(MirrorStage):
         )
         self._logged_injector.load_step(step, self._name)
         self.injector.fault = failed.get("injector", self.injector.fault)
+        self.fault = failed.get("D/A between frames")
+        self.ready = self.ready and self.fault is None
 
     @property
     def wanted_v(self) -> Floats:
@@ -333,6 +335,10 @@ class LoggedMirror(MirrorStage):
         if self._tick is not None:
             self.stack_v = _stacks(self._tick)
         super().send()
+
+    def write_due(self) -> float:
+        """Nothing: what was written between ticks is in the log as well."""
+        return math.inf
 
     def follow(self) -> None:
         """After the tick: go on from where it was sent then."""
@@ -372,7 +378,7 @@ class LoggedDac(NoDevice):
 
 
 class LoggedInjector(Injector):
-    """What an experiment wrote, as the log has it."""
+    """What was written outside the ticks, as the log has it."""
 
     def __init__(self, dac: LoggedDac, clock: Clock) -> None:
         super().__init__(dac, clock, np.zeros((3, 2)), 0.0, 0.0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +13,22 @@ from numpy.typing import NDArray
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.mirror import Mirror
-from fitctl.drivers.interface import MirrorDac
+from fitctl.drivers.interface import DeviceError, MirrorDac
 from fitctl.model.optics import saturate_diamond, scales
 from fitctl.stages.injector import Injection, Injector, stack_v_per_px
 
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3  # of mirror angles; frames are far younger when they are used
+_PROMPT_S = 1e-6  # a write is due so early: sums of times are not exact
 _UNWRITTEN_S = 0.4  # after so long without a write, the D/A's own watchdog may have acted
+
+
+class _Later(NamedTuple):
+    """A write between ticks: when it is due, and to which angles, shape (2,)."""
+
+    due_s: float
+    mirror_rad: Floats
+    hysteresis_inverse: bool
 
 
 class MirrorStage:
@@ -46,6 +57,8 @@ class MirrorStage:
         How far from its bias the mirror rests.
     injector : Injector
         Writes the D/A in the tick's stead while an experiment runs.
+    fault : DeviceError or None
+        What failed in a write between ticks.
     """
 
     def __init__(
@@ -62,6 +75,7 @@ class MirrorStage:
         self.stack_v = np.full(3, fsm.bias_v)
         self.command_rad = np.zeros(2)
         self.bias_offset_rad = np.zeros(2)
+        self.fault: DeviceError | None = None
         self.sent_s = math.nan
         self.written_s = clock.now_s()
         self.round_trip_s = 0.0
@@ -81,7 +95,10 @@ class MirrorStage:
         self._begun_s = math.nan  # of a write that is not confirmed yet
         self._known_s = -math.inf  # when the outputs were last written, or read
         self._lowest_v = self._highest_v = self.stack_v
-        shortest_s = min(rig.camera.period_s, self.injector.period_s)
+        write_s = rig.camera.period_s / fsm.dac.writes_per_frame
+        shortest_s = min(write_s, self.injector.period_s)
+        self._later: deque[_Later] = deque()
+        self._written: list[Injection] = []  # between ticks, since last asked
         self._history: deque[tuple[float, Floats]] = deque(
             [(-math.inf, np.zeros(2))], maxlen=math.ceil(HISTORY_S / shortest_s)
         )
@@ -119,6 +136,8 @@ class MirrorStage:
         self._begun_s = math.nan
         self._known_s = -math.inf  # the other devices were opened since
         self.ready = True
+        self.fault = None
+        self.drop_later()
 
     def move_to(self, mirror_rad: Floats, *, hysteresis_inverse: bool) -> None:
         """Turn the mirror, no farther than its diamond."""
@@ -126,6 +145,24 @@ class MirrorStage:
         self.stack_v = self._mirror.volts_for(
             self.command_rad, hysteresis_inverse=hysteresis_inverse
         )
+
+    def move_later(
+        self,
+        wanted_rad: Sequence[Floats],
+        first_s: float,
+        every_s: float,
+        *,
+        hysteresis_inverse: bool,
+    ) -> None:
+        """Turn the mirror to each of these angles, shape (2,), by :meth:`write_due`, the first at `first_s`."""
+        self._later.extend(
+            _Later(first_s + index * every_s, mirror_rad, hysteresis_inverse)
+            for index, mirror_rad in enumerate(wanted_rad)
+        )
+
+    def drop_later(self) -> None:
+        """Forget what :meth:`move_later` was given and is not written yet."""
+        self._later.clear()
 
     def rest_off_bias(self, offset_rad: Floats) -> None:
         """From now on the mirror rests this far from its bias, shape (2,), within its diamond."""
@@ -218,6 +255,32 @@ class MirrorStage:
         self._mirror.written(self.stack_v)
         self._history.append((self.written_s, self._mirror.angles_rad))
 
+    def write_due(self) -> float:
+        """Write what :meth:`move_later` was given and is due; of several, the newest.
+
+        A D/A that fails leaves its error in `fault`.
+
+        Returns
+        -------
+        float
+            When the next is due; infinite without one.
+        """
+        later, due = self._later, None
+        while later and later[0].due_s <= self._clock.now_s() + _PROMPT_S:
+            due = later.popleft()
+        if due is not None and self.ready:
+            self.move_to(due.mirror_rad, hysteresis_inverse=due.hysteresis_inverse)
+            try:
+                self.send()
+                self.confirm()
+            except DeviceError as error:
+                self.fault = error
+                later.clear()
+            else:
+                self._written.append(Injection(self.written_s, self.stack_v))
+            self.stack_v, self.command_rad = self._mirror.stack_v, self._mirror.angles_rad
+        return later[0].due_s if later else math.inf
+
     def drain_commanded_range(self) -> tuple[Floats, Floats]:
         """Lowest and highest voltages, shape (3,) each, that the D/A was sent since last asked."""
         commanded = self._lowest_v, self._highest_v
@@ -229,7 +292,8 @@ class MirrorStage:
         self._highest_v = np.maximum(self._highest_v, stack_v)
 
     def drain_injections(self) -> list[Injection]:
-        """What an experiment has written since last asked."""
+        """What was written outside the tick since last asked: between ticks, or by an experiment."""
+        between, self._written = self._written, []
         injections = self.injector.drain_written()
         for time_s, stack_v in injections:
             self._mirror.written(stack_v)
@@ -237,4 +301,4 @@ class MirrorStage:
             self.stack_v, self.command_rad = stack_v, self._mirror.angles_rad
             self._history.append((time_s, self.command_rad))
             self.written_s = self._known_s = time_s
-        return injections
+        return between + injections if between else injections

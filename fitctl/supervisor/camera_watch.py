@@ -52,15 +52,18 @@ class CameraWatch:
         self.skipped = 0
         self._last_frame_s = self._clock.now_s()
 
-    def next_frame(self) -> Frame | None:
-        """Wait for the next, no longer than two frame periods; after a stall, the newest of those that came."""
+    def next_frame(self, meanwhile: Callable[[], float]) -> Frame | None:
+        """Wait for the next, no longer than two frame periods; after a stall, the newest of those that came.
+
+        `meanwhile` is called at first, and until the frame comes again at each time that it returns.
+        """
         self.older.clear()
         if not self.ready:
             self._clock.sleep_until(self._clock.now_s() + self._period_s)
             return None
         frame = None
         try:
-            frame = self._camera.next_frame(2 * self._period_s)
+            frame = self._first_frame(meanwhile)
             while frame is not None and len(self.older) < _MOST_OLDER:
                 newer = self._camera.next_frame(0.0)
                 if newer is None:
@@ -77,6 +80,18 @@ class CameraWatch:
             self.skipped += len(self.older)
             self._last_frame_s = self._clock.now_s()
         return frame
+
+    def _first_frame(self, meanwhile: Callable[[], float]) -> Frame | None:
+        left_s = 2 * self._period_s
+        until_s = self._clock.now_s() + left_s
+        while True:
+            due_s, now_s = meanwhile(), self._clock.now_s()
+            if due_s - now_s >= left_s:
+                return self._camera.next_frame(left_s)
+            frame = self._camera.next_frame(max(0.0, due_s - now_s))
+            if frame is not None:
+                return frame
+            left_s = max(0.0, until_s - self._clock.now_s())
 
     @property
     def well(self) -> bool:

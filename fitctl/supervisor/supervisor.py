@@ -7,6 +7,7 @@ may take longer than a tick (opening, closing and polling devices) is handed to 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future
@@ -167,6 +168,7 @@ class Supervisor:
         self._wanted_designs: dict[
             str, Future
         ] = {}  # of each loop, by its last `controller` command
+        self._mirrors = [loop.mirror for loop in self.stellar_loops.values()]
         self._starlight = [Starlight(rig, loop, journal) for loop in self.stellar_loops.values()]
         self._reported_s = clock.now_s()
         self.piezos = {
@@ -255,9 +257,10 @@ class Supervisor:
     def step(self) -> None:
         """Wait for the next frame, no longer than two frame periods, and act on it.
 
+        Until it comes, mirrors are written that are due.
         Every loop has sent its stages what they are to do before the first waits for a confirmation.
         """
-        frame = self._camera.next_frame()
+        frame = self._camera.next_frame(self._write_due)
         self._finish_jobs()
         self._obey_posted()
         self._record_left()
@@ -292,6 +295,10 @@ class Supervisor:
                 piezo.ask()
         if self._clock.now_s() - self._reported_s >= 1.0:
             self._once_a_second()
+
+    def _write_due(self) -> float:
+        """Write the mirrors that are due between frames; when the next is."""
+        return min((mirror.write_due() for mirror in self._mirrors), default=math.inf)
 
     def _record_frame(self, frame: Frame) -> None:
         self._record(

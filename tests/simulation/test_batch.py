@@ -117,6 +117,17 @@ TIMELINE = (
         ),
         pytest.param(["loops.right.target_px={az=35.0, el=5.0}"], id="far from the field's middle"),
         pytest.param(
+            [CONTROLLER.format("minimum-variance"), "loops.right.fsm.dac.writes_per_frame=5"],
+            id="five writes of the D/A a frame",
+        ),
+        pytest.param(
+            [
+                CONTROLLER.format("minimum-variance"), "loops.right.fsm.dac.writes_per_frame=3",
+                "plant.loops.right.air_path.gain_px=6.0",
+            ],
+            id="three writes of the D/A a frame, star lost and found, mirror beyond its range",
+        ),
+        pytest.param(
             [
                 "plant.loops.right.spots=[{name='pointing', offset_px={az=0.0, el=0.0}, "
                 "flux_dn=28000.0, diameter_px=1.5}]"

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 
 from fitctl.config.addresses import BAUD_RATES
 from fitctl.config.conflict import Conflict, Part, at_least, at_most
-from fitctl.config.devices import Fsm
+from fitctl.config.devices import MOST_WRITES, Fsm
 from fitctl.config.rig import Rig
 
 _RTU_BITS = (23 + 7) * 11  # of a write of three registers, its answer, and the silences around them
+_LEAST_WRITE_S = 1e-3
+_CLEAR_OF_EXPOSURE_S = 5e-4  # writes arrive up to so late
 _MOST_SCALE_RATIO = (
     4.0  # between the stacks' identified stroke and the scale that fitctl moves them by
 )
@@ -23,6 +25,7 @@ def mirror_conflicts(rig: Rig) -> Iterator[Conflict]:
         for conflict in found:
             yield conflict.under(f"loops.{name}.fsm")
         yield from _serial_line(rig, f"loops.{name}.fsm.dac", loop.fsm)
+        yield from _writes(rig, f"loops.{name}.fsm.dac.writes_per_frame", loop.fsm)
 
 
 def _amplifier(fsm: Fsm) -> Iterator[Conflict]:
@@ -80,16 +83,62 @@ def _about(scale: float) -> str:
 
 
 def _serial_line(rig: Rig, key: str, fsm: Fsm) -> Iterator[Conflict]:
-    """Over RTU, the three registers must be written within a frame period."""
-    dac, rate_hz = fsm.dac, rig.camera.frame_rate_hz
+    """Over RTU, the three registers must be written in the time that there is for a write."""
+    dac, rate_hz = fsm.dac, rig.camera.frame_rate_hz * fsm.dac.writes_per_frame
     needed = _RTU_BITS * rate_hz
     if dac.transport == "rtu" and dac.baud_rate < needed:
         enough = min((one for one in BAUD_RATES if one >= needed), default=0)
         yield Conflict(
-            f"a write over RTU takes {_RTU_BITS / dac.baud_rate:.3g} s, longer than a frame period",
+            f"a write over RTU takes {_RTU_BITS / dac.baud_rate:.3g} s, and the next is due after "
+            f"{1 / rate_hz:.3g} s",
             (
                 Part(f"{key}.baud_rate", dac.baud_rate, f"at least {enough}" if enough else ""),
-                at_most("camera.frame_rate_hz", rate_hz, dac.baud_rate / _RTU_BITS),
+                at_most(
+                    "camera.frame_rate_hz",
+                    rig.camera.frame_rate_hz,
+                    dac.baud_rate / _RTU_BITS / dac.writes_per_frame,
+                ),
                 Part(f"{key}.transport", dac.transport, "tcp"),
             ),
         )
+
+
+def _writes(rig: Rig, key: str, fsm: Fsm) -> Iterator[Conflict]:
+    """Between two frames there must be time for each write, and none may come just as a frame is exposed."""
+    writes, camera = fsm.dac.writes_per_frame, rig.camera
+    if writes == 1:
+        return
+    every_s = camera.period_s / writes
+    if every_s < _LEAST_WRITE_S:
+        most = max(1, math.floor(camera.period_s / _LEAST_WRITE_S))
+        yield Conflict(
+            f"a write of the D/A every {every_s * 1e3:.3g} ms leaves the supervisor no time for the tick",
+            (
+                at_most(key, writes, most),
+                at_most("camera.frame_rate_hz", camera.frame_rate_hz, 1 / writes / _LEAST_WRITE_S),
+            ),
+        )
+    if _clear_s(camera.frame_delay_s, every_s) < _CLEAR_OF_EXPOSURE_S:
+        free = [
+            other
+            for other in range(2, MOST_WRITES + 1)
+            if camera.period_s / other >= _LEAST_WRITE_S
+            and _clear_s(camera.frame_delay_s, camera.period_s / other) >= _CLEAR_OF_EXPOSURE_S
+        ]
+        yield Conflict(
+            "a write of the D/A would come at mid-exposure, and the loop could not know what the frame shows",
+            (
+                Part(key, writes, f"one of {', '.join(map(str, [1, *free]))}"),
+                at_most(
+                    "camera.frame_delay_s",
+                    camera.frame_delay_s,
+                    round(camera.frame_delay_s / every_s) * every_s - _CLEAR_OF_EXPOSURE_S,
+                ),
+            ),
+        )
+
+
+def _clear_s(delay_s: float, every_s: float) -> float:
+    """How far the nearest write is from a mid-exposure."""
+    after_s = -delay_s % every_s
+    return min(after_s, every_s - after_s)

@@ -80,6 +80,8 @@ class Basis:
         rings; `fitctl design learn` measures it.
     fastest_line_hz : float
         No vibration is faster.
+    writes : int
+        Of the D/A in a frame period, at equal intervals. Designs that do not predict use one.
     """
 
     period_s: float
@@ -94,6 +96,7 @@ class Basis:
     mirror_gain: float = 1.0
     overshoot: float = 0.0
     fastest_line_hz: float = math.inf
+    writes: int = 1
 
 
 def basis(rig: Rig, loop_name: str) -> Basis:
@@ -121,6 +124,7 @@ def basis(rig: Rig, loop_name: str) -> Basis:
         mirror_range_px=scale.mirror_px_per_rad * loop.fsm.range_rad,
         settings=loop.vernier,
         fastest_line_hz=loop.fastest_line_hz or math.inf,
+        writes=loop.fsm.dac.writes_per_frame,
     )
 
 
@@ -142,6 +146,8 @@ def design_parameters(basis: Basis, *sections: str) -> dict[str, Any]:
         parameters["mirror_gain"] = basis.mirror_gain
     if basis.overshoot != 0.0:
         parameters["overshoot"] = basis.overshoot
+    if basis.writes != 1:
+        parameters["writes_per_frame"] = basis.writes
     return parameters
 
 
@@ -170,6 +176,12 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
     if not abs(mirror.overshoot) <= MOST_OVERSHOOT:
         msg = f"overshoot: expected at most {MOST_OVERSHOOT:g} either way, got {mirror.overshoot:g}"
         raise ValueError(msg)
+    writes = int(parameters.get("writes_per_frame", 1))
+    if not 1 <= writes <= rig_basis.writes:
+        msg = (
+            f"writes_per_frame: expected 1 to the {rig_basis.writes} of the rig file, got {writes}"
+        )
+        raise ValueError(msg)
     sections = {
         name: type(getattr(settings, name)).model_validate(values)
         for name, values in parameters["settings"].items()
@@ -183,4 +195,5 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         settings=settings.model_copy(update=sections),
         lines=tuple(Line(**line) for line in parameters.get("lines", ())),
         guard=Line(**parameters["guard"]) if "guard" in parameters else None,
+        writes=writes,
     )

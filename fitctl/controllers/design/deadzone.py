@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.linear_loop.sampled import sampled_loop, timing
+from fitctl.controllers.design.linear_loop.sampled import sampled_loop, timing, write_at_exposure
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]
@@ -59,13 +59,14 @@ class DeadzoneResult(NamedTuple):
 def deadzone_response(design: Design, basis: Basis, omega_rad_s: Floats) -> NDArray[np.complex128]:
     """M: from what passed the mirror's range to the mirror angle wanted, in the closed loop."""
     loop = sampled_loop(design, basis)
-    frames = timing(basis.period_s, basis.delay_s).frames
+    frames, walked = timing(basis.period_s, basis.delay_s)
     n = len(loop.a)
     own = n - len(design.a)
     # One more state: what passed the range a frame ago, which is an input of the design.
     a, b = np.zeros((n + 1, n + 1)), np.zeros((n + 1, 1))
     a[:n, :n] = loop.a + np.outer(loop.b, loop.star)
-    a[0, n], a[frames, n] = design.d[:, 1]  # into the newest mirror command, and the siderostat's
+    # Into the newest mirror command, and the siderostat's.
+    a[0, n], a[frames, n] = design.d[[write_at_exposure(design, walked), 1], 1]
     a[own:n, n] = design.b[:, 1]
     b[0], b[n] = -1.0, 1.0
     wanted = np.append(loop.command[0] + loop.command_error[0] * loop.star, design.d[0, 1])

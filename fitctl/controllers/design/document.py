@@ -13,14 +13,20 @@ FORMAT = "fitctl design 1"
 MATRICES = ("a", "b", "c", "d")
 
 
-def matrix_shapes(states: int) -> dict[str, tuple[int, int]]:
-    """Of the matrices of a design with so many states."""
+def matrix_shapes(states: int, writes: int = 1) -> dict[str, tuple[int, int]]:
+    """Of the matrices of a design with so many states and writes of the D/A in a frame."""
+    outputs = len(outputs_of(writes))
     return {
         "a": (states, states),
         "b": (states, len(INPUTS)),
-        "c": (len(OUTPUTS), states),
-        "d": (len(OUTPUTS), len(INPUTS)),
+        "c": (outputs, states),
+        "d": (outputs, len(INPUTS)),
     }
+
+
+def outputs_of(writes: int) -> list[str]:
+    """What the outputs of a design with so many writes are."""
+    return [*OUTPUTS, *(f"mirror_px of write {write}" for write in range(2, writes + 1))]
 
 
 def design_json(design: Design) -> str:
@@ -32,7 +38,7 @@ def design_json(design: Design) -> str:
         "period_s": design.period_s,
         "delay_s": design.delay_s,
         "inputs": list(INPUTS),
-        "outputs": list(OUTPUTS),
+        "outputs": outputs_of(design.writes),
         "hysteresis_inverse": design.hysteresis_inverse,
         "parameters": design.parameters,
         **({"learnt": True} if design.learnt else {}),
@@ -60,7 +66,7 @@ def design_from_json(text: str) -> Design:
     """
     document = json.loads(text)
     # A law without states has matrices of no rows, whose columns JSON does not keep.
-    shapes = matrix_shapes(len(document["a"]))
+    shapes = matrix_shapes(len(document["a"]), len(document["d"]) - 1)
     a, b, c, d = (np.array(document[name], dtype=float).reshape(shapes[name]) for name in MATRICES)
     return Design(
         document["name"],

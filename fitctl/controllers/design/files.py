@@ -15,9 +15,9 @@ from pydantic import ValidationError
 
 from fitctl.config import ConfigError, is_name
 from fitctl.controllers.design.basis import Basis, basis_of
-from fitctl.controllers.design.document import FORMAT, MATRICES, design_json
+from fitctl.controllers.design.document import FORMAT, MATRICES, design_json, outputs_of
 from fitctl.controllers.design.own import checked
-from fitctl.controllers.pair import INPUTS, OUTPUTS, Design
+from fitctl.controllers.pair import INPUTS, Design
 from fitctl.files import read_regular
 
 _MOST_BYTES = 1 << 20  # a hundred times a design's
@@ -72,7 +72,6 @@ def design_of(
     wanted: dict[str, Any] = {
         "format": FORMAT,
         "inputs": list(INPUTS),
-        "outputs": list(OUTPUTS),
         "period_s": rig_basis.period_s,
         "delay_s": rig_basis.delay_s,
     }
@@ -97,6 +96,7 @@ def design_of(
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         hint = "use a file that this fitctl saved"
         raise _refusal(path, "parameters", f"those of {name}", repr(error), hint) from None
+    _check_outputs(document, path, again.writes)
     for key in MATRICES:
         if not _follows(document.get(key), getattr(again, key)):
             hint = "the file was changed, or made by another fitctl; design it again"
@@ -108,8 +108,16 @@ def design_of(
     return again
 
 
+def _check_outputs(document: Mapping[str, Any], path: Path, writes: int) -> None:
+    expected, got = outputs_of(writes), document.get("outputs")
+    if got != expected:
+        hint = "design it again for this rig: fitctl design ... --out FILE"
+        raise _refusal(path, "outputs", f"this rig needs {_shown(expected)}", _shown(got), hint)
+
+
 def _as_given(document: Mapping[str, Any], name: str, path: Path, rig_basis: Basis) -> Design:
     """A design of the user's own making: there is nothing to make it from again but its matrices."""
+    _check_outputs(document, path, 1)
     matrices: dict[str, Any] = {key: document.get(key) for key in MATRICES}
     given = Design(
         name=name,

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag, solve_discrete_are
 from fitctl.controllers.design.basis import Basis
 from fitctl.controllers.design.linear_loop.disturbance import disturbance
 from fitctl.controllers.design.linear_loop.sampled import timing
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import Design, mirror_outputs
 
 Floats = NDArray[np.float64]
 
@@ -52,15 +52,15 @@ def star_filter(basis: Basis, drift_px_per_sqrt_s: float) -> Filter:
 
 
 class Gains(NamedTuple):
-    """How commands follow from what is expected; rows are mirror and motor step.
+    """How commands follow from what is expected; rows are the outputs of a design.
 
     Attributes
     ----------
-    star : array, shape (2, n)
+    star : array, shape (outputs, n)
         On the star's own motion at mid-exposure, less target.
-    motor : array, shape (2,)
+    motor : array, shape (outputs,)
         On where the siderostat will be when the command begins.
-    memory : array, shape (2, n)
+    memory : array, shape (outputs, n)
         On a memory of the law's own: m+ = keep m + drive @ (mirror, motor step).
     keep, drive : arrays, shapes (n, n), (n, 2)
     """
@@ -105,10 +105,11 @@ def predicting_design(
     a[own], b[own] = c[1], d[1]
     a[own + 1 : own + steps, own : own + steps - 1] = np.eye(steps - 1)
     a[own + steps :, own + steps :] = gains.keep
-    a[own + steps :] += gains.drive @ c
-    b[own + steps :] = gains.drive @ d
+    a[own + steps :] += gains.drive @ c[:2]
+    b[own + steps :] = gains.drive @ d[:2]
     # So far in the star's true motion; the mirror's input and output count what the rig file says of it.
-    c[0], d[0] = c[0] / basis.mirror_gain, d[0] / basis.mirror_gain
+    moves = mirror_outputs(len(c) - 1)
+    c[moves], d[moves] = c[moves] / basis.mirror_gain, d[moves] / basis.mirror_gain
     b[:, mirror], d[:, mirror] = b[:, mirror] * basis.mirror_gain, d[:, mirror] * basis.mirror_gain
     if basis.overshoot:
         a, b, c, d = _with_overshoot(a, b, c, d, basis.overshoot / basis.mirror_gain)

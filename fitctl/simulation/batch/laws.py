@@ -138,6 +138,11 @@ def step_pair(s: Any, r: Any, w: Any) -> None:
                 wanted_az, wanted_el = (total, wanted_el) if axis == 0 else (wanted_az, total)
             else:
                 step_az, step_el = (total, step_el) if axis == 0 else (step_az, total)
+        for write in range(s.later_writes):
+            total = 0.0
+            for column in range(5 + s.pair_states):
+                total += s.pair_later[write, column] * w.pair_inputs[column]
+            r.later_rad[write, axis] = total
     step_az, step_el = turned(s.scale.siderostat_back, step_az, step_el)
     siderostat_to(s, r, r.setpoint_rad[0] + step_az, r.setpoint_rad[1] + step_el)
     wanted_az, wanted_el = turned(s.scale.mirror_back, wanted_az, wanted_el)
@@ -145,6 +150,13 @@ def step_pair(s: Any, r: Any, w: Any) -> None:
     beyond = 1.0 - within
     r.excess_px[0], r.excess_px[1] = mirror_px(s, wanted_az * beyond, wanted_el * beyond)
     mirror_to(s, r, w, wanted_az * within, wanted_el * within)
+    for write in range(s.later_writes):
+        later_az, later_el = turned(
+            s.scale.mirror_back, r.later_rad[write, 0], r.later_rad[write, 1]
+        )
+        within = min(1.0, s.range_rad / max(abs(later_az) + abs(later_el), 1e-300))
+        r.later_rad[write, 0], r.later_rad[write, 1] = later_az * within, later_el * within
+    r.later, r.later_left = 0, s.later_writes
 
 
 @compilable()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -115,6 +116,23 @@ def write_stacks(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
     w.written_s[entry] = r.now_s
     w.written_rad[entry, 0], w.written_rad[entry, 1] = r.mirror_rad[0], r.mirror_rad[1]
     r.writes += 1
+
+
+@compilable()
+def next_write_s(r: Any) -> float:
+    """When the next write between frames is due; infinite without one."""
+    return float(r.later_s) if r.later_left > 0 else math.inf
+
+
+@compilable()
+def write_later(s: Any, r: Any, w: Any, c: Any, plant: Any) -> None:
+    """``MirrorStage.write_due``."""
+    mirror_to(s, r, w, r.later_rad[r.later, 0], r.later_rad[r.later, 1])
+    write_stacks(s, r, w, c, plant)
+    r.mirror_command_rad[0], r.mirror_command_rad[1] = r.mirror_rad[0], r.mirror_rad[1]
+    r.later += 1
+    r.later_left -= 1
+    r.later_s += s.later_every_s
 
 
 @compilable()

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
+from fitctl.config.devices import MOST_WRITES
 from fitctl.config.plant import MOST_INSTANTS
 from fitctl.controllers.attribution import MOST_STRANGERS
 from fitctl.messages.modes import Mode
@@ -126,6 +127,11 @@ STAR = np.dtype(
         ("excess_px", "f8", (2,)),
         ("motor_origin_rad", "f8", (2,)),
         ("target_origin_px", "f8", (2,)),
+        # writes of the D/A that are still to come before the next frame's command: the next, and how many
+        ("later_rad", "f8", (MOST_WRITES - 1, 2)),
+        ("later", "i8"),
+        ("later_left", "i8"),
+        ("later_s", "f8"),
         # the plant, the mirror's history, and sums of the residual
         ("origin_px", "f8", (2,)),
         ("hysteresis_epoch", "i8"),

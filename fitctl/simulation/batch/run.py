@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fitctl.model.compiled import compilable
 from fitctl.simulation.batch.beam import fire_beam, tick_beam
 from fitctl.simulation.batch.laws import command
-from fitctl.simulation.batch.mirror import mirror_at, write_stacks
+from fitctl.simulation.batch.mirror import mirror_at, next_write_s, write_later, write_stacks
 from fitctl.simulation.batch.modes import (
     ACQUIRE,
     OFF,
@@ -135,6 +135,7 @@ def tick_star(
 ) -> bool:
     """One tick with a frame, up to the D/A; False where the search has ended without a star."""
     s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
+    r.later_left = 0
     sensed = sense(ss, rr, ww, i)
     while sensed < 0:
         draw_own_air(ss, rr, ww, air_random, -sensed)
@@ -150,6 +151,7 @@ def tick_star(
     follow_sky(s, r)
     if not r.waits:
         command(s, r, w)
+        r.later_s = exposed_s + s.later_after_s
     return True
 
 
@@ -157,6 +159,7 @@ def tick_star(
 def wait_for_frame(ss: Any, rr: Any, ww: Any, i: int) -> None:
     """One tick without a frame."""
     s, r = ss.stars[i], rr.stars[i]
+    r.later_left = 0
     for axis in range(2):
         r.motor_rad[axis] = r.position_rad[axis]
     read_beam(ss, rr, ww, i, r.now_s)
@@ -171,6 +174,25 @@ def begin(ss: Any, rr: Any, ww: Any, cc: Any, pp: Any) -> None:
     """The stacks are at their bias."""
     for i in range(len(ss.stars)):
         move_plant_stacks(ss.stars[i], rr.stars[i], ww.stars[i], cc.stars[i], pp.stars[i])
+
+
+@compilable()
+def first_write_s(ss: Any, rr: Any) -> float:
+    """When the next write of a D/A between frames is due; infinite without one."""
+    due_s = math.inf
+    for i in range(len(ss.stars)):
+        due_s = min(due_s, next_write_s(rr.stars[i]))
+    return due_s
+
+
+@compilable()
+def write_mirrors(ss: Any, rr: Any, ww: Any, cc: Any, pp: Any, now_s: float) -> None:
+    """Write the D/As that are due between frames."""
+    for i in range(len(ss.stars)):
+        s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
+        if next_write_s(r) <= now_s:
+            r.now_s = now_s
+            write_later(s, r, w, cc.stars[i], pp.stars[i])
 
 
 @compilable(inline=True)
@@ -307,12 +329,17 @@ def run(
         while drawn * ss.step_s < until_s + ss.step_s:
             draw_shared_air(ss, rr, ww, air_random, drawn)
             drawn += ss.block_steps
-        while due_s <= until_s:
-            now_s = max(now_s, due_s)
+        write_s = first_write_s(ss, rr)
+        while min(due_s, write_s) <= until_s:
+            now_s = max(now_s, min(due_s, write_s))
             advance_to(ss, rr, ww, cc, pp, now_s, array_m, star_rad)
-            if not run_servos(ss, rr, ww, pp, now_s):
-                return FOLLOWING_ERROR
-            due_s += ss.servo_period_s
+            if due_s <= write_s:
+                if not run_servos(ss, rr, ww, pp, now_s):
+                    return FOLLOWING_ERROR
+                due_s += ss.servo_period_s
+            else:
+                write_mirrors(ss, rr, ww, cc, pp, now_s)
+                write_s = first_write_s(ss, rr)
         now_s = max(now_s, until_s)
         advance_to(ss, rr, ww, cc, pp, now_s, array_m, star_rad)
         before = rr.stars[0].summed_to

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config.devices import MOST_WRITES
 from fitctl.config.plant import MOST_INSTANTS
 from fitctl.controllers.attribution import look_places_px
 from fitctl.controllers.beam_hold import BeamHold
@@ -16,6 +17,7 @@ from fitctl.controllers.centroid import StarSensor, sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.mirror import Mirror
+from fitctl.controllers.pair import INPUTS
 from fitctl.controllers.photodiodes import PhotodiodeArray
 from fitctl.controllers.position_servo import position_servo
 from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
@@ -87,12 +89,14 @@ def star_settings(
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
     pointing = Pointing(rig, loop_name, target_px, design_for(rig, loop_name))
     pair = pointing.pair
+    states = pair.system.shape[1] - len(INPUTS)
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     noise_px = sensor_noise_px(rig.camera, loop, plant.spots[0].flux_dn)
     if pointing.design.uses_noise and noise_ratio(pointing.design, noise_px) > _MOST_NOISE_RATIO:
         msg = f"the star of loop {loop_name} has another light, and the batch's designs stay as they are"
         raise BatchRefusalError(msg)
-    writes = math.ceil(MIRROR_HISTORY_S / min(camera.period_s, PERIOD_S))
+    write_s = camera.period_s / fsm.dac.writes_per_frame
+    writes = math.ceil(MIRROR_HISTORY_S / min(write_s, PERIOD_S))
     if writes > MOST_HISTORY:
         msg = f"its rates give {writes} writes to remember; the batch holds {MOST_HISTORY}"
         raise BatchRefusalError(msg)
@@ -176,8 +180,12 @@ def star_settings(
             # control laws
             "prefilter": _fields(pointing.prefilter, "periods", "decay"),
             "coarse_step_rad_per_px": pointing.coarse_step_rad_per_px,
-            "pair_states": len(pair.system) - 2,
-            "pair_system": _padded(pair.system, MOST_STATES + 2, MOST_STATES + 5),
+            "pair_states": states,
+            "pair_system": _padded(pair.system[: 2 + states], MOST_STATES + 2, MOST_STATES + 5),
+            "pair_later": _padded(pair.system[2 + states :], MOST_WRITES - 1, MOST_STATES + 5),
+            "later_writes": pair.design.writes - 1,
+            "later_every_s": camera.period_s / pair.design.writes,
+            "later_after_s": camera.frame_delay_s + camera.period_s / pair.design.writes,
             "pair_at_rest": _padded(pair.at_rest, MOST_STATES),
             "pair_left_at_rest": pair.left_at_rest,
             # mirror

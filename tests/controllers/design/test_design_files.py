@@ -52,6 +52,22 @@ def test_a_file_says_what_it_is_and_in_which_units(saved):
     assert document["parameters"]["settings"]["minimum_variance"]["offload_per_s"] > 0
 
 
+def test_a_design_for_several_writes_is_refused_where_the_rig_has_fewer(tmp_path, fit):
+    several = dataclasses.replace(fit, writes=5)
+    design = DESIGNS["minimum-variance"](several)
+    path = tmp_path / "several.json"
+    save_design(design, path)
+
+    assert load_design(path, several, DESIGNS).writes == 5
+    assert json.loads(path.read_text())["outputs"][-1] == "mirror_px of write 5"
+    assert "writes_per_frame: expected 1 to the 1 of the rig file, got 5" in refusal(path, fit)
+
+
+def test_a_design_for_one_write_serves_a_rig_that_could_have_more(saved, fit):
+    several = dataclasses.replace(fit, writes=5)
+    assert load_design(saved, several, DESIGNS).writes == 1
+
+
 def test_it_brings_its_own_parameters_to_a_rig_that_has_others(tmp_path, fit, changed):
     stormy = DESIGNS["minimum-variance"](changed(fit, gain=3.0))
     save_design(stormy, tmp_path / "stormy.json")

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_discrete_are, solve_discrete_lyapunov
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.linear_loop.disturbance import disturbance, hold
+from fitctl.controllers.design.linear_loop.disturbance import disturbance, holds
 from fitctl.controllers.design.linear_loop.sampled import sampled_loop, timing
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import Design, mirror_outputs
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class Bound(NamedTuple):
     Attributes
     ----------
     residual_px : float
-        In continuous time, under a mirror that holds each command for one period: 0.0130 on FIT.
+        In continuous time, under a mirror that holds each write of the D/A until the next: 0.0130 on FIT.
         The siderostat stands still; one that walked with the star within each hold, as no backlash
         lets it, would gain 0.3 %.
     frame_residual_px : float
@@ -54,12 +54,12 @@ def filter_covariance(transition: Floats, noise: Floats, output: Floats, varianc
     return np.asarray(before - np.outer(gain, output @ before))
 
 
-def bound(basis: Basis, writes: int = 1) -> Bound:
+def bound(basis: Basis) -> Bound:
     """The bound of a loop: linear plant, stages that follow exactly, noise and delay as they are.
 
     The best command is the negative mean, over the time for which it acts, of what the Kalman filter
-    expects. What it leaves is the disturbance's variance less that of this prediction. With more `writes` of
-    the D/A a frame, at equal intervals, each acts for its part of the period.
+    expects. What it leaves is the disturbance's variance less that of this prediction. Of several writes of the
+    D/A in a frame, each acts for its part of the period.
     """
     moving = disturbance(basis)
     output = moving.seen
@@ -67,13 +67,11 @@ def bound(basis: Basis, writes: int = 1) -> Bound:
     after = filter_covariance(transition, noise, output, basis.noise_px**2)
     everything = moving.covariance
     open_loop = output @ everything @ output
-    part_s = basis.period_s / writes
     predicted = 0.0
-    for write in range(writes):
-        acts = hold(moving, part_s, basis.delay_s + write * part_s)
+    for acts in holds(moving, basis.writes, basis.period_s, basis.delay_s):
         expected = acts.weight @ acts.star
         predicted += float(expected @ (everything - after) @ expected)
-    residual = open_loop - predicted / writes
+    residual = open_loop - predicted / basis.writes
     frames = timing(basis.period_s, basis.delay_s).frames
     to_frame, new = moving.over(frames * basis.period_s)
     frame_residual = output @ (to_frame @ after @ to_frame.T + new) @ output
@@ -100,13 +98,19 @@ def linear_residual(design: Design, basis: Basis) -> float:
     covariance = solve_discrete_lyapunov(
         closed, block_diag(noise, np.outer(loop.b, loop.b) * variance)
     )
-    acts = hold(moving, basis.period_s, basis.delay_s)
-    # Mirror, and siderostat on its straight way, at each node.
-    share = np.column_stack([np.full_like(acts.part, basis.mirror_gain), acts.part])
-    stages = np.hstack([np.zeros((2, own)), loop.command]) + np.outer(loop.command_error, measured)
-    left = share @ stages
-    left[:, :own] += acts.star
-    left[:, own:] += loop.motor_held
-    from_noise = (share @ loop.command_error) ** 2 * variance
-    at_nodes = np.einsum("ni,ij,nj->n", left, covariance, left) + from_noise + acts.new_px2
-    return math.sqrt(acts.weight @ at_nodes)
+    outputs = np.hstack([np.zeros((len(loop.command), own)), loop.command])
+    stages = outputs + np.outer(loop.command_error, measured)
+    writes = design.writes
+    left_px2 = 0.0
+    for write, acts in enumerate(holds(moving, writes, basis.period_s, basis.delay_s)):
+        both = [mirror_outputs(writes)[write], 1]
+        # Mirror, and siderostat on its straight way, at each node.
+        part = (write + acts.part) / writes
+        share = np.column_stack([np.full_like(part, basis.mirror_gain), part])
+        left = share @ stages[both]
+        left[:, :own] += acts.star
+        left[:, own:] += loop.motor_held
+        from_noise = (share @ loop.command_error[both]) ** 2 * variance
+        at_nodes = np.einsum("ni,ij,nj->n", left, covariance, left) + from_noise + acts.new_px2
+        left_px2 += acts.weight @ at_nodes
+    return math.sqrt(left_px2 / writes)

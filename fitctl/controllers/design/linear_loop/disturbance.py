@@ -108,3 +108,9 @@ def hold(moving: Disturbance, period_s: float, delay_s: float) -> Hold:
         star=np.array([seen @ expm(a * time_s) for time_s in times_s]),
         new_px2=np.array([seen @ moving.over(time_s)[1] @ seen for time_s in times_s]),
     )
+
+
+def holds(moving: Disturbance, writes: int, period_s: float, delay_s: float) -> list[Hold]:
+    """The same time in equal parts, one for each write of the D/A."""
+    part_s = period_s / writes
+    return [hold(moving, part_s, delay_s + write * part_s) for write in range(writes)]

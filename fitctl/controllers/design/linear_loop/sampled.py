@@ -1,8 +1,9 @@
 """One axis of the loop from frame to frame, linear and exact: what a design meets.
 
-A frame exposed at k T leads to a command at k T + delay; the mirror holds it for one period T, and the
-siderostat walks there in a straight line (its 45 Hz servo is left out: it lags a walk of at most a few
-hundredths of a pixel per second). The delay may be any fraction of a period.
+A frame exposed at k T leads to a command at k T + delay; the mirror holds it for one period T, or holds each of
+several writes for its part of T, and the siderostat walks there in a straight line (its 45 Hz servo is left
+out: it lags a walk of at most a few hundredths of a pixel per second). The delay may be any fraction of a
+period.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import Design, mirror_outputs
 
 Floats = NDArray[np.float64]
 _ROUNDING = 1e-9
@@ -41,6 +42,12 @@ def timing(period_s: float, delay_s: float) -> Timing:
     return Timing(frames, frames - delay_s / period_s)
 
 
+def write_at_exposure(design: Design, walked: float) -> int:
+    """Which of a design's outputs the mirror holds at mid-exposure; the siderostat has then `walked` so far."""
+    write = max(0, math.ceil(walked * design.writes - _ROUNDING) - 1)
+    return mirror_outputs(design.writes)[write]
+
+
 class SampledLoop(NamedTuple):
     """A design on its stages, opened at the camera: x+ = a x + b error.
 
@@ -49,7 +56,7 @@ class SampledLoop(NamedTuple):
     a, b : arrays, shapes (n, n), (n,)
     star : array, shape (n,)
         The star's motion by both stages at mid-exposure is ``star @ x``.
-    command, command_error : arrays, shapes (2, n), (2,)
+    command, command_error : arrays, shapes (outputs, n), (outputs,)
         The pair's outputs are ``command @ x + command_error * error``.
     motor_held : array, shape (n,)
         Where the siderostat is when that command begins.
@@ -81,8 +88,8 @@ def sampled_loop(design: Design, basis: Basis) -> SampledLoop:
     advance[newest_motor, newest_motor] = 1.0
     advance[newest_motor + 1 : -1, newest_motor:-2] = np.eye(frames)
     advance[-1, frames - 1] = 1.0
-    drive = np.zeros((size, 2))
-    drive[0, 0] = drive[newest_motor, 1] = 1.0
+    drive = np.zeros((size, len(design.d)))
+    drive[0, write_at_exposure(design, walked)] = drive[newest_motor, 1] = 1.0
     mirror, motor = np.zeros(size), np.zeros(size)
     mirror[frames - 1] = 1.0
     motor[-2], motor[-3] = 1.0 - walked, walked

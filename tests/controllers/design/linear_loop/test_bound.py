@@ -36,7 +36,8 @@ def test_it_grows_with_delay_and_with_noise(fit):
 
 def test_more_writes_of_the_da_hardly_help_against_the_air_and_much_against_a_fast_line(fit):
     def left_px(basis):
-        return [bound(basis, writes).residual_px for writes in (1, 2, 4, 10)]
+        each = (dataclasses.replace(basis, writes=writes) for writes in (1, 2, 4, 10))
+        return [bound(one).residual_px for one in each]
 
     air, line = left_px(fit), left_px(dataclasses.replace(fit, lines=(Line(20.0, 0.005, 0.05),)))
 
