@@ -111,6 +111,10 @@ def linear_residual(design: Design, basis: Basis) -> float:
         left[:, :own] += acts.star
         left[:, own:] += loop.motor_held
         from_noise = (share @ loop.command_error[both]) ** 2 * variance
-        at_nodes = np.einsum("ni,ij,nj->n", left, covariance, left) + from_noise + acts.new_px2
+        at_nodes = (
+            np.einsum("ni,ij,nj->n", left, covariance, left)
+            + from_noise
+            + moving.new_px2(acts.star)
+        )
         left_px2 += acts.weight @ at_nodes
     return math.sqrt(left_px2 / writes)

@@ -13,7 +13,8 @@ from fitctl.controllers.design.basis import Basis, Line
 from fitctl.model.air_path import discretize, state_space
 
 Floats = NDArray[np.float64]
-_NODES = 8  # of Gauss-Legendre: exact to rounding for anything smooth over one period
+# Of Gauss-Legendre: exact to rounding for anything smooth over one period.
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(8)
 
 
 class Disturbance(NamedTuple):
@@ -33,6 +34,22 @@ class Disturbance(NamedTuple):
     def over(self, time_s: float) -> tuple[Floats, Floats]:
         """Transition matrix and the covariance of what comes new, over a time."""
         return discretize(self.a, self.noise, time_s)
+
+    def later(self, times_s: Floats) -> Floats:
+        """What of the states now is the star's own motion after these times, shape (times, n)."""
+        first = np.arange(0, len(self.a), 2)
+        pair = np.add.outer(first, np.arange(2))
+        oscillators = self.a[pair[:, :, None], pair[:, None, :]]  # nothing couples them
+        each = expm(times_s[:, None, None, None] * oscillators)
+        return np.asarray(
+            np.einsum("oi,toij->toj", self.seen[pair], each).reshape(len(times_s), -1)
+        )
+
+    def new_px2(self, later: Floats) -> Floats:
+        """Variance of what comes new until then, shape (times,); `later` is of :meth:`later`."""
+        everything = self.covariance
+        known = np.einsum("ti,ij,tj->t", later, everything, later)
+        return np.asarray(self.seen @ everything @ self.seen - known)
 
     @property
     def covariance(self) -> Floats:
@@ -85,29 +102,18 @@ class Hold(NamedTuple):
     part, weight : arrays, shape (nodes,)
         Place within the hold, from 0 to 1, and weight, of sum 1.
     star : array, shape (nodes, n)
-        The star's own motion there is this of the disturbance's state at mid-exposure,
-    new_px2 : array, shape (nodes,)
-        and besides something new of this variance.
+        The star's own motion there is this of the disturbance's state at mid-exposure, and something new.
     """
 
     part: Floats
     weight: Floats
     star: Floats
-    new_px2: Floats
 
 
 def hold(moving: Disturbance, period_s: float, delay_s: float) -> Hold:
     """The time from `delay_s` after mid-exposure to one period later."""
-    a, seen = moving.a, moving.seen
-    node, weight = np.polynomial.legendre.leggauss(_NODES)
-    part = (node + 1) / 2
-    times_s = delay_s + part * period_s
-    return Hold(
-        part=part,
-        weight=weight / 2,
-        star=np.array([seen @ expm(a * time_s) for time_s in times_s]),
-        new_px2=np.array([seen @ moving.over(time_s)[1] @ seen for time_s in times_s]),
-    )
+    part = (_NODE + 1) / 2
+    return Hold(part, _WEIGHT / 2, moving.later(delay_s + part * period_s))
 
 
 def holds(moving: Disturbance, writes: int, period_s: float, delay_s: float) -> list[Hold]:

@@ -79,14 +79,20 @@ def sampled_response(design: Design, basis: Basis) -> Response:
     With its measurements of the stages connected, as they are when it works, and opened at the star's
     error alone: its sign is that of Eq. 16.
     """
+    from scipy.linalg import schur  # a supervisor imports no scipy
+
     loop = sampled_loop(design, basis)
-    identity = np.eye(len(loop.a))
+    # Triangular, so that all frequencies are solved together, state by state: several times as quick.
+    triangle, turn = schur(loop.a, output="complex")
+    drive, star = turn.conj().T @ loop.b, loop.star @ turn
 
     def response(omega_rad_s: Floats) -> Complexes:
-        z = np.exp(1j * np.asarray(omega_rad_s) * basis.period_s)[..., None, None]
-        return np.asarray(
-            -(np.linalg.solve(z * identity - loop.a, loop.b[:, None]))[..., 0] @ loop.star
-        )
+        z = np.exp(1j * np.asarray(omega_rad_s) * basis.period_s)
+        states = np.zeros((len(drive), *z.shape), dtype=complex)
+        for n in reversed(range(len(drive))):
+            others = np.tensordot(triangle[n, n + 1 :], states[n + 1 :], axes=1)
+            states[n] = (drive[n] + others) / (z - triangle[n, n])
+        return np.asarray(-np.tensordot(star, states, axes=1))
 
     return response
 
