@@ -20,7 +20,7 @@ from random import Random
 
 import msgspec
 
-from benchmarks.swarm.drivers import BENCHES, drawn_run, run_wire
+from benchmarks.swarm.drivers import NIGHTS
 from benchmarks.swarm.past import DEFECTS, put_back
 from benchmarks.swarm.plan import Plan, plan_of
 from benchmarks.swarm.run import Result, run_plan
@@ -154,13 +154,13 @@ def replay(plan: Plan) -> int:
 def wires(seed: int, runs: int) -> dict[str, dict[str, object]]:
     """Each driver against its mock over a bad wire, so many nights of sixty calls each."""
     found: dict[str, dict[str, object]] = {}
-    for name in BENCHES:
+    for name, night in NIGHTS.items():
         ended: Counter[str] = Counter()
         mistaken = []
         for number in range(runs):
             random = Random(f"{seed} {number} {name}")  # noqa: S311 - a repeatable draw
             try:
-                ended.update(run_wire(name, *drawn_run(random)))
+                ended.update(night(random))
             except Exception as error:  # whatever it is, it is none that a driver may raise
                 mistaken.append(f"{seed} {number} {name}: {error!r}")
         found[name] = {"calls_ended_in": dict(ended.most_common()), "mistaken": mistaken[:_SHOWN]}

@@ -10,151 +10,43 @@ serial line no answer arrives after the driver has stopped waiting for late ones
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from random import Random
-from types import MappingProxyType
 from typing import Any
 
-import can
 import numpy as np
 
+from benchmarks.swarm.amplifier_benches import (
+    BalAnalogBench,
+    Cia402Bench,
+    EnsembleBench,
+    SlcanBench,
+)
+from benchmarks.swarm.bench import PAUSES_S, Bench, Course, Mistaken, Modbus, rig_of
+from benchmarks.swarm.camera_bench import drawn_camera_run, run_camera
 from benchmarks.swarm.wires import KINDS, Trouble, Wire, WireTime, virtual
-from fitctl.config import Rig, default_rig_path, load_rig
-from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
+from fitctl.config import Rig
 from fitctl.drivers.c887.driver import C887Hexapod
-from fitctl.drivers.cia402.driver import Cia402Amplifiers
-from fitctl.drivers.ensemble.driver import EnsembleAmplifiers
-from fitctl.drivers.interface import DeviceError, Pose, ServoReading
+from fitctl.drivers.interface import DeviceError, Pose
 from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.drivers.mdt693.driver import Mdt693
 from fitctl.drivers.modbus_dac.driver import ModbusDac
-from fitctl.mocks.bal_analog.station import BalAnalogMockStation
 from fitctl.mocks.c887.controller import Controller as C887Controller
 from fitctl.mocks.c887.platform import Platform
 from fitctl.mocks.c887.server import CommandSplitter
-from fitctl.mocks.cia402.drive import Cia402DriveMock
-from fitctl.mocks.cia402.slcan import OK, CanFrame, decode_frame
-from fitctl.mocks.ensemble.controller import CYCLE_S, EnsembleControllerMock, LineSplitter
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.amplifier import Amplifier
 from fitctl.mocks.mdt693.controller import Controller
 from fitctl.mocks.modbus import pdu as modbus_pdu
 from fitctl.mocks.modbus.rtu import frame as rtu_frame
 from fitctl.mocks.modbus.rtu import parse_frame
-from fitctl.mocks.modbus.tcp import ModbusTcpServer, pop_message
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
 
-RIGS = default_rig_path().parent
-_SLACK_S = 2e-3
 _MDT693_S = 0.02  # from a command to its answer
-_SPEED_RAD_S = 3.0
 _V_PER_S, _AROUND_S = 0.2, 40.0  # slope and period of photodiode voltages that encode the time
 _UNSURE_S = 0.015  # uncertainty of that time
 _NEAR_MM = 1e-4  # and degrees
-_PAUSES_S = (0.0, 0.002, 0.02, 0.3)
-
-
-class Mistaken(AssertionError):
-    """A driver returned a value that its device did not have, or a call took too long."""
-
-
-class Motors:
-    """Two ideal motors, at different angles."""
-
-    def __init__(self, time: WireTime) -> None:
-        self._time = time
-        self._angle_rad = [7.0, -11.0]
-        self._velocity_rad_s = (0.0, 0.0)
-        self._enabled = [False, False]
-        self._at_s = time.now_s
-
-    def position_rad(self) -> tuple[float, float]:
-        """Both angles."""
-        now_s = self._time.now_s
-        for axis, velocity in enumerate(self._velocity_rad_s):
-            self._angle_rad[axis] += velocity * (now_s - self._at_s) * self._enabled[axis]
-        self._at_s = now_s
-        az_rad, el_rad = self._angle_rad
-        return az_rad, el_rad
-
-    def command_velocity_rad_s(self, az: float, el: float) -> None:
-        """Turn at these velocities."""
-        self.position_rad()
-        self._velocity_rad_s = (az, el)
-
-    def set_enabled(self, axis: int, enabled: bool) -> None:
-        """Switch the current on or off."""
-        self.position_rad()
-        self._enabled[axis] = enabled
-
-
-class Course:
-    """The values that a device had, and since when."""
-
-    def __init__(self) -> None:
-        self._values: list[tuple[float, Any]] = []
-
-    def add(self, time_s: float, value: Any) -> None:
-        """Record a new value from this time on."""
-        self._values.append((time_s, value))
-
-    def between(self, begin_s: float, end_s: float) -> list[Any]:
-        """All values between two times."""
-        values = self._values
-        nexts = [time_s for time_s, _ in values[1:]] + [math.inf]
-        return [
-            value
-            for (since_s, value), until_s in zip(values, nexts, strict=True)
-            if since_s <= end_s and until_s >= begin_s
-        ]
-
-
-class Bench:
-    """A driver, a mock behind a wire, and the calls to make.
-
-    Attributes
-    ----------
-    driver : driver
-    calls : list of callable
-        Calls of the driver; each checks its own result.
-    most_s : float
-        Maximum duration of a call.
-    """
-
-    driver: Any
-    calls: list[Callable[[], None]]
-    most_s: float
-
-    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None], **options: Any) -> None:
-        self.time = time
-        self.wire = Wire(time, troubles, self.hear, self.reboot, **options)
-
-    def hear(self, data: Any) -> None:
-        """Pass data to the device."""
-        raise NotImplementedError
-
-    def reboot(self) -> None:
-        """Restart the device."""
-        raise NotImplementedError
-
-
-def _rig(name: str = "fit-mock.toml", *settings: str) -> Rig:
-    return load_rig(RIGS / name, list(settings))
-
-
-class _Modbus:
-    """Splits a TCP stream into requests and answers each."""
-
-    def __init__(self, server: ModbusTcpServer, wire: Callable[[bytes], None]) -> None:
-        self._server = server
-        self._answer = wire
-        self._pending = bytearray()
-
-    def hear(self, data: bytes) -> None:
-        self._pending += data
-        while (request := pop_message(self._pending)) is not None:
-            self._answer(self._server.respond(request))
 
 
 class DacBench(Bench):
@@ -162,8 +54,8 @@ class DacBench(Bench):
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
         super().__init__(time, troubles)
-        self._set_up(_rig())
-        self._modbus = _Modbus(self._mock._tcp, self.wire.answer)
+        self._set_up(rig_of())
+        self._modbus = Modbus(self._mock._tcp, self.wire.answer)
         self.driver = ModbusDac(self._dac)
 
     def _set_up(self, rig: Rig) -> None:
@@ -216,7 +108,7 @@ class RtuBench(DacBench):
     """The D/A over Modbus RTU."""
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        rig = _rig(
+        rig = rig_of(
             "fit-mock.toml",
             "loops.right.fsm.dac.transport=rtu",
             "loops.right.fsm.dac.serial_port=/dev/ttyUSB7",
@@ -241,7 +133,7 @@ class Mdt693Bench(Bench):
     """The piezo amplifier on RS-232."""
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        rig = _rig()
+        rig = rig_of()
         mocks: Any = rig.mock_parts()[1]
         piezo = rig.stellar_loops["right"].fsm.piezo
         super().__init__(
@@ -287,193 +179,17 @@ class Mdt693Bench(Bench):
             raise Mistaken(msg)
 
 
-class AmplifierBench(Bench):
-    """The siderostat's amplifiers."""
-
-    rig = "fit-mock.toml"
-    options: Mapping[str, Any] = MappingProxyType({})
-
-    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        rig = _rig(self.rig, *self.settings())
-        self.siderostat: Any = rig.loops["right"].siderostat
-        self.mocks: Any = rig.mock_parts()[1].loops["right"]
-        super().__init__(time, troubles, **self.options)
-        self.motors = Motors(time)
-        self._velocity = 0
-        self.most_s = 60 * self.siderostat.device.response_timeout_s + 2.0
-        self.calls = [self._exchange] * 6 + [self._enable, self._disable, self._reset]
-        self._course = Course()
-        self._watch()
-
-    def settings(self) -> Sequence[str]:
-        """``key.path=value`` texts that replace values of the rig file."""
-        return ()
-
-    def _watch(self) -> None:
-        self._course.add(self.time.now_s, self.motors.position_rad())
-        self.time.call_later(0.001, self._watch)
-
-    def _enable(self) -> None:
-        self.driver.enable()
-
-    def _disable(self) -> None:
-        self.driver.disable()
-
-    def _reset(self) -> None:
-        self.driver.reset_fault()
-
-    def _exchange(self) -> None:
-        self._velocity += 1
-        rad_s = _SPEED_RAD_S * math.sin(0.3 * self._velocity)
-        reading: ServoReading | None = self.driver.exchange((rad_s, -rad_s))
-        if reading is None:
-            return
-        if not self.time.now_s - 5.0 < reading.time_s <= self.time.now_s:
-            msg = f"a reading of {reading.time_s - self.time.now_s:.3f} s from now"
-            raise Mistaken(msg)
-        # An encoder rounds down, and the reading's time is uncertain by the response timeout.
-        count_rad = 2 * math.tau / self.siderostat.encoder_counts_per_rev
-        uncertain_s = self.siderostat.device.response_timeout_s
-        near = self._course.between(
-            reading.time_s - uncertain_s - _SLACK_S, reading.time_s + uncertain_s + _SLACK_S
-        )
-        for axis, position_rad in enumerate(reading.position_rad):
-            angles_rad = [both[axis] for both in near] + [self.motors.position_rad()[axis]]
-            if not min(angles_rad) - count_rad <= position_rad <= max(angles_rad) + count_rad:
-                had = f"{min(angles_rad):.3f} to {max(angles_rad):.3f}"
-                msg = f"axis {axis} read at {position_rad:.3f} rad, was at {had}"
-                raise Mistaken(msg)
-
-
-class BalAnalogBench(AmplifierBench):
-    """Analogue amplifiers behind Modbus/TCP I/O."""
-
-    rig = "fit-bal-analog.toml"
-
-    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        super().__init__(time, troubles)
-        settings = self.mocks.bal_analog
-        self._mock = BalAnalogMockStation(self.siderostat, settings, self.motors)
-        self._modbus = _Modbus(self._mock._server, self.wire.answer)
-        self.driver = BalAnalogAmplifiers(self.siderostat)
-
-    def hear(self, data: bytes) -> None:
-        """Pass Modbus requests to the device."""
-        self._modbus.hear(data)
-
-    def reboot(self) -> None:
-        """Restart with safe outputs."""
-        self._mock._fault_changed("reboot")
-
-
-class EnsembleBench(AmplifierBench):
-    """An Ensemble on its ASCII interface."""
-
-    rig = "ensemble.toml"
-    options = MappingProxyType({"has_numbers": False})
-
-    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        super().__init__(time, troubles)
-        settings = self.mocks.ensemble
-        self._reply_s = settings.reply_s
-        self._mock = EnsembleControllerMock(self.siderostat, settings, self.motors)
-        self._mock._stepped_s = time.now_s
-        self._mock._run_cycle()
-        self._mock._cycle.set_period(CYCLE_S)
-        self._lines = LineSplitter()
-        self.driver = EnsembleAmplifiers(self.siderostat)
-
-    def hear(self, data: bytes) -> None:
-        """Pass commands, one on each line, to the device."""
-        for line in self._lines.feed(data):
-            if line.strip():
-                answer = self._mock._answer(line.decode("ascii", "replace"))
-                self.time.call_later(self._reply_s, self.wire.answer, answer)
-
-    def reboot(self) -> None:
-        """Restart without power, as at power-up."""
-        self._mock._fault_changed("reboot")
-        self._lines.clear()
-
-
-class Cia402Bench(AmplifierBench):
-    """A CANopen drive."""
-
-    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        super().__init__(time, troubles)
-        self._mock = Cia402DriveMock(self.siderostat, self.motors, port=0, adapter=self)  # type: ignore[arg-type]
-        self._mock._control.set_period(0.002)
-        self._mock._reset_communication()
-        self.driver = Cia402Amplifiers(self.siderostat)
-
-    def settings(self) -> Sequence[str]:
-        """Use a virtual bus instead of SLCAN: the bus itself is the wire."""
-        return ("loops.right.siderostat.device.interface=virtual",)
-
-    def attach(self, received: Callable[[CanFrame], None]) -> None:
-        """Called as the adapter: register the drive's receiver."""
-        self._received = received
-
-    def send_line(self, line: bytes) -> None:
-        """Called as the adapter: the drive sends a frame."""
-        frame = decode_frame(line.rstrip(b"\r"))
-        self.wire.answer(
-            can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
-        )
-
-    def hear(self, data: Any) -> None:
-        """Pass one frame to the device."""
-        self._received(CanFrame(data.arbitration_id, bytes(data.data)))
-
-    def reboot(self) -> None:
-        """Restart without power, as at power-up."""
-        self._mock._power_off()
-        self._mock._reset_communication()
-
-
-class SlcanBench(Cia402Bench):
-    """A CANopen drive behind an SLCAN adapter: the wire is the adapter's own connection."""
-
-    def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        self._unfinished = b""
-        self._answers: bytes | None = None
-        super().__init__(time, troubles)
-
-    def settings(self) -> Sequence[str]:
-        """As the rig file has it."""
-        return ()
-
-    def send_line(self, line: bytes) -> None:
-        """A frame of the drive, with the answers of the segment that it comes in."""
-        if self._answers is None:
-            self.wire.answer(line)
-        else:
-            self._answers += line
-
-    def hear(self, data: Any) -> None:
-        """Pass frames on, and answer each line."""
-        *lines, self._unfinished = (self._unfinished + data).split(OK)
-        self._answers = b""
-        for line in lines:
-            self._answers += OK
-            if line[:1] == b"t":
-                frame = decode_frame(line)
-                self._received(frame)
-        answers, self._answers = self._answers, None
-        self.wire.answer(answers)
-
-
 class LabJackBench(Bench):
     """The converter of the photodiodes."""
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
         super().__init__(time, troubles)
-        rig = _rig("fit-testbed.toml")
+        rig = rig_of("fit-testbed.toml")
         mocks: Any = rig.mock_parts()[1]
         device = rig.metrology_loops["metrology"].sensor.device
         settings = mocks.loops["metrology"].labjack
         self._mock = LabJackT7Mock(device, settings, self._true_v)
-        self._modbus = _Modbus(self._mock._server, self.wire.answer)
+        self._modbus = Modbus(self._mock._server, self.wire.answer)
         self.driver = LabJackT7(device)
         self.calls = [self._sample] * 4 + [self._receive]
         self._asked_s: list[float] = []
@@ -521,7 +237,7 @@ class HexapodBench(Bench):
     """The collector's hexapod on RS-232."""
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        rig = _rig("fit-testbed.toml", "mocks.hexapod.referenced=true")
+        rig = rig_of("fit-testbed.toml", "mocks.hexapod.referenced=true")
         device: Any = rig.collector.hexapod  # type: ignore[union-attr]
         settings: Any = rig.mock_parts()[1].hexapod
         super().__init__(
@@ -670,4 +386,18 @@ def drawn_run(random: Random) -> tuple[list[Trouble | None], list[tuple[int, flo
         else None
         for _ in range(2000)
     ]
-    return troubles, [(random.randrange(100), random.choice(_PAUSES_S)) for _ in range(60)]
+    return troubles, [(random.randrange(100), random.choice(PAUSES_S)) for _ in range(60)]
+
+
+def _camera_night(random: Random) -> dict[str, int]:
+    return run_camera(*drawn_camera_run(random))
+
+
+def _night(name: str, random: Random) -> dict[str, int]:
+    return run_wire(name, *drawn_run(random))
+
+
+NIGHTS: dict[str, Callable[[Random], dict[str, int]]] = {
+    name: partial(_night, name) for name in BENCHES
+} | {"camera": _camera_night}
+"""By name of the driver: calls and troubles drawn at random; counts the outcomes of the calls."""

@@ -1,5 +1,7 @@
 """Each driver over a bad wire, on virtual time: no answer is taken for another's, and every call ends."""
 
+import re
+from contextlib import ExitStack
 from random import Random
 from unittest.mock import patch
 
@@ -7,9 +9,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.swarm.drivers import BENCHES, Mistaken, drawn_run, run_wire
+from benchmarks.swarm.bench import Mistaken
+from benchmarks.swarm.camera_bench import run_camera
+from benchmarks.swarm.camera_wire import KINDS as CAMERA_KINDS
+from benchmarks.swarm.camera_wire import RARE_KINDS
+from benchmarks.swarm.drivers import BENCHES, NIGHTS, run_wire
 from benchmarks.swarm.wires import KINDS, Trouble
 from fitctl.drivers.c887.link import C887Link
+from fitctl.drivers.gige import gvcp, heartbeat
+from fitctl.drivers.gige.stream import FrameAssembler
 from fitctl.drivers.labjack_t7.driver import LabJackT7
 from fitctl.drivers.modbus_dac import link as dac_link
 from fitctl.drivers.modbus_dac.driver import ModbusDac
@@ -22,7 +30,7 @@ CALLS = st.tuples(st.integers(0, 99), st.sampled_from([0.0, 0.002, 0.02, 0.3]))
 
 def random_nights(name):
     for seed in range(40):
-        run_wire(name, *drawn_run(Random(f"{seed} {name}")))
+        NIGHTS[name](Random(f"{seed} {name}"))
 
 
 @pytest.mark.parametrize("name", BENCHES)
@@ -42,8 +50,36 @@ def test_no_answer_is_taken_for_another_and_every_call_ends(name, troubles, call
     assert sum(ended.values()) == len(calls)
 
 
+CAMERA_TROUBLES = st.builds(
+    Trouble,
+    kind=st.sampled_from(CAMERA_KINDS + RARE_KINDS),
+    for_s=st.floats(3e-4, 2.0, allow_nan=False),
+)
+
+
+@settings(
+    derandomize=True,
+    max_examples=15,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+)
+@given(
+    control=st.lists(st.none() | CAMERA_TROUBLES, max_size=30),
+    stream=st.lists(st.none() | CAMERA_TROUBLES, max_size=60),
+    calls=st.lists(CALLS, min_size=1, max_size=15),
+)
+def test_no_frame_is_of_two_and_every_call_to_the_camera_ends(control, stream, calls):
+    ended = run_camera(control, stream, calls)
+
+    assert sum(ended.values()) == len(calls)
+
+
+def test_a_good_network_brings_frames_alone():
+    assert run_camera([], [], [(number, 0.02) for number in range(20)]) == {"value": 20}
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("name", BENCHES)
+@pytest.mark.parametrize("name", NIGHTS)
 def test_random_nights_on_a_bad_wire(name):
     random_nights(name)
 
@@ -86,6 +122,30 @@ def unread(self):
     self._port = Unread(self._port)
 
 
+def any_answer(packet):
+    """The next answer, whichever request it is to."""
+    answer = DECODE(packet)
+    return answer._replace(request_id=REQUEST[0])
+
+
+def request_id(self):
+    REQUEST[0] = NEXT_ID(self)
+    return REQUEST[0]
+
+
+def any_frame(self, block_id):
+    """One frame at a time: what comes is of it."""
+    return next(iter(self._open.values()), None) or BEGIN(self, block_id)
+
+
+def uncounted(self, block):
+    counted = self.packets_lost
+    MISS(self, block)
+    self.packets_lost = counted
+
+
+DECODE, REQUEST, NEXT_ID = gvcp.protocol.decode_answer, [0], gvcp.ControlChannel._next_id
+BEGIN, MISS = FrameAssembler._begin, FrameAssembler._miss
 POP, SEND, NUMBER = dac_link.pop_answer, dac_link.TcpLink.send, [0]
 MISTAKES = {
     "D/A over Modbus/TCP": [
@@ -100,14 +160,39 @@ MISTAKES = {
 }
 
 
+CAMERA_MISTAKES = {
+    "any answer": [
+        (gvcp.protocol, "decode_answer", any_answer),
+        (gvcp.ControlChannel, "_next_id", request_id),
+    ],
+    "packets of any frame": [(FrameAssembler, "_begin", any_frame)],
+    "lost packets that are not counted": [(FrameAssembler, "_miss", uncounted)],
+    "a restart that is not noticed": [(heartbeat.Heartbeat, "_lose", lambda _self, _error: None)],
+}
+
+
+def find(name, mistakes):
+    with ExitStack() as stack:
+        for mistake in mistakes:
+            stack.enter_context(patch.object(*mistake))
+        with pytest.raises(Mistaken) as found:
+            random_nights(name)
+    return str(found.value)
+
+
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_driver_that_takes_any_answer_is_found(name):
-    patches = [patch.object(*mistake) for mistake in MISTAKES[name]]
-    for each in patches:
-        each.start()
-    try:
-        with pytest.raises(Mistaken):
-            random_nights(name)
-    finally:
-        for each in patches:
-            each.stop()
+    find(name, MISTAKES[name])
+
+
+@pytest.mark.parametrize(
+    ("mistake", "shows"),
+    [
+        ("any answer", "register|identity|camera says|heartbeat set"),
+        ("packets of any frame", "is of several|is frame"),
+        ("lost packets that are not counted", "0 lost packets counted"),
+        ("a restart that is not noticed", "is not noticed"),
+    ],
+)
+def test_a_mistake_in_the_camera_driver_is_found(mistake, shows):
+    assert re.search(shows, find("camera", CAMERA_MISTAKES[mistake]))

@@ -88,6 +88,9 @@ class FrameAssembler:
         self._block = (
             0  # of the last complete frame, or the one before the first; 0 before any packet
         )
+        self._past = (
+            0  # nothing of this frame, complete or given up, or of those before it is wanted
+        )
         self._number = 0
 
     def add(self, packet: memoryview) -> CompleteFrame | None:
@@ -114,10 +117,12 @@ class FrameAssembler:
         if block_id == 0 or protocol.is_error(status):
             return None
         if self._block == 0:
-            self._block = protocol.previous_block(block_id)
+            self._block = self._past = protocol.previous_block(block_id)
         if self._is_past(block_id):
             return None
         block = self._open.get(block_id) or self._begin(block_id)
+        if block is None:
+            return None
         if kind == protocol.FORMAT_TRAILER:
             self._miss(block)
         elif packet_id < self._packets and not block.have[packet_id]:
@@ -156,15 +161,19 @@ class FrameAssembler:
         block.missing -= 1
 
     def _is_past(self, block_id: int) -> bool:
-        ahead = protocol.blocks_between(self._block, block_id)
+        ahead = protocol.blocks_between(self._past, block_id)
         return ahead == 0 or ahead > _OLD_BLOCKS
 
-    def _begin(self, block_id: int) -> _Block:
+    def _begin(self, block_id: int) -> _Block | None:
         """A packet of a new frame came: what older frames still miss is late or lost."""
         for block in self._open.values():
             self._miss(block)
         if len(self._open) >= _OPEN_FRAMES_MAX:
-            del self._open[next(iter(self._open))]
+            ids = (*self._open, block_id)
+            self._past = min(ids, key=lambda one: protocol.blocks_between(self._past, one))
+            if self._past == block_id:
+                return None
+            del self._open[self._past]
         block = _Block(block_id, self._shape, self._packets, f"<u{self._format.bytes}")
         self._open[block_id] = block
         return block
@@ -207,7 +216,7 @@ class FrameAssembler:
         self.frames += 1
         self.lost += step - 1
         self._number += step
-        self._block = block.block_id
+        self._block = self._past = block.block_id
         self._open = {i: other for i, other in self._open.items() if not self._is_past(i)}
         image = block.image.astype(np.uint16, copy=False)
         return CompleteFrame(self._number, block.leader, image)

@@ -10,6 +10,7 @@ from fitctl.config import Camera
 from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Register
+from fitctl.drivers.interface import DeviceUnreachable
 
 DRIFT = 50e-6  # how much a camera's crystal may be off
 _LATCHES_KEPT = 8
@@ -87,12 +88,25 @@ class CameraTime:
             self.runs = self._latches[-1].ticks > self._latches[0].ticks
 
     def latch(self) -> None:
-        """Read the camera's clock once, and keep the best of the last few readings."""
+        """Read the camera's clock once, and keep the best of the last few readings.
+
+        Raises
+        ------
+        DeviceUnreachable
+            If the clock went back: the camera has restarted, and would date frames from before it wrongly.
+        """
         before_s = time.monotonic()
         self._channel.write_register(Register.TIMESTAMP_CONTROL, protocol.TIMESTAMP_LATCH)
         after_s = time.monotonic()
         high = self._channel.read_register(Register.TIMESTAMP_HIGH)
         ticks = high << 32 | self._channel.read_register(Register.TIMESTAMP_LOW)
+        if self._latches and ticks < self._latches[-1].ticks:
+            raise self._channel.endpoint.error(
+                DeviceUnreachable,
+                f"a camera clock of more than {self._latches[-1].ticks} ticks",
+                str(ticks),
+                "the camera restarted, or another program has reset its clock; open it again",
+            )
         self._latches.append(Latch(ticks, before_s, after_s))
         self._best = min(self._latches, key=lambda latch: latch.error_bound_s(after_s))
 

@@ -104,6 +104,32 @@ def test_a_frame_that_stays_incomplete_is_lost_when_a_later_one_is_complete() ->
     assert (receiver.assembler.frames, receiver.assembler.lost) == (1, 1)
 
 
+def test_a_frame_that_was_given_up_costs_no_later_one_when_the_rest_of_it_comes() -> None:
+    receiver = Receiver()
+    packets = {block_id: packets_of(block_id) for block_id in range(1, 6)}
+    for block_id in packets:  # all but their last pixels; the fifth frame is one too many
+        receiver.take(*packets[block_id][:5])
+    lost = receiver.assembler.packets_lost
+
+    assert receiver.take(packets[1][5]) == []
+    frames = receiver.take(*[packets[block_id][5] for block_id in (2, 3, 4, 5)])
+
+    assert [frame.number for frame in frames] == [2, 3, 4, 5]
+    assert (receiver.assembler.lost, receiver.assembler.packets_lost) == (1, lost)
+
+
+def test_of_too_many_frames_at_once_the_oldest_is_given_up_though_it_came_last() -> None:
+    receiver = Receiver()
+    packets = {block_id: packets_of(block_id) for block_id in range(1, 7)}
+    receiver.take(*packets[1])
+    for block_id in (3, 4, 5, 6, 2):
+        receiver.take(*packets[block_id][:5])
+
+    frames = receiver.take(*[packets[block_id][5] for block_id in (2, 3, 4, 5, 6)])
+
+    assert [frame.number for frame in frames] == [3, 4, 5, 6]
+
+
 def test_the_number_counts_exposures_across_the_wrap_of_block_ids() -> None:
     receiver = Receiver()
     frames = receiver.take(*packets_of(65534), *packets_of(65535), *packets_of(2))
