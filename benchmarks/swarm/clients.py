@@ -1,6 +1,7 @@
 """The service and its clients on virtual time: admission of commands, consoles and running sequences.
 
-Known limitations: messages do not pass through a socket, so none is late or too long.
+Known limitations: commands do not pass through a socket, so none is late or too long; telemetry does so in
+:mod:`benchmarks.swarm.telemetry_wire` only.
 """
 
 from __future__ import annotations
@@ -8,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from random import Random
 
+import msgspec
+
 from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.telemetry_wire import Publisher
 from benchmarks.swarm.threads import VirtualEvent, VirtualTime
 from fitctl.config import Rig
 from fitctl.logging.records import AnyRecord, Event
@@ -19,6 +23,7 @@ from fitctl.sequences.contact import Contact
 from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import SequenceError
 from fitctl.service.admission import Admission, Sender
+from fitctl.service.service import Service as RealService
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.tui.state import ConsoleState
@@ -46,6 +51,16 @@ _ANSWERED_HERE = {"Status", "RecentEvents", "RecorderReport", "TakeOver"}
 _REPLY_S = 5.0
 
 
+class _Buffer(TelemetryBuffer):
+    """Also keeps the newest message as it was before it was encoded."""
+
+    newest: Telemetry
+
+    def telemetry(self, supervisor: Supervisor, state: ServiceState, now_s: float) -> Telemetry:
+        self.newest = super().telemetry(supervisor, state, now_s)
+        return self.newest
+
+
 class Service:
     """The service of one supervisor: it admits commands and publishes telemetry.
 
@@ -56,6 +71,8 @@ class Service:
     invariants : Invariants
     pid : int
         Process number of the supervisor.
+    publisher : Publisher
+        The PUB socket; it also sends to consoles that are far away.
     lost, offered : callable
         Return the counts of the record queue.
     """
@@ -66,10 +83,11 @@ class Service:
         time: VirtualTime,
         invariants: Invariants,
         pid: int,
+        publisher: Publisher,
         lost: Callable[[], int],
         offered: Callable[[], int],
     ) -> None:
-        self.buffer = TelemetryBuffer()
+        self.buffer = self._buffer = _Buffer()
         self.events = 0
         self.subscribers: list[Callable[[Telemetry], None]] = []
         self._supervisor = supervisor
@@ -83,6 +101,10 @@ class Service:
             records_lost=lost,
             records_offered=offered,
         )
+        publisher.supervisor = supervisor
+        self._publisher = publisher
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._snapshot_s = time.now_s()
         time.spawn(self._run, "service")
 
     def take(self, record: AnyRecord) -> None:
@@ -109,12 +131,9 @@ class Service:
         period_s = 1.0 / self._supervisor.rig.supervisor.telemetry_hz
         while True:
             self._time.sleep(period_s)
-            now_s, state = self._time.now_s(), self._state
-            state.sequence += 1
-            state.commander = self._admission.commander(now_s)
-            telemetry = self.buffer.telemetry(self._supervisor, state, now_s)
+            RealService._publish(self, self._time.now_s())  # type: ignore[arg-type]
             for take in list(self.subscribers):
-                take(telemetry)
+                take(self.buffer.newest)
 
 
 class Console:

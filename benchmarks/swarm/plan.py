@@ -67,6 +67,7 @@ OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
 _CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
+_REMOTE = 0.1  # fraction of runs with remote consoles, whose decoding takes a fifth of the run's time
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
 _FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
 _REPEATED, _REPEATED_S = 0.1, 0.02  # fraction of commands repeated, and mean delay: a key held down
@@ -170,6 +171,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         In order of time.
     console_loss : float
         Fraction of the messages that the console misses.
+    remote_consoles : int
+        Consoles that receive encoded telemetry by the real client, each over a link with little room.
     """
 
     seed: int
@@ -178,6 +181,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float
     happenings: list[Happening]
     console_loss: float = 0.0
+    remote_consoles: int = 0
 
 
 def drawn_search(random: Random) -> Acquire:
@@ -312,6 +316,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         duration_s=duration_s,
         happenings=happenings,
         console_loss=random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0,
+        remote_consoles=random.randint(1, 3) if random.random() < _REMOTE else 0,
     )
 
 

@@ -42,6 +42,13 @@ from benchmarks.swarm.plan import (
     Strike,
 )
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
+from benchmarks.swarm.telemetry_wire import (
+    Publisher,
+    RemoteConsole,
+    Subscriber,
+    drawn_subscribers,
+)
+from benchmarks.swarm.telemetry_wire import installed as client_installed
 from benchmarks.swarm.threads import VirtualExecutor, VirtualTime, installed
 from fitctl.config import Rig, load_rig
 from fitctl.config.base import ARCSEC_PER_RAD
@@ -129,6 +136,8 @@ class Instrument:
     plan : Plan
     time : VirtualTime
         Whose threads are installed.
+    subscribers : list of Subscriber
+        Sockets of the consoles that are far away.
     on_record : callable, optional
         Takes every record.
     """
@@ -138,12 +147,14 @@ class Instrument:
         rig: Rig,
         plan: Plan,
         time: VirtualTime,
+        subscribers: list[Subscriber],
         on_record: Callable[[AnyRecord], None] = lambda _: None,
     ) -> None:
         self.rig = rig
         self.time = time
         self.plant = Plant(rig, [plan.seed], history_s=_HISTORY_S)
         self.plant.advance(self.plant.step_s)
+        self.subscribers = subscribers
         self.lines: dict[str, Line] = {}
         self.resets: dict[str, Callable[[], None]] = {}
         self.modes: dict[str, int] = {}
@@ -167,6 +178,10 @@ class Instrument:
         if not any(isinstance(one, Strike | Stall) for one in plan.happenings):
             self.invariants.nothing_fails = True
         self._console = Console(self.invariants, time, self._random("console"), plan.console_loss)
+        for number, subscriber in enumerate(subscribers):
+            name = f"remote console {number}"
+            remote = RemoteConsole(self.invariants, time, self._random(name), subscriber)
+            time.spawn(remote.run, name, apart=True)
         self.camera = SwarmCamera(rig, time, self.plant, self._random("camera"))
         self._add("camera", self.camera)
         loops = {name: self._loop_devices(name) for name in rig.loops}
@@ -243,6 +258,7 @@ class Instrument:
             self.time,
             self.invariants,
             self._lives,
+            Publisher(self.subscribers),
             lambda: queue.lost,
             lambda: queue.offered,
         )
@@ -493,8 +509,14 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
     began_s = process_time()
     rig = load_rig(RIGS / plan.rig, plan.settings)
     time = VirtualTime()
-    with installed(time), patch("fitctl.logging.queue.zmq", ZMQ):
-        instrument = Instrument(rig, plan, time, on_record)
+    random = Random(f"{plan.seed} subscribers")  # noqa: S311 - a repeatable draw
+    subscribers = drawn_subscribers(time, random, plan.remote_consoles)
+    with (
+        installed(time),
+        patch("fitctl.logging.queue.zmq", ZMQ),
+        client_installed(time, subscribers),
+    ):
+        instrument = Instrument(rig, plan, time, subscribers, on_record)
         for happening in plan.happenings:
             time.call_at(happening.at_s, partial(instrument.happen, happening))
         end_s = 0.0
