@@ -91,6 +91,11 @@ class Child:
         """It was started and has not ended."""
         return self._process.poll() is None
 
+    @property
+    def started_s(self) -> float | None:
+        """When the process that runs now was started, by the monotonic clock; None if it has ended."""
+        return self._started_s if self.running else None
+
     def ask_to_end(self) -> None:
         """Tell it to end, without waiting for it."""
         self._process.terminate()

@@ -171,6 +171,7 @@ def run_supervisor(
             scheduling=scheduling,
             records_lost=lambda: queue.lost,
             records_offered=lambda: queue.offered,
+            recorder_started_s=lambda: children[0].started_s,
         )
 
         keep_bound = _keeps_bound(

@@ -226,6 +226,8 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     ``commander`` is who has the instrument, empty while nobody has.
     ``stopped_by`` is who sent the last `stop`, empty before the first one.
     ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
+    ``recorder`` is what the recorder reported last, None before its first report; ``recorder_started_s`` is
+    when the one that runs now was started, None if none runs.
     """
 
     version: int = PROTOCOL_VERSION
@@ -252,6 +254,12 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     collector: CollectorState | None = None
     stopped_by: str = ""
     fringes: FringeOptics | None = None
+    recorder_started_s: float | None = None
+
+    @property
+    def recorder_awaited(self) -> bool:
+        """A recorder runs that has not reported yet: whether it records is not known."""
+        return self.recorder is None and self.recorder_started_s is not None
 
     @property
     def unlogged(self) -> Unlogged:

@@ -15,7 +15,6 @@ from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
 FIND_STAR = "check shutter and clouds; release, stop or acquire ends the search"
 RECORDER_SILENT_S = 10.0  # it reports about once a second
-RECORDER_STARTS_S = 5.0  # records wait for it meanwhile
 
 _DID = {
     "warn": "nothing was changed",
@@ -284,25 +283,22 @@ def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
 def _of_recording(telemetry: Telemetry) -> Iterator[Trouble]:
     recorder, lost = telemetry.recorder, telemetry.records_lost
     go_on = "the loop goes on"
-    if recorder is None:
-        starts = all(
-            loop.mode == Mode.OFF.name or telemetry.time_s - loop.since_s < RECORDER_STARTS_S
-            for loop in telemetry.loops
-        )
+    heard_s = telemetry.recorder_started_s if recorder is None else recorder.time_s
+    if heard_s is None:
         yield Trouble(
             "recorder",
-            "note" if starts else "warning",
+            "warning",
             "nothing is being recorded",
             telemetry.time_s,
             f"{go_on}, the supervisor tries again",
             "see the events: disk full, or logging.folder?",
         )
-    elif (silent_s := telemetry.time_s - recorder.time_s) > RECORDER_SILENT_S:
+    elif (silent_s := telemetry.time_s - heard_s) > RECORDER_SILENT_S:
         yield Trouble(
             "recorder",
             "warning",
             f"the recorder has been silent for {silent_s:.0f} s",
-            recorder.time_s,
+            heard_s,
             f"{go_on}, records wait for it",
             "see the events, and the disk of logging.folder",
         )

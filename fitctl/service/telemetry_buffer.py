@@ -137,6 +137,7 @@ class TelemetryBuffer:
             collector=None if supervisor.collector is None else supervisor.collector.state,
             stopped_by=self.stopped_by,
             fringes=_fringe_optics(supervisor.rig),
+            recorder_started_s=state.recorder_started_s(),
         )
 
     def recent_events(self) -> list[Event]:
@@ -185,3 +186,4 @@ class ServiceState(msgspec.Struct):
     sequence: int = 0
     commander: str = ""
     replies_unsent: int = 0
+    recorder_started_s: Callable[[], float | None] = lambda: None

@@ -12,7 +12,7 @@ from fitctl.commands.operate.status import duration, status_document, status_lin
 from fitctl.commands.shared.printing import to_json, utc
 from fitctl.logging.records import Event
 from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
-from fitctl.messages.troubles import RECORDER_SILENT_S, RECORDER_STARTS_S, troubles
+from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
 from tests.fake_supervisor import STAR_LOST, FakeSupervisor
 
 TRIPPED = TrippedInterlock(
@@ -66,16 +66,22 @@ def test_what_is_not_well_is_one_line_each(trouble, expected):
     assert expected in line
 
 
-def test_a_recorder_has_a_few_seconds_to_start_before_anyone_is_warned():
-    message = told(recorder=None)
-    since_s = message.loops[0].since_s
+def test_a_recorder_that_has_not_reported_yet_is_no_trouble_until_it_has_been_silent():
+    def after(started_s):
+        now_s = told().time_s
+        return lines(told(recorder=None, recorder_started_s=now_s - started_s))
 
-    def severity(after_s):
-        (trouble,) = troubles(msgspec.structs.replace(message, time_s=since_s + after_s))
-        return trouble.severity
+    assert after(0.9 * RECORDER_SILENT_S) == []
+    (line,) = after(1.1 * RECORDER_SILENT_S)
+    assert "the recorder has been silent for 11 s" in line
 
-    assert severity(0.9 * RECORDER_STARTS_S) == "note"
-    assert severity(1.1 * RECORDER_STARTS_S) == "warning"
+
+@pytest.mark.parametrize("mode", ["OFF", "STANDBY", "VERNIER"])
+def test_without_a_recorder_that_runs_nothing_is_recorded_in_any_mode(mode):
+    found = [
+        one for one in troubles(told(FakeSupervisor(mode), recorder=None)) if one.key == "recorder"
+    ]
+    assert [one.severity for one in found] == ["warning"]
 
 
 def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():

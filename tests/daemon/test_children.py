@@ -37,6 +37,14 @@ def test_one_that_cannot_be_started_again_is_reported_and_tried_again(tmp_path, 
     child.end()
 
 
+def test_when_it_was_started_is_known_only_while_it_runs(tmp_path, noted):
+    before_s = time.monotonic()
+    child = Child("recorder", ["record"], tmp_path / "e", "a new one", lambda *it: noted.append(it))
+    assert before_s <= child.started_s <= time.monotonic()
+    child.end()
+    assert child.started_s is None
+
+
 def test_whatever_a_check_raises_becomes_an_event(noted):
     checked = Future()
     checked.set_exception(RuntimeError("boom"))

@@ -153,6 +153,7 @@ class LoggedRun:
             piezo=list({record.loop: record for record in records[PiezoReading]}.values()),
             timing=list({record.loop: record for record in records[LoopTiming]}.values()),
             recorder=next(reversed(records[RecorderStatus]), None),
+            recorder_started_s=self.span_s()[0],  # one that ran has written this
             losses=losses[-1],
             metrology_ticks=records[MetrologyTick],
             overlaps=records[Overlap],

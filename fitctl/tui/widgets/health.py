@@ -126,6 +126,8 @@ def _recorder(newest: Telemetry, columns: int) -> Line:
     if lost:
         return [text(f" ✗ {lost:,} RECORDS LOST ".replace(",", " "), PAPER, on=RED, bold=True)]
     recorder = newest.recorder
+    if newest.recorder_awaited:
+        return [text("○ the recorder is starting", DIM)]
     if recorder is None:
         return [text("○", ORANGE, bold=True), text(" not recording", ORANGE)]
     size = f"{recorder.bytes_written / 1e6:.1f} MB"
