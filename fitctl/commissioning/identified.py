@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from fitctl.commissioning.closed import SETTLED_S, supervised
@@ -22,7 +20,6 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import EXPERIMENTS, Finding
 from fitctl.identify.hysteresis import HysteresisResult
 from fitctl.identify.run import on_rig
-from fitctl.logging.copying import merge
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, experiment_s
 
 SURE = 3.0  # standard deviations by which a rig file's value must differ
@@ -77,12 +74,7 @@ def _identify(site: Site, what: str) -> Outcome:
             time.sleep(SETTLED_S)
             paths = on_rig(loop.client, site.rig, site.name, what, drives, _progress(site))
             loop.stop()
-            with tempfile.TemporaryDirectory(prefix="fitctl-commission-") as folder:
-                whole = paths[0]
-                if len(paths) > 1:
-                    whole = Path(folder) / "whole.mcap"
-                    merge(paths, whole)
-                finding = experiment.from_log(site.rig, site.name, whole)
+            finding = experiment.from_logs(site.rig, site.name, paths)
     except IdentifyError as error:
         raise StepError(str(error)) from None
     figures, differs = _COMPARED[what](site, finding)

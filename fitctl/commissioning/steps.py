@@ -23,7 +23,7 @@ from fitctl.commissioning.outcome import Outcome, Site
 from fitctl.config import Rig
 
 _NOTHING = "nothing"
-_OVER_A_LINK = {"star": "photodiodes", "gentle": "link"}
+_OVER_A_LINK = {"star": "photodiodes", "gentle": "link", "coupling": "collector"}
 """What a step needs of the loop that holds the link over which its star comes."""
 
 
@@ -37,6 +37,7 @@ class Step(NamedTuple):
     of : str
         ``rig``: done once. ``siderostat``: once for each loop. ``star``: once for each stellar loop.
         ``beam``: once for each metrology loop; ``collector``: likewise, if the rig has a collector.
+        ``feedforward``: once for each stellar loop with a feedforward, if the rig has a collector.
     moves : callable
         What it moves and by how much.
     needs : tuple of str
@@ -49,7 +50,7 @@ class Step(NamedTuple):
     """
 
     title: str
-    of: Literal["rig", "siderostat", "star", "beam", "collector"]
+    of: Literal["rig", "siderostat", "star", "beam", "collector", "feedforward"]
     moves: Callable[[Site], str]
     needs: tuple[str, ...]
     takes_s: float
@@ -186,6 +187,24 @@ STEPS: dict[str, Step] = {
             ("delay", "The time from mid-exposure to the command, as the star shows it", 60.0),
         )
     },
+    "coupling": Step(
+        "How far the link's siderostat turns the star, without the feedforward",
+        "feedforward",
+        link.coupling_moves,
+        ("airpath", "hysteresis", "backlash"),
+        85.0,
+        link.check_coupling,
+        supervised=True,
+    ),
+    "feedforward": Step(
+        "The feedforward keeps the star on its target while the collector moves",
+        "feedforward",
+        link.feedforward_moves,
+        ("coupling",),
+        125.0,
+        link.check_feedforward,
+        supervised=True,
+    ),
     "design": Step(
         "The design of the loop, and its margins on what was identified",
         "star",
@@ -225,19 +244,18 @@ class Task(NamedTuple):
     loop : str
         Empty for a step of the rig.
     step : Step
-    link : str
-        The loop that holds the link over which the loop's star comes; empty without one.
+    also : tuple of str
+        Tasks that must be done before, beside those of its own loop that its step needs.
     """
 
     name: str
     loop: str
     step: Step
-    link: str = ""
+    also: tuple[str, ...] = ()
 
     def needs(self) -> Iterator[str]:
-        """Names of the tasks that must be done before: over a link, no star comes before its beam does."""
-        if self.link:
-            yield f"{self.link}.{_OVER_A_LINK[self.name.rpartition('.')[2]]}"
+        """Names of the tasks that must be done before."""
+        yield from self.also
         for name in self.step.needs:
             of_rig = STEPS[name].of == "rig"
             yield name if of_rig or not self.loop else f"{self.loop}.{name}"
@@ -252,15 +270,20 @@ def tasks_of(rig: Rig) -> list[Task]:
         "star": list(rig.stellar_loops),
         "beam": beams,
         "collector": beams if rig.collector else [],
+        "feedforward": [
+            name for name, one in rig.stellar_loops.items() if one.feedforward and rig.collector
+        ],
     }
-    links = {loop: one.link or "" for loop, one in rig.stellar_loops.items()}
+
+    def also(name: str, loop: str) -> Iterator[str]:
+        stellar = rig.stellar_loops.get(loop)
+        if stellar and stellar.link and name in _OVER_A_LINK:  # no star comes before its beam does
+            yield f"{stellar.link}.{_OVER_A_LINK[name]}"
+        if name == "acceptance" and loop in loops["feedforward"]:
+            yield f"{loop}.feedforward"
+
     return [
-        Task(
-            f"{loop}.{name}" if loop else name,
-            loop,
-            step,
-            links[loop] if name in _OVER_A_LINK else "",
-        )
+        Task(f"{loop}.{name}" if loop else name, loop, step, tuple(also(name, loop)))
         for name, step in STEPS.items()
         for loop in loops[step.of]
     ]

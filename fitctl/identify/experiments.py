@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from fitctl.identify.frames import TimedImage, frames_of_log, frames_of_records,
 from fitctl.identify.link import ambient, beam, feedforward
 from fitctl.identify.link.step_record import TickKind, gather_step_log
 from fitctl.identify.record import gather, gather_log
+from fitctl.logging.copying import merge
 from fitctl.logging.reading import Columns
 from fitctl.logging.records import AnyRecord, MetrologyTick, Tick
 from fitctl.mocks.detector import DetectorBench
@@ -51,6 +53,15 @@ class Identification(NamedTuple):
     from_log: Callable[[Rig, str, Path], Finding]
     from_records: Callable[[Rig, str, list[AnyRecord]], Finding] | None
     step: str = ""
+
+    def from_logs(self, rig: Rig, loop_name: str, paths: list[Path]) -> Finding:
+        """From all logs that were written meanwhile: another may have begun within the experiment."""
+        if len(paths) == 1:
+            return self.from_log(rig, loop_name, paths[0])
+        with tempfile.TemporaryDirectory(prefix="fitctl-identify-") as folder:
+            whole = Path(folder) / "whole.mcap"
+            merge(paths, whole)
+            return self.from_log(rig, loop_name, whole)
 
 
 def _of_stages(

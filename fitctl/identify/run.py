@@ -98,9 +98,22 @@ def on_rig(
         raise
     change = next(loop.last_change for loop in telemetry.loops if loop.name == loop_name)
     _require_end(_mode(telemetry, loop_name), change.reason if change else "")
+    return written_logs(client, rig, paths)
+
+
+def written_logs(client: Client, rig: Rig, paths: dict[Path, None]) -> list[Path]:
+    """A running supervisor's logs, in their order, once the newest second is on disk.
+
+    `paths` has those of which it was heard before.
+
+    Raises
+    ------
+    IdentifyError
+        If it has no recorder, or if what it names as its log is none of this rig and this user.
+    """
     end_s = time.monotonic() + rig.logging.flush_s + _FLUSH_SLACK_S
-    while time.monotonic() < end_s:  # until the log's newest second is on disk
-        _hear(client, paths)
+    while time.monotonic() < end_s:
+        hear(client, paths)
     if not paths:
         msg = "the supervisor has no recorder, so there is no log to learn from; see its events"
         raise IdentifyError(msg)
@@ -130,8 +143,8 @@ def _require_own_log(path: Path, rig_name: str) -> None:
         raise IdentifyError(msg)
 
 
-def _hear(client: Client, paths: dict[Path, None]) -> Telemetry | None:
-    """The next message; which log is written just now goes to `paths`."""
+def hear(client: Client, paths: dict[Path, None]) -> Telemetry | None:
+    """The next message of a supervisor; which log it writes just now goes to `paths`."""
     telemetry = client.receive(0.5)
     if telemetry is not None and telemetry.recorder is not None:
         paths[Path(telemetry.recorder.path)] = None
@@ -149,7 +162,7 @@ def _followed(
     """Wait until the loop is out of the experiment that the supervisor accepted; the message that says so."""
     start_s = heard_s = time.monotonic()
     while True:
-        telemetry = _hear(client, paths)
+        telemetry = hear(client, paths)
         now_s = time.monotonic()
         if telemetry is None:
             if now_s - heard_s > _SILENCE_S:

@@ -46,7 +46,8 @@ def whitener(rig: Rig, loop_name: str, mid_exposure_s: Floats) -> Callable[[Floa
     see = np.array([1.0, 0.0, 1.0])
     # A lost frame makes a longer step; times within one period are the clocks' noise.
     missed = np.maximum(1, np.rint(np.diff(mid_exposure_s) / period_s)).astype(int)
-    steps = {n: air_path.discretize(a, intensity, n * period_s) for n in set(missed.tolist())}
+    one = air_path.discretize(a, intensity, period_s)
+    steps = {n: _repeated(*one, n) for n in set(missed.tolist())}
     gains, deviations, transitions = [], [], []
     for n in [*missed.tolist(), 1]:
         variance = see @ covariance @ see + noise_px**2
@@ -67,3 +68,11 @@ def whitener(rig: Rig, loop_name: str, mid_exposure_s: Floats) -> Callable[[Floa
         return innovations / np.array(deviations)[:, None]
 
     return whiten
+
+
+def _repeated(transition: Floats, noise: Floats, times: int) -> tuple[Floats, Floats]:
+    """Some steps as one: discretized as a whole, a gap of seconds has lost all digits of its noise."""
+    through, added = transition, noise
+    for _ in range(times - 1):
+        through, added = transition @ through, transition @ added @ transition.T + noise
+    return through, added

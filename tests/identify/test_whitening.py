@@ -30,6 +30,15 @@ def test_lost_frames_make_it_no_less_white(rig):
     assert abs(correlation(white[:, 0], 1)) < 0.06
 
 
+@pytest.mark.parametrize("gap_s", [2.0, 10.0, 60.0])
+def test_a_gap_of_any_length_makes_it_no_less_white(rig, gap_s):
+    record = record_of(rig, "right", [], seed=3, extra_s=70.0)
+    times_s = record.tick["mid_exposure_s"]
+    kept = (times_s < times_s[0] + 5.0) | (times_s > times_s[0] + 5.0 + gap_s)
+    white = whitener(rig, "right", times_s[kept])(record.star_px[kept])[1:]
+    assert np.std(white) == pytest.approx(1.0, rel=0.1)
+
+
 def test_where_the_star_stands_does_not_matter(rig):
     times_s = np.arange(200) * rig.camera.period_s
     noise_px = centroid_noise_px(rig.camera, rig.loops["right"].star_flux_dn, 7)

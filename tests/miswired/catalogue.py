@@ -38,6 +38,12 @@ class Entry(NamedTuple):
         Whose motions are watched.
     exchanged : tuple of str
         Two keys of the rig file that have each other's address.
+    rewritten : tuple of str
+        A line of the rig file, and the wrong one in its place.
+    skipped : tuple of str
+        Steps that other entries prove.
+    most_s : float
+        How long the whole entry may take.
     """
 
     name: str
@@ -52,6 +58,9 @@ class Entry(NamedTuple):
     only: tuple[str, ...] = ()
     loop: str = "right"
     exchanged: tuple[str, ...] = ()
+    rewritten: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
+    most_s: float = 300.0
 
 
 def wired(axes=(0, 1), velocity=(1, 1), encoder=(1, 1)):
@@ -420,6 +429,35 @@ def _of_right(other):
     )
 
 
+FEEDFORWARD = "loops.left.feedforward"
+OF_FEEDFORWARD = (*OF_BEAM, "metrology.collector", "left.coupling", "left.feedforward")
+OF_OTHERS = (
+    "camera",
+    "stacks",
+    "left.amplifiers",
+    "star",
+    "siderostat",
+    "mirror",
+    "travel",
+    "link",
+)
+OF_OTHERS += ("gentle", "loop", "airpath", "hysteresis", "backlash", "delay")
+
+
+def _feedforward(name, matrix):
+    return _testbed(
+        name,
+        only=OF_FEEDFORWARD,
+        skipped=OF_OTHERS,
+        rewritten=("matrix = [[1.0, 0.0], [0.0, 1.0]]", f"matrix = {matrix}"),
+        found={f"{FEEDFORWARD}.gain": 1.0, f"{FEEDFORWARD}.matrix": [[1.0, 0.0], [0.0, 1.0]]},
+        loop="left",
+        most_rad=7.0,
+        most_v=4.0,
+        most_s=900.0,
+    )
+
+
 TESTBED_ENTRIES = [
     _testbed("nothing", only=OF_ALL, most_v=2.6),
     _of_right("left"),
@@ -443,6 +481,9 @@ TESTBED_ENTRIES = [
         only=(*OF_BEAM, "metrology.collector"),
         found={AZIMUTH: [0.0, 0.0, 1.0]},
     ),
+    _feedforward("feedforward 20 % too large", [[1.2, 0.0], [0.0, 1.2]]),
+    _feedforward("feedforward of the wrong sign", [[-1.0, 0.0], [0.0, -1.0]]),
+    _feedforward("feedforward with its axes exchanged", [[0.0, 1.0], [1.0, 0.0]]),
 ]
 CATALOGUE = [
     entry._replace(name=f"{entry.name} ({entry.group})" if entry.name == "nothing" else entry.name)

@@ -67,10 +67,12 @@ def steps_table():
     """A row for each step, as it is on the default rig; of a metrology loop, on the testbed."""
     one, whole = load_rig(default_rig_path()), load_rig(default_rig_path().with_name(TESTBED))
     loops = {"rig": "", "siderostat": "right", "star": "right"}
+    linked = {"feedforward": "left"}
     rows = []
     for name, step in STEPS.items():
         rig = one if step.of in loops else whole
-        site = Site(rig, loops.get(step.of, "metrology"), print, default_rig_path(), ())
+        name_of = (loops | linked).get(step.of, "metrology")
+        site = Site(rig, name_of, print, default_rig_path(), ())
         needs = ", ".join(f"`{one}`" for one in step.needs)
         rows.append([f"`{name}`", step.title, step.moves(site), needs, f"{step.takes_s:g} s"])
     return table(STEPS_HEADER, rows)

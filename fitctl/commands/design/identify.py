@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,12 +23,10 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import (
     EXPERIMENTS,
     Finding,
-    Identification,
     response_on_mock_bench,
 )
 from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
-from fitctl.logging.copying import merge
 from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -185,24 +182,14 @@ def _finding(
         with demos.instrument(rig_path, overrides, source.seed) as running:
             _hold_a_star(running, loop_name)
             paths = on_rig(running.client, rig, loop_name, what, drives, progress)
-            return _from_logs(experiment, rig, loop_name, paths)
+            return experiment.from_logs(rig, loop_name, paths)
     client = client_of(rig)
     try:
         require_vernier(client, loop_name)
         paths = on_rig(client, rig, loop_name, what, drives, progress)
     finally:
         client.close()
-    return _from_logs(experiment, rig, loop_name, paths)
-
-
-def _from_logs(experiment: Identification, rig: Rig, loop_name: str, paths: list[Path]) -> Finding:
-    """From all logs that were written meanwhile: another may have begun within the experiment."""
-    if len(paths) == 1:
-        return experiment.from_log(rig, loop_name, paths[0])
-    with tempfile.TemporaryDirectory(prefix="fitctl-identify-") as folder:
-        whole = Path(folder) / "whole.mcap"
-        merge(paths, whole)
-        return experiment.from_log(rig, loop_name, whole)
+    return experiment.from_logs(rig, loop_name, paths)
 
 
 def _by_axis(progress: Progress) -> Callable[[str], None]:

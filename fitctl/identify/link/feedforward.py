@@ -31,6 +31,7 @@ _LEAST_SWING_ARCSEC = 10.0  # of the link's beam, along each axis
 _LEAST_FRAMES = 500
 _SMOOTH_S = 0.3  # the hold's own motion is faster
 _MOVES = 0.3  # of the largest rate: slower, and the plays may not be taken up
+_FAR = 0.3  # of an axis' whole swing: an axis that rests may take up its play as fast, but not go as far
 _MOST_EXCESS = 3.0
 # How well the mirror's way is known, which makes up for what the rig file's matrix is wrong by (choice): by its
 # hysteresis, whose state before the scan is unknown, or by its commands alone.
@@ -232,13 +233,17 @@ def _direction(times_s: Floats, link_px: Floats) -> Floats:
         padded = np.pad(link_px[:, axis], half, mode="edge")
         rate = np.gradient(np.convolve(padded, kernel, mode="valid"), times_s)
         fast = _MOVES * np.quantile(np.abs(rate), 0.95)
-        swings = _swings(times_s, np.abs(rate) > fast)
+        swings = _swings(times_s, np.abs(rate) > fast, link_px[:, axis])
         moved = np.where(np.abs(rate) > fast, np.sign(rate), np.nan)
         directions.append(np.where(swings, moved, 0.0))
     return np.stack(directions, axis=-1)
 
 
-def _swings(times_s: Floats, fast: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """From the first to the last frame on which an axis moves fast."""
-    first_s, last_s = times_s[fast][[0, -1]] if fast.any() else (np.inf, -np.inf)
-    return (times_s >= first_s) & (times_s <= last_s)
+def _swings(times_s: Floats, fast: NDArray[np.bool_], place_px: Floats) -> NDArray[np.bool_]:
+    """From the first to the last frame on which an axis moves fast and far."""
+    changes = np.flatnonzero(np.diff(fast, prepend=False, append=False))
+    begins, ends = changes[::2], changes[1::2] - 1
+    far = np.abs(place_px[ends] - place_px[begins]) >= _FAR * np.ptp(place_px)
+    if not far.any():
+        return np.zeros(len(times_s), dtype=bool)
+    return (times_s >= times_s[begins[far][0]]) & (times_s <= times_s[ends[far][-1]])

@@ -16,7 +16,7 @@ from fitctl.messages.modes import Mode
 from fitctl.model.optics import sky_px_per_rad
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import Behaviour, Result
-from fitctl.sequences.view import StepFailed, View
+from fitctl.sequences.view import StepFailed, View, columns
 
 _DIRECTIONS_DEG = (0.0, 90.0)  # azimuth and elevation of the link
 _LEAST_SAMPLES = 100
@@ -88,6 +88,7 @@ def _collector_scan_done(step: steps.CollectorScan, view: View) -> Result | None
     if link.mode != Mode.LOCKED.name:
         msg = f"loop {link.name} is in {link.mode}; the link must hold during the scan"
         raise StepFailed(msg)
+    view.squares.add(columns(view.measurements)[:, 3:5])
     view.measurements.clear()  # the log has them
     collector = view.telemetry.collector
     if collector is None or collector.error:
@@ -108,9 +109,11 @@ def _collector_scan_done(step: steps.CollectorScan, view: View) -> Result | None
         if axis + 1 < len(_DIRECTIONS_DEG):
             _start_axis(step, view, axis + 1)
             return None
+        az_px, el_px = view.squares.rms_px.tolist()
         return Result(
-            {"scanned_s": view.now_s - view.marks[0]},
-            f"scanned along both axes{_log_hint(view, 'feedforward')}",
+            {"scanned_s": view.now_s - view.marks[0], "rms_az_px": az_px, "rms_el_px": el_px},
+            f"scanned along both axes, the star within az {az_px:.3f}, el {el_px:.3f} px RMS"
+            f"{_log_hint(view, 'feedforward')}",
         )
     if not collector.motion:
         msg = "the collector no longer moves: somebody stopped it"

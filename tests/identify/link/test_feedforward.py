@@ -51,7 +51,7 @@ def air_px(random, times):
     return np.array(moved)
 
 
-def scan(seed, swing_arcsec=60.0, rig=RIG):
+def scan(seed, swing_arcsec=60.0, rig=RIG, jumps_arcsec=0.0):
     """Ticks of a scan: the link's siderostat swings, the own one follows by the rig file's matrix."""
     random, scale = np.random.default_rng(seed), scales(RIG, LOOP)
     period_s = RIG.camera.period_s
@@ -61,7 +61,8 @@ def scan(seed, swing_arcsec=60.0, rig=RIG):
     first, sine = (since_s < SCAN_S)[:, None], np.sin(phase)[:, None]
     swings = np.where([True, False], first * sine, ~first * sine)
     jitter = 0.1 * random.standard_normal(swings.shape)
-    link_px = (swing_arcsec * swings + jitter) / scale.sky_arcsec_per_px
+    jumps = jumps_arcsec * (since_s % SCAN_S > SCAN_S / 2)[:, None] * (swings == 0)
+    link_px = (swing_arcsec * swings + jitter + jumps) / scale.sky_arcsec_per_px
     own_px = -link_px @ np.array(rig.loops["left"].feedforward.matrix).T
     turned_px = behind(link_px, 1.0, scale) @ TRUTH.T + behind(own_px, 1.0, scale)
     moved_px = turned_px + air_px(random, len(times_s))
@@ -120,6 +121,14 @@ def test_the_fragment_has_the_matrix_and_the_whole_gain():
     assert section["gain"] == 1.0
     assert np.array(section["matrix"]) == pytest.approx(TRUTH, abs=0.01)
     assert "rig file's gain times matrix" in found.lines()[2]
+
+
+def test_an_axis_that_takes_up_its_play_while_it_rests_does_not_count_as_swinging():
+    quiet = feedforward.analyse(KNOWN, "left", scan(1, swing_arcsec=8.0, rig=KNOWN))
+    taken_up = scan(1, swing_arcsec=8.0, rig=KNOWN, jumps_arcsec=1.0)
+    found = feedforward.analyse(KNOWN, "left", taken_up)
+    assert found.frames > 0.9 * quiet.frames
+    assert np.all(np.abs(found.matrix - TRUTH) < 4 * found.matrix_sd)
 
 
 def test_it_is_plotted(tmp_path):
