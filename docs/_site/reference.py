@@ -260,6 +260,8 @@ It has the methods of the steps above, too: `await instrument.hold(30.0)`.
 
 ::: fitctl.logging.reading
 
+::: fitctl.logging.listing
+
 ## Rig files
 
 ::: fitctl.config.load_rig

@@ -8,6 +8,7 @@ from log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
+from fitctl.logging.listing import newest_run
 
 RIG = load_rig(default_rig_path()).name
 DAY_S = 86400.0
@@ -150,3 +151,9 @@ def test_check_refuses_two_rig_files(fitctl, logs):
 
     assert status == 2
     assert "expected one rig file" in problem
+
+
+def test_python_finds_the_newest_run_of_a_rig_by_its_records_not_by_the_names_of_files(logs):
+    assert newest_run(logs, RIG) == [logs / "b.mcap"]
+    assert newest_run(logs, "another") == [logs / "a.mcap"]
+    assert newest_run(logs, "none") == []

@@ -20,14 +20,13 @@ from fitctl.commands.shared.logs import (
     chosen_log,
     chosen_logs,
     logging_rig,
-    logs_in,
-    rig_name,
 )
 from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
 from fitctl.logging.errors import LogError
+from fitctl.logging.listing import logs_in, rig_name
 from fitctl.logging.reading import LogInfo, log_info
 
 app = typer.Typer(help="Inspect, repair and convert logs.", no_args_is_help=True)

@@ -1,4 +1,4 @@
-"""The logs of a rig: all of them, and the newest run, for ``--latest``."""
+"""Which logs a command reads: those it is given, or with ``--latest`` the newest run of the rig."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import typer
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address_or_shipped
 from fitctl.config import ConfigError, Rig
-from fitctl.logging.errors import LogError
-from fitctl.logging.reading import LogInfo, log_info
+from fitctl.logging.listing import newest_run
 
 LatestOption = Annotated[
     bool, typer.Option("--latest", help="Use the newest log of the rig, in place of LOG.")
@@ -23,22 +22,6 @@ def logging_rig(command: str, rig: Path | None, overrides: list[str] | None = No
     """The rig whose logs a command reads: ``--rig``, ``FITCTL_RIG``, the running rig, or the shipped one."""
     found = address_or_shipped(command, rig, overrides)
     return rig_of(found.file, found.settings)
-
-
-def logs_in(folder: Path) -> tuple[list[LogInfo], list[str]]:
-    """The logs in a folder that can be read, oldest first, and what is wrong with each other one."""
-    logs, problems = [], []
-    for path in sorted(folder.glob("*.mcap")):
-        try:
-            logs.append(log_info(path))
-        except LogError as error:
-            problems.append(str(error))
-    return sorted(logs, key=lambda log: log.start_s if log.counts else 0.0), problems
-
-
-def rig_name(log: LogInfo) -> str:
-    """The name of the rig that a log is of; empty for a log that fitctl did not record."""
-    return log.metadata.get("rig", {}).get("name", "")
 
 
 def chosen_logs(
@@ -61,15 +44,14 @@ def chosen_logs(
         raise ConfigError(msg)
     settings = logging_rig(command, rig)
     folder = Path(settings.logging.folder)
-    of_rig = [log for log in logs_in(folder)[0] if log.counts and rig_name(log) == settings.name]
-    if not of_rig:
+    newest = newest_run(folder, settings.name)
+    if not newest:
         msg = (
             f"{command}: --latest: {folder} has no log of rig {settings.name}; name a LOG, or another rig "
             "with --rig"
         )
         raise ConfigError(msg)
-    clock = of_rig[-1].metadata.get("clock")
-    return [log.path for log in of_rig if log.metadata.get("clock") == clock]
+    return newest
 
 
 def chosen_log(command: str, log: Path | None, rig: Path | None, *, latest: bool) -> Path:

@@ -1,0 +1,48 @@
+"""The logs in a folder, by their start, and the newest run of a rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fitctl.logging.errors import LogError
+from fitctl.logging.reading import LogInfo, log_info
+
+
+def logs_in(folder: Path) -> tuple[list[LogInfo], list[str]]:
+    """The logs in a folder that can be read, oldest first, and for each other one what is wrong."""
+    logs, problems = [], []
+    for path in sorted(folder.glob("*.mcap")):
+        try:
+            logs.append(log_info(path))
+        except LogError as error:
+            problems.append(str(error))
+    return sorted(logs, key=lambda log: log.start_s if log.counts else 0.0), problems
+
+
+def rig_name(log: LogInfo) -> str:
+    """The name of the rig that a log is of; empty for a log that fitctl did not record."""
+    return log.metadata.get("rig", {}).get("name", "")
+
+
+def newest_run(folder: Path, rig: str) -> list[Path]:
+    """All files of the newest run of a rig, oldest first, as ``--latest`` chooses them.
+
+    Names are not compared: a log counts by its first record, whatever its file is called.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of logs, `logging.folder` of the rig file.
+    rig : str
+        Name of the rig.
+
+    Returns
+    -------
+    list of Path
+        Empty if the folder has no log of this rig.
+    """
+    of_rig = [log for log in logs_in(folder)[0] if log.counts and rig_name(log) == rig]
+    if not of_rig:
+        return []
+    clock = of_rig[-1].metadata.get("clock")
+    return [log.path for log in of_rig if log.metadata.get("clock") == clock]
