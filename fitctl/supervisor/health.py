@@ -25,12 +25,15 @@ def camera_health(
     now_s: float,
 ) -> DeviceHealth:
     """The camera, which all loops share."""
+    detail = f"{counts.frames} frames, {counts.lost} lost"
+    # Most rows of a console have no room for counts that say that nothing happened.
+    for count, what in ((counts.packets_lost, "packets missed"), (skipped, "skipped")):
+        detail += f", {count} {what}" if count else ""
     return _health(
         CAMERA,
         rig.camera.device.endpoint,
         is_open,
-        f"{counts.frames} frames, {counts.lost} lost, {counts.packets_lost} packets missed, "
-        f"{skipped} skipped",
+        detail,
         identities,
         now_s,
     )

@@ -158,7 +158,7 @@ class ConsoleApp(App[None]):
             draw=self.draw_all,
         )
         self._beat = 0
-        self._pace = Pace()
+        self.pace = Pace()
         self._wire = Wire(
             link,
             clock,
@@ -220,7 +220,7 @@ class ConsoleApp(App[None]):
         return bottom[0] if bottom and isinstance(bottom[0], View) else None
 
     def _draw_due(self) -> None:
-        if self._pace.due():
+        if self.pace.due():
             self._beat += 1
             self._draw(self._beat)
 

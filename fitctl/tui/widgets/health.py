@@ -46,11 +46,15 @@ class Devices(Panel):
                 if device.state != "ok" or not device.device.startswith(others)
             ]
         if len(devices) <= rows:
-            names = max((len(device.device) for device in devices), default=0)
+            names = {  # a long name of a device at fault leaves the well ones room for what they report
+                ill: max((len(d.device) for d in devices if (d.state != "ok") is ill), default=0)
+                for ill in (False, True)
+            }
             spare, faults = rows - len(devices), sum(d.state == "fault" for d in devices)
             lines: list[Line] = []
             for number, device in enumerate(devices):
-                own = _device(device, names, columns, 1 + spare // max(1, faults - number))
+                name_columns = names[device.state != "ok"]
+                own = _device(device, name_columns, columns, 1 + spare // max(1, faults - number))
                 spare -= len(own) - 1
                 lines += own
             return lines
