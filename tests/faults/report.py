@@ -93,7 +93,7 @@ def run_line(results):
     )
     return (
         f"*{len(known)} of {len(entries)} entries have a result, {first} at the first try; "
-        "another is made only where the machine itself stood still. "
+        "an entry is tried again only if the machine itself stood still. "
         f"The results, from a virtual machine: {runs}.*"
     )
 
