@@ -117,6 +117,20 @@ def test_a_log_and_latest_are_too_many(fitctl, logs):
     assert "leave out --latest, or logs/z.mcap" in problem
 
 
+def test_identify_and_the_console_read_the_newest_log_too(fitctl, logs, monkeypatch):
+    shown = []
+    monkeypatch.setenv("TEXTUAL_DRIVER", "a browser's")
+    monkeypatch.setattr(
+        "fitctl.commands.operate.console._show_log", lambda log, *_, web: shown.append(log)
+    )
+
+    status, _, _ = fitctl("console", "--latest")
+    _, _, problem = fitctl("identify", "airpath", "--latest")
+
+    assert (status, [path.name for path in shown]) == (0, ["b.mcap"])
+    assert "the stages never stood still" in problem  # the sample was read, and has no frames
+
+
 def test_latest_of_a_rig_without_logs_names_folder_and_rig(fitctl, logs):
     for path in logs.glob("[bz].mcap"):
         path.unlink()

@@ -139,7 +139,7 @@ class Left(NamedTuple):
             for name, px in self.expected.items()
         ]
         if self.why_not:
-            lines.append(f"loop {self.loop}: no RMS can be expected: {self.why_not}")
+            lines.append(f"loop {self.loop}: no expected RMS: {self.why_not}")
         return lines
 
 

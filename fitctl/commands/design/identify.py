@@ -13,10 +13,11 @@ import typer
 
 from fitctl import demo as demos
 from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.logs import LatestOption, chosen_log
 from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SeedOption, SetOption
 from fitctl.commands.shared.printing import progress_line, say, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
-from fitctl.commands.shared.supervisor import address, client_of, show_rig
+from fitctl.commands.shared.supervisor import address, address_or_shipped, client_of, show_rig
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.files import write_whole
 from fitctl.identify.errors import IdentifyError
@@ -63,6 +64,7 @@ def identify(
         Path | None,
         typer.Option(metavar="LOG", help="Use this log (or bench file) of an earlier run."),
     ] = None,
+    latest: LatestOption = False,
     simulated: Annotated[
         bool, typer.Option("--simulate", help="Make the experiment on the virtual clock.")
     ] = False,
@@ -82,18 +84,22 @@ def identify(
 ) -> None:
     """Measure the parameters of a rig, and write a fragment that its rig file includes.
 
-    Without --log, --simulate or --mocks, the running supervisor makes the experiment: the loop must hold a star
-    in VERNIER. The stages then move open loop; STOP ends the experiment at once. The parameters of a link come
-    from the log of a sequence: name it with --log.
+    Without --log, --latest, --simulate or --mocks, the running supervisor makes the experiment: the loop must
+    hold a star in VERNIER. The stages then move open loop; STOP ends the experiment at once. The parameters of
+    a link come from the log of a sequence: name it with --log or --latest.
     """
     if what not in EXPERIMENTS:
         msg = f"identify: unknown experiment {what!r}. Available: {', '.join(EXPERIMENTS)}"
         raise ConfigError(msg)
+    if latest:
+        found = address_or_shipped("identify", rig, overrides)
+        rig, overrides = found.file, found.settings
+        log = chosen_log("identify", log, rig, latest=True)
     step = EXPERIMENTS[what].step
     if step and log is None:
         msg = (
             f"identify: {what} is evaluated from the log of a sequence with the step {step}; run one with "
-            f"fitctl sequence run, and name its log with --log"
+            f"fitctl sequence run, and name its log with --log, or with --latest"
         )
         raise ConfigError(msg)
     if (log is not None) + simulated + mock > 1:

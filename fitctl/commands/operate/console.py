@@ -12,6 +12,7 @@ import typer
 
 from fitctl.commands.operate.logged_loops import loops_at_start
 from fitctl.commands.operate.web import serve_console
+from fitctl.commands.shared.logs import LatestOption, chosen_log
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address, client_of, connect
@@ -46,8 +47,9 @@ def console(
     ] = "auto",
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Show a log instead of a running instrument."),
+        typer.Option("--log", metavar="LOG", help="Show a log instead of a running instrument."),
     ] = None,
+    latest: LatestOption = False,
     web: Annotated[
         bool, typer.Option("--web", help="Open the console in a browser on this machine.")
     ] = False,
@@ -58,13 +60,13 @@ def console(
     """Open the operator console on a running supervisor.
 
     With --remote, also name the rig file with --rig if you need sequences and the margins on the screen Loop.
-    With --log, the console shows a log: it needs no supervisor and sends no commands.
+    With --log or --latest, the console shows a log: it needs no supervisor and sends no commands.
     """
     # A browser's page runs this command too, with a driver of textual-serve in place of a terminal.
     if not (web or "TEXTUAL_DRIVER" in os.environ or has_terminal()):
         raise ConfigError(_NO_TERMINAL)
-    if log is not None:
-        _show_log(log, remote, graphics, web=web)
+    if latest or log is not None:
+        _show_log(chosen_log("console", log, rig, latest=latest), remote, graphics, web=web)
         return
     arguments: list[str] | None = None  # what the shipped file says is not true of a rig elsewhere
     if remote is None:

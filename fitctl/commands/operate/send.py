@@ -78,7 +78,7 @@ def send(
 
 
 def _wait_s(wanted: AnyCommand, wait: bool | None, timeout_s: float | None) -> float | None:
-    """How long to wait for the outcome; None for a command without one, or where nobody waits."""
+    """How long to wait for the outcome; None for a command without an outcome, or without waiting."""
     usual_s = ROWS[type(wanted)].wait_s
     if wait is None:
         wait = timeout_s is not None or has_terminal()

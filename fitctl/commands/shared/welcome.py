@@ -8,7 +8,7 @@ _LARGEST_BYTES = 1_000_000
 
 
 def welcome(folder: Path) -> str:
-    """A few lines for whoever has just typed `fitctl` in a folder."""
+    """The lines that `fitctl` prints without a command."""
     rigs = rig_files(folder)
     steps = [("fitctl demo", "see the whole instrument on mock devices acquire and hold a star")]
     if rigs:
