@@ -53,25 +53,25 @@ class Instrument(StepMethods[Figures]):
 
     Each step of a sequence is a method with the step's keys as arguments, such as :meth:`acquire` and
     :meth:`hold`. It returns the figures of the step: a dict of numbers with units in their names (``_px`` on
-    the camera, ``_sky_arcsec`` on the sky, ``_s``), NaN where a value is unknown. Where a step was for several
-    loops, each name begins with the loop's and ``_``.
+    the camera, ``_sky_arcsec`` on the sky, ``_s``), NaN where a value is unknown. For a step on several
+    loops, each name begins with the loop's name and ``_``.
 
     Leaving the ``with`` block leaves the instrument as it is: a star that is held stays held.
 
     Parameters
     ----------
     rig : Rig or path, optional
-        By default the rig file that the environment variable FITCTL_RIG names, else the rig of your one
-        supervisor that runs on this machine. With `simulate`, `folder` or `remote`, the shipped fit-mock rig
-        in place of the latter.
+        By default the rig file that the environment variable FITCTL_RIG names, or else the rig of your only
+        running supervisor on this machine. With `simulate`, `folder` or `remote`, the second default is the
+        shipped fit-mock rig.
     simulate : bool
-        On the virtual clock, in this process; otherwise the rig's running supervisor works.
+        Simulate the rig on the virtual clock in this process, without a supervisor.
     folder : path, optional
-        The supervisor's socket folder, where it is not the one that the rig file says.
+        The supervisor's socket folder, if it differs from the one in the rig file.
     remote : path, optional
         A key file, for a rig on another machine.
     seed : int
-        Of a simulation.
+        Seed of the simulation.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class Instrument(StepMethods[Figures]):
         self.close()
 
     def close(self) -> None:
-        """Disconnect; the instrument goes on."""
+        """Disconnect; the instrument continues."""
         self._link.close()
 
     def run(self, step: steps.Step) -> Figures:
@@ -180,7 +180,7 @@ class Instrument(StepMethods[Figures]):
         return Runner(contact, motion_goes_on=name == NAME)
 
     def _run(self, runner: Runner, todo: Sequence[steps.Step]) -> list[Figures]:
-        """Run steps; the figures of each, NaN where a value could not be had."""
+        """Run steps; return the figures of each, NaN where a value is missing."""
         self._runner = runner
         # The last attempt at a step is the one that was done; a step may be for several loops.
         last = {(each.step_number, each.loop): each for each in run_steps(runner, todo)}
@@ -331,7 +331,7 @@ class Instrument(StepMethods[Figures]):
         Raises
         ------
         SequenceError
-            If it is refused, as with a key that may only watch.
+            If the supervisor refuses it, for example with a viewer's key.
         """
         reply = self.send(Stop())
         if not reply.accepted:
