@@ -67,7 +67,9 @@ OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
 _CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
-_REMOTE = 0.1  # fraction of runs with remote consoles, whose decoding takes a fifth of the run's time
+_REMOTE = (
+    0.1  # fraction of runs with remote consoles, whose decoding takes a fifth of the run's time
+)
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
 _FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
 _REPEATED, _REPEATED_S = 0.1, 0.02  # fraction of commands repeated, and mean delay: a key held down
