@@ -178,9 +178,7 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         raise ValueError(msg)
     writes = int(parameters.get("writes_per_frame", 1))
     if not 1 <= writes <= rig_basis.writes:
-        msg = (
-            f"writes_per_frame: expected 1 to the {rig_basis.writes} of the rig file, got {writes}"
-        )
+        msg = f"writes_per_frame {writes}, but the rig file's fsm.dac allows {rig_basis.writes}"
         raise ValueError(msg)
     sections = {
         name: type(getattr(settings, name)).model_validate(values)

@@ -94,8 +94,9 @@ def design_of(
         hint = "use a file that this fitctl saved"
         raise _refusal(path, "parameters", f"those of {name}", got, hint) from None
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        hint = "use a file that this fitctl saved"
-        raise _refusal(path, "parameters", f"those of {name}", repr(error), hint) from None
+        hint = "use a file that this fitctl saved for this rig"
+        got = str(error) if isinstance(error, ValueError) else repr(error)
+        raise _refusal(path, "parameters", f"those of {name}", got, hint) from None
     _check_outputs(document, path, again.writes)
     for key in MATRICES:
         if not _follows(document.get(key), getattr(again, key)):

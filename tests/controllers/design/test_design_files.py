@@ -60,7 +60,7 @@ def test_a_design_for_several_writes_is_refused_where_the_rig_has_fewer(tmp_path
 
     assert load_design(path, several, DESIGNS).writes == 5
     assert json.loads(path.read_text())["outputs"][-1] == "mirror_px of write 5"
-    assert "writes_per_frame: expected 1 to the 1 of the rig file, got 5" in refusal(path, fit)
+    assert "got writes_per_frame 5, but the rig file's fsm.dac allows 1" in refusal(path, fit)
 
 
 def test_a_design_for_one_write_serves_a_rig_that_could_have_more(saved, fit):
