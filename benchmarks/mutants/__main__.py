@@ -59,7 +59,7 @@ TESTS = (  # not those of the batch, which compare it with the live loop for min
         f"tests/simulation/test_simulated_{what}.py"
         for what in ("devices", "instrument", "testbed")
     ),
-    "tests/commands/test_cli_log.py",
+    "tests/commands/analyse/test_cli_log.py",
     "tests/test_error_budget.py",
 )
 # In seconds, and a ratio to the time without the mutant: what takes longer than both together hangs.

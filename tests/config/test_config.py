@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_document
 
-RIGS = sorted((Path(__file__).parent.parent / "rigs").glob("*.toml"))
+RIGS = sorted((Path(__file__).parents[2] / "rigs").glob("*.toml"))
 DOCUMENT = tomllib.loads(default_rig_path().read_text(encoding="utf-8"))
 OPTIONAL = {"plant", "mocks"}  # a rig of real hardware leaves them out
 LEFT_OUT_AT_WILL = {

@@ -14,7 +14,7 @@ from benchmarks.loop.others import floor
 from fitctl.config import default_rig_path, load_rig
 from fitctl.simulation.simulation import Simulation
 
-SOURCE = Path(__file__).parent.parent / "benchmarks" / "loop" / "floor.c"
+SOURCE = Path(__file__).parents[2] / "benchmarks" / "loop" / "floor.c"
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
