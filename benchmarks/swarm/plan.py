@@ -72,7 +72,11 @@ _REMOTE = (
 )
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
 _FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
-_REPEATED, _REPEATED_S = 0.1, 0.02  # fraction of commands repeated, and mean delay: a key held down
+_REPEATED, _REPEATED_S = (
+    (0.0, 0.1, 0.6),
+    0.02,
+)  # fraction of commands repeated, and mean delay: a key held down
+_PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
@@ -194,17 +198,22 @@ def drawn_search(random: Random) -> Acquire:
     return Acquire(expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec)
 
 
+def drawn_target(random: Random) -> SetTarget:
+    """A target anywhere but at the edge of the frame."""
+    return SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30))
+
+
 _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "onwards": lambda _: None,
     "stop": lambda _: Stop(),
     "off": lambda _: Off(),
     "recover": lambda _: Recover(),
     "standby": lambda _: Standby(),
-    "acquire": lambda _: Acquire(),
+    "acquire": drawn_search,
     "release": lambda _: Release(),
     "status": lambda _: Status(),
     "take-over": lambda _: TakeOver(),
-    "target": lambda random: SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30)),
+    "target": drawn_target,
     "jog": lambda random: Jog(
         az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
     ),
@@ -286,6 +295,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     while at_s < duration_s:  # the first operator keeps trying to hold the star
         happenings.append(Order(at_s=at_s, who=OPERATORS[0]))
         at_s += random.expovariate(1 / attend_s)
+    repeated = random.choice(_REPEATED)
+    few = random.random() < _FEW_PLACES  # so that two loops are sent to one
+    places = [drawn_target(random) for _ in range(_PLACES * few)]
     at_s = 0.2
     while True:
         burst = random.random() < _BURST
@@ -295,12 +307,10 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         if strikes and random.random() < fault_part:
             happenings.append(random.choice(strikes)(random, at_s))
         else:
-            command = _COMMANDS[random.choice(words)](random)
-            if command is not None and random.random() < _OF_ONE_LOOP:
-                command = msgspec.structs.replace(command, loop=random.choice(loops))
+            command = _drawn_command(random, random.choice(words), places, loops)
             who, again_s = random.choice(people), at_s
             happenings.append(Order(at_s=at_s, who=who, command=command))
-            while command is not None and random.random() < _REPEATED:
+            while command is not None and random.random() < repeated:
                 again_s += random.expovariate(1 / _REPEATED_S)
                 happenings.append(Order(at_s=again_s, who=who, command=command))
     happenings.sort(key=lambda happening: happening.at_s)
@@ -320,6 +330,17 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         console_loss=random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0,
         remote_consoles=random.randint(1, 3) if random.random() < _REMOTE else 0,
     )
+
+
+def _drawn_command(
+    random: Random, word: str, places: list[SetTarget], loops: tuple[str, ...]
+) -> AnyCommand | None:
+    command = _COMMANDS[word](random)
+    if places and isinstance(command, SetTarget):
+        command = random.choice(places)
+    if command is not None and random.random() < _OF_ONE_LOOP:
+        command = msgspec.structs.replace(command, loop=random.choice(loops))
+    return command
 
 
 def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> Happening:
@@ -344,7 +365,7 @@ def _kill(random: Random, at_s: float) -> Happening:
 
 
 def _cloud(random: Random, at_s: float) -> Happening:
-    return Cloud(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.2), part=random.random() ** 2)
+    return Cloud(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.8), part=random.random() ** 2)
 
 
 def _recorder_death(random: Random, at_s: float) -> Happening:
