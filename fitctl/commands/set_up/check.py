@@ -45,8 +45,13 @@ def check(
     settings = rig_from_parts(parts, str(path))
     check_plant(settings)
     if show:
-        for line in _lines(settings, parts.marks):
-            say(line)
+        origins = list(_origins(settings, parts.marks))
+        if as_json:
+            shown = {key: {"value": value, "origin": origin} for key, value, origin in origins}
+            say(to_json({"file": str(path), "rig": settings.name, "values": shown}))
+            return
+        for key, value, origin in origins:
+            say(f"{key} = {_toml(value)}".ljust(_COLUMN) + f" # {origin}")
         return
     if as_json:
         mixed = list(mixture(settings))
@@ -67,12 +72,11 @@ def check(
         say(line)
 
 
-def _lines(rig: Rig, marks: Marks) -> Iterator[str]:
-    """A line for each value: a rig file that says the same as all layers together."""
+def _origins(rig: Rig, marks: Marks) -> Iterator[tuple[str, Any, str]]:
+    """Each key, its value and its origin; as lines, a rig file that says the same as all layers together."""
     for path, value in _values(rig.model_dump(mode="json", exclude_none=True), ()):
         mark = marks_at(marks, path)
-        origin = str(mark.layer) if isinstance(mark, Mark) else _DEFAULT
-        yield f"{'.'.join(path)} = {_toml(value)}".ljust(_COLUMN) + f" # {origin}"
+        yield ".".join(path), value, str(mark.layer) if isinstance(mark, Mark) else _DEFAULT
 
 
 def _values(table: dict[str, Any], place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:

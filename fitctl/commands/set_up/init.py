@@ -143,14 +143,19 @@ def _show_serial_ports() -> None:
 
 
 def _ask(base: str, device: str) -> Chosen:
+    """A kind, then what is asked of it; or all of it at once, as the option takes it."""
     title, hardware = DEVICES[base][device]
-    kinds = [*hardware, MOCK]
-    kind = ""
-    while kind not in kinds:
-        kind = typer.prompt(f"{title} ({', '.join(kinds)})", default=MOCK)
-    if kind == MOCK:
-        return Chosen()
-    return Chosen(kind, tuple(map(_answer, hardware[kind].asked)))
+    kinds = ", ".join([*hardware, MOCK])
+    while True:
+        answer = typer.prompt(f"{title} ({kinds})", default=MOCK).strip()
+        if answer == MOCK:
+            return Chosen()
+        if answer in hardware:
+            return Chosen(answer, tuple(map(_answer, hardware[answer].asked)))
+        try:
+            return chosen(base, device, answer)
+        except ConfigError:
+            say(f"  Expected {kinds}, or {' or '.join(forms(base, device))}; got {answer!r}.")
 
 
 def _answer(asked: Asked) -> str:
@@ -159,7 +164,9 @@ def _answer(asked: Asked) -> str:
         return str(typer.prompt(f"  {asked.question}", default=asked.example))
     answer = ""
     while answer not in asked.choices:
-        answer = typer.prompt(f"  {asked.question}")
+        if answer:
+            say(f"  Expected one of {', '.join(asked.choices)}; got {answer!r}.")
+        answer = typer.prompt(f"  {asked.question}").strip()
     return answer
 
 

@@ -1,5 +1,6 @@
 """`fitctl check`: what it says of a sound rig, and where each value of it comes from."""
 
+import json
 import tomllib
 
 import pytest
@@ -71,6 +72,13 @@ def test_every_value_of_the_file_is_shown(check):
 
     in_file = {".".join(path) for path in keys(tomllib.loads(default_rig_path().read_text()))}
     assert in_file <= origins(check("--show")).keys()
+
+
+def test_a_program_gets_each_value_with_its_origin(check):
+    shown = json.loads("\n".join(check("--show", "--json", "--set", "camera.frame_delay_s=0.036")))
+    assert shown["rig"] == "fit-mock"
+    assert shown["values"]["camera.frame_delay_s"] == {"value": 0.036, "origin": "--set"}
+    assert shown["values"]["camera.exposure_s"]["origin"].endswith("fit-mock.toml")
 
 
 # ---------------------------------------------------------------- mocks and hardware in one rig

@@ -304,7 +304,7 @@ def test_nothing_is_overwritten(fitctl, tmp_path):
 
 
 def test_questions_are_asked_on_a_terminal_and_asked_again_when_the_answer_is_none(tmp_path):
-    answers = ["night", "webcam", "gige", "10.0.0.9", "ensemble", "", "tcp", "10.0.0.8"]
+    answers = ["night", "webcam", "gige", "10.0.0.9", "ensemble:10.0.0.5", "tcp", "10.0.0.8"]
     answers += [
         "mdt693",
         "",
@@ -332,11 +332,14 @@ def test_questions_are_asked_on_a_terminal_and_asked_again_when_the_answer_is_no
     rig = load_rig(tmp_path / "my-rig.toml")
     assert rig.name == "night"
     assert rig.camera.device.address == "10.0.0.9"
-    assert rig.loops["right"].siderostat.device.port == "/dev/ttyUSB0"  # as it was offered
+    assert rig.loops["right"].siderostat.device.port == "socket://10.0.0.5:8000"
     assert rig.loops["right"].fsm.dac.host == "10.0.0.8"
     assert rig.loops["right"].fsm.piezo.limit_v == 75.5
     assert "simulated: nothing" in done.stdout
     assert done.stdout.count("Camera") == 2
+    assert "Expected gige, aravis, mock, or gige:192.168.1.20" in done.stdout
+    assert "got 'webcam'" in done.stdout
+    assert "Expected one of 75, 100, 150; got '120'." in done.stdout
 
 
 def test_at_its_end_the_devices_are_asked_and_one_that_is_not_there_shows_in_the_exit_status(
