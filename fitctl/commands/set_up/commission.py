@@ -34,6 +34,7 @@ _MARKS: dict[State, str] = {
     "failed": "FAILED",
     "skipped": "skipped",
 }
+_CHANGE = "{:<56} {:>12} {:>12} {:>9}"  # a figure of two commissionings
 
 
 def commission(
@@ -287,7 +288,7 @@ def _conclude(
     said = flat(read_parts(course.rig_path, course.overrides).document)
     files.write_page(page(record, titles, earlier, said))
     if as_json:
-        document = {
+        document: dict[str, Any] = {
             "rig": record.rig,
             "verdict": verdict(record, titles),
             "tasks": record.tasks,
@@ -298,12 +299,17 @@ def _conclude(
                 "page": str(files.page),
             },
         }
+        if earlier is not None:
+            document["compared"] = [
+                {"figure": one.figure, "now": one.now, "earlier": one.then}
+                for one in changes(record, earlier)
+            ]
         say(to_json(document))
         return
     if earlier is not None:
+        say(_CHANGE.format("figure", "now", "earlier", "change"))
         for change in changes(record, earlier):
-            now, then, relative = change_texts(change)
-            say(f"{change.figure:<56} {now:>12} {then:>12} {relative:>9}")
+            say(_CHANGE.format(change.figure, *change_texts(change)).rstrip())
     say(f"{record.rig}: {verdict(record, titles)}")
     say(f"record: {files.record}")
     say(f"page: {files.page}")

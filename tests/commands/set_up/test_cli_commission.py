@@ -139,3 +139,7 @@ def test_two_commissionings_are_compared(commission, two_steps, tmp_path):
     assert status == 0
     assert "+100.0%" in text
     assert "+100.0%" in (tmp_path / "fit-mock.commissioning.html").read_text()
+    assert ["figure", "now", "earlier", "change"] in [line.split() for line in text.splitlines()]
+    _, text = commission("--yes", "--json", "--until", "one", "--compare", str(earlier))
+    (one, *_) = json.loads(text)["compared"]
+    assert one["now"] == 2 * one["earlier"]
