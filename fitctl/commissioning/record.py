@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -133,13 +134,9 @@ class Files:
         def placed(name: str) -> str:
             return name if nearby else str((self._source.parent / name).resolve())
 
-        inherited: list[str] = []
+        names = _include_list(self._source, document)
         if "base" in document:
-            base = str(document["base"])
-            under = tomlkit.parse((self._source.parent / base).read_text(encoding="utf-8"))
-            inherited = list(map(str, under.get("include", [])))
-            document["base"] = placed(base)
-        names = list(map(str, document.get("include", inherited)))
+            document["base"] = placed(str(document["base"]))
         include = [*map(placed, names), self.found.name]
         text = tomlkit.dumps(document)
         if "include" in document:
@@ -148,6 +145,14 @@ class Files:
         else:  # a key of the document itself stands before its first table
             text = f"include = {tomlkit.item(include).as_string()}\n{text}"
         _write(self.rig, text.encode())
+
+
+def _include_list(path: Path, document: Mapping[str, Any]) -> list[str]:
+    """The include list of a rig file, or that of the nearest rig file under it."""
+    while "include" not in document and "base" in document:
+        path = path.parent / str(document["base"])
+        document = tomlkit.parse(path.read_text(encoding="utf-8"))
+    return list(map(str, document.get("include", [])))
 
 
 def load(path: Path, rig_name: str) -> Commissioning:

@@ -23,6 +23,7 @@ from fitctl.text import plain
 
 _EXAMPLE = "camera.frame_rate_hz=50.0"
 _SET = "--set"
+_MOST_BASES = 5
 
 
 class LaidOver(NamedTuple):
@@ -35,8 +36,8 @@ class LaidOver(NamedTuple):
 def load_rig(path: Path, overrides: Sequence[str] = ()) -> Rig:
     """Read and validate a rig file.
 
-    It is laid over the rig file that its ``base`` names, if it names one; then the fragments of its
-    ``include`` list are laid over it, in order.
+    It is laid over the rig file that its ``base`` names, if it names one, which may have a base itself; then
+    the fragments of its ``include`` list are laid over it, in order.
 
     Parameters
     ----------
@@ -77,18 +78,11 @@ def lay_parts(path: Path, document: dict[str, Any], overrides: Sequence[str] = (
         As :func:`read_parts`.
     """
     _place_files(document, path)
-    base = document.pop("base", None)
-    layers: list[tuple[str, str, dict[str, Any]]] = []
-    if base is not None:
-        if not isinstance(base, str):
-            msg = f"{path}: base: must be a file name (is {base!r})"
-            raise ConfigError(msg)
-        under_path = path.parent / base
-        under = _read_part(under_path, f"no such rig file; it is the base of {path}")
-        layers.append((str(under_path), "base", under))
+    layers = _bases_of(path, document)
     layers.append((str(path), "", document))
-    in_base = layers[0][2].pop("include", [])
-    fragments = document.pop("include", in_base)
+    fragments: Any = []
+    for _, _, part in layers:  # the list of the uppermost file that has one
+        fragments = part.pop("include", fragments)
     if not isinstance(fragments, list) or not all(isinstance(name, str) for name in fragments):
         msg = f"{path}: include: must be a list of file names (is {fragments!r})"
         raise ConfigError(msg)
@@ -102,6 +96,26 @@ def lay_parts(path: Path, document: dict[str, Any], overrides: Sequence[str] = (
     for depth, override in enumerate(overrides, start=len(layers)):
         _override(laid, override, depth)
     return laid
+
+
+def _bases_of(path: Path, document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    """The rig files under one, the lowest first: a base may have a base itself."""
+    found: list[tuple[str, str, dict[str, Any]]] = []
+    while (base := document.pop("base", None)) is not None:
+        if not isinstance(base, str):
+            msg = f"{path}: base: must be a file name (is {base!r})"
+            raise ConfigError(msg)
+        if len(found) == _MOST_BASES:
+            msg = (
+                f"{path}: base: {base} would be more than {_MOST_BASES} files under a rig file; see whether a "
+                "file is its own base"
+            )
+            raise ConfigError(msg)
+        missing = f"no such rig file; it is the base of {path}"
+        path = path.parent / base
+        document = _read_part(path, missing)
+        found.insert(0, (str(path), "base", document))
+    return found
 
 
 def _read_part(path: Path, missing: str) -> dict[str, Any]:

@@ -172,6 +172,21 @@ def test_a_rig_file_with_base_and_includes_keeps_them(tmp_path, table):
     assert kept.loops["right"].siderostat.spur_gear_ratio == 26.0
 
 
+def test_a_rig_file_over_two_bases_keeps_the_include_list_of_the_lower_one(tmp_path, table):
+    whole = default_rig_path().read_text()
+    (tmp_path / "lowest.toml").write_text(f'include = ["part.toml"]\n{whole}')
+    (tmp_path / "under.toml").write_text('base = "lowest.toml"\nname = "under"\n')
+    (tmp_path / "part.toml").write_text("camera = { bias_dn = 990.0 }\n")
+    rig = tmp_path / "rig.toml"
+    rig.write_text('base = "under.toml"\nname = "fit-mock"\n')
+    course = again(rig)
+    table(gear=step(corrects_the_gear))
+    do(course, task(course, "gear"))
+    kept = load_rig(course.files.rig)
+    assert kept.camera.bias_dn == 990.0
+    assert kept.loops["right"].siderostat.spur_gear_ratio == 26.0
+
+
 def test_another_rigs_record_is_refused(course, table):
     table(one=step(lambda _site: Outcome()))
     do(course, task(course, "one"))

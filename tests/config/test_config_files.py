@@ -145,6 +145,34 @@ def test_a_base_that_is_not_there_is_named(tmp_path):
         load_rig(based(tmp_path, "", "gone.toml"))
 
 
+def test_a_base_may_have_a_base_itself(tmp_path):
+    under = based(tmp_path, "[camera]\nframe_rate_hz = 40.0\nwidth_px = 48\n")
+    upper = tmp_path / "upper.toml"
+    upper.write_text(f'base = "{under.name}"\nname = "upper"\n[camera]\nwidth_px = 50\n')
+    rig = load_rig(upper)
+    assert (rig.name, rig.camera.frame_rate_hz, rig.camera.width_px) == ("upper", 40.0, 50)
+
+
+def test_the_include_list_is_that_of_the_uppermost_file_that_has_one(tmp_path):
+    (tmp_path / "bias.toml").write_text("[camera]\nbias_dn = 990.0\n")
+    under = based(tmp_path, "")
+    under.write_text('include = ["bias.toml"]\n' + under.read_text())
+    upper = tmp_path / "upper.toml"
+    upper.write_text(f'base = "{under.name}"\nname = "upper"\n')
+    assert load_rig(upper).camera.bias_dn == 990.0
+    upper.write_text("include = []\n" + upper.read_text())
+    assert load_rig(upper).camera.bias_dn == 1000.0
+
+
+def test_a_file_that_is_its_own_base_is_named(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "mine.toml"\n')
+    with pytest.raises(
+        ConfigError, match=r"mine\.toml: base: .* see whether a file is its own base"
+    ):
+        load_rig(path)
+
+
 def test_a_base_must_be_a_name(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("base = 3\n")
