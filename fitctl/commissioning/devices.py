@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fitctl.commissioning.asking import examine_all
+from fitctl.commissioning.asking import NOT_STARTED, examine_all, without_mocks
 from fitctl.commissioning.outcome import Outcome, Site
 
 _REFERENCED_LATER = {"c887"}
@@ -11,9 +11,10 @@ _REFERENCED_LATER = {"c887"}
 
 def check_devices(site: Site) -> Outcome:
     """Ask every device who it is; nothing is set, nothing moves."""
-    findings = examine_all(site.rig)
+    findings = without_mocks(site.rig, examine_all(site.rig))
+    absent = [finding.device for finding in findings if finding.note == NOT_STARTED]
     lines: list[str] = []
-    troubles: list[str] = []
+    troubles = [f"{', '.join(absent)}: {NOT_STARTED}, then the step again"] if absent else []
     figures: dict[str, float] = {}
     for finding in findings:
         who = finding.identity

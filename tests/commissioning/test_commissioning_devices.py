@@ -22,3 +22,16 @@ def test_only_a_hexapod_that_answers_may_still_be_unreferenced(
     outcome = devices.check_devices(site_of())
     assert outcome.state == state
     assert "device: is not referenced" in [*outcome.lines, outcome.trouble]
+
+
+def test_mocks_that_are_not_started_are_one_trouble_that_names_the_command(monkeypatch):
+    findings = [
+        Finding(name, "gige", False, None, None, ["connection refused"])
+        for name in ("camera", "right D/A")
+    ]
+    monkeypatch.setattr(devices, "examine_all", lambda _rig: findings)
+    outcome = devices.check_devices(site_of())
+    assert outcome.trouble == (
+        "camera, right D/A: simulated, and the mocks are not started: run `fitctl mocks` with this rig, "
+        "then the step again"
+    )

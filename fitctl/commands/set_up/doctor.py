@@ -20,9 +20,9 @@ from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
-from fitctl.commissioning.asking import Finding, examine_all, parts_of
+from fitctl.commissioning.asking import Finding, examine_all, parts_of, without_mocks
 from fitctl.config import Rig
-from fitctl.config.simulated import mixture, places
+from fitctl.config.simulated import mixture
 from fitctl.drivers.interface import DeviceIdentity
 from fitctl.messages.endpoints import COMMAND_SOCKET, service_folder
 from fitctl.messages.telemetry import Telemetry
@@ -30,7 +30,6 @@ from fitctl.text import plain
 
 _WIDEST = 118
 _FIRST_REPORT_S = 3.0
-_NOT_STARTED = "simulated, and the mocks are not started: run `fitctl mocks` with this rig"
 
 
 def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
@@ -62,19 +61,6 @@ def ask_devices(rig: Rig, *, as_json: bool) -> int:
                 " not query the devices, because that would disturb it. To query them, shut it down first."
             )
     return FAILED if any(finding.disagreements for finding in findings) else 0
-
-
-def without_mocks(rig: Rig, findings: list[Finding]) -> list[Finding]:
-    """What was found, where no mock answers: then `fitctl mocks` does not run, and no mock has failed."""
-    simulated = {name for name, place in places(rig).items() if place.simulated}
-    if any(finding.found for finding in findings if finding.device in simulated):
-        return findings
-    return [
-        finding._replace(disagreements=[], note=_NOT_STARTED)
-        if finding.device in simulated
-        else finding
-        for finding in findings
-    ]
 
 
 def reported(rig: Rig, running: Telemetry) -> list[Finding]:
