@@ -54,7 +54,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """A clock that stands still until it is told to go on: simulation and tests."""
+    """A clock that stands still until it is advanced: for simulation and tests."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s

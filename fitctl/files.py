@@ -1,4 +1,4 @@
-"""Files on disk: reading those that anybody may have put there, and replacing one whole."""
+"""Files on disk: reading files of unknown origin, and replacing a file in one step."""
 
 from __future__ import annotations
 

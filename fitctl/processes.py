@@ -24,7 +24,7 @@ _LONGEST_NAME = 107  # sun_path, without the NUL before it
 
 
 def rig_arguments(path: Path, overrides: Sequence[str]) -> list[str]:
-    """Options by which another fitctl process is told the same rig."""
+    """Options that give another fitctl process the same rig."""
     return ["--rig", str(path), *(part for text in overrides for part in ("--set", text))]
 
 

@@ -193,7 +193,7 @@ def _common_scale(site: Site, scale: float) -> dict[str, Any]:
 
 
 def _fit(seen: Floats, expected: Floats) -> Floats:
-    """The matrix that takes expected motions, rows, to those that were seen."""
+    """The matrix that maps expected motions (rows) to measured ones."""
     return np.asarray(np.linalg.lstsq(expected, seen, rcond=None)[0].T, dtype=float)
 
 

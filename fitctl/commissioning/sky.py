@@ -76,7 +76,7 @@ class Watch:
         return found
 
     def brightest(self, frames: int = 5, still: Sequence[Star] = ()) -> Star | None:
-        """The brightest spot of the next frames that is none of those that stand still."""
+        """The brightest spot on the next frames, apart from the spots that stand still."""
         found = [
             star
             for spots in self._spots(frames)

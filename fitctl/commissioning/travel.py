@@ -1,4 +1,4 @@
-"""The travel of a siderostat: each motor to both ends, slowly where nobody has been yet, and back."""
+"""The travel of a siderostat: each motor to both ends, slowly over the untried part, and back."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def require_order(low: float, high: float) -> None:
 
 
 def _kind_of(settings: Any) -> str:
-    """A loop's kind: as its table says, and stellar without a word."""
+    """A loop's kind: the `kind` of its table, or stellar without this key."""
     if isinstance(settings, dict):
         return str(settings.get("kind", STELLAR))
     return getattr(settings, "kind", STELLAR)

@@ -71,7 +71,7 @@ QUANTITIES: dict[str, Quantity] = {
     "siderostat_asked_fraction": Quantity(
         "the wanted set-point's way from the encoders' zero, before it is limited, over the travel",
         "siderostat",
-        "the siderostat waits at its limit; hold, then re-point, or look for a wrong star",
+        "the siderostat waits at its limit; release, then re-point, or look for a wrong star",
     ),
     "siderostat_travel_fraction": Quantity(
         "the motors' way from the encoders' zero, over the travel",
@@ -116,7 +116,7 @@ QUANTITIES: dict[str, Quantity] = {
     "dac_unwritten_s": Quantity(
         "time since the D/A took its last voltages; its own watchdog acts on this",
         "D/A",
-        "see what held the loop up",
+        "find out what delays the computer",
     ),
     "dac_round_trip_s": Quantity(
         "time of the last write to the D/A",

@@ -206,7 +206,7 @@ class Loop(Settings):
                     below("flux_range.high", high, spot.flux_dn / star_dn),
                 )
                 found.append(
-                    Conflict(f"{spot.name} would be taken for the star, by its light", parts)
+                    Conflict(f"by its light, the loop could accept {spot.name} as its star", parts)
                 )
         if found:
             raise Conflicts(found)

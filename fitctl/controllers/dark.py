@@ -127,7 +127,7 @@ def dark_bytes(path: Path) -> bytes:
 def _good_about(
     bad: NDArray[np.bool_], row: int, column: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the good pixels next to one: those that share an edge, else a corner."""
+    """Rows and columns of a pixel's good neighbours: the pixels at its edges, or else at its corners."""
     beside: list[tuple[int, int]] = []
     corners: list[tuple[int, int]] = []
     for down in (-1, 0, 1):

@@ -100,7 +100,7 @@ class Design:
 
     @property
     def uses_noise(self) -> bool:
-        """Another noise of the sensor makes another design: of the shipped ones, those that predict."""
+        """Whether another noise of the sensor makes another design: of the shipped ones, if it predicts."""
         by_itself = not (self.learnt or self.own or self.file)
         return by_itself and self.name in {"minimum-variance", "fslq"}
 

@@ -24,7 +24,7 @@ Volts = tuple[float, float, float, float]
 
 
 class BeamState(IntEnum):
-    """What one sample says about the beam; the number is what logs carry."""
+    """What one sample shows of the beam; logs have the number."""
 
     LOST = 0
     EDGE = 1
@@ -72,7 +72,7 @@ class Sensor(Protocol):
 
     @property
     def saturated_v(self) -> float:
-        """From here on a reading says no more than that there is at least so much light."""
+        """From here on, a reading gives only a lower bound of the light."""
         ...
 
 

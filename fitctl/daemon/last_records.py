@@ -1,4 +1,4 @@
-"""The end of a run's log: the recorder takes what is still there, and what may be missing is said."""
+"""The end of a run's log: the recorder writes the remaining records, and missing ones are reported."""
 
 from __future__ import annotations
 

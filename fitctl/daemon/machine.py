@@ -86,7 +86,7 @@ class Machine:
                 self._measured("disk_free_bytes", float(free_bytes(self._folder)))
                 self._tell("")
             except OSError as error:
-                self._tell(f"does not tell its free space: {error.strerror}")
+                self._tell(f"does not report its free space: {error.strerror}")
             self._asked_s = None
 
     def _tell(self, trouble: str) -> None:

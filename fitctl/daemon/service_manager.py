@@ -1,4 +1,4 @@
-"""What systemd is told, if it started us: that we are ready, alive, ending. See sd_notify(3)."""
+"""Reports to systemd, if it started fitctl: ready, alive, ending. See sd_notify(3)."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class StarPlaces:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Leave nothing, if the supervisor ends as it was told to."""
+        """Remove the file, if the supervisor ends in order."""
         self._over.set()
         self._some.set()
         self._thread.join(_PATIENCE_S)

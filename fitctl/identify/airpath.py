@@ -100,7 +100,7 @@ class AirPathResult:
         if not self.test.fits:
             lines.append(
                 "Do not use this air path: Eq. 8 does not explain these frames. A vibration looks like strong "
-                "air; fitctl design learn tells them apart, in a log of the star held in VERNIER"
+                "air; fitctl design learn separates the two, in a log of the star held in VERNIER"
             )
         for spot, pair in enumerate(self.fits):
             lines += [

@@ -217,7 +217,7 @@ def _distance(events_s: Floats, times_s: Floats) -> Floats:
 
 
 class _Evidence:
-    """What the frames say about the stacks, whitened; both axes' rows below each other."""
+    """The frames' information about the stacks, whitened; both axes' rows below each other."""
 
     def __init__(
         self, rig: Rig, record: ExperimentRecord, late_s: float = 0.0, unsure_s: float = 0.0

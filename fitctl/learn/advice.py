@@ -293,7 +293,7 @@ def estimated(series: list[Series], rig_basis: Basis) -> tuple[Night, Basis]:
         longest_s = max((len(one.disturbance_px) for one in series), default=0) * rig_basis.period_s
         msg = (
             f"learn: the longest piece in VERNIER is {longest_s:.0f} s; expected at least {LEAST_S:.0f} s, "
-            "better two minutes, of a star held on its target; give a longer log"
+            "preferably two minutes, with a star held on its target; give a longer log"
         )
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
@@ -342,7 +342,7 @@ def _gain_for_design(night: Night) -> float:
         return 1.0
     if not LEAST_GAIN <= found.value <= 1 / LEAST_GAIN:
         msg = (
-            f"learn: the mirror moves by {found} of what the rig file says; expected {LEAST_GAIN:g} to "
+            f"learn: the mirror moves by {found} of what the rig file predicts; expected {LEAST_GAIN:g} to "
             f"{1 / LEAST_GAIN:g}; look at its amplifiers, then measure it with fitctl identify hysteresis"
         )
         raise ConfigError(msg)

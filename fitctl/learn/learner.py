@@ -72,7 +72,7 @@ class Learner:
         self._since_s = 0.0
 
     def watch(self, design: str, now_s: float) -> None:
-        """The design in force now, by whatever tells one from another."""
+        """The design in force now, by its key."""
         if design != self._design:
             self._design, self._since_s = design, now_s
 
@@ -100,7 +100,7 @@ class Learner:
         return self._new >= self._due_after
 
     def report(self, present: Design) -> LearnerReport:
-        """Estimate and design, with `present` in force; without an answer, the report's text says why."""
+        """Estimate and design, with `present` in force; a report without a result has the reason."""
         self._new, self._due_after = 0, round(EVERY_S / self._period_s)
         try:
             with solving("learn", self._loop_name):

@@ -33,7 +33,7 @@ from fitctl.learn.whittle import (
 Floats = NDArray[np.float64]
 MOST_LINES = 8
 LEAST_LINE_HZ = 0.3
-"""Slower motion is the air's or a drift: within minutes they cannot be told from a line."""
+"""Slower motion counts as air or drift: minutes of frames cannot distinguish them from a line."""
 _WIDTHS = (1, 3, 9, 27)  # in frequencies: over which a line may spread
 _ABOUT_BINS = 3
 _STRENGTH, _DAMPING, _STIFFNESS, _NOISE, _GAIN, _OVERSHOOT, _FIRST_LINE = range(7)

@@ -99,7 +99,7 @@ class _Target:
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         if path.exists() and not overwrite:
-            msg = f"{path}: exists already; give another name with --out, or say --overwrite"
+            msg = f"{path}: exists already; give another name with --out, or pass --overwrite"
             raise LogError(msg)
         if in_use(path):
             msg = f"{path}: is being recorded just now and is not overwritten; give another name"

@@ -175,7 +175,7 @@ class _Recording:
         """Write a warning that the log may end before the queue does."""
         self._write_event(
             "warning",
-            f"records still came when the {DRAIN_S:g} s to drain the queue were over; "
+            f"after {DRAIN_S:g} s of draining the queue, records still arrived; "
             "some may be missing at the end of this log",
         )
 

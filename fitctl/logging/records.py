@@ -348,7 +348,7 @@ class Losses(Record, frozen=True, kw_only=True):
 
     @property
     def unsent(self) -> dict[str, int]:
-        """What was let go instead of sent, because somebody was too slow for it; by kind."""
+        """Messages that were dropped because their receiver was too slow, by kind."""
         return {
             name.removesuffix("_unsent"): getattr(self, name)
             for name in self.__struct_fields__

@@ -85,7 +85,7 @@ class RotatingLog:
             self._writer.write(self._run_info, time.time())
 
     def pop_notes(self) -> list[tuple[Severity, str]]:
-        """What somebody should read of files deleted, once."""
+        """What people should read about deleted files, once."""
         notes, self._notes = self._notes, []
         return notes
 

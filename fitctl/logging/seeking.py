@@ -83,7 +83,9 @@ class SeekableLog:
         with opened(path) as (stream, _), contextlib.suppress(*DAMAGE):
             self._scan(stream)
         if not self._chunks:
-            msg = f"{path}: holds no messages that can be read; `fitctl log verify` says more"
+            msg = (
+                f"{path}: holds no messages that can be read; `fitctl log verify` lists the damage"
+            )
             raise LogError(msg)
 
     @property

@@ -150,7 +150,7 @@ class Interlocks:
         return changes
 
     def reset(self, name: str, now_s: float, readings: Mapping[str, Reading]) -> str:
-        """Let a tripped row go by hand; why not, if it cannot be."""
+        """Reset a tripped interlock by hand; return the reason if it stays tripped."""
         rule = self._rules.get(name)
         if rule is None:
             return f"no interlock is named {name}; there are {', '.join(self._rules)}"

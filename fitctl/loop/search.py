@@ -155,8 +155,8 @@ class StarSearch(SpiralSearch):
             return None
         return Finding(
             Trigger.SEARCH_EXHAUSTED,
-            "the siderostat did not come to where the search begins or goes on within "
-            f"{self._slew_limit_s:.0f} s; look whether its motors turn, then stop, recover and acquire again",
+            "the siderostat did not reach the start of the search, or the place to continue it, within "
+            f"{self._slew_limit_s:.0f} s; check that its motors turn, then stop, recover and acquire again",
         )
 
     def advance_from(self, motor_rad: Floats, duration_s: float) -> Floats:
@@ -183,8 +183,8 @@ def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
     least_dn = acquisition.detection_sigma * rig.camera.pixel_noise_dn / LARGEST_PEAK
     if star_flux_dn < least_dn:
         return (
-            f"a star of {star_flux_dn:g} DN could not be told from noise; loops.{loop_name}.acquisition."
-            f"detection_sigma needs at least {least_dn:.0f} DN"
+            f"a star of {star_flux_dn:g} DN could not be distinguished from noise; "
+            f"loops.{loop_name}.acquisition.detection_sigma needs at least {least_dn:.0f} DN"
         )
     return ""
 

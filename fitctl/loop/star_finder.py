@@ -1,4 +1,4 @@
-"""Where one loop's star is on a frame: where it is expected, where somebody said, or anywhere."""
+"""Find a loop's star on a frame: at its expected place, where a person pointed, or anywhere."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class StarFinder:
         return star or attribution.choose(self._sensor.candidates(image), mode, expected_px)
 
     def _looked_for(self, image: NDArray[np.uint16], mode: Mode) -> Star | None:
-        """The star where somebody told the loop to look, if there is one."""
+        """The star at the place of a `look` command, if there is one."""
         look_px, self.look_at_px = self.look_at_px, None
         if look_px is None or mode not in WITH_WINDOW:
             return None

@@ -615,7 +615,7 @@ class StellarLoop(Loop):
         self._report_event("info", f"controller {before} -> {design.title}{why}")
 
     def start_experiment(self, name: str, drives: list[Drive]) -> bool:
-        """Move the stages as told, from the next tick on; False where this mode has no star to watch."""
+        """Make an experiment's motions from the next tick on; False in a mode without a star."""
         now_s = self._clock.now_s()
         if not self.fire(Trigger.EXPERIMENT, name):
             return False

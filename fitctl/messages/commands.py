@@ -142,7 +142,7 @@ class MoveCollector(Command, frozen=True, kw_only=True):
 
 
 class Experiment(Command, frozen=True, kw_only=True):
-    """From COARSE or VERNIER: move the stages of one loop as told, open loop, and go back to COARSE."""
+    """From COARSE or VERNIER: make motions with one loop's stages, open loop, then return to COARSE."""
 
     name: str
     drives: list[Drive]
@@ -165,7 +165,7 @@ class Shutdown(Command, frozen=True, kw_only=True):
 
 
 class RecorderReport(Command, frozen=True, kw_only=True):
-    """The recorder tells what it has written."""
+    """The recorder reports what it has written."""
 
     status: RecorderStatus
 
@@ -204,7 +204,7 @@ class LearnerReport(Command, frozen=True, kw_only=True):
 
 
 class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a sequence is; ``run`` tells two runs apart, ``wanted`` is what people ask of it."""
+    """Where a sequence is; ``run`` identifies a run, ``wanted`` is the newest order to it."""
 
     run: str
     name: str
@@ -220,7 +220,7 @@ class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class SequenceReport(Command, frozen=True, kw_only=True):
-    """A sequence tells where it is, at least once a second."""
+    """A sequence reports where it is, at least once a second."""
 
     status: SequenceStatus
 
@@ -272,7 +272,7 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decode_command(payload: bytes) -> AnyCommand | Reply:
-    """A command as it came, or the refusal that tells what is wrong with it."""
+    """A command as it came, or a refusal with the reason."""
     try:
         command = _decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:

@@ -167,7 +167,7 @@ def open_folder(folder: Path) -> int:
             target = Path(os.readlink("", dir_fd=part))
             os.close(part)
             if (links := links + 1) > _MOST_LINKS:
-                raise ConfigError(_refused(folder, f"{path / name} is one of too many links"))
+                raise ConfigError(_refused(folder, f"{path / name} goes through too many links"))
             pending += reversed(target.parts[1:] if target.is_absolute() else target.parts)
             if target.is_absolute():
                 os.close(at)

@@ -155,7 +155,7 @@ def revoke_key(rig: Rig, name: str) -> None:
 
 
 def allowed_keys(rig: Rig) -> tuple[dict[str, AllowedKey], list[str]]:
-    """The allowed clients by public key, and what is wrong with files that allow nobody therefore."""
+    """The allowed clients by public key, and what is wrong with key files that cannot be used."""
     keys, problems = {}, []
     for path in _allowed_paths(rig):
         try:
@@ -203,7 +203,9 @@ def read_key_of(rig: Rig, path: Path) -> RemoteKey:
     """
     key = read_remote(path)
     if key.rig != rig.name:
-        msg = f"{path}: is a key to rig {key.rig}, not {rig.name}; give the rig file that goes with it"
+        msg = (
+            f"{path}: is a key to rig {key.rig}, not {rig.name}; give the rig file of the key's rig"
+        )
         raise ConfigError(msg)
     return key
 
@@ -236,8 +238,8 @@ def _read(path: Path, kind: type[T]) -> T:
             text = file.read(65536)
         if mode & 0o077:
             msg = (
-                f"{path}: other users can read it (mode {mode:04o}); revoke it if somebody may have read it, "
-                "then: chmod 600"
+                f"{path}: other users can read it (mode {mode:04o}); revoke it if another user "
+                "may have read it, then: chmod 600"
             )
             raise ConfigError(msg)
         return msgspec.toml.decode(text, type=kind)
@@ -250,7 +252,7 @@ def _read(path: Path, kind: type[T]) -> T:
 
 
 def _write_new(path: Path, content: msgspec.Struct) -> None:
-    """Write a file that must not exist, mode 0600; whoever sees it sees it whole."""
+    """Write a file that must not exist, mode 0600, in one step."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         # Made with mode 0600 from the beginning, and given its name when it is complete.

@@ -95,7 +95,7 @@ def only_running_rig(asking: str) -> RunningRig | None:
     running = running_rigs()
     if len(running) > 1:
         lines = "".join(f"\n  {rig.where}" for rig in running)
-        msg = f"{asking}: {len(running)} supervisors run; nothing was done. Say which:{lines}"
+        msg = f"{asking}: {len(running)} supervisors run; nothing was done. Name one:{lines}"
         raise ConfigError(msg)
     return running[0] if running else None
 

@@ -275,7 +275,7 @@ def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
         "error",
         f"{device.device} at {device.endpoint}: {what}",
         device.time_s,
-        "the loop is in SAFE" if is_safe else "it is asked again",
+        "the loop is in SAFE" if is_safe else "fitctl tries again",
         _then(todo, "recover") if is_safe else todo,
     )
 

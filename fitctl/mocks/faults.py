@@ -50,7 +50,7 @@ WIRE_FAULTS = {
 
 
 class UnknownFault(ValueError):
-    """There is no such fault here; the text lists those that exist."""
+    """The device has no such fault; the text lists its faults."""
 
 
 class Faults:

@@ -60,7 +60,7 @@ class Pty(asyncio.ReadTransport):
         return self._speed in {None, termios.tcgetattr(self._theirs)[_OUTPUT_SPEED]}
 
     def write(self, data: bytes) -> None:
-        """Send to whoever reads; without flow control, what nobody reads is lost."""
+        """Send to the pty's reader; without flow control, bytes that are not read are lost."""
         with suppress(BlockingIOError):
             os.write(self._ours, data)
 

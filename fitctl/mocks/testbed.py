@@ -393,7 +393,7 @@ class Testbed:
         return np.ascontiguousarray(np.rot90(mirrored, -self._quarter_turns))
 
     async def _keep_up(self) -> None:
-        """Advance in small pieces also when nobody looks, so that nobody ever waits for an hour's steps."""
+        """Advance in small pieces also without a request, so that none waits for an hour's steps."""
         while True:
             self._live.advance()
             await asyncio.sleep(_HOUSEKEEPING_S)

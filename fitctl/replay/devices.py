@@ -1,4 +1,4 @@
-"""What stands in for the devices in a replay: each says and does what the log tells of its original."""
+"""Substitutes for the devices in a replay: each behaves as the log recorded of its original."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _NOBODY = DeviceIdentity("fitctl", "log", "", "")
 
 
 class LoggedClock:
-    """A clock that stands at the time last set; nobody waits by it."""
+    """A clock that shows the time last set; nothing waits on it."""
 
     def __init__(self) -> None:
         self._now_s = 0.0
@@ -349,7 +349,7 @@ class LoggedMirror(MirrorStage):
 
 
 class LoggedDac(NoDevice):
-    """Confirms voltages when the log says so, has the outputs that were found then, or fails as it says."""
+    """Confirms voltages, finds outputs and fails at the times of the log."""
 
     def __init__(self, clock: LoggedClock) -> None:
         self._clock = clock

@@ -114,7 +114,7 @@ class LoggedStep:
             self.older.append(message)
 
     def add_report(self, kind: type[AnyRecord], message: Any) -> None:
-        """A loop's timing, what the recorder says it lost, or when the camera was last reported on."""
+        """A loop's timing, the records that the recorder lost, or the time of the camera's last report."""
         if kind is LoopTiming:
             self.timing[message.loop] = message
         elif kind is RecorderStatus:
@@ -201,7 +201,7 @@ def read_steps(info: LogInfo, rig: Rig) -> Iterator[LoggedStep]:
 
 
 def _records(info: LogInfo, rig: Rig) -> Iterator[tuple[Logged, int]]:
-    """What of a log a replay goes by, and its sequence numbers; LogError if that cannot do."""
+    """The records of a log that a replay needs, and their sequence numbers; LogError if they do not suffice."""
     kinds = {TOPICS[kind].format(loop=loop): kind for kind in KINDS for loop in rig.loops}
     tick_topics = [
         TOPICS[MetrologyTick if loop in rig.metrology_loops else Tick].format(loop=loop)
@@ -255,7 +255,7 @@ def _insist_on_start(info: LogInfo, first_ns: int) -> None:
     try:
         start_s = float(clock["run_start_monotonic_s"]) + float(clock["wall_minus_monotonic_s"])
     except (KeyError, ValueError):
-        msg = f"{info.path}: does not say when its run began (metadata clock); name a log that fitctl recorded"
+        msg = f"{info.path}: has no start of its run (metadata clock); name a log that fitctl recorded"
         raise LogError(msg) from None
     late_s = first_ns / 1e9 - start_s
     if late_s > _AT_THE_START_S:

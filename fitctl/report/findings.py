@@ -1,4 +1,4 @@
-"""Everything that a report says of a run, before it is drawn or written."""
+"""All findings of a report about a run, before they are drawn or written."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def _of_any(
 
 
 def _mode_s(ticks: Columns, period_s: float) -> dict[str, float]:
-    """By the ticks; where none came for long, nobody knows."""
+    """By the ticks; unknown where no tick came for long."""
     lasted_s = np.minimum(np.diff(ticks["time_s"], append=np.nan), 1.0)
     lasted_s[-1:] = period_s
     spent = {mode.name: float(lasted_s[ticks["mode_number"] == mode].sum()) for mode in Mode}

@@ -70,5 +70,7 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
             msg = f"no PDF: {browser} cannot use its sandbox; add --pdf-without-sandbox if you trust the log"
             raise PdfError(msg)
         last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-        msg = f"no PDF: {browser} ended with {done.returncode} and said: {last}; print {page} from any browser"
+        msg = (
+            f"no PDF: {browser} ended with {done.returncode}: {last}; print {page} from any browser"
+        )
         raise PdfError(msg)

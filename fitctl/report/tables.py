@@ -333,7 +333,9 @@ def attempts(findings: Findings) -> Table:
         ]
         for row in findings.gathered.attempts[:MOST_ROWS]
     ]
-    return Table("Steps of sequences", ["step", "loop", "attempt", "took", "outcome", "told"], rows)
+    return Table(
+        "Steps of sequences", ["step", "loop", "attempt", "took", "outcome", "message"], rows
+    )
 
 
 def versions(findings: Findings) -> Table:

@@ -192,7 +192,7 @@ class Runner:
         collector = view.telemetry.collector
         if self._moves_collector and (collector is None or not collector.motion):
             why = "" if collector is None else collector.error
-            msg = f"the collector no longer moves: {why or 'somebody stopped it'}"
+            msg = f"the collector no longer moves: {why or 'another person stopped it'}"
             raise StepFailed(msg)
 
     def _wait_for_mode(self, step: Step, behaviour: Behaviour, view: View) -> None:

@@ -1,4 +1,4 @@
-"""Who may command: roles, and the lease that one person has at a time."""
+"""Who may send commands: roles, and the lease that one person has at a time."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class Admission:
         self._heard_s = 0.0
 
     def commander(self, now_s: float) -> str:
-        """Who has the instrument; empty when nobody has."""
+        """The person who has the lease; empty if there is none."""
         return self._holder if now_s - self._heard_s <= self._lease_s else ""
 
     def release(self, name: str) -> None:
-        """Take the lease from somebody who is no longer let in."""
+        """Take the lease from a person whose key was revoked."""
         if self._holder == name:
             self._holder = ""
 

@@ -105,7 +105,7 @@ def publisher_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[byte
 
 
 def local_sender(payload: zmq.Frame) -> Sender:
-    """Whose process is at the other end of a Unix socket; the kernel tells."""
+    """The process at the other end of a Unix socket, from the kernel."""
     # As libzmq has it of the kernel: HOST:UID:GID:PID. Who hung up at once is unknown, but was the owner.
     parts = frame_property(payload, "Peer-Address").split(":")
     uid, pid = (int(parts[1]), parts[3]) if len(parts) == 4 else (os.getuid(), "unknown")
@@ -113,7 +113,7 @@ def local_sender(payload: zmq.Frame) -> Sender:
 
 
 def frame_property(frame: zmq.Frame, name: str) -> str:
-    """What libzmq knows of a frame's connection; empty if it does not."""
+    """What libzmq knows of a frame's connection; empty if it knows nothing."""
     try:
         return str(frame.get(name))
     except zmq.ZMQError:

@@ -15,7 +15,7 @@ MAX_ENVELOPE_BYTES = 1_048_576  # a report of some ten thousand keys
 
 
 class Passed(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
-    """A message as it came, and whose key it came with; nobody of this machine has such a name."""
+    """A message as it came, and the owner of its key; no local user can have such a name."""
 
     name: Name
     role: Role
@@ -31,7 +31,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown
 
 
 def decode_envelope(payload: bytes) -> Passed | Report | None:
-    """What the gateway says; None if that is no envelope."""
+    """The gateway's message; None if the bytes are no envelope."""
     try:
         return _decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError):

@@ -50,7 +50,7 @@ _NO_SUPERVISOR = Reply(
 _MOST_EVENTS = 100  # lines that wait for a supervisor that takes none
 
 Route = tuple[bytes, bytes]
-"""Identity and tag of whoever asked; the supervisor hands it back with its reply."""
+"""Identity and tag of the sender; the supervisor returns them with its reply."""
 
 
 def be_modest() -> None:
@@ -172,7 +172,7 @@ class Gateway:
             self._folder.close()
 
     def _connect(self) -> None:
-        """Connect to the supervisor's sockets where they are now: in a folder that can be nobody else's."""
+        """Connect to the supervisor's sockets where they are now, in a folder that only its user can change."""
         for name, one in ((GATEWAY_SOCKET, self._supervisor), (TELEMETRY_SOCKET, self._telemetry)):
             try:
                 endpoint = self._folder.endpoint(name)

@@ -89,14 +89,14 @@ class Intake:
         return Accepted(command, not within_rate)
 
     def answers_refusal(self, name: str, now_s: float) -> bool:
-        """Whether one more refusal of somebody's message is answered; otherwise it is counted."""
+        """Whether one more refusal of a sender's message is answered; otherwise it is counted."""
         if self._answers.within(name, now_s):
             return True
         self.drop(name, "refused without an answer")
         return False
 
     def logs_refusal(self, name: str, now_s: float) -> bool:
-        """Whether one more refusal of somebody's command gets a record; otherwise it is counted."""
+        """Whether one more refusal of a sender's command gets a record; otherwise it is counted."""
         if self._records.within(name, now_s):
             return True
         self.drop(name, "refused without a record of its own")

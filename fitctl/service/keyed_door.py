@@ -133,7 +133,7 @@ class KeyedDoor:
         return whose
 
     def ban(self, key: AllowedKey) -> None:
-        """Refuse new connections of a key for a while; those that it has may stay."""
+        """Refuse new connections of a key for a while; its open connections stay."""
         now_s = self._clock.now_s()
         if now_s >= self._banned_until_s.get(key.public, 0.0):
             self._banned_until_s[key.public] = now_s + _BANNED_S
@@ -150,7 +150,7 @@ class KeyedDoor:
         return self.allowed.get(frame_property(payload, "User-Id"))
 
     def publish(self, telemetry: zmq.Frame) -> None:
-        """Send telemetry to whoever listens; who is too slow for it misses it."""
+        """Send telemetry to all subscribers; a slow subscriber misses messages."""
         if self._publisher is not None:
             with suppress(zmq.Again):
                 self._publisher.send(telemetry, zmq.NOBLOCK, copy=False)

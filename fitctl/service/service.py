@@ -198,7 +198,7 @@ class Service(threading.Thread):
                 self._intake.drop(GATEWAY, "no envelopes")
 
     def _apply_report(self, report: Report) -> None:
-        """Take the instrument from whoever is no longer let in, and tell what the gateway has to say."""
+        """Take the lease from a person whose key was revoked, and report the gateway's messages."""
         before, self._keys = self._keys, {key.name: key for key in report.keys}
         for name, key in before.items():
             if self._keys.get(name) != key:

@@ -152,7 +152,7 @@ class TelemetryBuffer:
         return list(newest)
 
     def losses(self, state: ServiceState, now_s: float) -> Losses:
-        """What every queue has let go so far."""
+        """The messages that each queue has dropped so far."""
         return Losses(
             time_s=now_s,
             records_offered=state.records_offered(),

@@ -312,7 +312,7 @@ def _summarize_beam(runs: dict[int, MetrologyResult]) -> BeamSummary:
 
 
 def _worst(rms: dict[int, dict[str, float]]) -> tuple[dict[int, float], list[int]]:
-    """The worst axis of each seed, and the worst seeds; those that could not be judged come first."""
+    """The worst axis of each seed, and the worst seeds; seeds without a result come first."""
     worst_axis = {seed: max(axes.values()) for seed, axes in rms.items()}
     ranked = sorted(worst_axis, key=lambda seed: -np.nan_to_num(worst_axis[seed], nan=np.inf))
     return worst_axis, ranked[:_WORST_SEEDS]

@@ -73,7 +73,7 @@ class SimulatedAmplifiers:
         self._enabled = False
 
     def open(self) -> DeviceIdentity:
-        """Nothing to connect; whoever turned the motors meanwhile is noticed at the next exchange."""
+        """Nothing to connect; the next exchange reads where the motors are."""
         self._at_rest = False
         return _identity("amplifiers")
 

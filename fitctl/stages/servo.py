@@ -324,7 +324,7 @@ class SiderostatServo:
         return self._servo.step(self._position_rad)
 
     def _go_on_from(self, position_rad: AzEl) -> None:
-        """Go to the set-point from here: a drive that hears nothing turns on at its last velocity."""
+        """Go to the set-point from the present position: without commands, a drive kept its last velocity."""
         self._blind = False
         self._servo.reset(position_rad)
         if self._applied_rad is not None:

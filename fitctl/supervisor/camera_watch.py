@@ -53,9 +53,9 @@ class CameraWatch:
         self._last_frame_s = self._clock.now_s()
 
     def next_frame(self, meanwhile: Callable[[], float]) -> Frame | None:
-        """Wait for the next, no longer than two frame periods; after a stall, the newest of those that came.
+        """Wait for the next frame, at most two frame periods; after a stall, return the newest frame.
 
-        `meanwhile` is called at first, and until the frame comes again at each time that it returns.
+        Calls `meanwhile` at first, and then at each time that it returns, until the frame comes.
         """
         self.older.clear()
         if not self.ready:

@@ -146,7 +146,7 @@ class CollectorWatch:
         self._hexapod.close()
 
     def _work(self, motion: CollectorMotion | None, stops: int) -> None:
-        """Begin a motion, or without one reference the hexapod; whoever hears of its end can begin the next."""
+        """Begin a motion, or without one reference the hexapod; at its end, the next motion can begin."""
         try:
             try:
                 severity, message = self._begin(motion, stops)

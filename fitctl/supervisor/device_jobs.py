@@ -107,7 +107,7 @@ class DeviceJobs:
         self._abandoned = self._abandoned or not self._opening.isdisjoint(names)
 
     def turn_off(self, names: list[str], ended: Ended) -> None:
-        """OFF for these loops, and their devices let go; `ended` once they are."""
+        """Close the devices of these loops for OFF, then call `ended`."""
         for name in names:
             self._loops[name].release()
             self._loops[name].fire(Trigger.OFF, "operator")
@@ -120,7 +120,7 @@ class DeviceJobs:
         )
 
     def close_all(self) -> None:
-        """Disable and let go of everything, whatever state it is in, and wait for that."""
+        """Disable and close all devices, from every state, and wait until this is done."""
         for loop in self._loops.values():
             loop.release()
         self._camera.ready = False

@@ -1,4 +1,4 @@
-"""Commands that concern some loops and nothing else of the rig: each says why it cannot be, or is done."""
+"""Commands that concern only some loops: each is carried out, or returns the reason for its refusal."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def reset_interlock(_rig: Rig, loops: Loops, command: Reset) -> str:
 
 
 def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
-    """Move one loop's stages as told; empty, or why not."""
+    """Make an experiment's motions with one loop's stages; return why not, or an empty text."""
     if len(loops) != 1:
         return f"an experiment is on one loop; name it: {', '.join(loop.name for loop in loops)}"
     (loop,) = loops

@@ -87,7 +87,7 @@ MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], Loop]
 def loop_of_kind(
     name: str, rig: Rig, devices: LoopDevices, journal: Journal, design: Designer
 ) -> Loop:
-    """A loop of the kind that the rig file says, on its devices."""
+    """A loop of the kind in the rig file, on its devices."""
     if name in rig.metrology_loops:
         return metrology_loop(name, rig, devices, journal)
     return stellar_loop(name, rig, devices, journal, design)
@@ -330,7 +330,7 @@ class Supervisor:
         return all(loop.at_rest() for loop in self.loops.values())
 
     def close(self) -> None:
-        """Disable and let go of everything, whatever state it is in; it obeys nothing any more."""
+        """Disable and close all devices, from every state; the supervisor accepts no command afterwards."""
         self.shutdown_wanted = True
         self._obey_posted()
         self._closed = True  # devices that answer slowly keep nobody waiting for an answer
@@ -429,7 +429,9 @@ class Supervisor:
         if not usable:
             return _refusal(self._why_not(trigger, names))
         if self._device_jobs.busy and trigger is not Trigger.STOP:
-            return _refusal("devices are being opened or closed; wait for the event that says so")
+            return _refusal(
+                "devices are being opened or closed; wait for the event that reports the end"
+            )
         moving = self._rest_mirrors(usable) if trigger is Trigger.OFF else []
         if moving:
             return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
@@ -448,7 +450,7 @@ class Supervisor:
         return reply
 
     def _rest_mirrors(self, names: list[str]) -> list[str]:
-        """Have these loops' mirrors rest, at the next ticks; those that do not rest yet."""
+        """Send these loops' mirrors to rest at the next ticks; return the loops with a moving mirror."""
         moving = [name for name in names if not self.loops[name].at_rest()]
         for name in moving:
             self.loops[name].rest()

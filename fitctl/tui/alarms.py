@@ -129,7 +129,7 @@ def notes(state: ConsoleState) -> list[Alarm]:
 
 
 def _stop(state: ConsoleState, stopped: list[Trouble]) -> Alarm:
-    """Loops that are SAFE for one reason, by somebody's wish; where it is known, with who it was."""
+    """Loops that a person sent to SAFE, together, with the person's name where it is known."""
     alarm, loops = _alarm(stopped[0]), [name for each in stopped for name in each.loops]
     stopped_by = state.newest.stopped_by if state.newest else ""
     if stopped_by and alarm.what == STOPPED:

@@ -284,7 +284,7 @@ class ConsoleApp(App[None]):
         self._wire.send(RecentEvents())
 
     def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
-        """Do something once the operator has said yes."""
+        """Do something after the operator has confirmed it."""
 
         def answered(yes: bool | None) -> None:
             if yes:

@@ -239,5 +239,5 @@ KEYS = (
 
 
 def keys_of(view: str) -> list[Key]:
-    """The keys that one screen has for itself; an empty name is for what all have."""
+    """The keys of one screen; an empty name stands for the keys of all screens."""
     return [key for key in KEYS if key.view == view]

@@ -38,7 +38,7 @@ class Console(Protocol):
         """Send a command for the shown loop."""
 
     def ask(self, title: str, question: str, then: Callable[[], object]) -> None:
-        """Do something once the operator has said yes."""
+        """Do something after the operator has confirmed it."""
 
     def end_step(self) -> None:
         """End the running step of the commissioning."""

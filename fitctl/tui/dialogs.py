@@ -195,7 +195,7 @@ class Ask(ModalScreen[str | None]):
             yield Static("", id="refused")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Accept it, or say why not."""
+        """Accept the input, or show why it is not accepted."""
         why_not = self._refused(event.value)
         if why_not:
             self.query_one("#refused", Static).update(Text(f"✗ {why_not}", RED))

@@ -95,7 +95,7 @@ class Wire:
         thread.start()
 
     def close(self) -> None:
-        """Let commands that are on their way arrive (a stop above all), then let go of the link."""
+        """Wait until the sent commands have arrived (a stop above all), then close the link."""
         self._ended.set()
         deadline_s = time.monotonic() + EXIT_WAIT_S
         for thread in (*self._senders, self._reader):

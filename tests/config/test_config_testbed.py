@@ -186,8 +186,8 @@ def test_fringe_spots_that_lie_on_each_other_are_checked_as_they_interfere():
     )
     assert "loops.right.flux_range.low must be above 0.6067 (is 0.6)" in line
     assert (
-        "fringe lies on fringe of loop right, and both reach 16985.3 DN: that would be taken for the star "
-        "of loop right, which may have 16800 to 44800" in line
+        "fringe lies on fringe of loop right, and both reach 16985.3 DN: loop right could accept it "
+        "as its star, which may have 16800 to 44800" in line
     )
     apart = copy.deepcopy(brighter)
     apart["left"]["other_spots"][0]["offset_px"]["el"] = 8.0

@@ -225,7 +225,7 @@ def test_a_disk_that_is_gone_is_told_of_once_and_asked_again(tmp_path, monkeypat
 
     until(looked_again)
     assert [row[0] for row in told] == ["warning", "info"]
-    assert "does not tell its free space: Input/output error" in told[0][2]
+    assert "does not report its free space: Input/output error" in told[0][2]
 
 
 def raised(error):

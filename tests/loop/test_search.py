@@ -164,7 +164,7 @@ def test_a_finer_search_takes_longer():
         ({"search_radius_sky_arcsec": 1201.0}, "would reach 1201 arcsec"),
         ({"search_radius_sky_arcsec": 0.0}, "must be above 0"),
         ({"star_flux_dn": math.nan}, "star_flux_dn must be above 0"),
-        ({"star_flux_dn": 1.0}, "a star of 1 DN could not be told from noise"),
+        ({"star_flux_dn": 1.0}, "a star of 1 DN could not be distinguished from noise"),
         ({"search_radius_sky_arcsec": math.nan}, "must be above 0"),
         ({"search_radius_sky_arcsec": math.inf}, "must be above 0"),
         ({"field_overlap": 0.9}, "must lie in 0.05 to 0.6"),

@@ -73,7 +73,7 @@ def commission(
         typer.Option(metavar="RECORD", help="Compare with the record of another commissioning."),
     ] = None,
     on_console: Annotated[
-        bool, typer.Option("--console", help="On the screen Commissioning of a console.")
+        bool, typer.Option("--console", help="Run the steps on a console.")
     ] = False,
     console_pid: Annotated[
         int | None,

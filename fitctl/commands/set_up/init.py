@@ -39,7 +39,7 @@ def _device(text: str) -> Any:
 
 def init(
     file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("my-rig.toml"),
-    name: Annotated[str | None, typer.Option(help="Of the rig; by default the file's.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the rig. [default: the file's]")] = None,
     testbed: Annotated[
         bool,
         typer.Option("--testbed", help="Two stars, metrology and a collector on a hexapod."),

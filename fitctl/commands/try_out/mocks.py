@@ -42,7 +42,7 @@ def mocks(
     seed: SeedOption = 0,
     as_json: JsonOption = False,
     free_ports: Annotated[
-        bool, typer.Option("--free-ports", help="Take any free port for every device.")
+        bool, typer.Option("--free-ports", help="Use any free port for every device.")
     ] = False,
     faults: Annotated[
         Path | None,

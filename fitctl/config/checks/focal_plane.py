@@ -91,7 +91,7 @@ def _overlapping_spots(rig: Rig) -> Iterator[Conflict]:
                 low = loop.flux_range.low
                 narrow = above(f"loops.{name}.flux_range.low", low, together_dn / loop.star_flux_dn)
                 yield Conflict(
-                    f"{here}: that would be taken for the star of loop {name}, which may have {low_dn:g} to "
+                    f"{here}: loop {name} could accept it as its star, which may have {low_dn:g} to "
                     f"{high_dn:g}",
                     (*fluxes, narrow),
                 )

@@ -33,7 +33,7 @@ def _twice(places: _Places, why: str, must_be: str) -> Iterator[Conflict]:
 
 
 def _lines(rig: Rig) -> _Places:
-    """Serial ports and sockets that one device has for itself; drives may share an adapter."""
+    """Serial ports and sockets that devices cannot share; drives may share an adapter."""
     places = []
     adapters = set()
     for name, loop in rig.loops.items():

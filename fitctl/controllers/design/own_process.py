@@ -77,7 +77,7 @@ def design_in_own_process(
 
 
 def end_designs() -> None:
-    """Kill the processes that design, whatever thread waits for them: nobody needs their designs any more."""
+    """Kill all processes that make a design, whatever thread waits for them."""
     for process in list(_running):
         process.kill()
 

@@ -1,4 +1,4 @@
-"""What the rig file and a design say of a loop's error, for its error budget."""
+"""What the rig file and a design predict for a loop's error, for its error budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The C-887 driver: a hexapod that goes where it is sent, and stops whenever somebody wants it to."""
+"""The C-887 driver: moves a hexapod, and can stop it at any time."""
 
 from __future__ import annotations
 

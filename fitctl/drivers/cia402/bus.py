@@ -62,7 +62,7 @@ class CanBus:
         return link
 
     def _connected(self, device: Cia402Device) -> CanLink:
-        """A connection; to make it takes seconds where nobody answers."""
+        """A connection; connecting takes seconds where no adapter answers."""
         # Here, because python-can costs 140 ms that a command without hardware need not wait for.
         from fitctl.drivers.cia402.link import CanLink
 

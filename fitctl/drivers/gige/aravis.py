@@ -100,7 +100,7 @@ class AravisCamera:
                     "read access only",
                     "another program has it: end that, or wait for its heartbeat to lapse",
                 )
-            with self._translated("the camera to be as the rig file says"):
+            with self._translated("the camera to match the rig file"):
                 self._configure()
             registers = _Registers(self._device.get_device(), self._endpoint, self._translated)
             self._time = CameraTime(registers)

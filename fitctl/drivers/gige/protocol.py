@@ -132,7 +132,7 @@ def decode_answer(packet: bytes) -> AnswerPacket:
 def _payload(packet: bytes, length: int) -> bytes:
     payload = packet[8:]
     if len(payload) != length:
-        msg = f"a payload of {len(payload)} bytes where its header says {length}"
+        msg = f"a payload of {len(payload)} bytes, but its header gives {length}"
         raise MalformedPacketError(msg)
     return payload
 

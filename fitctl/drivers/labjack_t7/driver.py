@@ -1,4 +1,4 @@
-"""The LabJack T7 driver: one Modbus request reads all four photodiodes, and nobody waits for its answer."""
+"""The LabJack T7 driver: one Modbus request reads all four photodiodes, and no tick waits for the answer."""
 
 from __future__ import annotations
 

@@ -193,7 +193,7 @@ class T7Link(ModbusLink):
         }
 
     def _registers(self, answer: Answer, count: int) -> list[int]:
-        """The registers in an answer to a reading that nobody waited for."""
+        """The registers in the answer to a reading that was requested without waiting."""
         if answer.unit != _UNIT:
             raise self.nonsense(f"an answer of unit {_UNIT}", f"unit {answer.unit}")
         code = None if answer.pdu[0] == _READ else decode_exception(answer.pdu, _READ)

@@ -146,7 +146,7 @@ class BalAnalogMockStation:
 
     # ------------------------------------------------------------ the amplifiers
     def _update_latches(self) -> None:
-        """Latch the faults that are present, and clear those that were reset."""
+        """Latch the present faults, and clear the faults that were reset."""
         requested = lines(self._outputs[_LINES], self._device.enabled_level)
         for axis, part in enumerate(AXES):
             is_so = self.faults.value("amplifier_fault", part) is not None

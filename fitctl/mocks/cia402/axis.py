@@ -122,7 +122,7 @@ class Axis:
 
     @property
     def moves(self) -> bool:
-        """Its demand has to be brought on also when nobody sends anything."""
+        """Its demand moves on with time, also without a message."""
         follows = self.state is State.OPERATION_ENABLED
         return self.state in _STOPPING or (
             follows and (self.demand_rad_s != 0 or self._wanted_rad_s() != 0)

@@ -124,7 +124,7 @@ class Acquisition:
         self._arm()
 
     def stop(self) -> None:
-        """Take no more frames, and drop those that have not left."""
+        """Take no more frames, and drop the frames that were not sent yet."""
         self._running = None
         self._in_flight.clear()
         self._stream.clear()

@@ -1,4 +1,4 @@
-"""The mock camera's UDP: what it sends goes through its faults, and it hears broadcasts on loopback."""
+"""The mock camera's UDP: its faults act on what it sends, and it receives broadcasts on loopback."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Datagrams:
 
 
 class ControlSocket(asyncio.DatagramProtocol):
-    """The GVCP socket on 127.0.0.1, and what hears DISCOVERY broadcasts for it; see :func:`listen`."""
+    """The GVCP socket on 127.0.0.1, and the one that receives DISCOVERY broadcasts; see :func:`listen`."""
 
     def __init__(self, answer: Callable[[bytes, Address], bytes | None], faults: Faults) -> None:
         self._answer = answer

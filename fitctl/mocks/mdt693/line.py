@@ -91,6 +91,6 @@ class Sender:
 
 
 def write_to(writer: asyncio.StreamWriter, data: bytes) -> None:
-    """Send to a TCP client; without flow control, what nobody reads is lost."""
+    """Send to a TCP client; without flow control, bytes that it does not read are lost."""
     if not writer.is_closing() and writer.transport.get_write_buffer_size() < _UNREAD_BYTES_MAX:
         writer.write(data)

@@ -159,7 +159,7 @@ _FUNCTIONS: Mapping[int, Callable[[DataModel, bytes], bytes]] = {
 }
 
 BROADCAST_FUNCTIONS = {protocol.WRITE_SINGLE_REGISTER, protocol.WRITE_MULTIPLE_REGISTERS}
-"""What may be asked of all devices on a serial line at once; nobody answers that."""
+"""Requests that may go to all devices on a serial line at once; no device answers them."""
 
 
 def _fields(layout: str, body: bytes) -> tuple[Any, ...]:

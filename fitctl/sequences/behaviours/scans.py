@@ -116,7 +116,7 @@ def _collector_scan_done(step: steps.CollectorScan, view: View) -> Result | None
             f"{_log_hint(view, 'feedforward')}",
         )
     if not collector.motion:
-        msg = "the collector no longer moves: somebody stopped it"
+        msg = "the collector no longer moves: another person stopped it"
         raise StepFailed(msg)
     if view.now_s - view.marks[-1] >= _scan_s(step):
         view.command(MoveCollector(action="stop"))

@@ -37,7 +37,7 @@ def age(seconds: float) -> str:
 
 
 def has_failed(loop: LoopView) -> bool:
-    """Whether the loop is SAFE because of a fault. False when somebody stopped it."""
+    """Whether the loop is SAFE because of a fault. False when a person stopped it."""
     return loop.state.mode == "SAFE" and loop.change is not None and loop.change.trigger == "FAULT"
 
 

@@ -97,7 +97,9 @@ class LoggedRun:
         except (KeyError, ValueError):
             self._offset_s = math.nan
         if not abs(self._offset_s) < BOUND:
-            msg = f"{path}: does not say when its run began (metadata clock); name a log that fitctl recorded"
+            msg = (
+                f"{path}: has no start of its run (metadata clock); name a log that fitctl recorded"
+            )
             raise LogError(msg)
         self._rig_name = plain(metadata.get("rig", {}).get("name", ""))[:40]
         self._scheduling = plain(metadata.get("scheduling", {}).get("policy", ""))[:200]
@@ -249,7 +251,7 @@ class LoggedRun:
 
 
 def _kinds_of(topics: set[str]) -> dict[str, type[AnyRecord]]:
-    """Which record each topic of a log has, for those that a console shows."""
+    """The kind of record of each topic of a log that a console shows."""
     known: dict[str, type[AnyRecord]] = {
         TOPICS[kind]: kind for kind in (*_OF_RIG, Event, FrameRecord) if TOPICS[kind] in topics
     }

@@ -43,7 +43,7 @@ class Player:
             self._thread.start()
 
     def close(self) -> None:
-        """End the thread once it is done with its request; a daemon, it holds up nobody."""
+        """End the thread after its present request; a daemon, it does not delay the end of the process."""
         with self._change:
             self._ended = True
             self._change.notify()

@@ -159,7 +159,7 @@ class OperateView(View):
             self._set_hand("")
         elif self.pad.stage(self.state.loop) is None:
             self.notify(
-                "you can jog stages in STANDBY, and the target while the loop holds a star",
+                "you can move stages in STANDBY, and the target while the loop holds a star",
                 timeout=4,
             )
         else:

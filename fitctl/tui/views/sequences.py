@@ -138,7 +138,7 @@ class SequencesView(View):
             self._start("dry-run", *from_now, *(self.console.remote_arguments if from_now else ()))
 
     def action_go(self) -> None:
-        """Run the chosen sequence on the instrument, once the operator has said yes."""
+        """Run the chosen sequence on the instrument, after the operator has confirmed it."""
         document = self._chosen()
         if document is None:
             return

@@ -1,4 +1,4 @@
-"""The base of all panels: lines drawn by hand, and only those that changed sent to the terminal."""
+"""The base of all panels: lines drawn by hand, of which the terminal gets only the changed ones."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def _scaled(suffix: str, value: float) -> str:
 
 
 class DeviceList(Choice):
-    """A device a row: state, name, link, what it says of itself, where it is."""
+    """A device a row: state, name, link, what it reports, its address."""
 
     def rows(self, columns: int) -> list[Line]:
         """All devices of the rig."""
@@ -94,7 +94,7 @@ class DeviceList(Choice):
         return [*line, text(shorten(f"{report}  {device.endpoint}", rest), DIM)]
 
     def link_of(self, device: DeviceHealth) -> str:
-        """How quick its link is, in words; empty where nothing says so."""
+        """How quick its link is, in words; empty where it is not measured."""
         loop_name, _, part = device.device.rpartition(" ")
         loop = self.state.loops.get(loop_name) or self.state.loop
         if loop is None or self.state.newest is None or device.state == "closed":
@@ -282,14 +282,14 @@ def _gauge(row: Watched, columns: int, colour: str) -> list[Segment]:
 
 
 def device_lines(devices: DeviceList, device: DeviceHealth) -> list[tuple[str, str]]:
-    """All about a device: names and what there is to say."""
+    """All about a device, as names and values."""
     return [
         ("state", device.state),
         ("endpoint", device.endpoint),
         ("identity", device.identity or "no reading yet"),
-        ("says", device.detail),
+        ("reports", device.detail),
         ("link", devices.link_of(device) or "no reading"),
-        ("since", wall(devices.state.wall_s(device.time_s)) + " (last told)"),
+        ("since", wall(devices.state.wall_s(device.time_s)) + " (last report)"),
         ("actions", "r Recover from SAFE: reconnects, resets faults · b Standby from OFF · o Off"),
     ]
 

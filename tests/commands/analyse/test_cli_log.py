@@ -106,7 +106,7 @@ def test_recover_says_how_many_records_were_saved_and_overwrites_nothing(log, wh
 
     status, text, error = log("recover", broken)
     assert (status, text) == (2, "")
-    assert error == (f"{target}: exists already; give another name with --out, or say --overwrite")
+    assert error == (f"{target}: exists already; give another name with --out, or pass --overwrite")
     assert log("recover", broken, "--overwrite")[0] == 0
 
 

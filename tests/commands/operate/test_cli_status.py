@@ -93,7 +93,7 @@ def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():
 
     assert found == [
         TRIPPED.reason,
-        f"{camera.device} at {camera.endpoint}: no frame came; it is asked again",
+        f"{camera.device} at {camera.endpoint}: no frame came; fitctl tries again",
     ]
 
 

@@ -115,7 +115,7 @@ def test_a_scan_fails_where_somebody_stops_the_collector(testbed):
     run.link.meddling = [(30.0, stop_once)]
     run(REFERENCE, {"step": "acquire"}, {**SCAN, "cycles": 10})
     assert begun
-    assert "the collector no longer moves: somebody stopped it" in run.error
+    assert "the collector no longer moves: another person stopped it" in run.error
 
 
 def test_photodiodes_and_link_delay_are_found_from_a_scan_of_the_beam(testbed):

@@ -199,7 +199,7 @@ HEAD = 'schema_version = 1\nname = "a"\ndescription = "b"\n[[steps]]\nstep = "st
         ("stars = [{name='far', az_sky_arcsec=1100, el_sky_arcsec=0}]", "star far: the search would"),
         ("stars = [A]\non_failure = 'go'", "on_failure: must be"),
         ("stars = [{name='f', az_sky_arcsec=0, el_sky_arcsec=0, star_flux_dn=20}]",
-         "star f: a star of 20 DN could not be told from noise"),
+         "star f: a star of 20 DN could not be distinguished from noise"),
         ("stars = [{name='f', az_sky_arcsec=0, el_sky_arcsec=0, star_flux_dn=-1}]",
          "stars.0.star_flux_dn: must be greater than 0"),
         ("stars = [{name='b', az_sky_arcsec=1}]", "stars.0.el_sky_arcsec: is missing"),

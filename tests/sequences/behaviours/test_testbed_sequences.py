@@ -82,7 +82,7 @@ def test_stop_stops_the_motion_and_the_sequence(testbed):
 def test_a_step_fails_where_somebody_else_stops_the_collector(testbed):
     testbed.link.meddling = [(8.0, MoveCollector(action="stop"))]
     testbed(REFERENCE, SINE, {"step": "wait", "duration_s": 30.0})
-    assert "the collector no longer moves: somebody stopped it" in testbed.error
+    assert "the collector no longer moves: another person stopped it" in testbed.error
 
 
 def test_a_hexapod_that_is_not_referenced_fails_the_step(testbed):
