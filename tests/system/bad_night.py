@@ -29,7 +29,11 @@ PATIENT_LOOP = (
     "siderostat.servo.following_error_limit_rad=100.0",
     "siderostat.device.response_timeout_s=10.0",
 )
-PATIENT = ("interlocks.frame_missing.stale_s=5.0", "interlocks.siderostat_rate.for_s=5.0")
+PATIENT = (
+    "interlocks.frame_missing.stale_s=5.0",
+    "interlocks.siderostat_rate.for_s=5.0",
+    "interlocks.servo_overrun.for_s=60.0",
+)
 HOLDING = {"stellar": "VERNIER", "metrology": "LOCKED"}
 
 
