@@ -67,15 +67,12 @@ OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
 _CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
-_REMOTE = (
-    0.1  # fraction of runs with remote consoles, whose decoding takes a fifth of the run's time
-)
+_SEVERAL_WRITES = 0.15  # fraction of runs whose mirrors are written between frames
+_REMOTE = 0.1  # fraction of runs with remote consoles: decoding takes a fifth of their time
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
 _FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
-_REPEATED, _REPEATED_S = (
-    (0.0, 0.1, 0.6),
-    0.02,
-)  # fraction of commands repeated, and mean delay: a key held down
+# Fraction of commands that are repeated, drawn for each run, and the mean delay: a key held down.
+_REPEATED, _REPEATED_S = (0.0, 0.1, 0.6), 0.02
 _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
@@ -243,6 +240,16 @@ def slow_servos(rig: str, which: int) -> list[str]:
     ] + [f"interlocks.following_error.high={(3.0, 8.0)[which]}"]
 
 
+def several_writes(rig: str) -> list[str]:
+    """Settings with which a rig's mirrors are written several times a frame."""
+    return [
+        f"loops.{loop}.{key}"
+        for loop in RIGS[rig]
+        if loop != "metrology"
+        for key in ("fsm.dac.writes_per_frame=5", "vernier.controller=minimum-variance")
+    ]
+
+
 def devices_of(rig: str) -> list[str]:
     """The devices of a rig."""
     devices = ["camera"]
@@ -321,14 +328,18 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         settings += _FAST_FRAMES
     elif random.random() < _SLOW.get(rig, 0.0):
         settings += slow_servos(rig, random.randrange(2))
+    console_loss = random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0
+    remote_consoles = random.randint(1, 3) if random.random() < _REMOTE else 0
+    if not fast and random.random() < _SEVERAL_WRITES:
+        settings += several_writes(rig)
     return Plan(
         seed=seed,
         rig=rig,
         settings=settings,
         duration_s=duration_s,
         happenings=happenings,
-        console_loss=random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0,
-        remote_consoles=random.randint(1, 3) if random.random() < _REMOTE else 0,
+        console_loss=console_loss,
+        remote_consoles=remote_consoles,
     )
 
 
