@@ -80,7 +80,7 @@ def test_a_siderostat_that_does_not_come_to_where_the_search_begins_is_told(vern
     vernier.command(Acquire(expected_az_sky_arcsec=400.0, expected_el_sky_arcsec=0.0))
     until(vernier, Mode.STANDBY, limit_s=60.0)
 
-    assert "did not come to where the search begins" in events_of(vernier)[-1].message
+    assert "did not reach the start of the search" in events_of(vernier)[-1].message
 
 
 @pytest.mark.parametrize("stack", [0, 1, 2])

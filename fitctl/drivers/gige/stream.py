@@ -88,9 +88,8 @@ class FrameAssembler:
         self._block = (
             0  # of the last complete frame, or the one before the first; 0 before any packet
         )
-        self._past = (
-            0  # nothing of this frame, complete or given up, or of those before it is wanted
-        )
+        # Packets of this frame, which is complete or given up, and of those before it are dropped.
+        self._past = 0
         self._number = 0
 
     def add(self, packet: memoryview) -> CompleteFrame | None:

@@ -74,7 +74,7 @@ def test_another_controller_differs_and_the_table_says_where_and_that_it_is_open
 def test_a_log_too_short_for_an_expected_rms_says_so(replay, log):
     _, text, _ = replay(log, "--controller", "lqg-ltr")
 
-    assert "loop right: no RMS can be expected: learn: the longest piece in VERNIER is" in text
+    assert "loop right: no expected RMS: learn: the longest piece in VERNIER is" in text
 
 
 def test_another_controller_stays_to_the_end_whatever_the_log_changed(replay, changed_log):

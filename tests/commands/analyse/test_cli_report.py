@@ -83,8 +83,8 @@ def browser(folder, script):
 @pytest.mark.parametrize(
     ("script", "told"),
     [
-        ("echo no display >&2; exit 3", "ended with 3 and said: no display"),
-        ("exit 0", "ended with 0 and said: nothing"),
+        ("echo no display >&2; exit 3", "ended with 3: no display"),
+        ("exit 0", "ended with 0: nothing"),
         ("exec /bin/sleep 60", "did not end within 0.5 s"),
     ],
 )

@@ -65,7 +65,7 @@ def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp
             for record in part:
                 log.write(record, WALL_S + record.time_s)
 
-    found = commands._from_logs(EXPERIMENTS["delay"], rig, "right", paths)
+    found = EXPERIMENTS["delay"].from_logs(rig, "right", paths)
 
     whole = EXPERIMENTS["delay"].from_records(rig, "right", records)
     assert found.fragment() == whole.fragment()
