@@ -57,7 +57,7 @@ def _ask_while_dac_ready(self: PiezoWatch) -> None:
         _ASK(self)
 
 
-def _oldest_frame(self: CameraWatch) -> Frame | None:
+def _oldest_frame(self: CameraWatch, _meanwhile: Callable[[], float]) -> Frame | None:
     self.older.clear()
     if not self.ready:
         self._clock.sleep_until(self._clock.now_s() + self._period_s)
