@@ -143,7 +143,7 @@ def _show_serial_ports() -> None:
 
 
 def _ask(base: str, device: str) -> Chosen:
-    """A kind, then what is asked of it; or all of it at once, as the option takes it."""
+    """Ask for a kind, then for its address; an answer KIND:ADDRESS gives both, as in the option."""
     title, hardware = DEVICES[base][device]
     kinds = ", ".join([*hardware, MOCK])
     while True:
