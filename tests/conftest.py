@@ -11,7 +11,7 @@ import pytest
 
 from fitctl.config import Rig, default_rig_path, load_rig
 
-pytest_plugins = ["pytester", "skips", "virtual_instrument"]
+pytest_plugins = ["pytester", "skips", "instruments.virtual_instrument"]
 
 # The machine itself may stand still for 100 ms: an example's time says nothing about the code. The examples
 # differ from run to run, also with CI set, where Hypothesis by itself repeats the same ones.

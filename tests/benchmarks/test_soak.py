@@ -5,7 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from log_samples import RUN_INFO, SETTINGS, WALL_S, filled, tick
+from samples.log_samples import RUN_INFO, SETTINGS, WALL_S, filled, tick
 
 from benchmarks.soak import growth, logs, strikes
 from fitctl.commands.shared.fault_kinds import kinds

@@ -6,7 +6,7 @@ import sys
 from contextlib import ExitStack
 
 import pytest
-from served import free_port
+from instruments.served import free_port
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.daemon.locks import device_addresses, only_master, only_supervisor

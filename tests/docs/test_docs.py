@@ -19,7 +19,7 @@ from documents import (
     blocks,
     commands,
 )
-from logged_simulation import designs_of
+from samples.logged_simulation import designs_of
 
 from fitctl.cli import COMMANDS, app, load_command, main
 from fitctl.config import default_rig_path, load_rig
@@ -52,7 +52,7 @@ INSTALLED = {"rerun", "pymcap-cli", "pytest", "python", "ruff", "mypy"}
 NEARBY_PX = np.array([30.0, -10.0])  # a star that is found and held within 20 s
 # Every documented command that the test below does not run, and why; a test named here runs its like.
 NOT_RUN = {
-    "fitctl commission --console*": "wants a terminal: tests/tui/test_commissioning.py",
+    "fitctl commission --console*": "wants a terminal: tests/tui/views/test_commissioning.py",
     "fitctl commission --rig*": "asks a person, or wants mocks: tests/miswired/test_miswired.py",
     "fitctl console*": "wants a terminal: tests/system/screens.py",
     "fitctl demo*": "a whole instrument, in real time: tests/system/test_demos.py",

@@ -24,7 +24,7 @@ from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.mocks.faults import WIRE_FAULTS
 from fitctl.service.metrics import InstrumentCollector
 from fitctl.tui.commands import OPERATOR_COMMANDS, SCREENS, keys_of
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 
 
 def test_the_table_of_modes_is_that_of_the_code():

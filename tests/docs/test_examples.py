@@ -6,7 +6,7 @@ import importlib
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from tests.logged_simulation import LoggedSimulation
+from tests.samples.logged_simulation import LoggedSimulation
 
 # Each has at least so many examples.
 MODULES = {

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Coroutine
 from typing import Any, NamedTuple
 
-from mock_bench import SimulatedMotors
+from instruments.mock_bench import SimulatedMotors
 
 from fitctl import config
 from fitctl.daemon.devices import AMPLIFIERS

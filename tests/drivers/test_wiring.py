@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl.config.wiring import AmplifierWiring
 from fitctl.drivers.wiring import WiredDac, WiredPiezo, crossing

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import pytest
-from served import free_port
+from instruments.served import free_port
 from system.conftest import NEAR, end, running
 
 from fitctl.config import default_rig_path

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import msgspec
 import numpy as np
 import pytest
-from fake_supervisor import FakeSupervisor
-from learner_reports import SHAKEN, learnt_json
+from instruments.fake_supervisor import FakeSupervisor
+from samples.learner_reports import SHAKEN, learnt_json
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for

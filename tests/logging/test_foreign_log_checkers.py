@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from log_samples import RUN_INFO, SETTINGS, one_of_each, tick
+from samples.log_samples import RUN_INFO, SETTINGS, one_of_each, tick
 
 from fitctl.logging.copying import cut, merge, recover
 from fitctl.logging.reading import log_info

@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import (
+from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
     SMALL_CHUNKS,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import (
+from mcap.reader import SeekingReader
+from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
     WALL_S,
@@ -19,7 +20,6 @@ from log_samples import (
     tick,
     write_log,
 )
-from mcap.reader import SeekingReader
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.indexed import IndexedReader

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import RUN_INFO, SETTINGS, WALL_S, contents, files_end_at, frame, tick
 from pydantic import ValidationError
+from samples.log_samples import RUN_INFO, SETTINGS, WALL_S, contents, files_end_at, frame, tick
 
 from fitctl.config import Logging
 from fitctl.logging.copying import merge

@@ -8,8 +8,8 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import given
 from hypothesis import strategies as st
-from log_samples import RUN_INFO, filled, one_of_each
-from logged_simulation import designs_of
+from samples.log_samples import RUN_INFO, filled, one_of_each
+from samples.logged_simulation import designs_of
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for

@@ -5,8 +5,17 @@ import contextlib
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import RUN_INFO, SETTINGS, WALL_S, filled, frame, one_of_each, tick, write_log
 from mcap.writer import MCAP0_MAGIC
+from samples.log_samples import (
+    RUN_INFO,
+    SETTINGS,
+    WALL_S,
+    filled,
+    frame,
+    one_of_each,
+    tick,
+    write_log,
+)
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records

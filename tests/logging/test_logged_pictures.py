@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from log_samples import RUN_INFO, frame, tick, write_log
+from samples.log_samples import RUN_INFO, frame, tick, write_log
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.pictures import LoggedPictures

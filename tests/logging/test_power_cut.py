@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from log_samples import RUN_INFO, logs_in, start_recorder, tick, wait_until
+from samples.log_samples import RUN_INFO, logs_in, start_recorder, tick, wait_until
 from stalls import stalls
 
 from fitctl.config import default_rig_path, load_rig
@@ -29,7 +29,7 @@ PACES = [("500", "frames"), ("500", "ticks only"), ("50", "ticks only")]
 FEEDER = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
-from log_samples import RUN_INFO, frame, tick
+from samples.log_samples import RUN_INFO, frame, tick
 from fitctl.logging.queue import RecordQueue
 
 queue = RecordQueue(sys.argv[1], 4096)

@@ -3,7 +3,7 @@ import time
 import msgspec
 import pytest
 import zmq
-from log_samples import RUN_INFO, tick, wait_until
+from samples.log_samples import RUN_INFO, tick, wait_until
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.queue import RecordQueue, RecordReceiver

@@ -7,7 +7,7 @@ import time
 import msgspec
 import pytest
 import zmq
-from log_samples import (
+from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
     logs_in,

@@ -8,7 +8,7 @@ from fitctl.logging.reading import read_records
 from fitctl.logging.records import Event
 from fitctl.logging.seeking import SeekableLog
 from fitctl.logging.writer import LogWriter
-from tests.log_samples import RUN_INFO, SMALL_CHUNKS, WALL_S
+from tests.samples.log_samples import RUN_INFO, SMALL_CHUNKS, WALL_S
 
 COUNT = 2000
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated import events_of, failing, mode_of, until
+from instruments.simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.commands import SetBiasOffset, Standby

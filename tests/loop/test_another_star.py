@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from simulated import NEAR, TWO_STARS, events_of, mode_of, until
+from instruments.simulated import NEAR, TWO_STARS, events_of, mode_of, until
 
 from fitctl.messages.commands import Look
 from fitctl.messages.modes import Mode

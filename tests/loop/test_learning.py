@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from learner_reports import PAPER, SHAKEN, report
+from samples.learner_reports import PAPER, SHAKEN, report
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line

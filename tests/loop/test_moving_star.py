@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from simulated import darken, mode_of, until
+from instruments.simulated import darken, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import Acquire, Experiment, Release, Standby

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated import darken, events_of, mode_of, until
+from instruments.simulated import darken, events_of, mode_of, until
 
 from fitctl.messages.commands import Acquire, Release, Stop
 from fitctl.messages.modes import Mode

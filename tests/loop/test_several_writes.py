@@ -3,7 +3,7 @@
 import itertools
 
 import pytest
-from simulated import NEAR, events_of, failing, mode_of, until
+from instruments.simulated import NEAR, events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.logging.records import InjectionRecord

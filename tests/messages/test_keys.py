@@ -6,7 +6,7 @@ import stat
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from served import rig_in
+from instruments.served import rig_in
 
 from fitctl.config import ConfigError
 from fitctl.messages.keys import (

@@ -1,7 +1,7 @@
 import asyncio
 
 import pytest
-from mock_bench import in_a_loop
+from instruments.mock_bench import in_a_loop
 
 from fitctl.config import Fault
 from fitctl.mocks.faults import WIRE_FAULTS, FaultKind, Faults, UnknownFault, Wire

@@ -3,7 +3,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from labjack_bench import Bench
+from instruments.labjack_bench import Bench
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.mocks.modbus_dac.server import ModbusDacMock

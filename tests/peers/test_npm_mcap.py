@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from log_samples import RUN_INFO, SETTINGS, frame, one_of_each, tick, write_log
+from samples.log_samples import RUN_INFO, SETTINGS, frame, one_of_each, tick, write_log
 
 from fitctl.logging.copying import cut, merge, recover
 from fitctl.logging.reading import log_info

@@ -5,7 +5,7 @@ import importlib
 import time
 
 import pytest
-from c887_settings import MOCK
+from instruments.c887_settings import MOCK
 
 from fitctl.mocks.c887.server import C887ControllerMock
 

@@ -7,7 +7,7 @@ from importlib.resources import files
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.mocks.cia402.drive import Cia402DriveMock

@@ -5,7 +5,7 @@ import subprocess
 import time
 
 import pytest
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers

@@ -9,7 +9,7 @@ from collections import Counter
 
 import pytest
 from can.interfaces.slcan import slcanBus
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.drivers.cia402.driver import Cia402Amplifiers

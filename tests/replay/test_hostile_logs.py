@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from replay_courses import hold_a_star
+from samples.replay_courses import hold_a_star
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
@@ -16,7 +16,7 @@ from fitctl.controllers.design.document import design_json
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import ControllerChange, Event
-from tests.logged_simulation import LoggedSimulation
+from tests.samples.logged_simulation import LoggedSimulation
 
 PLANTED = "planted-by-the-log"
 

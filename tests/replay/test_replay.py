@@ -4,7 +4,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
-from replay_courses import COURSES, hold_a_star, replayed, two_loops
+from samples.replay_courses import COURSES, hold_a_star, replayed, two_loops
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for

@@ -4,7 +4,7 @@ import math
 
 import msgspec
 import pytest
-from replay_courses import hold_a_star, replayed
+from samples.replay_courses import hold_a_star, replayed
 
 from fitctl.logging.records import CommandRecord, FrameRecord, Tick
 from fitctl.messages.commands import Recover

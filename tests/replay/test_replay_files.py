@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
-from replay_courses import hold_a_star, replayed
+from samples.replay_courses import hold_a_star, replayed
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
@@ -15,7 +15,7 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import Tick
 from fitctl.messages.commands import SetTarget, Stop
-from tests.logged_simulation import WALL_S, LoggedSimulation
+from tests.samples.logged_simulation import WALL_S, LoggedSimulation
 
 
 def test_the_files_that_a_run_was_rotated_into_are_replayed_as_one(logged, tmp_path):

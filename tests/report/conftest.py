@@ -1,5 +1,5 @@
 import pytest
-from report_samples import held_and_jogged, record
+from samples.report_samples import held_and_jogged, record
 
 from fitctl.report.findings import find
 from fitctl.report.run import find_run

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from learner_reports import LINE, report
-from report_samples import record
+from samples.learner_reports import LINE, report
+from samples.report_samples import record
 
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for

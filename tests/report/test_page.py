@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import msgspec
 import numpy as np
 import pytest
-from report_samples import record
+from samples.report_samples import record
 
 from fitctl.config import ConfigError
 from fitctl.daemon.run import run_info

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from logged_simulation import designs_of
 from mcap.writer import Writer
-from report_samples import record
+from samples.logged_simulation import designs_of
+from samples.report_samples import record
 
 from fitctl.config import ConfigError
 from fitctl.daemon.run import run_info

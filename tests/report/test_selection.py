@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from report_samples import PERIOD_S, ticks_of
+from samples.report_samples import PERIOD_S, ticks_of
 
 from fitctl.error_budget import regular
 from fitctl.messages.modes import Mode

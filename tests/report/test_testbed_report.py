@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from report_samples import record
+from samples.report_samples import record
 from test_page import Reader
 
 from fitctl.config import default_rig_path, load_rig

@@ -6,7 +6,7 @@ import math
 import threading
 
 import pytest
-from simulated import failing
+from instruments.simulated import failing
 
 import fitctl
 from fitctl import AsyncInstrument, Instrument

@@ -12,7 +12,7 @@ import pytest
 import zmq
 from hypothesis import given
 from hypothesis import strategies as st
-from served import Served, rig_in, until
+from instruments.served import Served, rig_in, until
 
 from fitctl.clock import MonotonicClock, VirtualClock
 from fitctl.config import ConfigError

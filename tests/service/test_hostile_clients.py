@@ -13,7 +13,7 @@ import psutil
 import pytest
 import zmq
 import zmq.utils.monitor
-from served import Served, until
+from instruments.served import Served, until
 
 from fitctl.messages.commands import Status, Stop
 from fitctl.messages.endpoints import tcp_endpoint
@@ -21,6 +21,18 @@ from fitctl.messages.endpoints import tcp_endpoint
 pytestmark = pytest.mark.long
 
 _LISTENS_S = 60.0
+FLOODS = """
+import sys
+import zmq
+endpoint, server, public, secret, message = map(bytes.fromhex, sys.argv[1:])
+while True:
+    one = zmq.Context.instance().socket(zmq.DEALER)
+    one.curve_serverkey, one.curve_publickey, one.curve_secretkey = server, public, secret
+    one.connect(endpoint.decode())
+    for _ in range(500):
+        one.send_multipart([b"tag", message])
+    one.close(linger=20_000)
+"""
 _RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 
 
@@ -150,16 +162,19 @@ def test_who_connects_anew_with_each_flood_of_stops_is_refused_for_a_while_and_o
 ):
     """Each connection stays below its limit, and hangs up; a commander's stops exceed the rate of commands."""
     key, stop = served.key("stopper"), msgspec.msgpack.encode(Stop())
+    given = [
+        tcp_endpoint(key.host, key.command_port).encode(),
+        key.server_public.encode(),
+        key.public.encode(),
+        key.secret.encode(),
+        stop,
+    ]
+    # A process of its own: here, each message would wait for the thread that steps the instrument.
+    flood = subprocess.Popen([sys.executable, "-c", FLOODS, *(one.hex() for one in given)])
 
-    def refused():
-        one = socket_of(zmq.DEALER, key)
-        one.connect(tcp_endpoint(key.host, key.command_port))
-        for _ in range(500):
-            one.send_multipart([b"tag", stop])
-        one.close(linger=20_000)
-        return any("the key stopper sends far more" in told for told in served.events())
-
-    until(refused)
+    until(lambda: any("the key stopper sends far more" in told for told in served.events()))
+    flood.terminate()
+    flood.wait(20)
     is_well(served)
 
 

@@ -4,7 +4,7 @@ import itertools
 import time
 
 import msgspec
-from served import Served
+from instruments.served import Served
 
 from fitctl.logging.records import Snapshot
 from fitctl.messages.commands import Standby

@@ -14,7 +14,7 @@ from fitctl.config import ConfigError
 from fitctl.logging.records import MetrologyTick, Overlap
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.service.metrics import HOST, InstrumentCollector, serve_metrics
-from tests.fake_supervisor import WALL_MINUS_MONOTONIC_S, FakeSupervisor
+from tests.instruments.fake_supervisor import WALL_MINUS_MONOTONIC_S, FakeSupervisor
 
 
 class Line:

@@ -6,7 +6,7 @@ from contextlib import suppress
 import msgspec
 import pytest
 import zmq
-from served import Served, until
+from instruments.served import Served, until
 
 from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError

@@ -5,7 +5,7 @@ import threading
 
 import msgspec
 import pytest
-from served import Served, until
+from instruments.served import Served, until
 
 from fitctl.clock import VirtualClock
 from fitctl.config import ConfigError, default_rig_path, load_rig

@@ -6,7 +6,7 @@ import pytest
 import zmq
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from served import Served
+from instruments.served import Served
 
 from fitctl.messages.commands import Status, Stop
 from fitctl.messages.endpoints import COMMAND_SOCKET, TELEMETRY_SOCKET, tcp_endpoint

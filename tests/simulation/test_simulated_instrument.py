@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from simulated import NEAR, darken, events_of, mode_of, until
+from instruments.simulated import NEAR, darken, events_of, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from c887_settings import MOCK, device
+from instruments.c887_settings import MOCK, device
 
 from fitctl.clock import MonotonicClock, VirtualClock
 from fitctl.config import CollectorMotion, ConfigError, default_rig_path, load_rig

@@ -5,7 +5,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from c887_settings import MOCK, device
+from instruments.c887_settings import MOCK, device
 from serial.urlhandler import protocol_socket
 
 from fitctl.clock import MonotonicClock

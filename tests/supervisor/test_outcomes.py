@@ -4,7 +4,7 @@ import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
-from simulated import NEAR, darken, events_of, failing, until
+from instruments.simulated import NEAR, darken, events_of, failing, until
 
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.command_table import COMMANDS

@@ -6,7 +6,7 @@ from unittest.mock import patch
 import msgspec
 import numpy as np
 import pytest
-from simulated import darken, events_of, failing, mode_of, until
+from instruments.simulated import darken, events_of, failing, mode_of, until
 
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import DeviceFault

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated import events_of, failing, mode_of, until
+from instruments.simulated import events_of, failing, mode_of, until
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.logging.records import CommandRecord, DeviceHealth, FrameRecord, PiezoReading, Tick

@@ -4,7 +4,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 
 import pytest
-from simulated import darken, events_of, until
+from instruments.simulated import darken, events_of, until
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.centroid import StarSensor, sensor_noise_px

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from served import free_port
+from instruments.served import free_port
 
 from fitctl.config import default_rig_path
 from fitctl.messages.client import Client

@@ -12,7 +12,7 @@ from contextlib import suppress
 import psutil
 import pytest
 import zmq
-from served import free_port
+from instruments.served import free_port
 
 from fitctl.config import load_rig
 from fitctl.messages.client import Client

@@ -10,7 +10,7 @@ import pytest
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.reading import read_records
 from fitctl.messages.commands import SetTarget, Shutdown, Stop
-from tests.logged_simulation import LoggedSimulation
+from tests.samples.logged_simulation import LoggedSimulation
 
 from .conftest import NEAR, end, running
 

@@ -12,8 +12,8 @@ from contextlib import suppress
 
 import psutil
 import pytest
+from instruments.served import free_port
 from prometheus_client.parser import text_string_to_metric_families
-from served import free_port
 
 from fitctl.messages.commands import Stop
 

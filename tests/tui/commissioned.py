@@ -1,6 +1,6 @@
 """A console that does the steps of a commissioning, whose process is answered by heart."""
 
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp
 
 RIG = ["--rig", "mine.toml", "--folder", "records"]

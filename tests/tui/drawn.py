@@ -3,7 +3,7 @@
 import msgspec
 
 from fitctl.tui.state import ConsoleState
-from tests.fake_supervisor import START_S
+from tests.instruments.fake_supervisor import START_S
 
 
 def shown(supervisor, count=50):

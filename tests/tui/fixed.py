@@ -11,7 +11,7 @@ from fitctl.controllers.design.theory import loop_theory
 from fitctl.error_budget import LoopTheory, theory_to_plain
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.rewind.player import Player
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 
 

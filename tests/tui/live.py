@@ -9,7 +9,7 @@ from textual.pilot import Pilot
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.widgets.alarmbar import AlarmBar
 from fitctl.tui.widgets.header import Header
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 
 DEADLINE_S = 10.0

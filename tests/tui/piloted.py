@@ -7,7 +7,7 @@ from pathlib import Path
 from textual.events import Key
 from textual.pilot import Pilot
 
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, settle
 
 Scenario = Callable[[FixedApp, Pilot], Awaitable[None]]

@@ -11,7 +11,7 @@ from fitctl.tui.dialogs import Alarms, alarms_text
 from fitctl.tui.inks import ORANGE, RED
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.alarmbar import AlarmBar
-from tests.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
 from tests.tui.wrong import ALARMS, FAULT, stopped_testbed
 
 

@@ -17,7 +17,7 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.telemetry import TrippedInterlock
 from fitctl.tui.dialogs import Confirm
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 from tests.tui.live import header_text, notifications, run, until
 

@@ -30,7 +30,7 @@ from fitctl.tui.state import WINDOWS
 from fitctl.tui.views.operate import OperateView
 from fitctl.tui.widgets.choice import Choice
 from fitctl.tui.widgets.focalplane import FocalPlane
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, make_logs
 
 SCREENS = [ConsoleApp.MODES[view.name] for view in ALL_SCREENS]
@@ -183,7 +183,7 @@ LISTS = [
             ("f", "4", {"dialog": "Ask"}),
         ],
     ),
-    # A console of a supervisor only shows the steps: tests/tui/test_commissioning.py does them.
+    # A console of a supervisor only shows the steps: tests/tui/views/test_commissioning.py does them.
     *lines(ConsoleApp.MODES["commissioning"], [(key, "7", {}) for key in ("g", "d", "n", "z")]),
     *lines(
         ConsoleApp.MODES["logs"],

@@ -5,7 +5,7 @@ import pytest
 from fitctl.messages.commands import Jog, SetBiasOffset, SetTarget
 from fitctl.tui.jog import AGAIN_S, STAGES, JogPad
 from fitctl.tui.state import ConsoleState
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 
 
 def loop_in(mode, bias_offset_urad=(0.0, 0.0)):

@@ -10,8 +10,8 @@ from pytest_textual_snapshot import SVGImageExtension
 
 from fitctl.messages.telemetry import LearningState
 from fitctl.tui.commands import COMMISSIONING, VIEWS
-from tests.fake_supervisor import MODE_NUMBERS, TESTBED, FakeSupervisor
-from tests.learner_reports import LINE, learnt_json, report
+from tests.instruments.fake_supervisor import MODE_NUMBERS, TESTBED, FakeSupervisor
+from tests.samples.learner_reports import LINE, learnt_json, report
 from tests.tui.commissioned import OUTPUT, commissioning
 from tests.tui.fixed import FixedApp, make_logs, settle
 from tests.tui.wrong import (

@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from fitctl.logging.records import Event, MetrologyTick, Overlap
 from fitctl.tui.history import KEPT_S, Past
 from fitctl.tui.state import WINDOWS, ConsoleState, error_rms
-from tests.fake_supervisor import MESSAGE_S, START_S, WALL_MINUS_MONOTONIC_S, FakeSupervisor
+from tests.instruments.fake_supervisor import (
+    MESSAGE_S,
+    START_S,
+    WALL_MINUS_MONOTONIC_S,
+    FakeSupervisor,
+)
 
 
 def fed(supervisor, count):

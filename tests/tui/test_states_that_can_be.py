@@ -10,7 +10,7 @@ from fitctl.messages.commands import Acquire, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.simulation import Simulation
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 
 MODES = ["STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE"]
 STAR_OFFSET_PX = (30.0, 20.0)  # out of the field: the search takes a while

@@ -17,7 +17,7 @@ from fitctl.tui import app as console_app
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.dialogs import events_text
 from fitctl.tui.wire import UNDRAWN_MESSAGES
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
 from tests.tui.live import DEADLINE_S, Clock, header_text, notifications, run, until
 

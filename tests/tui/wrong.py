@@ -5,7 +5,7 @@ from collections.abc import Callable
 import msgspec
 
 from fitctl.messages.telemetry import LoopFailure, Telemetry, TrippedInterlock
-from tests.fake_supervisor import STAR_LOST, START_S, TESTBED, FakeSupervisor
+from tests.instruments.fake_supervisor import STAR_LOST, START_S, TESTBED, FakeSupervisor
 
 FAULT = (
     "siderostat right at socket://127.0.0.1:29536: expected no fault, got axis 2: following error; "

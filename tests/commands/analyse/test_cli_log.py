@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from log_samples import (
+from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
     SMALL_CHUNKS,

@@ -9,7 +9,7 @@ from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.messages.commands import SetController
-from tests.logged_simulation import LoggedSimulation
+from tests.samples.logged_simulation import LoggedSimulation
 
 
 @pytest.fixture(scope="module")

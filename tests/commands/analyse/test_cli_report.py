@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from report_samples import record
+from samples.report_samples import record
 
 from fitctl.cli import main
 from fitctl.report.pdf import BROWSERS, PdfError, print_pdf

@@ -4,7 +4,7 @@ import json
 
 import msgspec
 import pytest
-from log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
+from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from report_samples import record
+from samples.report_samples import record
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig

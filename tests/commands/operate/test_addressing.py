@@ -5,7 +5,7 @@ import time
 from contextlib import ExitStack
 
 import pytest
-from served import Served, free_port, rig_in
+from instruments.served import Served, free_port, rig_in
 
 from fitctl import Instrument
 from fitctl.cli import main

@@ -13,7 +13,7 @@ from fitctl.commands.shared.printing import to_json, utc
 from fitctl.logging.records import Event
 from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
 from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
-from tests.fake_supervisor import STAR_LOST, FakeSupervisor
+from tests.instruments.fake_supervisor import STAR_LOST, FakeSupervisor
 
 TRIPPED = TrippedInterlock(
     name="flux_low",

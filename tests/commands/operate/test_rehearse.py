@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from served import Served
+from instruments.served import Served
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path

@@ -6,8 +6,8 @@ import threading
 from functools import partial
 
 import pytest
-from served import Served, until
-from simulated import darken, failing
+from instruments.served import Served, until
+from instruments.simulated import darken, failing
 
 from fitctl.cli import main
 from fitctl.commands.operate import send

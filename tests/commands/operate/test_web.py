@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from urllib.parse import urlsplit
 
 import pytest
-from served import free_port
+from instruments.served import free_port
 
 LIMIT_S = 60.0
 

@@ -10,7 +10,7 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from served import Served
+from instruments.served import Served
 
 from fitctl.cli import main
 from fitctl.commissioning.asking import PROBES

@@ -4,7 +4,7 @@ import asyncio
 import signal
 
 import pytest
-from served import Served
+from instruments.served import Served
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path

@@ -17,7 +17,7 @@ from fitctl.controllers.design.standing import standing
 from fitctl.messages.command_table import command_of
 from fitctl.report.findings import find
 from fitctl.report.run import find_run
-from tests.logged_simulation import LoggedSimulation
+from tests.samples.logged_simulation import LoggedSimulation
 
 (EXAMPLE,) = (block.text for block in blocks("python") if "def design" in block.text)
 RAN = "import pathlib; pathlib.Path(__file__).with_suffix('.ran').touch()\n"

@@ -7,7 +7,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from c887_settings import MOCK, device
+from instruments.c887_settings import MOCK, device
 from scripted_server import scripted_server
 from serial.urlhandler import protocol_socket
 

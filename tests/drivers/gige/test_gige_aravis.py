@@ -1,4 +1,4 @@
-"""The Aravis back end where Aravis is not; with it: tests/peers/test_aravis.py."""
+"""The Aravis back end where Aravis is not; with it: tests/peers/gige/test_aravis.py."""
 
 from __future__ import annotations
 

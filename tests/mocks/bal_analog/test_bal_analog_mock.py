@@ -5,7 +5,7 @@ import functools
 import math
 
 import pytest
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 from pymodbus.client import AsyncModbusTcpClient
 
 from fitctl import config

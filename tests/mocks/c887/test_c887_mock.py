@@ -9,9 +9,9 @@ import termios
 import hypothesis
 import numpy as np
 import pytest
-from c887_settings import MOCK
 from hypothesis import given
 from hypothesis import strategies as st
+from instruments.c887_settings import MOCK
 
 from fitctl.config import Fault
 from fitctl.drivers.c887 import protocol

@@ -4,7 +4,7 @@ import asyncio
 import math
 import time
 
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl import config
 from fitctl.drivers.cia402 import protocol

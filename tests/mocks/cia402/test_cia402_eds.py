@@ -6,7 +6,7 @@ from importlib.resources import files
 import canopen
 import pytest
 from canopen import objectdictionary as od
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl import config
 from fitctl.mocks.cia402.dictionary import SdoAbortError

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 from cia402_bus import Bus
-from mock_bench import ToldMotors
+from instruments.mock_bench import ToldMotors
 
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.drivers.cia402 import protocol

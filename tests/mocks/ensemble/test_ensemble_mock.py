@@ -9,7 +9,7 @@ import hypothesis
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mock_bench import SimulatedMotors, ToldMotors
+from instruments.mock_bench import SimulatedMotors, ToldMotors
 
 from fitctl import config
 from fitctl.drivers.ensemble.protocol import (

@@ -11,8 +11,8 @@ import time
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from labjack_bench import DEVICE, SETTINGS, Bench
-from mock_bench import in_a_loop
+from instruments.labjack_bench import DEVICE, SETTINGS, Bench
+from instruments.mock_bench import in_a_loop
 
 from fitctl.config import Fault
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock

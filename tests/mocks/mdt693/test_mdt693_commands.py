@@ -4,8 +4,8 @@ import asyncio
 import itertools
 
 import pytest
+from instruments.mock_bench import in_a_loop
 from mdt693_terminal import A_301, B_110, EXACT, QUIET, SETTINGS, amplifier
-from mock_bench import in_a_loop
 
 from fitctl.mocks.mdt693.amplifier import Amplifier
 

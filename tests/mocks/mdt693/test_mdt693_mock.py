@@ -6,8 +6,8 @@ import os
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instruments.mock_bench import in_a_loop
 from mdt693_terminal import A_301, B_105, B_110, COMPATIBLE, QUIET, amplifier
-from mock_bench import in_a_loop
 
 from fitctl.mocks.mdt693.line import CommandSplitter
 

@@ -6,7 +6,7 @@ import termios
 from contextlib import asynccontextmanager
 
 import pytest
-from mock_bench import in_a_loop
+from instruments.mock_bench import in_a_loop
 
 from fitctl.config import Fault
 from fitctl.mocks.faults import WIRE_FAULTS, Faults

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 
 import pytest
-from mock_bench import in_a_loop
+from instruments.mock_bench import in_a_loop
 
 from fitctl.mocks.faults import WIRE_FAULTS, Faults
 from fitctl.mocks.modbus.pdu import DataModel

@@ -5,7 +5,7 @@ import contextlib
 import socket
 
 import pytest
-from mock_bench import in_a_loop
+from instruments.mock_bench import in_a_loop
 
 from fitctl.config import DacMock, Fault, default_rig_path, load_rig
 from fitctl.mocks.modbus_dac.server import ModbusDacMock

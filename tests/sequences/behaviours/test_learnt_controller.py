@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from learner_reports import SHAKEN, report
+from samples.learner_reports import SHAKEN, report
 from sequence_runs import run_sequence
 
 from fitctl.sequences.links import SimulatedLink

@@ -17,7 +17,7 @@ from fitctl.tui.widgets.header import Header
 from fitctl.tui.widgets.keys import Keys
 from fitctl.tui.widgets.loglist import LogList
 from fitctl.tui.widgets.panel import Panel
-from tests.fake_supervisor import MESSAGE_S, START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import MESSAGE_S, START_S, FakeSupervisor
 from tests.tui.drawn import plain
 from tests.tui.fixed import FixedApp, settle
 from tests.tui.piloted import pressed, run, sent

@@ -19,7 +19,7 @@ from fitctl.tui.graphics import Graphics, PictureSender, cell_size_px, graphics_
 from fitctl.tui.inks import SKY
 from fitctl.tui.widgets import focalplane
 from fitctl.tui.widgets.focalplane import FocalPlane
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp, settle
 from tests.tui.piloted import run_app
 

@@ -5,8 +5,8 @@ import timeit
 
 import numpy as np
 import pytest
+from instruments.served import until
 from interlock_bench import Bench, late_frames, servo_that_skips, struck
-from served import until
 
 from fitctl.config import QUANTITIES
 from fitctl.daemon.machine import Machine, wall_minus_monotonic_s

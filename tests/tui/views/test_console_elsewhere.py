@@ -4,7 +4,7 @@ from fitctl.messages.commands import SequenceControl
 from fitctl.tui.dialogs import Confirm
 from fitctl.tui.widgets.margins import Margins
 from fitctl.tui.widgets.printed import Printed
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FixedApp
 from tests.tui.live import notifications
 from tests.tui.piloted import pressed, run_app, sent

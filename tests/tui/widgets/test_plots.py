@@ -20,7 +20,7 @@ from fitctl.tui.widgets.spectrum import ErrorBudget, Spectrum, _limits, loop_spe
 from fitctl.tui.widgets.stages import Stages, working_point
 from fitctl.tui.widgets.timing import Breakdown
 from fitctl.tui.widgets.traces import Traces, axis_limit, trace_lines
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.drawn import changed_tick, plain, shown
 from tests.tui.fixed import theory_of
 

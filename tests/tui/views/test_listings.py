@@ -13,7 +13,7 @@ from fitctl.tui.widgets.loglist import LogList
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.readings import Readings
 from fitctl.tui.widgets.sequencing import Parameters, SequenceList
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import FakeJob, make_logs, settle
 from tests.tui.live import notifications
 from tests.tui.piloted import pressed, run, sent, typed_at_once

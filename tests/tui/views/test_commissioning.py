@@ -13,7 +13,7 @@ from fitctl.tui.dialogs import Ask, Confirm
 from fitctl.tui.jobs import Job
 from fitctl.tui.steps import StepFacts, StepList
 from fitctl.tui.widgets.header import Header
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.commissioned import GO, OUTPUT, RIG, commissioning
 from tests.tui.fixed import FixedApp, settle
 from tests.tui.live import header_text, notifications

@@ -29,8 +29,13 @@ from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces
 from fitctl.tui.wire import NoLink
-from tests.fake_supervisor import START_S, TESTBED, WALL_MINUS_MONOTONIC_S, FakeSupervisor
-from tests.log_samples import SETTINGS
+from tests.instruments.fake_supervisor import (
+    START_S,
+    TESTBED,
+    WALL_MINUS_MONOTONIC_S,
+    FakeSupervisor,
+)
+from tests.samples.log_samples import SETTINGS
 from tests.tui.drawn import plain
 from tests.tui.fixed import FakeJob, PromptPlayer
 from tests.tui.live import until

@@ -8,7 +8,7 @@ from fitctl.tui.widgets.events import Events
 from fitctl.tui.widgets.focalplane import FocalPlane
 from fitctl.tui.widgets.hand import Hand
 from fitctl.tui.widgets.keys import Keys
-from tests.fake_supervisor import FakeSupervisor
+from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.fixed import settle
 from tests.tui.piloted import pressed, run, sent
 

@@ -1,13 +1,13 @@
 """Fixtures of an instrument on the virtual clock, which the tests of several rooms share."""
 
 import pytest
-from replay_courses import SOON, hold_a_star
-from simulated import NEAR, until
+from instruments.simulated import NEAR, until
+from samples.replay_courses import SOON, hold_a_star
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
-from tests.logged_simulation import LoggedSimulation
+from tests.samples.logged_simulation import LoggedSimulation
 
 
 @pytest.fixture

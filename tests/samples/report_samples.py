@@ -1,7 +1,7 @@
 """Logs to report on, from the virtual clock, and ticks made by hand."""
 
 import numpy as np
-from logged_simulation import designs_of
+from samples.logged_simulation import designs_of
 
 from fitctl.daemon.run import run_info
 from fitctl.logging.records import FrameRecord, RecorderStatus

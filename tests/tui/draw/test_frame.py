@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from fitctl.tui.draw import frame
 from fitctl.tui.draw.colours import ANCHORS, colour_map
 from fitctl.tui.look import width
-from tests.fake_supervisor import spot_image
+from tests.instruments.fake_supervisor import spot_image
 
 INFERNO = colour_map("inferno")
 

@@ -20,7 +20,7 @@ from fitctl.tui.widgets.sequencing import (
     Progress,
     SequenceList,
 )
-from tests.fake_supervisor import START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.drawn import plain, shown
 from tests.tui.fixed import SEQUENCES
 

@@ -176,7 +176,7 @@ def test_packets_that_aravis_camera_loses_and_cannot_resend_are_counted() -> Non
 
 def back_end(script: str, **order) -> dict:
     python = python_with_the_binding()
-    packages = [sysconfig.get_path("purelib"), str(HERE.parents[1])]
+    packages = [sysconfig.get_path("purelib"), str(HERE.parents[2])]
     environment = ["env", f"PYTHONPATH={os.pathsep.join(packages)}", python]
     if not works(*environment, "-c", "import fitctl.drivers.gige.driver, fitctl.config"):
         pytest.skip("the system's Python cannot use this environment's packages")

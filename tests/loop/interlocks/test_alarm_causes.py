@@ -5,9 +5,9 @@ it is about, every device failed, commands that fail, two loops on one camera.
 """
 
 import pytest
+from instruments.simulated import failing
 from interlock_bench import STRIKES, Bench, light, struck
-from replay_courses import two_loops
-from simulated import failing
+from samples.replay_courses import two_loops
 
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.messages.commands import (

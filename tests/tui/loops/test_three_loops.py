@@ -19,7 +19,7 @@ from fitctl.tui.widgets.health import Devices
 from fitctl.tui.widgets.keys import Keys
 from fitctl.tui.widgets.readings import DeviceList
 from fitctl.tui.widgets.traces import Traces
-from tests.fake_supervisor import STAR_LOST, TESTBED, FakeSupervisor
+from tests.instruments.fake_supervisor import STAR_LOST, TESTBED, FakeSupervisor
 from tests.loop.test_link import Testbed
 from tests.tui.drawn import changed_tick, plain, shown
 from tests.tui.fixed import settle

@@ -1,9 +1,9 @@
 """What a simulation does while it is logged, and the replay of such a log."""
 
 import pytest
-from learner_reports import SHAKEN
-from learner_reports import report as learner_report
-from simulated import TWO_STARS, darken, failing, until
+from instruments.simulated import TWO_STARS, darken, failing, until
+from samples.learner_reports import SHAKEN
+from samples.learner_reports import report as learner_report
 
 from fitctl.config import default_rig_path, load_rig, rig_from_document, rig_from_log
 from fitctl.drivers.interface import DeviceMismatch, DeviceTimeout

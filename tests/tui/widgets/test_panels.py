@@ -28,7 +28,7 @@ from fitctl.tui.widgets.spectrum import ErrorBudget, Spectrum
 from fitctl.tui.widgets.stages import Stages
 from fitctl.tui.widgets.timing import Breakdown, Histograms
 from fitctl.tui.widgets.traces import Traces
-from tests.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
+from tests.instruments.fake_supervisor import STAR_LOST, START_S, FakeSupervisor
 from tests.tui.drawn import plain, shown
 from tests.tui.fixed import DESIGN
 
