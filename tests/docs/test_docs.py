@@ -55,7 +55,7 @@ NOT_RUN = {
     "fitctl commission --console*": "wants a terminal: tests/tui/views/test_commissioning.py",
     "fitctl commission --rig*": "asks a person, or wants mocks: tests/miswired/test_miswired.py",
     "fitctl console*": "wants a terminal: tests/system/screens.py",
-    "fitctl demo*": "a whole instrument, in real time: tests/system/test_demos.py",
+    "fitctl demo*": "a whole instrument, in real time: tests/system/alone/test_demos.py",
     "fitctl fault clear": "needs running mocks: tests/commands/try_out/test_cli_fault.py",
     "fitctl fault now": "needs running mocks: tests/commands/try_out/test_cli_fault.py",
     "fitctl fault set *": "needs running mocks: tests/commands/try_out/test_cli_fault.py",

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from .conftest import fitctl, nothing_was_lost_without_a_stall
+from ..conftest import fitctl, nothing_was_lost_without_a_stall
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import fitctl
+from ..conftest import fitctl
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""What needs both cores: more than one instrument, or the whole testbed."""
