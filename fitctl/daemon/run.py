@@ -197,7 +197,9 @@ def run_supervisor(
         on_ready(folder)
         tell_service_manager(READY)
         try:
-            _loop(supervisor, service, housekeep, children, machine, executor, clock, ending)
+            # A thread for them alone: that of the devices may wait for a silent one for seconds.
+            with ThreadPoolExecutor(1, thread_name_prefix="children") as watcher:
+                _loop(supervisor, service, housekeep, children, machine, watcher, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -275,7 +277,7 @@ def _loop(
     housekeep: Callable[[], None],
     children: Sequence[Child],
     machine: Machine,
-    executor: ThreadPoolExecutor,
+    watcher: ThreadPoolExecutor,
     clock: MonotonicClock,
     ending: threading.Event,
 ) -> None:
@@ -288,7 +290,7 @@ def _loop(
                 housekeeping_s += _HOUSEKEEPING_S
                 housekeep()
                 for child in children:
-                    checked = executor.submit(child.check)
+                    checked = watcher.submit(child.check)
                     checked.add_done_callback(partial(_report_failure, child.name, report))
                 machine.look()
                 if not service.is_alive():
