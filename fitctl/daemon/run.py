@@ -197,9 +197,7 @@ def run_supervisor(
         on_ready(folder)
         tell_service_manager(READY)
         try:
-            # A thread for them alone: that of the devices may wait for a silent one for seconds.
-            with ThreadPoolExecutor(1, thread_name_prefix="children") as watcher:
-                _loop(supervisor, service, housekeep, children, machine, watcher, clock, ending)
+            _loop(supervisor, service, housekeep, children, machine, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -277,12 +275,13 @@ def _loop(
     housekeep: Callable[[], None],
     children: Sequence[Child],
     machine: Machine,
-    watcher: ThreadPoolExecutor,
     clock: MonotonicClock,
     ending: threading.Event,
 ) -> None:
     housekeeping_s = clock.now_s() + _HOUSEKEEPING_S
     report = supervisor.report_event
+    # A thread for the children alone: that of the devices may wait for a silent one for seconds.
+    watcher = ThreadPoolExecutor(1, thread_name_prefix="children")
     try:
         while not (supervisor.shutdown_wanted or ending.is_set()):
             supervisor.step()
@@ -304,6 +303,7 @@ def _loop(
             supervisor.step()
     finally:
         supervisor.close()
+        watcher.shutdown(cancel_futures=True)
 
 
 def _keeps_bound(

@@ -145,6 +145,7 @@ class Learner:
             learnt_camera_px=advice.learnt.camera_px,
             measured_px=max(advice.measured_px),
             worth_it=advice.worth_it,
+            fits=advice.night.test.fits,
         )
 
 

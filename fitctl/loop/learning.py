@@ -76,6 +76,8 @@ class Learning:
         if abs(gained - self._told) < _NEWS or (self.setting == "on" and not self._by_hand):
             return ""
         self._told = gained
+        if not report.fits:
+            return "the learner's model no longer explains the frames; the design in force is kept"
         if not gained:
             return "the design in force leaves as little as a learnt one would"
         return f"{self.what_is_gained(report)}; to apply it: {self.command}"

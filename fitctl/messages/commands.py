@@ -190,6 +190,8 @@ class LearnerReport(Command, frozen=True, kw_only=True):
         The same, measured with the design in force; of the worst axis.
     worth_it : bool
         The model fits the frames, and the learnt design leaves clearly less.
+    fits : bool
+        The model fits the frames.
     """
 
     design_json: str
@@ -201,6 +203,7 @@ class LearnerReport(Command, frozen=True, kw_only=True):
     learnt_camera_px: float = 0.0
     measured_px: float = 0.0
     worth_it: bool = False
+    fits: bool = True
 
 
 class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -87,6 +87,14 @@ def test_a_night_that_the_design_in_force_suits_gives_no_event():
     assert night.loop.state(0.0).learning.state == "kept"
 
 
+def test_advice_is_withdrawn_with_its_reason(shaken):
+    night = Night(*SHAKEN, learn="advise")
+    night.report()
+    night.report(worth_it=False, fits=False)
+
+    assert any("no longer explains the frames" in text for text in night.events())
+
+
 def test_the_operator_applies_what_was_advised():
     night = Night(*SHAKEN, learn="advise")
     refused = night.simulation.command(SetController(name="learnt"))

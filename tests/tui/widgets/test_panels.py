@@ -391,7 +391,7 @@ def test_a_place_is_read_from_the_palette(query, command):
 # ---------------------------------------------------------------- what was learnt
 
 
-def learnt(state, **values):
+def learnt(state, fits=True, **values):
     report = LearnerReport(
         loop="right",
         design_json="{}",
@@ -399,6 +399,7 @@ def learnt(state, **values):
         evaluated_s=60.0,
         present_px=0.1,
         learnt_px=0.024,
+        fits=fits,
     )
     return LearningState(setting="on", state=state, text="a line at 6 Hz", report=report, **values)
 
@@ -408,6 +409,7 @@ def learnt(state, **values):
     [
         (LearningState(setting="advise", state="collecting"), ["collecting frames in VERNIER"]),
         (learnt("kept"), ["no other design would leave clearly less", "a line at 6 Hz"]),
+        (learnt("kept", fits=False), ["the model does not explain the frames: kept"]),
         (
             learnt("advice"),
             ["0.0240 px instead of 0.1000", "fitctl send controller learnt --loop right"],
