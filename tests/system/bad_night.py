@@ -3,7 +3,7 @@
 The pictures of docs/console.md, on the whole testbed in tmux, and the one in a browser (in ``tests/``):
 
 python -m system.bad_night ../docs/pictures
-python -m system.bad_night ../docs/pictures --browser
+unshare -u sh -c "hostname observatory; python -m system.bad_night ../docs/pictures --browser"
 """
 
 import argparse
