@@ -88,6 +88,7 @@ _VALUES = {
     "learnt_camera_px": 0.018,
     "measured_px": 0.022,
     "worth_it": True,
+    "fits": True,
 }
 _RECORDER = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_written=9)
 # Where a field of one command means something else.
