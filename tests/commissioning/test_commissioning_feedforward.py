@@ -33,7 +33,7 @@ def matrix(az, el):
     return f"loops.left.feedforward.matrix=[[{az}, 0.0], [0.0, {el}]]"
 
 
-def scanned(found=TRUTH, rms_px=0.02, sd=0.002):
+def scanned(found=TRUTH, rms_px=0.02, sd=0.002, late=0.0):
     """What a scan gave."""
     nothing = np.empty((0, 2))
     result = feedforward.FeedforwardResult(
@@ -44,6 +44,8 @@ def scanned(found=TRUTH, rms_px=0.02, sd=0.002):
         px_per_mm=0.015,
         excess=1.0,
         frames=4000,
+        left_out=0.0,
+        late=late,
         link_arcsec=nothing,
         turned_arcsec=nothing,
         left_arcsec=nothing,
@@ -144,21 +146,29 @@ def test_with_the_right_matrix_the_star_is_held_while_the_collector_moves(monkey
 def scan_of(monkeypatch):
     """The step, with a scan that gives this matrix and RMS."""
 
-    def give(found, rms_px):
-        monkeypatch.setattr(link, "scanned", lambda *_: scanned(found, rms_px))
+    def give(found, rms_px, **others):
+        monkeypatch.setattr(link, "scanned", lambda *_: scanned(found, rms_px, **others))
         return link.check_feedforward(site_of())
 
     return give
 
 
-def test_a_matrix_is_replaced_where_the_scan_excludes_it(scan_of):
-    assert scan_of([[1.005, 0.0], [0.0, 1.0]], 0.02).state == "passed"
-    assert scan_of([[1.007, 0.0], [0.0, 1.0]], 0.02).state == "corrected"
+def test_a_matrix_is_replaced_where_the_scan_excludes_it_and_it_matters(scan_of):
+    assert scan_of([[1.009, 0.0], [0.0, 1.0]], 0.02).state == "passed"
+    assert scan_of([[1.012, 0.0], [0.0, 1.0]], 0.02, sd=0.005).state == "passed"
+    assert scan_of([[1.012, 0.0], [0.0, 1.0]], 0.02).state == "corrected"
 
 
 def test_a_star_that_the_right_matrix_does_not_hold_is_named_with_the_requirement(scan_of):
-    with pytest.raises(StepError, match=r"held to 0\.300 px RMS; the requirement is 0\.1 px"):
+    with pytest.raises(
+        StepError, match=r"held to 0\.300 px RMS; the requirement is 0\.1 px; .* backlash"
+    ):
         scan_of([[1.0, 0.0], [0.0, 1.0]], 0.3)
+
+
+def test_a_star_that_late_ticks_let_go_is_not_blamed_on_the_backlash(scan_of):
+    with pytest.raises(StepError, match=r"32% of the ticks were late, so let nothing else run"):
+        scan_of([[1.0, 0.0], [0.0, 1.0]], 0.3, late=0.32)
 
 
 def test_only_a_loop_with_a_feedforward_has_the_steps_and_is_accepted_after_them():

@@ -36,6 +36,10 @@ _MOST_EXCESS = 3.0
 # How well the mirror's way is known, which makes up for what the rig file's matrix is wrong by (choice): by its
 # hysteresis, whose state before the scan is unknown, or by its commands alone.
 _MIRROR_KNOWN, _MIRROR_COMMANDED = 0.1, 0.2
+_OUTLIER = 4.0  # standard deviations
+_SD_PER_MEDIAN = 1.4826  # of the absolute value of a normal variable
+_MOST_FITS = 10
+_BLOCKS = 8  # of the scan, each about half a swing
 _WORTH_ANOTHER = 0.01  # a change after which another scan knows the matrix better
 
 
@@ -57,6 +61,10 @@ class FeedforwardResult:
     excess : float
         RMS of what is left, over what the rig file's air path and centroid noise explain.
     frames : int
+    left_out : float
+        The fraction of them that the fit leaves out as outliers.
+    late : float
+        The fraction of ticks that were late: a stage that is commanded late leaves the star behind.
     link_arcsec, turned_arcsec, left_arcsec : arrays, shape (frames, 2)
         The link's beam, what the own stages undid of it, and what is left after the fit.
     """
@@ -68,6 +76,8 @@ class FeedforwardResult:
     px_per_mm: float
     excess: float
     frames: int
+    left_out: float
+    late: float
     link_arcsec: Floats = field(repr=False)
     turned_arcsec: Floats = field(repr=False)
     left_arcsec: Floats = field(repr=False)
@@ -95,7 +105,8 @@ class FeedforwardResult:
             f"largest change from the rig file's gain times matrix: {change:.4f}{again}",
             f"an error of one standard deviation leaves {self.px_per_mm:.4f} px for each millimetre of the "
             "collector's motion",
-            f"unexplained: {self.excess:.2f} times what the rig file's air path explains, {self.frames} frames",
+            f"unexplained: {self.excess:.2f} times what the rig file's air path explains, {self.frames} "
+            f"frames, {self.left_out:.1%} of them left out as outliers; {self.late:.1%} of the ticks were late",
         ]
 
     def plot(self, path: Path) -> None:
@@ -168,11 +179,12 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:
     times_s, link_px, undone_px = times_s[known], link_px[known], undone_px[known]
     whiten = whitener(rig, loop_name, times_s)
     white, wanted = whiten(design), whiten(undone_px)
-    solution = np.asarray(np.linalg.lstsq(white, wanted, rcond=None)[0], dtype=np.float64)
+    solution, kept = _solve_without_outliers(white, wanted)
+    white, wanted = white[kept], wanted[kept]
     left = wanted - white @ solution
-    variance = np.sum(left**2, axis=0) / (len(times_s) - len(solution))
+    variance = np.sum(left**2, axis=0) / (len(white) - len(solution))
     inverse = np.diag(np.linalg.inv(white.T @ white))
-    sd = np.sqrt(np.outer(inverse, variance))
+    sd = np.maximum(np.sqrt(np.outer(inverse, variance)), _sd_by_blocks(white, wanted))
     given = loop.feedforward
     before = np.zeros((2, 2)) if given is None else given.gain * np.array(given.matrix)
     mirror_error = _MIRROR_COMMANDED if loop.fsm.hysteresis is None else _MIRROR_KNOWN
@@ -194,10 +206,47 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:
         px_per_mm=float(matrix_sd.max() * mm_px),
         excess=excess,
         frames=len(times_s),
+        left_out=float(np.mean(~kept)),
+        late=float(np.mean(ticks["late"])),
         link_arcsec=link_px * per_px,
         turned_arcsec=undone_px * per_px,
         left_arcsec=(undone_px - design @ solution) * per_px,
     )
+
+
+def _solve_without_outliers(design: Floats, wanted: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """The least-squares solution, shape (columns, axes), and the frames that it keeps, shape (frames,).
+
+    On a busy computer a reading of an encoder comes late, and counts as taken later than it was. While the
+    collector moves, that is wrong by many times the noise, and always makes the matrix too small.
+    """
+    kept = np.ones(len(design), dtype=bool)
+    for _ in range(_MOST_FITS):
+        solution = np.linalg.lstsq(design[kept], wanted[kept], rcond=None)[0]
+        left = np.abs(wanted - design @ solution)
+        before, kept = (
+            kept,
+            np.all(left < _OUTLIER * _SD_PER_MEDIAN * np.median(left, axis=0), axis=1),
+        )
+        if np.array_equal(kept, before):
+            break
+    return np.asarray(solution, dtype=np.float64), kept
+
+
+def _sd_by_blocks(design: Floats, wanted: Floats) -> Floats:
+    """Standard deviation of a least-squares solution, shape (columns, axes), by leaving out parts of the scan.
+
+    What a busy computer does to the readings comes in bursts, and is not noise from frame to frame. This is the
+    delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, Springer 1995).
+    """
+    block = np.arange(len(design)) * _BLOCKS // len(design)
+    without = np.array(
+        [
+            np.linalg.lstsq(design[block != left_out], wanted[block != left_out], rcond=None)[0]
+            for left_out in range(_BLOCKS)
+        ]
+    )
+    return np.asarray(np.sqrt(_BLOCKS - 1) * without.std(axis=0), dtype=np.float64)
 
 
 def _mirror_rad(fsm: Fsm, ticks: Columns) -> Floats:
