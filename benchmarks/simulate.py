@@ -17,7 +17,7 @@ import numpy as np
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.model.air_path import NODE_S
 from fitctl.model.compiled import compilable, compiled
-from fitctl.model.pixel_noise import mix, quantiles
+from fitctl.model.image.pixel_noise import mix, quantiles
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.simulation import Simulation
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from fitctl.commissioning.outcome import BEFORE, Cable, Outcome, Site, StepError, nobody_there
 from fitctl.commissioning.record import Commissioning, Entry, Files, save
-from fitctl.commissioning.steps import Task, tasks_of
+from fitctl.commissioning.tasks import Task, tasks_of
 from fitctl.config import ConfigError, Rig, load_rig
 from fitctl.config.reading import lay_over, read_parts, rig_from_parts
 from fitctl.daemon.locks import only_master

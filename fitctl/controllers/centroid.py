@@ -13,7 +13,7 @@ from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 from fitctl.controllers.dark import Dark
 from fitctl.controllers.spot_fit import SpotFit, spot_fit
 from fitctl.model.compiled import compilable
-from fitctl.model.light import centroid_noise_px, light_below
+from fitctl.model.image.light import centroid_noise_px, light_below
 
 _LEVER_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1.0)
 # Eq. 7's three sums over a window, row by row: light, and its moments along azimuth and elevation.

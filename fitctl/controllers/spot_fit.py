@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.model.compiled import compilable
-from fitctl.model.light import light_below
+from fitctl.model.image.light import light_below
 
 Floats = NDArray[np.float64]
 STEPS_PER_PX = 8

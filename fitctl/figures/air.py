@@ -18,7 +18,7 @@ from fitctl.identify.airpath import (
 from fitctl.identify.frames import frames_of_records, track_spots
 from fitctl.identify.run import on_simulation
 from fitctl.learn.intervals import Interval
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.plant import Plant
 
 _PAPER_GAIN_PX, _PAPER_B1_S2, _PAPER_B2_S, _PAPER_NOISE_PX = 0.45, 0.517, 2.5, 0.01  # Eq. 9

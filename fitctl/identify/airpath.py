@@ -16,7 +16,7 @@ from fitctl.identify.air_fit import AirFit, fit_air_path
 from fitctl.identify.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.frames import Tracks
-from fitctl.learn.fit_test import FitTest, fit_test
+from fitctl.learn.goodness_of_fit import FitTest, fit_test
 from fitctl.learn.opened import Series, periodograms
 from fitctl.learn.spectrum import air_of, air_px2_per_hz, white_px2_per_hz
 from fitctl.model.air_path import rms_px, state_space

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.model import air_path
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
 
 Floats = NDArray[np.float64]
 _ANYWHERE_PX2 = 1e4  # variance of where the star stands before the first frame

@@ -8,7 +8,7 @@ The loop was closed when the data were recorded, but the likelihood is that of t
 motion follows from the measurements by taking away what the mirror did, and the mirror acts only on later
 frames. So a change of variables between both has the determinant one, whatever the controller was. This is the
 direct method of closed-loop identification (Forssell and Ljung, Automatica 35, 1215, 1999): it has no bias
-if the model can express the disturbance, which :mod:`fitctl.learn.fit_test` tests. Therefore the mirror's
+if the model can express the disturbance: :mod:`fitctl.learn.goodness_of_fit` tests this. Therefore the mirror's
 gain and overshoot are two more parameters, and need no experiment.
 """
 

@@ -27,10 +27,10 @@ from fitctl.drivers.interface import (
     ServoReading,
 )
 from fitctl.logging.records import MetrologyTick
-from fitctl.loop.beam_search import beam_search
 from fitctl.loop.loop import Loop
 from fitctl.loop.quantities import MetrologyQuantities, metrology_places
-from fitctl.loop.spiral_search import SpiralSearch
+from fitctl.loop.search.beam import beam_search
+from fitctl.loop.search.spiral import SpiralSearch
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import (
     BEAM_FOLLOWING,

@@ -30,9 +30,9 @@ from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing, error_from
 from fitctl.loop.quantities import StellarQuantities, stellar_places
-from fitctl.loop.search import StarSearch
+from fitctl.loop.search.finder import StarFinder
+from fitctl.loop.search.star import StarSearch
 from fitctl.loop.sky import Sky
-from fitctl.loop.star_finder import StarFinder
 from fitctl.loop.tick_record import TickRecords, TickTimes
 from fitctl.messages.commands import Acquire, LearnerReport
 from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger

@@ -10,7 +10,7 @@ from fitctl.drivers.interface import ServoReading
 from fitctl.logging.records import Tick
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
-from fitctl.loop.spiral_search import SpiralSearch
+from fitctl.loop.search.spiral import SpiralSearch
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.stages.mirror import MirrorStage

@@ -29,11 +29,11 @@ from fitctl.mocks.gige.camera import GigeCameraMock
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 from fitctl.mocks.mdt693.server import Mdt693Mock
 from fitctl.mocks.modbus_dac.server import ModbusDacMock
+from fitctl.model.image.pixel_noise import pixel_normals
+from fitctl.model.image.scene import Scene
 from fitctl.model.metrology.part import BeamState
-from fitctl.model.pixel_noise import pixel_normals
 from fitctl.model.plant import Plant
 from fitctl.model.plant_step import PlantState
-from fitctl.model.scene import Scene
 
 _HOUSEKEEPING_S = 0.05
 

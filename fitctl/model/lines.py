@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Line
 from fitctl.model.compiled import compilable
-from fitctl.model.pixel_noise import pixel_normals
+from fitctl.model.image.pixel_noise import pixel_normals
 
 Floats = NDArray[np.float64]
 LEAST_HZ = 0.01

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.model.image.pixel_noise import noise_key
 from fitctl.model.optics import scales
-from fitctl.model.pixel_noise import noise_key
 
 Floats = NDArray[np.float64]
 _SEEDS_APART = 1000  # of two loops of one run

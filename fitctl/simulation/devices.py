@@ -26,11 +26,11 @@ from fitctl.drivers.interface import (
     ServoReading,
 )
 from fitctl.model.hexapod_motion import MotionLimits, Trajectory, at_rest, plan_move, plan_stop
+from fitctl.model.image.pixel_noise import pixel_normals
+from fitctl.model.image.scene import Scene
 from fitctl.model.metrology.collector import CollectorPart
 from fitctl.model.metrology.part import MetrologyPart
-from fitctl.model.pixel_noise import pixel_normals
 from fitctl.model.plant import Plant
-from fitctl.model.scene import Scene
 from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]

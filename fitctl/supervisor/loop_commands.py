@@ -10,8 +10,8 @@ import numpy as np
 from fitctl.config import Rig
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
-from fitctl.loop.search import refused_search
-from fitctl.loop.spiral_search import refused_area
+from fitctl.loop.search.spiral import refused_area
+from fitctl.loop.search.star import refused_search
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import (

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.clock import VirtualClock
-from fitctl.commissioning import motors
 from fitctl.commissioning.outcome import Site, StepError
+from fitctl.commissioning.steps import motors
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import ServoReading
 

@@ -4,7 +4,7 @@ import pytest
 from miswired.catalogue import CATALOGUE
 from miswired.report import PAGE, steps_table
 
-from fitctl.commissioning.steps import tasks_of
+from fitctl.commissioning.tasks import tasks_of
 from fitctl.config import default_rig_path, load_rig
 
 TEXT = PAGE.read_text()

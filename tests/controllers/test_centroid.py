@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from fitctl.config import HALF_WINDOW_PX
 from fitctl.controllers.centroid import StarSensor
-from fitctl.model.scene import Scene
+from fitctl.model.image.scene import Scene
 
 NOWHERE = (-500.0, -500.0)
 window_fits = st.tuples(st.floats(3.0, 36.0), st.floats(3.0, 36.0))

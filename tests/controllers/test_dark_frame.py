@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fitctl.config import ConfigError, HotPixel
 from fitctl.controllers.centroid import StarSensor
 from fitctl.controllers.dark import Dark, read_dark
-from fitctl.model.scene import Scene
+from fitctl.model.image.scene import Scene
 
 STAR = (24.3, 19.6)
 HOT = HotPixel(az_px=22, el_px=20, dn=3000.0)

@@ -6,7 +6,7 @@ import pytest
 from fitctl.config import Spot
 from fitctl.config.base import AxisPair
 from fitctl.controllers.centroid import OtherLight, StarSensor
-from fitctl.model.scene import Scene
+from fitctl.model.image.scene import Scene
 
 STAR = (28.2, 19.9)
 

@@ -7,7 +7,7 @@ import numpy as np
 from fitctl.controllers.position_servo import PositionServo
 from fitctl.identify.record import ExperimentRecord
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, channel_values, experiment_s
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.optics import scales, stack_volts
 from fitctl.model.plant import Plant
 

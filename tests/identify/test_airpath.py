@@ -13,9 +13,9 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.identify.frames import TimedImage, Tracks, track_spots
 from fitctl.identify.noise_model import negative_log_likelihood
 from fitctl.model import air_path
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
+from fitctl.model.image.scene import Scene
 from fitctl.model.plant import Plant
-from fitctl.model.scene import Scene
 
 TRUTH = AirPathModel(gain_px=0.45, b1_s2=0.517, b2_s=2.5)
 ELSEWHERE = AirPathModel(gain_px=1.0, b1_s2=0.3, b2_s=1.0)

@@ -8,7 +8,7 @@ from fitctl.identify import delay
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.record import ExperimentRecord
 from fitctl.model.drives import FSM, channel_values, experiment_s
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.optics import scales, stack_volts
 from fitctl.model.plant import Plant
 

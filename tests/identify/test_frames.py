@@ -18,7 +18,7 @@ from fitctl.identify.record import tick_columns
 from fitctl.logging.records import FrameRecord, RunInfo, Tick
 from fitctl.logging.writer import LogWriter
 from fitctl.messages.modes import Mode
-from fitctl.model.scene import Scene
+from fitctl.model.image.scene import Scene
 
 NOWHERE = AxisPair(az=0.0, el=0.0)
 RUN_INFO = RunInfo(

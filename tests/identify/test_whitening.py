@@ -3,7 +3,7 @@ import pytest
 from plant_records import record_of
 
 from fitctl.identify.whitening import whitener
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
 
 
 def correlation(values, lag):

@@ -13,7 +13,7 @@ from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.learn.advice import advise
-from fitctl.learn.fit_test import fit_test
+from fitctl.learn.goodness_of_fit import fit_test
 from fitctl.learn.night import estimate
 from fitctl.learn.opened import Series, periodograms
 from fitctl.learn.spectrum import Air, air_of, framed_line_px2_per_hz

@@ -8,7 +8,7 @@ from pathlib import Path
 from documents import ROOT, table
 
 from fitctl.commissioning.outcome import Site
-from fitctl.commissioning.steps import STEPS
+from fitctl.commissioning.tasks import STEPS
 from fitctl.config import default_rig_path, load_rig
 
 from .catalogue import CATALOGUE, TESTBED

@@ -1,10 +1,10 @@
 import math
 
 import numpy as np
-import plant_references
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from model import plant_references
 from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.signal import welch
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from plant_references import bind_reference
+from model.plant_references import bind_reference
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.controllers.position_servo import PositionServo
-from fitctl.model import plant_step
 from fitctl.model.compiled import numba_installed
 from fitctl.model.optics import piston_m, scales, stack_volts
 from fitctl.model.plant import Plant
@@ -109,7 +108,7 @@ def test_the_motion_does_not_depend_on_how_the_time_is_cut(rig, cuts):
 
 @pytest.mark.parametrize("machine_code", STEPS)
 def test_a_run_does_not_depend_on_the_runs_beside_it(rig, machine_code, monkeypatch):
-    monkeypatch.setattr(plant_step, "numba_installed", lambda: machine_code)
+    monkeypatch.setattr("fitctl.model.plant_step.numba_installed", lambda: machine_code)
     together, alone = (
         Plant(rig, [3, 4, 5]).stellar_loops["right"],
         Plant(rig, [4]).stellar_loops["right"],

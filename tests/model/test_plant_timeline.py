@@ -5,8 +5,8 @@ import pytest
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.model import air_path
+from fitctl.model.image.scene import Scene
 from fitctl.model.plant import Plant
-from fitctl.model.scene import Scene
 
 STILL_AIR = "plant.loops.right.air_path.gain_px=0.0"
 LINE = "{frequency_hz=10.0, rms_px=0.1, direction_deg=0.0, damping=0.0, drift_hz_per_min=0.0}"

@@ -20,7 +20,7 @@ from fitctl.commissioning.outcome import Cable, State, StepError
 from fitctl.commissioning.page import change_texts, changes, flat, page, verdict
 from fitctl.commissioning.record import Commissioning, Entry, Files, load, load_any, writable
 from fitctl.commissioning.run import Course, chosen, do, skip
-from fitctl.commissioning.steps import Task, tasks_of
+from fitctl.commissioning.tasks import Task, tasks_of
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 from fitctl.config.reading import read_parts
 from fitctl.config.simulated import places

@@ -163,7 +163,7 @@ class MetrologyPart(Part):
     misaligned_rad : array, shape (runs, 2)
         Where the beam goes with the motors at zero.
     noise_keys : list of int
-        Of the photodiodes' noise, by :mod:`fitctl.model.pixel_noise`, one for each run.
+        Of the photodiodes' noise, by :mod:`fitctl.model.image.pixel_noise`, one for each run.
     """
 
     def __init__(

@@ -8,8 +8,8 @@ import numpy as np
 
 from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
-from fitctl.loop.search import refused_search
-from fitctl.loop.spiral_search import refused_area
+from fitctl.loop.search.spiral import refused_area
+from fitctl.loop.search.star import refused_search
 from fitctl.messages.commands import Acquire, Release, Standby
 from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.optics import scales

@@ -17,9 +17,9 @@ from fitctl.controllers.spiral import spiral_angle_after
 from fitctl.loop.metrology import IN_REACH, MOST_TICK_S, OUT_OF_REACH
 from fitctl.messages.modes import METROLOGY_TRANSITIONS, Mode, Trigger, transition
 from fitctl.model.compiled import compilable
+from fitctl.model.image.pixel_noise import GOLDEN, QUANTILE_SHIFT, mix
 from fitctl.model.metrology.photodiodes import light_v
 from fitctl.model.optics import turned_back
-from fitctl.model.pixel_noise import GOLDEN, QUANTILE_SHIFT, mix
 from fitctl.simulation.batch.laws import ACQUISITION, COARSE
 from fitctl.simulation.batch.modes import (
     LOCKED,

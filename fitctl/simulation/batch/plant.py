@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from fitctl.model.air_path import air_motion
 from fitctl.model.compiled import compilable
+from fitctl.model.image.pixel_noise import GOLDEN, QUANTILE_SHIFT, mix
 from fitctl.model.lines import line_motion
 from fitctl.model.metrology.part import turn_beam
-from fitctl.model.pixel_noise import GOLDEN, QUANTILE_SHIFT, mix
 from fitctl.model.plant_step import move_stacks, stack_piston_m, step_creeping_run, step_run
 from fitctl.simulation.batch.records import BLOCK_NODES
 

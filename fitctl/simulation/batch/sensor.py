@@ -19,8 +19,8 @@ from fitctl.controllers.centroid import (
 )
 from fitctl.controllers.spot_fit import NODES, STEPS_PER_PX, node
 from fitctl.model.compiled import compilable
-from fitctl.model.light import REACH_SIGMAS, light_fractions
-from fitctl.model.scene import render
+from fitctl.model.image.light import REACH_SIGMAS, light_fractions
+from fitctl.model.image.scene import render
 from fitctl.simulation.batch.laws import ACQUISITION, COARSE, NOT_DUE, VERNIER, has_arrived
 from fitctl.simulation.batch.mirror import mirror_px
 from fitctl.simulation.batch.records import SIDE_PX

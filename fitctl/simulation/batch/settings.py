@@ -24,17 +24,17 @@ from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
 from fitctl.controllers.spot_fit import PLACES
 from fitctl.loop.metrology import PULL_IN
 from fitctl.loop.pointing import Pointing
-from fitctl.loop.search import NEAR
+from fitctl.loop.search.star import NEAR
 from fitctl.loop.sky import sky_rad_s
 from fitctl.model.compiled import record
-from fitctl.model.light import light_table
+from fitctl.model.image.light import light_table
+from fitctl.model.image.pixel_noise import quantiles
+from fitctl.model.image.scene import FULL_WELL_DN, photon_dn
 from fitctl.model.lines import FIELDS as LINE_FIELDS
 from fitctl.model.metrology.part import BeamConstants
 from fitctl.model.optics import motor_sky_rad_per_rad, scales, sky_px_per_rad
-from fitctl.model.pixel_noise import quantiles
 from fitctl.model.plant import exposure_instants_s, pixel_noises
 from fitctl.model.plant_constants import AirConstants, PlantConstants
-from fitctl.model.scene import FULL_WELL_DN, photon_dn
 from fitctl.simulation.batch.interlocks import acting_interlocks
 from fitctl.simulation.batch.records import (
     BEAM_SETTINGS,

@@ -11,7 +11,7 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.identify.link import feedforward
 from fitctl.model import air_path
 from fitctl.model.hysteresis import displacement_series
-from fitctl.model.light import centroid_noise_px
+from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.optics import (
     mirror_from_stacks,
     motor_sky_rad_per_rad,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.model.scene import Scene
+from fitctl.model.image.scene import Scene
 from fitctl.sequences.behaviours.overlap import FringeSensor, direction_of
 from fitctl.sequences.behaviours.table import problems
 from fitctl.sequences.contact import Contact

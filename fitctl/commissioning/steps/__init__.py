@@ -1,0 +1,1 @@
+"""The steps of a commissioning, and what they have in common."""

@@ -1,0 +1,126 @@
+"""Which star on a shared frame belongs to a loop."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.controllers.attribution import (
+    FOLLOWED_PX,
+    MOST_STRANGERS,
+    PROVEN_PX,
+    is_within,
+    look_places_px,
+    second_look,
+)
+from fitctl.controllers.centroid import Star
+from fitctl.controllers.estimator import StarEstimator
+from fitctl.messages.modes import FOLLOWING, Mode
+from fitctl.model.optics import AzEl
+
+Floats = NDArray[np.float64]
+
+
+class Attribution:
+    """One loop's, where the stars of other loops are on the same frame.
+
+    A star that is followed is accepted only near where it is expected. In a search, a star is a candidate at
+    first: the siderostat moves it, and it is the loop's own only if it comes to where that should bring it.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    estimator : StarEstimator
+
+    Attributes
+    ----------
+    candidate : Star or None
+        As a frame first showed it, while the second look at it lasts.
+    """
+
+    def __init__(self, rig: Rig, loop_name: str, estimator: StarEstimator) -> None:
+        self.candidate: Star | None = None
+        self._estimator = estimator
+        self._looks_px = look_places_px(rig, loop_name)
+        self._strangers_px: deque[AzEl] = deque(maxlen=MOST_STRANGERS)
+        self._rejected = 0
+        self._last_stages_px = 0.0, 0.0
+
+    def begin_search(self) -> None:
+        """A new search: the loop has no candidate."""
+        self._drop()
+        self._rejected = 0
+
+    def begin_round(self) -> None:
+        """A new spiral, about a place where the star may have been rejected before."""
+        self._strangers_px.clear()
+
+    def choose(self, candidates: Iterable[Star], mode: Mode, expected_px: AzEl) -> Star | None:
+        """The star that may be the loop's own: the nearest to `expected_px` of all that may be it, or none."""
+        strangers: Iterable[AzEl] = ()
+        reach_px = math.inf
+        if mode in FOLLOWING:
+            reach_px = FOLLOWED_PX
+        elif mode is Mode.ACQUISITION and self.candidate is not None:
+            reach_px = PROVEN_PX
+        elif mode is Mode.ACQUISITION:
+            strangers = self._strangers_px
+        return min(
+            (
+                star
+                for star in candidates
+                if is_within(*star[:2], *expected_px, reach_px)
+                and not any(
+                    is_within(*star[:2], *place_px, HALF_WINDOW_PX) for place_px in strangers
+                )
+            ),
+            key=lambda star: math.dist(star[:2], expected_px),
+            default=None,
+        )
+
+    def observe(self, star: Star, mode: Mode, stages_px: AzEl) -> None:
+        """A frame shows `star`, exposed with the stages where they move a star by `stages_px`."""
+        self._last_stages_px = stages_px
+        if mode in FOLLOWING:
+            self._estimator.observe(star[:2], stages_px)
+
+    def moved_px(self, stages_px: AzEl) -> AzEl:
+        """How far the stages, moved to `stages_px`, have taken the star since it was last seen."""
+        az_px, el_px = self._last_stages_px
+        return stages_px[0] - az_px, stages_px[1] - el_px
+
+    # ------------------------------------------------------------ the second look
+
+    def propose(self, star: Star) -> Floats:
+        """A frame shows a candidate: where the siderostat is to bring it, shape (2,)."""
+        self.candidate = star
+        self._estimator.suppose(star[:2], self._last_stages_px)
+        place_px: Floats = self._looks_px[second_look(self._looks_px, *star[:2], self._rejected)]
+        return place_px
+
+    def has_moved(self, star: Star) -> bool:
+        """What the second look shows, where the candidate is expected now, has left the candidate's place."""
+        candidate = self.candidate
+        return candidate is not None and not is_within(*star[:2], *candidate[:2], HALF_WINDOW_PX)
+
+    def confirm(self) -> None:
+        """The candidate is the loop's own star."""
+        self.candidate = None
+        self._estimator.keep()
+
+    def reject(self) -> None:
+        """The candidate is not: what stands at its place is another star, until the next round."""
+        if self.candidate is not None:
+            self._strangers_px.append(self.candidate[:2])
+        self._rejected += 1
+        self._drop()
+
+    def _drop(self) -> None:
+        self.candidate = None
+        self._estimator.withdraw()

@@ -1,0 +1,133 @@
+"""What measured motions of the star make of the rig file: order, signs, rotation, scale."""
+
+import itertools
+
+import numpy as np
+import pytest
+from commissioning.motor_bench import RIG, site_of
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from fitctl.commissioning.outcome import StepError
+from fitctl.commissioning.steps.mirror import _mirror_outcome
+from fitctl.commissioning.steps.plate import (
+    _flipped,
+    _refuse_meeting,
+    _siderostat_outcome,
+    similar,
+)
+from fitctl.commissioning.steps.sky import square_spiral
+from fitctl.config.wiring import AmplifierWiring
+from fitctl.model.optics import rotation
+
+STRAIGHT = np.array([[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]])
+"""Where stack 1, 2 and 3 move a star, in units of their stroke."""
+degrees = st.floats(-170.0, 170.0)
+scale = st.floats(0.5, 2.0)
+
+
+def found(outcome, stage):
+    return outcome.found.get("loops", {}).get("right", {}).get(stage, {})
+
+
+def apart_deg(a, b):
+    return abs((a - b + 180) % 360 - 180)
+
+
+@given(degrees, scale)
+def test_a_turned_siderostat_gets_its_rotation_and_its_gear(turned, size):
+    outcome = _siderostat_outcome(site_of(), size * rotation(turned), 0.0)
+    said = found(outcome, "siderostat")
+    assert apart_deg(said.get("rotation_deg", 0.0), turned) <= 5.0
+    gear = RIG.loops["right"].siderostat.spur_gear_ratio
+    assert said.get("spur_gear_ratio", gear) * size == pytest.approx(gear, rel=0.09)
+    assert "wiring" not in said
+
+
+@given(degrees, st.sampled_from([[-1.0, 1.0], [1.0, -1.0]]))
+def test_a_mirror_image_becomes_a_wiring_with_which_the_rest_is_a_rotation(turned, hand):
+    seen = rotation(turned) @ np.diag(hand)
+    said = found(_siderostat_outcome(site_of(), seen, 0.0), "siderostat")
+    wiring = AmplifierWiring(**said["wiring"])
+    assert wiring.velocity_signs == wiring.encoder_signs  # angles change their hand, not the servo
+    undo = np.diag(wiring.encoder_signs) if wiring.axes == [0, 1] else np.array([[0, 1], [1, 0]])
+    left = seen @ undo
+    assert np.linalg.det(left) > 0
+    assert apart_deg(similar(left).rotation_deg, said.get("rotation_deg", 0.0)) <= 5.0
+
+
+def test_axes_of_different_gains_become_axis_gains():
+    seen = rotation(20.0) @ np.array([[1.3, 0.0], [0.0, 0.9]])
+    said = found(_siderostat_outcome(site_of(), seen, 0.0), "siderostat")
+    again = rotation(said["rotation_deg"]) @ np.array(said["axis_gains"])
+    assert again == pytest.approx(seen, abs=0.01)
+
+
+def test_exchanged_axes_keep_the_signs_that_were_found_before():
+    wiring = AmplifierWiring(axes=[0, 1], velocity_signs=[1, -1], encoder_signs=[1, 1])
+    loop = RIG.loops["right"]
+    siderostat = loop.siderostat.model_copy(update={"wiring": wiring})
+    rig = RIG.model_copy(
+        update={"loops": {"right": loop.model_copy(update={"siderostat": siderostat})}}
+    )
+    flipped = _flipped(site_of(rig), np.array([[0.0, 1.0], [1.0, 0.0]]))
+    assert flipped == {"axes": [1, 0], "velocity_signs": [-1, 1], "encoder_signs": [1, 1]}
+
+
+@given(st.permutations([0, 1, 2]), st.floats(-4.0, 4.0), st.floats(0.9, 1.1))
+def test_stacks_in_any_order_are_told_apart(order, turned, size):
+    seen = size * (STRAIGHT[list(order)] @ rotation(turned).T)
+    said = found(_mirror_outcome(site_of(), seen, STRAIGHT, 0.0), "fsm")
+    channels = said.get("dac", {"channels": [1, 2, 3]})["channels"]
+    assert [order[channel - 1] for channel in channels] == [0, 1, 2]
+    assert channels == said.get("piezo", {"channels": [1, 2, 3]})["channels"]
+
+
+@given(degrees)
+def test_a_turned_mirror_gets_its_rotation(turned):
+    said = found(_mirror_outcome(site_of(), STRAIGHT @ rotation(turned).T, STRAIGHT, 0.0), "fsm")
+    assert apart_deg(said.get("rotation_deg", 0.0), turned) <= 5.05
+    assert "dac" not in said
+
+
+@given(degrees)
+def test_a_mirror_image_is_two_stacks_exchanged_and_a_rotation(turned):
+    seen = STRAIGHT @ (rotation(turned) @ np.diag([-1.0, 1.0])).T
+    said = found(_mirror_outcome(site_of(), seen, STRAIGHT, 0.0), "fsm")
+    assert said["dac"]["channels"] == [3, 2, 1]
+    assert (
+        apart_deg(said.get("rotation_deg", 0.0), turned + 90) <= 5.05
+        or apart_deg(said.get("rotation_deg", 0.0), turned - 90) <= 5.05
+    )
+
+
+def test_a_stack_that_moves_no_star_is_named():
+    seen = STRAIGHT * [[1.0], [1.0], [0.01]]
+    with pytest.raises(StepError, match="stack 3"):
+        _mirror_outcome(site_of(), seen, STRAIGHT, 0.0)
+
+
+@given(st.integers(1, 6))
+def test_the_spiral_visits_every_place_once_by_neighbours(turns):
+    places = [(0, 0), *square_spiral(turns)]
+    assert len(set(places)) == len(places) == (2 * turns + 1) ** 2
+    assert all(abs(a - c) + abs(b - d) == 1 for (a, b), (c, d) in itertools.pairwise(places))
+
+
+@given(degrees, scale)
+def test_a_rotation_with_a_scale_is_taken_apart(turned, size):
+    assume(abs(turned) < 170)
+    parts = similar(size * rotation(turned))
+    assert parts == pytest.approx((size, turned, 1.0))
+
+
+RIGHT_PX, LEFT_PX = np.array([30.0, 21.0]), np.array([11.0, 19.0])
+TARGET_PX = np.array([28.0, 20.0])
+
+
+def test_a_star_is_not_sent_where_another_one_is():
+    """As where two loops' amplifiers are exchanged."""
+    with pytest.raises(StepError, match="another star"):
+        _refuse_meeting(site_of(), [LEFT_PX, RIGHT_PX], LEFT_PX, TARGET_PX)
+    _refuse_meeting(site_of(), [LEFT_PX, RIGHT_PX], RIGHT_PX, TARGET_PX)
+    _refuse_meeting(site_of(), [LEFT_PX], LEFT_PX, TARGET_PX)
