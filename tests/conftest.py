@@ -10,6 +10,7 @@ import hypothesis
 import pytest
 
 from fitctl.config import Rig, default_rig_path, load_rig
+from fitctl.processes import name_held
 
 pytest_plugins = ["pytester", "skips", "instruments.virtual_instrument"]
 
@@ -46,3 +47,11 @@ def in_loop():
     left = asyncio.all_tasks(loop)
     loop.close()
     assert not left
+
+
+@pytest.fixture
+def locks_of_its_own(monkeypatch):
+    """Locks of devices that no other process takes, such as another worker, or an instrument that runs here."""
+    monkeypatch.setattr(
+        "fitctl.daemon.locks.name_held", lambda name: name_held(f"{name} of test {os.getpid()}")
+    )

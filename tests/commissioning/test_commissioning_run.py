@@ -4,14 +4,15 @@ import shutil
 
 import pytest
 
-from fitctl.commissioning import steps
+from fitctl.commissioning import tasks
 from fitctl.commissioning.outcome import Outcome, StepError
 from fitctl.commissioning.page import changes, page, verdict
 from fitctl.commissioning.record import Commissioning, Files, load
 from fitctl.commissioning.run import Course, chosen, do, skip
-from fitctl.commissioning.steps import Step, tasks_of
+from fitctl.commissioning.tasks import Step, tasks_of
 from fitctl.config import ConfigError, default_rig_path, load_rig
 
+pytestmark = pytest.mark.usefixtures("locks_of_its_own")
 GEAR = {"loops": {"right": {"siderostat": {"spur_gear_ratio": 26.0}}}}
 
 
@@ -42,7 +43,7 @@ def again(path):
 @pytest.fixture
 def table(monkeypatch):
     def use(**table):
-        monkeypatch.setattr(steps, "STEPS", table)
+        monkeypatch.setattr(tasks, "STEPS", table)
 
     return use
 

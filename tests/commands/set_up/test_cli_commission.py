@@ -5,16 +5,16 @@ import json
 import pytest
 
 from fitctl.cli import main
-from fitctl.commissioning import steps
+from fitctl.commissioning import tasks
 from fitctl.commissioning.outcome import Outcome
-from fitctl.commissioning.steps import STEPS, Step
+from fitctl.commissioning.tasks import STEPS, Step
 from fitctl.config import default_rig_path
 
 REAL = "loops.right.siderostat.device.channel=/dev/ttyACM0"
 
 
 @pytest.fixture
-def commission(capsys, tmp_path, monkeypatch):
+def commission(capsys, tmp_path, monkeypatch, locks_of_its_own):
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
@@ -38,7 +38,7 @@ def two_steps(monkeypatch):
 
         return Step(f"step {name}", "star", lambda _site: "nothing", needs, 1.0, run)
 
-    monkeypatch.setattr(steps, "STEPS", {"one": step("one"), "two": step("two", "one")})
+    monkeypatch.setattr(tasks, "STEPS", {"one": step("one"), "two": step("two", "one")})
     return done
 
 

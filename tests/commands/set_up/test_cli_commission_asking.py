@@ -13,11 +13,17 @@ import pytest
 
 pytestmark = pytest.mark.long
 STEPS = """
+import os
 import sys
 import time
 from fitctl.cli import main
-from fitctl.commissioning import steps
+from fitctl.commissioning import tasks
 from fitctl.commissioning.outcome import Cable, Outcome, StepError
+from fitctl.daemon import locks
+from fitctl.processes import name_held
+
+# No other process takes these locks of devices.
+locks.name_held = lambda name: name_held(f"{name} of test {os.getpid()}")
 
 def step(name, *needs, fails=False):
     def run(site):
@@ -25,9 +31,9 @@ def step(name, *needs, fails=False):
         if fails:
             raise StepError("the cable is off")
         return Outcome(["seen"])
-    return steps.Step(f"step {name}", "star", lambda _site: f"the {name} motor", needs, 1.0, run)
+    return tasks.Step(f"step {name}", "star", lambda _site: f"the {name} motor", needs, 1.0, run)
 
-steps.STEPS = {"one": step("one"), "two": step("two", "one"), "three": step("three", "two", fails=True)}
+tasks.STEPS = {"one": step("one"), "two": step("two", "one"), "three": step("three", "two", fails=True)}
 def cable(site):
     for on in (False, True):
         site.cable(Cable("the camera's cable", "camera"), on)
@@ -42,8 +48,8 @@ def moving(_site):
         print("STANDS", flush=True)
 
 nothing = lambda _site: "nothing"
-steps.STEPS["moving"] = steps.Step("moves", "star", nothing, (), 1.0, moving)
-steps.STEPS["cable"] = steps.Step("cables", "star", nothing, (), 1.0, cable)
+tasks.STEPS["moving"] = tasks.Step("moves", "star", nothing, (), 1.0, moving)
+tasks.STEPS["cable"] = tasks.Step("cables", "star", nothing, (), 1.0, cable)
 main(["commission", *sys.argv[1:]])
 """
 ASKS = "Go? (yes, no, skip)"
