@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.swarm.devices import SwarmAmplifiers
+from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.lines import Line
 from fitctl.clock import Clock
 from fitctl.config import Rig

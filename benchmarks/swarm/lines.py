@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.drivers.interface import (
+    DeviceIdentity,
     DeviceProtocolError,
     DeviceRefused,
     DeviceTimeout,
@@ -203,3 +204,8 @@ class Line:
 def drawn_slowness(random: Random) -> float:
     """Draw a factor for "slow", from 1 to 1000."""
     return math.pow(10.0, 3.0 * random.random())
+
+
+def identity(model: str) -> DeviceIdentity:
+    """Who a device of the swarm says it is."""
+    return DeviceIdentity("fitctl", f"swarm {model}", "", "")

@@ -18,14 +18,10 @@ import msgspec
 import numpy as np
 
 from benchmarks.swarm.clients import SENDERS, Console, Link, RunningSequence, Service
-from benchmarks.swarm.devices import (
-    SwarmAmplifiers,
-    SwarmCamera,
-    SwarmDac,
-    SwarmHexapod,
-    SwarmPhotodiodes,
-    SwarmPiezo,
-)
+from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
+from benchmarks.swarm.devices.hexapod import SwarmHexapod
+from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
+from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
 from benchmarks.swarm.invariants import Invariants, Violation
 from benchmarks.swarm.lines import Bus, Line
 from benchmarks.swarm.plan import (

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from benchmarks.swarm.clients import SENDERS, STEPS
-from benchmarks.swarm.devices import SwarmAmplifiers
+from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import (

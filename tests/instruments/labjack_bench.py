@@ -1,8 +1,13 @@
-"""A LabJack T7 as tests have it: settings, and a mock with voltages that a test sets."""
+"""A LabJack T7 as tests have it: settings, a mock with voltages that a test sets, and how a loop asks."""
+
+import time
+
+import pytest
 
 from fitctl.config import Fault, LabJackMock, LabJackT7Device
 from fitctl.mocks.labjack_t7.server import LabJackT7Mock
 
+AT_ONCE_S = 0.1  # the machine itself may stand still for tens of milliseconds
 DEVICE = LabJackT7Device(
     driver="labjack_t7",
     host="127.0.0.1",
@@ -41,3 +46,27 @@ class Bench:
     def _sample(self, time_s):
         self.sampled_s.append(time_s)
         return list(self.volts)
+
+
+def device_at(port, **changes):
+    return DEVICE.model_copy(update={"port": port, **changes})
+
+
+def sampled(driver, within_s=5.0):
+    """The next sample that arrives."""
+    end_s = time.monotonic() + within_s
+    while time.monotonic() < end_s:
+        if (reading := driver.receive()) is not None:
+            return reading
+        time.sleep(0.001)
+    return pytest.fail("no sample")
+
+
+def ask_every_20_ms(driver):
+    """Ask as a loop does, for a second, and never wait."""
+    for _ in range(50):
+        started_s = time.monotonic()
+        driver.send_request()
+        driver.receive()
+        assert time.monotonic() - started_s < AT_ONCE_S
+        time.sleep(0.02)

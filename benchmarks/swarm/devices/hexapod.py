@@ -1,0 +1,79 @@
+"""The hexapod of the collector."""
+
+from __future__ import annotations
+
+from functools import partial
+from random import Random
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.swarm.lines import Line
+from benchmarks.swarm.threads import VirtualTime
+from fitctl.config import Rig
+from fitctl.drivers.interface import (
+    DeviceIdentity,
+    HexapodReading,
+    Pose,
+)
+from fitctl.model.plant import Plant
+from fitctl.simulation.devices import (
+    SimulatedHexapod,
+)
+
+Floats = NDArray[np.float64]
+_REFERENCE_S = 5.0
+
+
+class SwarmHexapod(SimulatedHexapod):
+    """The hexapod's controller on a serial line."""
+
+    def __init__(self, plant: Plant, time: VirtualTime, rig: Rig, random: Random) -> None:
+        _, mocks = rig.mock_parts()
+        device = rig.collector.hexapod  # type: ignore[union-attr]
+        super().__init__(plant.collector, time, device, mocks.hexapod)  # type: ignore[arg-type]
+        self.line = Line("hexapod", device.endpoint, time, random, 0.01, device.response_timeout_s)
+        self._time = time
+
+    def open(self) -> DeviceIdentity:
+        """Connect and check."""
+        self.line.open()
+        for _ in range(10):
+            self.line.ask(lambda: None)
+        return super().open()
+
+    def reference(self) -> None:
+        """Make a reference move, which takes seconds."""
+        self.line.ask(lambda: None)
+        ends_s = self._time.now_s() + _REFERENCE_S
+        while self._time.now_s() < ends_s:
+            self._time.sleep(0.1)
+            self.line.ask(lambda: None)
+        super().reference()
+
+    def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
+        """Start a move."""
+        self.line.ask(partial(super().move_to, pose, velocity_mm_s))
+
+    def pose(self) -> HexapodReading:
+        """Read the pose."""
+        return self.line.ask(super().pose)
+
+    def stop(self) -> None:
+        """Brake, and wait until the platform is at rest."""
+        self.line.ask(super().stop)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.line.close()
+
+    def reset(self) -> None:
+        """Restart at the present pose, without a reference."""
+        super().stop()
+        self._referenced = False
+        self.line.connected = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether the platform is moving."""
+        return self._time.now_s() < self._trajectory.ends_s
