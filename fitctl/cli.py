@@ -190,4 +190,7 @@ def _message(error: TyperException) -> str:
     """The error as one line, with the option that it is about."""
     format_message = getattr(error, "format_message", None)
     text = str(error) if format_message is None else format_message()
+    context = getattr(error, "ctx", None)
+    if text == "Missing command." and context is not None:
+        text = f"expected a command: {', '.join(context.command.commands)}"
     return text.replace("\n", " ").replace("Input should be", "expected").rstrip(".")

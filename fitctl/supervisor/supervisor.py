@@ -569,7 +569,10 @@ class Supervisor:
             loop.servo.disable()
 
     def _finish_jobs(self) -> None:
+        were_busy = self._device_jobs.busy
         self._device_jobs.finish()
+        if were_busy and not self._device_jobs.busy:
+            self._reported_s = -math.inf  # consoles show at once what was opened or closed
         while self._designs and self._designs[0].future.done():
             design = self._designs.popleft()
             design.done(design.future)

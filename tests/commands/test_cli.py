@@ -96,6 +96,7 @@ BAD_INPUT = {
         "history_s may be at most",
     ),
     "a table that is none": (["check", "--set", "camera.width_px.of=3"], "is not a table"),
+    "a group without a command": (["fault"], "fitctl fault: expected a command: set, clear, now"),
     "an option that is none": (["demo", "--fast"], "--fast"),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),

@@ -288,6 +288,19 @@ def test_the_stacks_are_watched_on_after_the_da_has_failed(vernier, monkeypatch)
     assert any("/dev/ttyUSB0" in event.message for event in events_of(vernier))
 
 
+def test_devices_that_were_closed_are_reported_so_at_once(vernier):
+    """Not up to a second later, in which consoles would show them open in OFF."""
+    vernier.command(Release())
+    vernier.run(3.0)
+    vernier.records.clear()
+    assert vernier.command(Off()).accepted
+    until(vernier, Mode.OFF, limit_s=5.0)
+    vernier.run(2 * vernier.rig.camera.period_s)
+
+    health = {r.device: r.state for r in vernier.records if isinstance(r, DeviceHealth)}
+    assert set(health.values()) == {"closed"}
+
+
 def test_a_piezo_amplifier_that_is_closed_is_not_asked(vernier, monkeypatch):
     vernier.command(Release())
     vernier.run(3.0)

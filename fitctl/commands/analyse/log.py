@@ -29,7 +29,7 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.listing import logs_in, rig_name
 from fitctl.logging.reading import LogInfo, log_info
 
-app = typer.Typer(help="Inspect, repair and convert logs.", no_args_is_help=True)
+app = typer.Typer(help="Inspect, repair and convert logs.")
 
 LogArgument = Annotated[
     Path | None, typer.Argument(metavar="LOG", help="An MCAP file, finished or not.")

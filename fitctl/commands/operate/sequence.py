@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     help="Run, check and steer sequences of steps.",
-    no_args_is_help=True,
 )
 
 SequenceArgument = Annotated[

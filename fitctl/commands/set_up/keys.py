@@ -14,7 +14,6 @@ from fitctl.messages.keys import allowed_keys, new_key, revoke_key
 
 app = typer.Typer(
     help="Manage keys for remote access.",
-    no_args_is_help=True,
 )
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the person: a-z, 0-9, - and _.")]

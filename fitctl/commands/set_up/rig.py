@@ -14,7 +14,7 @@ from fitctl.config import ConfigError
 from fitctl.config.rig import SCHEMA_VERSION
 from fitctl.config.upgrade import upgrade as upgraded
 
-app = typer.Typer(help="Upgrade rig files of older versions.", no_args_is_help=True)
+app = typer.Typer(help="Upgrade rig files of older versions.")
 
 
 @app.callback()

@@ -49,8 +49,8 @@ def address(command: str, path: Path | None, overrides: list[str] | None) -> Add
     found = _address(command, path, overrides)
     if found is None:
         say(
-            f"{command}: you have no supervisor running on this machine; start everything on mocks with fitctl "
-            "demo, or a rig's with fitctl run --rig FILE, or name a rig with --rig or FITCTL_RIG",
+            f"{command}: you have no supervisor running on this machine; start one with fitctl run --rig FILE, "
+            "or everything on mocks with fitctl demo, or name a rig with --rig or FITCTL_RIG",
             err=True,
         )
         raise typer.Exit(NO_SUPERVISOR)

@@ -19,7 +19,7 @@ from fitctl.messages.endpoints import service_folder
 from fitctl.messages.running import running_rigs
 from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
-app = typer.Typer(help="Inject faults into running mocks.", no_args_is_help=True)
+app = typer.Typer(help="Inject faults into running mocks.")
 
 DeviceArgument = Annotated[
     str,

@@ -88,7 +88,7 @@ class Mdt693:
         """
         self.close()
         self._port = self._endpoint.open_serial(
-            "a serial port",
+            "an MDT693 amplifier",
             "check its cable and power, who else has the port open, and piezo.port",
             baud_rate=self._piezo.baud_rate,
             poll_s=_POLL_S,
