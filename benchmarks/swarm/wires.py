@@ -250,10 +250,11 @@ class Port:
             self._check()
         return self._wire.take(size)
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> int:
         """Send."""
         self._check()
         self._wire.send(bytes(data))
+        return len(data)
 
     def reset_input_buffer(self) -> None:
         """Forget what has arrived."""
@@ -374,8 +375,9 @@ def virtual(time: WireTime, wire: Wire) -> Iterator[None]:
     )
     adapter = {  # what an SLCAN bus reads its port by
         "select": SimpleNamespace(
-            select=lambda ports, _writers, _errors, left_s: (
+            select=lambda ports, writers, _errors, left_s: (
                 [one for one in ports if wire.wait(left_s)],
+                writers,
             )
         ),
         "os": SimpleNamespace(read=lambda _descriptor, most: wire.take(most)),

@@ -25,6 +25,7 @@ from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 
 _SEND_TIMEOUT_S = 0.1
+_AT_ONCE = 0.0  # pyserial writes what is taken at once, and says how much
 _END_OF_LINE = re.compile(rb"[\r\a]")
 _LONGEST_LINE = 64  # a frame with a timestamp takes 31 bytes
 _FRAME = re.compile(
@@ -67,17 +68,34 @@ class BulkSlcanBus(slcanBus):
         self._batch = bytearray()
         try:
             for message in messages:
-                self.send(message, _SEND_TIMEOUT_S)
+                self.send(message, _AT_ONCE)
         finally:
             batch, self._batch = self._batch, None
-        with can.exceptions.error_check("Could not write to the adapter"):
-            self.serialPortOrig.write(batch)
+        self._write_all(batch)
 
     def _write(self, string: str) -> None:
+        line = string.encode("ascii") + self.LINE_TERMINATOR
         if self._batch is None:
-            super()._write(string)
+            self._write_all(line)
         else:
-            self._batch += string.encode("ascii") + self.LINE_TERMINATOR
+            self._batch += line
+
+    def _write_all(self, line: bytes | bytearray) -> None:
+        """Write as soon as the adapter takes it.
+
+        pyserial's own time limit would also count how long the computer stood still after everything was taken.
+        """
+        port, left = self.serialPortOrig, memoryview(line)
+        if port.write_timeout != _AT_ONCE:
+            port.write_timeout = _AT_ONCE
+        deadline_s = time.monotonic() + _SEND_TIMEOUT_S
+        with can.exceptions.error_check("Could not write to the adapter"):
+            while left:
+                left_s = max(0.0, deadline_s - time.monotonic())
+                if not select.select([], [port.fileno()], [], left_s)[1]:
+                    msg = f"{len(left)} bytes not taken within {_SEND_TIMEOUT_S:g} s"
+                    raise TimeoutError(msg)
+                left = left[port.write(left) :]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame; python-can's own waits by the wall clock, which may be set back."""

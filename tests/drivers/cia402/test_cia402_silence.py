@@ -1,13 +1,14 @@
 """A drive, a master or a link that falls silent, and what both sides then do."""
 
 import time
+from types import SimpleNamespace
 
 import can
 import pytest
 from can.interfaces.slcan import slcanBus
 from cia402_bench import STILL, exchange_until, reading_of, wait_until
 
-from fitctl.drivers.cia402 import protocol
+from fitctl.drivers.cia402 import link, protocol
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.cia402.protocol import State
 from fitctl.drivers.interface import DeviceError, DeviceFault, DeviceTimeout, DeviceUnreachable
@@ -106,6 +107,36 @@ def test_a_drive_taken_out_of_operation_is_a_fault(bench, amplifiers):
             exchange_for(amplifiers, 2.0)
     finally:
         other.shutdown()
+
+
+def test_a_computer_that_stands_still_while_it_writes_breaks_no_connection(
+    bench, amplifiers, monkeypatch
+):
+    """The adapter has taken the frames by then: pyserial would say that writing took too long."""
+    amplifiers.open()
+    port = amplifiers._opened().link._bus.serialPortOrig
+    taken = port._socket
+
+    class StandsStill:
+        def send(self, data):
+            count = taken.send(data)
+            time.sleep(1.5 * link._SEND_TIMEOUT_S)
+            return count
+
+        def __getattr__(self, name):
+            return getattr(taken, name)
+
+    monkeypatch.setattr(port, "_socket", StandsStill())
+    amplifiers.stage(STILL)
+
+
+def test_an_adapter_that_takes_no_bytes_is_unreachable_within_the_time_limit(
+    bench, amplifiers, monkeypatch
+):
+    amplifiers.open()
+    monkeypatch.setattr(link, "select", SimpleNamespace(select=lambda *_: ([], [], [])))
+    with pytest.raises(DeviceUnreachable, match="Could not write to the adapter"):
+        amplifiers.stage(STILL)
 
 
 def test_positions_that_do_not_come_give_no_reading_after_one_period(bench, amplifiers):
