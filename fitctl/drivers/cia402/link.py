@@ -25,7 +25,7 @@ from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 
 _SEND_TIMEOUT_S = 0.1
-_AT_ONCE = 0.0  # pyserial writes what is taken at once, and says how much
+_AT_ONCE = 0.0  # with this time limit, pyserial's write returns at once how many bytes the port has accepted
 _END_OF_LINE = re.compile(rb"[\r\a]")
 _LONGEST_LINE = 64  # a frame with a timestamp takes 31 bytes
 _FRAME = re.compile(
@@ -35,7 +35,9 @@ _STAMP_DIGITS = 4
 
 
 class BulkSlcanBus(slcanBus):
-    """python-can's SLCAN bus, with reads in chunks, no Nagle delay, and a shutdown that always closes.
+    """python-can's SLCAN bus, with reads in chunks, writes with their own time limit, and no Nagle delay.
+
+    Its shutdown always closes the port.
 
     A serial port is locked before the adapter on it gets a byte: python-can shares its port, and sets the
     adapter up anew under whoever uses it.
@@ -81,9 +83,9 @@ class BulkSlcanBus(slcanBus):
             self._batch += line
 
     def _write_all(self, line: bytes | bytearray) -> None:
-        """Write as soon as the adapter takes it.
+        """Write as soon as the port accepts it.
 
-        pyserial's own time limit would also count how long the computer stood still after everything was taken.
+        pyserial's own time limit also counts a stall of the computer after the port has accepted all bytes.
         """
         port, left = self.serialPortOrig, memoryview(line)
         if port.write_timeout != _AT_ONCE:

@@ -41,7 +41,7 @@ def test_killing_the_recorder_costs_no_tick_and_its_file_stays_readable(rig):
         seen = rig.follow(
             lambda t: t.recorder is not None and t.recorder.path != path, limit_s=20.0
         )
-        # What the last of these ticks went through is told up to a second later.
+        # Telemetry reports the timing of the last of these ticks up to a second later.
         seen += rig.follow(
             lambda t: any(timing.time_s > seen[-1].time_s for timing in t.timing), limit_s=5.0
         )
