@@ -6,6 +6,8 @@ from contextlib import contextmanager
 
 LOOK_S = 0.005
 STALL_S = 0.02  # less is no stall
+# Interlocks that trip where this computer, or the host of a virtual one, gives fitctl too little time.
+BUSY = {"servo_overrun", "loop_overrun", "frame_age"}
 
 
 class Stalls:

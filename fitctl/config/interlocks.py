@@ -101,7 +101,7 @@ QUANTITIES: dict[str, Quantity] = {
     "servo_skipped_fraction": Quantity(
         "part of the siderostat servo's periods that were skipped, over the last second",
         "computer",
-        "free the computer of other work; see the realtime rights",
+        "free the computer, and the host of a virtual one, of other work; see the realtime rights",
     ),
     "piezo_limit_error_v": Quantity(
         "the voltage-limit switch as read, less the rig file's limit_v",
@@ -138,7 +138,7 @@ QUANTITIES: dict[str, Quantity] = {
     "tick_period_fraction": Quantity(
         "time that the last tick took, over the frame period",
         "computer",
-        "free the computer of other work; see the realtime rights",
+        "free the computer, and the host of a virtual one, of other work; see the realtime rights",
     ),
     "disk_free_bytes": Quantity(
         "room left where the log is written",

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from urllib.request import urlopen
 
 import psutil
+from stalls import BUSY
 from system.conftest import Rig
 
 from fitctl.config import load_rig
@@ -40,7 +41,6 @@ REACH_S = 60.0
 ANSWER_S = 5.0  # to a command that is accepted
 OPENING_S = 20.0
 CALM_S = 10.0
-BUSY = {"servo_overrun", "loop_overrun", "frame_age"}
 HIDDEN = {
     "right": SetFault("camera", "star_fading", value=0.001),
     "metrology": SetFault("metrology.labjack", "laser_dim", value=0.0),
