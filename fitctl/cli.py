@@ -193,4 +193,7 @@ def _message(error: TyperException) -> str:
     context = getattr(error, "ctx", None)
     if text == "Missing command." and context is not None:
         text = f"expected a command: {', '.join(context.command.commands)}"
+    text, _, possible = text.partition(" (Possible options: ")
+    if possible:
+        text += f"; did you mean {possible.rstrip(')').replace(', ', ' or ')}?"
     return text.replace("\n", " ").replace("Input should be", "expected").rstrip(".")

@@ -254,10 +254,6 @@ def _star_places(folder: Path, supervisor: Supervisor) -> StarPlaces:
     return places
 
 
-def _modes(supervisor: Supervisor) -> str:
-    return ", ".join(f"{name} {loop.mode.name}" for name, loop in supervisor.loops.items())
-
-
 @contextmanager
 def _designer() -> Iterator[ThreadPoolExecutor]:
     """A thread for designs alone: one may take a minute, in which devices must be read, and closed if asked."""
@@ -294,7 +290,7 @@ def _loop(
                 machine.look()
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
-                tell_service_manager(ALIVE, status_line(_modes(supervisor)))
+                tell_service_manager(ALIVE, status_line(supervisor.modes_of(supervisor.loops)))
         tell_service_manager(ENDING)
         supervisor.shutdown_wanted = True
         supervisor.stop("shutting down")

@@ -237,7 +237,7 @@ class Service(threading.Thread):
                     self._record(waiting, command, reply, now_s)
                 self._refuse(waiting, reply, now_s)
             case Status():
-                text = self._status_text()
+                text = self._supervisor.modes_of(self._supervisor.loops)
                 self._answer_here(waiting, command, Reply(accepted=True, text=text))
             case RecentEvents():
                 events = self._buffer.recent_events()
@@ -283,11 +283,6 @@ class Service(threading.Thread):
     def _record(self, waiting: Waiting, command: AnyCommand, reply: Reply, now_s: float) -> None:
         sender = waiting.sender
         self._supervisor.leave(command_record(command, reply, sender.name, sender.address, now_s))
-
-    def _status_text(self) -> str:
-        return ", ".join(
-            f"{name} {loop.mode.name}" for name, loop in self._supervisor.loops.items()
-        )
 
     def _send_replies(self) -> None:
         while True:

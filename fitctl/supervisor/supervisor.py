@@ -15,6 +15,8 @@ from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
+import msgspec
+
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT, Designer
@@ -223,6 +225,10 @@ class Supervisor:
         """Leave a quantity of all loops, for their interlocks, for the next step; from any thread."""
         reading = QuantityReading(time_s=self._clock.now_s(), name=name, value=value)
         self._quantities.append(reading)
+
+    def modes_of(self, names: Iterable[str]) -> str:
+        """The modes of some loops, for people."""
+        return ", ".join(f"{name} {self.loops[name].mode.name}" for name in names)
 
     @property
     def stellar_loops(self) -> dict[str, StellarLoop]:
@@ -447,6 +453,8 @@ class Supervisor:
             for loop in self._in_order:
                 if loop.name in usable:
                     loop.obey(trigger, command)
+            if trigger is Trigger.STOP:
+                return msgspec.structs.replace(reply, text=self.modes_of(usable))
         return reply
 
     def _rest_mirrors(self, names: list[str]) -> list[str]:

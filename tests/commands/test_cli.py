@@ -98,6 +98,10 @@ BAD_INPUT = {
     "a table that is none": (["check", "--set", "camera.width_px.of=3"], "is not a table"),
     "a group without a command": (["fault"], "fitctl fault: expected a command: set, clear, now"),
     "an option that is none": (["demo", "--fast"], "--fast"),
+    "an option that is misspelt": (
+        ["status", "--jsn"],
+        "fitctl status: No such option: --jsn; did you mean --json or --set? (see fitctl status --help)",
+    ),
     "a command that is not there": (["point"], "point"),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
     "an option without its value": (["console", "--log"], "fitctl console: Option '--log'"),

@@ -108,7 +108,7 @@ def test_where_several_run_they_are_named_and_only_stop_is_for_all(start, said):
 
     status, out, err = said("send", "stop")
 
-    assert (status, out) == (0, "accepted\n" * 2)
+    assert (status, out) == (0, "right SAFE\n" * 2)
     assert "2 supervisors run; stopping all of them" in err
     assert "rig north: " in err
     assert "rig south: " in err
@@ -202,7 +202,7 @@ def test_a_second_demo_says_so_and_how_to_address_it(demos, said):
     assert f"process {other['pid']}" in err
 
     status, out, err = said("send", "stop")
-    assert (status, out) == (0, "accepted\n" * 2)
+    assert (status, out) == (0, "right SAFE\n" * 2)
     assert "2 supervisors run; stopping all of them" in err
     end(second, signal.SIGINT, START_S)
     assert [loop["mode"] for loop in runs(said)["loops"]] == ["SAFE"]

@@ -290,7 +290,7 @@ def test_send_gives_commands_from_a_shell(rig):
     assert "standby" in text
     assert send("standby") == (0, "accepted")
     rig.follow_to("STANDBY")
-    assert send("stop") == (0, "accepted")
+    assert send("stop") == (0, "right SAFE")
     assert send("status") == (0, "right SAFE")
 
 

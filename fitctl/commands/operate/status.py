@@ -111,8 +111,9 @@ def _rows(telemetry: Telemetry) -> Iterator[tuple[str, str]]:
     if telemetry.recorder is not None:
         text = f"{telemetry.recorder.path}, {telemetry.recorder.records} records"
         yield "log", f"{text}, {telemetry.records_lost} lost"
-    unsent = ", ".join(f"{count} {name}" for name, count in telemetry.losses.unsent.items())
-    yield "unsent", unsent.replace("_", " ")
+    unsent = telemetry.losses.unsent.items()
+    text = ", ".join(f"{count} {name}" for name, count in unsent if count)
+    yield "unsent", text.replace("_", " ") or "nothing"
     running = telemetry.running_sequence
     if running is not None:
         text = f"{running.name} {running.state}, step {running.step_number} of {running.steps}"

@@ -42,7 +42,7 @@ CAUSE_LOOKS = {
     "unexplained": ("·", DIM),
 }
 _STAGES = ("fsm", "mirror", "siderostat", "link")
-_NOT_EVALUATED = "error budget: not known until the design is evaluated, which needs the rig file"
+_NOT_EVALUATED = "error budget: needs the design's figures, see the panel Design"
 _FIELDS = (
     "mid_exposure_s",
     "star_flux_dn",

@@ -60,7 +60,7 @@ def test_the_one_that_runs_is_meant_and_not_the_shipped_rig(night, fitctl):
 
     status, out, err = fitctl("send", "stop")
 
-    assert (status, out) == (0, "accepted\n")
+    assert (status, out) == (0, "right SAFE\n")
     assert "rig night: " in err
     assert [accepted for _, accepted in served.commands("Stop")] == [True]
 
@@ -82,7 +82,7 @@ def test_where_several_run_stop_stops_all_of_them_and_says_so(night, fitctl):
 
     status, out, err = fitctl("send", "stop")
 
-    assert (status, out) == (0, "accepted\n" * 2)
+    assert (status, out) == (0, "right SAFE\n" * 2)
     assert "2 supervisors run; stopping all of them" in err
     assert "rig north: " in err
     assert "rig south: " in err
@@ -152,7 +152,7 @@ def test_an_option_names_one_of_several(night, fitctl):
 
     status, out, _ = fitctl("send", "stop", "--rig", str(default_rig_path()), *at)
 
-    assert (status, out) == (0, "accepted\n")
+    assert (status, out) == (0, "right SAFE\n")
     assert north.commands("Stop") == []
 
 

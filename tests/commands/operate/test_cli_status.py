@@ -161,10 +161,19 @@ def test_people_read_the_verdict_first_then_loops_devices_and_log():
     assert second.strip().startswith("! 3 records are missing from the log of this run")
     text = "\n".join(rest)
     assert "VERNIER for 2 min 13 s, controller minimum-variance" in text
-    assert "0 ticks, 0 events, 0 mode changes, 0 replies" in text
+    assert "unsent             nothing" in text
     for device in message.devices:
         assert device.endpoint in text
     assert message.recorder.path in text
+
+
+def test_people_read_of_the_queues_that_left_something_unsent():
+    supervisor = FakeSupervisor()
+    supervisor.ticks_unsent = 12
+
+    (row,) = (row for row in status_lines(supervisor.message(), []) if row.startswith("  unsent"))
+
+    assert row.split() == ["unsent", "12", "ticks"]
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ def test_what_is_refused_or_takes_no_time_is_not_waited_for(fitctl):
     status, _, err = fitctl("send", "acquire", "--wait")
     assert status == 1
     assert "acquire is not available in OFF" in err
-    assert fitctl("send", "stop", "--wait")[:2] == (0, "accepted\n")
+    assert fitctl("send", "stop", "--wait")[:2] == (0, "right SAFE\n")
 
 
 @pytest.mark.parametrize("timeout", ["0", "soon"])
