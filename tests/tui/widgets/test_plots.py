@@ -321,7 +321,10 @@ def test_the_error_budget_waits_for_ticks_and_for_the_rig_file():
     (line,) = plain(ErrorBudget(state, "", known_design(state)).draw(80, 3))
     assert "64 ticks with a star" in line
     assert len(line) <= 80
-    assert "needs the design's figures" in plain(ErrorBudget(state, "", DesignFigures()).draw(80, 3))[0]
+    assert (
+        "needs the design's figures"
+        in plain(ErrorBudget(state, "", DesignFigures()).draw(80, 3))[0]
+    )
 
 
 def test_other_modes_have_neither_an_error_budget_nor_a_prediction():
