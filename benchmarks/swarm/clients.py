@@ -1,40 +1,24 @@
-"""The service and its clients on virtual time: admission of commands, consoles and running sequences.
-
-Known limitations: commands do not pass through a socket, so none is late or too long; telemetry does so in
-:mod:`benchmarks.swarm.telemetry_wire` only.
-"""
+"""The service's clients on virtual time: a console and running sequences."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from random import Random
 
-import msgspec
-
 from benchmarks.swarm.invariants import Invariants
-from benchmarks.swarm.telemetry_wire import Publisher
+from benchmarks.swarm.service import SwarmService
 from benchmarks.swarm.threads import VirtualEvent, VirtualTime
 from fitctl.config import Rig
-from fitctl.logging.records import AnyRecord, Event
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.telemetry import Telemetry
 from fitctl.sequences import steps
 from fitctl.sequences.contact import Contact
 from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import SequenceError
-from fitctl.service.admission import Admission, Sender
-from fitctl.service.service import Service as RealService
-from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.service.admission import Sender
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.tui.state import ConsoleState
 
-SENDERS = {
-    "ada": Sender("ada", "here", "commander", is_local=True),
-    "ben": Sender("ben", "elsewhere", "commander", is_local=False),
-    "cleo": Sender("cleo", "here", "commander", is_local=True),
-    "dora": Sender("dora", "elsewhere", "viewer", is_local=False),
-}
-"""By name. The first three can send commands."""
 STEPS: dict[str, Callable[[], steps.Step]] = {
     "standby": steps.Standby,
     "acquire": steps.Acquire,
@@ -47,93 +31,7 @@ STEPS: dict[str, Callable[[], steps.Step]] = {
     "off": steps.Off,
 }
 """The steps of which operators make their sequences."""
-_ANSWERED_HERE = {"Status", "RecentEvents", "RecorderReport", "TakeOver"}
 _REPLY_S = 5.0
-
-
-class _Buffer(TelemetryBuffer):
-    """Also keeps the newest message as it was before it was encoded."""
-
-    newest: Telemetry
-
-    def telemetry(self, supervisor: Supervisor, state: ServiceState, now_s: float) -> Telemetry:
-        self.newest = super().telemetry(supervisor, state, now_s)
-        return self.newest
-
-
-class Service:
-    """The service of one supervisor: it admits commands and publishes telemetry.
-
-    Parameters
-    ----------
-    supervisor : Supervisor
-    time : VirtualTime
-    invariants : Invariants
-    pid : int
-        Process number of the supervisor.
-    publisher : Publisher
-        The PUB socket; it also sends to consoles that are far away.
-    lost, offered : callable
-        Return the counts of the record queue.
-    """
-
-    def __init__(
-        self,
-        supervisor: Supervisor,
-        time: VirtualTime,
-        invariants: Invariants,
-        pid: int,
-        publisher: Publisher,
-        lost: Callable[[], int],
-        offered: Callable[[], int],
-    ) -> None:
-        self.buffer = self._buffer = _Buffer()
-        self.events = 0
-        self.subscribers: list[Callable[[Telemetry], None]] = []
-        self._supervisor = supervisor
-        self._time = time
-        self._invariants = invariants
-        self._admission = Admission(supervisor.rig.service.lease_s)
-        self._state = ServiceState(
-            pid=pid,
-            wall_minus_monotonic_s=0.0,
-            scheduling="virtual",
-            records_lost=lost,
-            records_offered=offered,
-        )
-        publisher.supervisor = supervisor
-        self._publisher = publisher
-        self._encode = msgspec.msgpack.Encoder().encode
-        self._snapshot_s = time.now_s()
-        time.spawn(self._run, "service")
-
-    def take(self, record: AnyRecord) -> None:
-        """Add a record to the next telemetry."""
-        self.events += isinstance(record, Event)
-        self.buffer.add(record)
-
-    def send(self, sender: Sender, command: AnyCommand, reply: Callable[[Reply], None]) -> None:
-        """Send a command."""
-        refusal = self._admission.refusal(sender, command, self._time.now_s())
-        self._invariants.admitted(sender, command, refusal)
-        if refusal or type(command).__name__ in _ANSWERED_HERE:
-            reply(Reply(accepted=not refusal, text=refusal))
-            return
-        self._invariants.posted(command)
-
-        def answered(to_it: Reply) -> None:
-            self._invariants.answered(command, to_it)
-            reply(to_it)
-
-        self._supervisor.post(command, answered, sender.name, sender.address)
-
-    def _run(self) -> None:
-        period_s = 1.0 / self._supervisor.rig.supervisor.telemetry_hz
-        while True:
-            self._time.sleep(period_s)
-            RealService._publish(self, self._time.now_s())  # type: ignore[arg-type]
-            for take in list(self.subscribers):
-                take(self.buffer.newest)
 
 
 class Console:
@@ -154,10 +52,10 @@ class Console:
         self._random = random
         self._loss = loss
         self._missed = self._heard = 0
-        self._service: Service | None = None
+        self._service: SwarmService | None = None
         self._supervisor: Supervisor | None = None
 
-    def connect(self, service: Service, supervisor: Supervisor) -> None:
+    def connect(self, service: SwarmService, supervisor: Supervisor) -> None:
         """Receive telemetry from this service from now on."""
         self._service, self._supervisor = service, supervisor
         self._missed = self._heard = 0
@@ -200,14 +98,14 @@ class Link:
     """
 
     def __init__(
-        self, time: VirtualTime, service: Callable[[], Service | None], sender: Sender
+        self, time: VirtualTime, service: Callable[[], SwarmService | None], sender: Sender
     ) -> None:
         self._time = time
         self._service = service
         self._sender = sender
         self._telemetry: list[Telemetry] = []
         self._some = VirtualEvent(time)
-        self._heard: Service | None = None
+        self._heard: SwarmService | None = None
 
     def now_s(self) -> float:
         """The virtual time."""

@@ -17,7 +17,7 @@ from unittest.mock import patch
 import msgspec
 import numpy as np
 
-from benchmarks.swarm.clients import SENDERS, Console, Link, RunningSequence, Service
+from benchmarks.swarm.clients import Console, Link, RunningSequence
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
@@ -38,6 +38,8 @@ from benchmarks.swarm.plan import (
     Strike,
 )
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
+from benchmarks.swarm.service import SENDERS, SwarmService
+from benchmarks.swarm.service import installed as service_installed
 from benchmarks.swarm.telemetry_wire import (
     Publisher,
     RemoteConsole,
@@ -233,7 +235,7 @@ class Instrument:
         size = self.rig.logging.queue_records
         self._queue = RecordQueue("swarm", size)
         self.recorder = SwarmRecorder(self.time, self._queue)
-        self.service: Service | None = None
+        self.service: SwarmService | None = None
         self.supervisor = Supervisor(
             self.rig,
             self.devices,
@@ -249,7 +251,7 @@ class Instrument:
         self.invariants.watch(self.supervisor)
         self.running = True
         queue = self._queue
-        self.service = Service(
+        self.service = SwarmService(
             self.supervisor,
             self.time,
             self.invariants,
@@ -297,6 +299,8 @@ class Instrument:
         supervisor.close()
         for thread in self._threads:
             thread.stop()
+        if self.service is not None:
+            self.service.stop()
         self.service = None
         self._finish_log()
         self.time.kill_process()
@@ -367,9 +371,12 @@ class Instrument:
         number = self._posted
         since = self.time.now_s(), self.time.awake_s(), type(command).__name__
         self._unanswered[number] = since
-        service.send(SENDERS[who], command, partial(self._answered, number, command))
+        answered = partial(self._answered, self._lives, number, command)
+        service.send(SENDERS[who], command, answered)
 
-    def _answered(self, number: int, command: AnyCommand, reply: Reply) -> None:
+    def _answered(self, life: int, number: int, command: AnyCommand, reply: Reply) -> None:
+        if life != self._lives or not self.running:
+            return  # it was on its way when the supervisor ended
         if self._unanswered.pop(number, None) is None:
             name = type(command).__name__
             self.invariants.violated("a command is answered once", f"{name} {number}: twice")
@@ -511,6 +518,7 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
         installed(time),
         patch("fitctl.logging.queue.zmq", ZMQ),
         client_installed(time, subscribers),
+        service_installed(time, Random(f"{plan.seed} service")),  # noqa: S311
     ):
         instrument = Instrument(rig, plan, time, subscribers, on_record)
         for happening in plan.happenings:

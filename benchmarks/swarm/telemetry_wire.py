@@ -84,6 +84,9 @@ class Publisher:
         for one in self.subscribers:
             one.arrive(payload, modes)
 
+    def close(self) -> None:
+        """It is closed with its process."""
+
 
 class Subscriber:
     """A client's SUB socket."""

@@ -20,6 +20,7 @@ from unittest.mock import patch
 from greenlet import GreenletExit, getcurrent, greenlet
 
 _WITH_THREADS = (
+    "fitctl.service.service",
     "fitctl.supervisor.collector",
     "fitctl.stages.collector",
     "fitctl.stages.injector",

@@ -5,7 +5,7 @@ from random import Random
 import msgspec
 import pytest
 
-from benchmarks.swarm.clients import SENDERS, STEPS
+from benchmarks.swarm.clients import STEPS
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.past import put_back
@@ -28,6 +28,7 @@ from benchmarks.swarm.plan import (
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
+from benchmarks.swarm.service import SENDERS
 from benchmarks.swarm.telemetry_wire import RemoteConsole
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import load_rig

@@ -1,0 +1,332 @@
+"""The service as it is, on virtual time: commands come to its doors encoded, after a while; answers go back.
+
+:func:`installed` puts sockets in memory in place of ZeroMQ's in :mod:`fitctl.service`. An operator elsewhere
+sends through the gateway's door, in an envelope. Now and then somebody sends what is no command.
+
+Known limitations: a connection holds any number of messages, and loses none; no message is longer than a
+socket allows. A round of the service begins when there is something to do, not every 5 ms.
+Invented: how long messages take, and how often what comes is no command.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from random import Random
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import msgspec
+import zmq
+
+from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.telemetry_wire import Publisher
+from benchmarks.swarm.threads import VirtualEvent, VirtualTime
+from fitctl.logging.records import AnyRecord, Event
+from fitctl.messages.commands import (
+    AnyCommand,
+    RecentEvents,
+    RecorderReport,
+    Reply,
+    Status,
+    TakeOver,
+)
+from fitctl.messages.telemetry import Telemetry
+from fitctl.service.admission import Admission, Sender
+from fitctl.service.envelope import Passed
+from fitctl.service.service import Service, Waiting
+from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
+from fitctl.supervisor.supervisor import Supervisor
+
+SENDERS = {
+    "ada": Sender("ada", "here", "commander", is_local=True),
+    "ben": Sender("ben", "elsewhere", "commander", is_local=False),
+    "cleo": Sender("cleo", "here", "commander", is_local=True),
+    "dora": Sender("dora", "elsewhere", "viewer", is_local=False),
+}
+"""By name. The first three can send commands."""
+_ANSWERED_HERE = (Status, RecentEvents, RecorderReport, TakeOver)
+_ROUND_S = 0.005
+_ENDS_S = 5.0
+_LOCAL_S = (1e-5, 1e-3)
+_REMOTE_S = (1e-3, 0.3)
+_GARBAGE = 0.02  # of the messages
+_MOST_GARBAGE_BYTES = 200
+
+
+class _Frame(NamedTuple):
+    """A part of a message, as ZeroMQ gives it; `sender` is whom the kernel names."""
+
+    buffer: bytes
+    more: bool
+    sender: Sender | None = None
+
+
+class _Wire:
+    """What a service's sockets have in common, in place of a ZeroMQ context.
+
+    Attributes
+    ----------
+    some : VirtualEvent
+        Set when there is something to do.
+    due_s : float
+        When the next telemetry is.
+    answered : callable
+        Takes the tag and the payload of each answer.
+    """
+
+    def __init__(self, time: VirtualTime, random: Random) -> None:
+        self.time = time
+        self.random = random
+        self.some = VirtualEvent(time)
+        self.due_s = 0.0
+        self.answered: Callable[[bytes, bytes], None] = lambda _tag, _payload: None
+
+    def socket(self, _kind: int) -> _Router:
+        return _Router(self)
+
+    def term(self) -> None:
+        """Nothing is left behind."""
+
+
+class _Router:
+    """A ROUTER socket; of the PUB that the service makes, only this much is used."""
+
+    def __init__(self, wire: _Wire) -> None:
+        self.wire = wire
+        self._frames: deque[_Frame] = deque()
+
+    def setsockopt(self, _option: int, _value: int) -> None:
+        """It has no limits."""
+
+    def bind(self, _endpoint: str) -> None:
+        """There is one service."""
+
+    def close(self) -> None:
+        """It is closed with its process."""
+
+    @property
+    def has_some(self) -> bool:
+        return bool(self._frames)
+
+    def arrive(self, sender: Sender, tag: bytes, payload: bytes) -> None:
+        """A message is here."""
+        self._frames.append(_Frame(sender.name.encode(), more=True))
+        self._frames.append(_Frame(tag, more=True))
+        self._frames.append(_Frame(payload, more=False, sender=sender))
+        self.wire.some.set()
+
+    def recv(self, _flags: int, *, copy: bool) -> _Frame:
+        if not self._frames:
+            raise zmq.Again
+        return self._frames.popleft()
+
+    def send_multipart(self, parts: list[bytes], _flags: int) -> None:
+        _, tag, payload = parts
+        self.wire.answered(tag, payload)
+
+
+class _Poller:
+    """Returns once a message is here, an answer is to be sent, or telemetry is due."""
+
+    def __init__(self) -> None:
+        self._routers: list[_Router] = []
+
+    def register(self, router: _Router, _flags: int) -> None:
+        self._routers.append(router)
+
+    def poll(self, _timeout_ms: int) -> list[_Router]:
+        wire = self._routers[0].wire
+        wait_s = wire.due_s - wire.time.now_s()
+        if wait_s > 0 and not wire.some.is_set() and wire.some.wait(wait_s):
+            wire.time.sleep(wire.random.uniform(0.0, _ROUND_S))  # a round is under way
+        wire.some.clear()
+        return [router for router in self._routers if router.has_some]
+
+
+class _WatchedAdmission(Admission):
+    """It tells what it has decided."""
+
+    def __init__(self, lease_s: float, invariants: Invariants) -> None:
+        super().__init__(lease_s)
+        self._invariants = invariants
+
+    def refusal(self, sender: Sender, command: AnyCommand, now_s: float) -> str:
+        refusal = super().refusal(sender, command, now_s)
+        self._invariants.admitted(sender, command, refusal)
+        if not refusal and not isinstance(command, _ANSWERED_HERE):
+            self._invariants.posted(command)
+        return refusal
+
+
+class _Buffer(TelemetryBuffer):
+    """Also keeps the newest message as it was before it was encoded."""
+
+    newest: Telemetry
+
+    def telemetry(self, supervisor: Supervisor, state: ServiceState, now_s: float) -> Telemetry:
+        self.newest = super().telemetry(supervisor, state, now_s)
+        return self.newest
+
+
+class SwarmService(Service):
+    """The service of one supervisor, and the ways to it; within :func:`installed`.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+    time : VirtualTime
+    invariants : Invariants
+    pid : int
+        Process number of the supervisor.
+    publisher : Publisher
+        The PUB socket; it also sends to consoles that are far away.
+    lost, offered : callable
+        Return the counts of the record queue.
+
+    Attributes
+    ----------
+    events : int
+        Reported until now.
+    subscribers : list of callable
+        Each takes every telemetry message.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        time: VirtualTime,
+        invariants: Invariants,
+        pid: int,
+        publisher: Publisher,
+        lost: Callable[[], int],
+        offered: Callable[[], int],
+    ) -> None:
+        state = ServiceState(
+            pid=pid,
+            wall_minus_monotonic_s=0.0,
+            scheduling="virtual",
+            records_lost=lost,
+            records_offered=offered,
+        )
+        self.buffer = _Buffer()
+        self.events = 0
+        self.subscribers: list[Callable[[Telemetry], None]] = []
+        super().__init__(supervisor, self.buffer, Path(), state, time)
+        self._admission = _WatchedAdmission(supervisor.rig.service.lease_s, invariants)
+        publisher.supervisor = supervisor
+        self._publisher = publisher  # type: ignore[assignment]
+        self._time = time
+        self._invariants = invariants
+        self._wire: _Wire = self._context  # type: ignore[assignment]
+        self._wire.due_s = time.now_s()
+        self._wire.answered = self._take_answer
+        self._random = self._wire.random
+        self._decode = msgspec.msgpack.Decoder(Reply).decode
+        self._sent: dict[bytes, tuple[Sender, AnyCommand | None, Callable[[Reply], None]]] = {}
+        self._arrives_s: dict[str, float] = {}  # by sender: no message overtakes another
+        self._ended = VirtualEvent(time)
+        time.spawn(self.run, "service")
+
+    def take(self, record: AnyRecord) -> None:
+        """Add a record to the next telemetry."""
+        self.events += isinstance(record, Event)
+        self.buffer.add(record)
+
+    def stop(self) -> None:
+        """Send what answers there are, publish once more, and end."""
+        self._ending.set()
+        self._wire.some.set()
+        self._ended.wait(_ENDS_S)
+
+    def run(self) -> None:
+        """Serve; this is the thread."""
+        super().run()
+        self._ended.set()
+
+    # ------------------------------------------------------------ the clients' side
+
+    def send(self, sender: Sender, command: AnyCommand, reply: Callable[[Reply], None]) -> None:
+        """Send a command; `reply` takes the answer once it is back."""
+        if self._random.random() < _GARBAGE:
+            size = self._random.randint(0, _MOST_GARBAGE_BYTES)
+            self._pass(sender, None, self._random.randbytes(size), self._refused)
+        self._pass(sender, command, self._encode(command), reply)
+
+    def _refused(self, reply: Reply) -> None:
+        if reply.accepted:
+            self._invariants.violated("what is no command is refused", "it was accepted")
+
+    def _pass(
+        self,
+        sender: Sender,
+        command: AnyCommand | None,
+        payload: bytes,
+        reply: Callable[[Reply], None],
+    ) -> None:
+        tag = len(self._sent).to_bytes(8, "big")
+        self._sent[tag] = sender, command, reply
+        door = self._local if sender.is_local else self._gateway
+        if not sender.is_local:
+            payload = self._encode(
+                Passed(name=sender.name, role=sender.role, address=sender.address, payload=payload)
+            )
+        at_s = self._time.now_s() + self._delay_s(sender)
+        at_s = self._arrives_s[sender.name] = max(at_s, self._arrives_s.get(sender.name, 0.0))
+        router: Any = door.router
+        self._time.call_at(at_s, partial(router.arrive, sender, tag, payload))
+
+    def _delay_s(self, sender: Sender) -> float:
+        return self._random.uniform(*(_LOCAL_S if sender.is_local else _REMOTE_S))
+
+    def _take_answer(self, tag: bytes, payload: bytes) -> None:
+        sender, _, reply = self._sent[tag]
+        at_s = self._time.now_s() + self._delay_s(sender)
+        self._time.call_at(at_s, lambda: reply(self._decode(payload)))
+
+    # ------------------------------------------------------------ the service's side
+
+    def _receive(self, waiting: Waiting, payload: bytes) -> None:
+        sender, _, _ = self._sent[waiting.tag]
+        if waiting.sender != sender:
+            told = f"{waiting.sender} is taken for the sender, {sender} is"
+            self._invariants.violated("a command is its sender's", told)
+        super()._receive(waiting, payload)
+
+    def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
+        _, command, _ = self._sent[waiting.tag]
+        if command is not None:
+            self._invariants.answered(command, reply)
+        super()._done(waiting, stopped, reply)
+        self._wire.some.set()
+
+    def _publish(self, now_s: float) -> None:
+        self._wire.due_s = now_s + self._period_s
+        super()._publish(now_s)
+        for take in list(self.subscribers):
+            take(self.buffer.newest)
+
+
+@contextmanager
+def installed(time: VirtualTime, random: Random) -> Iterator[None]:
+    """Services have sockets in memory meanwhile."""
+    names: dict[str, Any] = {name: getattr(zmq, name) for name in dir(zmq) if name.isupper()}
+    stand_in = SimpleNamespace(
+        Context=lambda: _Wire(time, random),
+        Poller=_Poller,
+        Again=zmq.Again,
+        ZMQError=zmq.ZMQError,
+        **names,
+    )
+    with ExitStack() as stack:
+        for module in ("service", "doors"):
+            stack.enter_context(patch(f"fitctl.service.{module}.zmq", stand_in))
+        of_kernel = patch("fitctl.service.service.local_sender", lambda frame: frame.sender)
+        stack.enter_context(of_kernel)
+        no_file = patch("fitctl.service.service.file_identity", lambda _path: None)
+        stack.enter_context(no_file)
+        yield

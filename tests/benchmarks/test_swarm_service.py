@@ -1,0 +1,113 @@
+"""Commands in the swarm go through the real service; what that does wrong is a violation."""
+
+import msgspec
+import pytest
+
+from benchmarks.swarm import service as swarm_service
+from benchmarks.swarm.plan import Kill, Order, Plan
+from benchmarks.swarm.run import run_plan
+from fitctl.logging.records import Event
+from fitctl.messages.commands import Standby, Stop, TakeOver
+from fitctl.service import intake
+from fitctl.service.admission import Admission
+from fitctl.service.envelope import decode_envelope
+from fitctl.service.service import Service
+
+ORDERS = [
+    Order(at_s=at_s, who=who, command=command)
+    for at_s, who, command in (
+        (0.1, "ada", None),
+        (0.5, "ben", Standby()),
+        (1.0, "dora", Standby()),
+        (1.5, "ben", TakeOver()),
+        (2.0, "ben", Stop()),
+        (3.0, "cleo", Standby()),
+        (8.0, "dora", Stop()),  # it is on its way when the supervisor is killed
+    )
+]
+PLAN = Plan(
+    seed=1,
+    rig="fit-mock.toml",
+    settings=(),
+    duration_s=14.0,
+    happenings=[*ORDERS, Kill(at_s=8.01, back_after_s=0.5)],
+    console_loss=0.0,
+)
+
+
+def violated():
+    return {one.invariant for one in run_plan(PLAN).violations}
+
+
+def test_people_here_and_elsewhere_are_answered_and_nothing_is_violated():
+    assert violated() == set()
+
+
+def test_what_is_no_command_is_refused_and_reported(monkeypatch):
+    monkeypatch.setattr(swarm_service, "_GARBAGE", 1.0)
+    told = []
+
+    result = run_plan(
+        PLAN, lambda record: told.append(record.message) if isinstance(record, Event) else None
+    )
+
+    assert result.violations == []
+    assert any("ada: " in text and "messages, no commands" in text for text in told)
+    assert any("ben: " in text and "messages, no commands" in text for text in told)
+
+
+def answered(times):
+    answer = Service._answer
+
+    def wrongly(self, waiting, reply):
+        for _ in range(times):
+            answer(self, waiting, reply)
+
+    return wrongly
+
+
+def everybody_a_commander(payload):
+    return msgspec.structs.replace(decode_envelope(payload), role="commander")
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "mistake", "invariant"),
+    [
+        pytest.param(Service, "_answer", answered(0), "a command is answered once", id="silent"),
+        pytest.param(Service, "_answer", answered(2), "a command is answered once", id="twice"),
+        pytest.param(
+            Admission,
+            "refusal",
+            lambda *_: "",
+            "lease and rights are kept",
+            id="everybody may do everything",
+        ),
+        pytest.param(
+            "fitctl.service.service",
+            "decode_envelope",
+            everybody_a_commander,
+            "a command is its sender's",
+            id="another's role",
+        ),
+    ],
+)
+def test_a_mistake_of_the_service_is_found(monkeypatch, owner, name, mistake, invariant):
+    if isinstance(owner, str):
+        monkeypatch.setattr(f"{owner}.{name}", mistake)
+    else:
+        monkeypatch.setattr(owner, name, mistake)
+
+    assert invariant in violated()
+
+
+def test_garbage_that_is_taken_for_a_command_is_found(monkeypatch):
+    monkeypatch.setattr(swarm_service, "_GARBAGE", 1.0)
+    decoded = intake.decode_command
+
+    def obliging(payload):
+        command = decoded(payload)
+        return command if hasattr(command, "loop") else Stop()
+
+    monkeypatch.setattr(intake, "decode_command", obliging)
+
+    assert "what is no command is refused" in violated()
