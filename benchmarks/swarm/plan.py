@@ -74,6 +74,9 @@ _FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at
 # Fraction of commands that are repeated, drawn for each run, and the mean delay: a key held down.
 _REPEATED, _REPEATED_S = (0.0, 0.1, 0.6), 0.02
 _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
+_SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
+_SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
+_MEETS_S = 0.1  # and a stall follows within this
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
@@ -189,8 +192,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
 def drawn_search(random: Random) -> Acquire:
     """A search near the star's expected place, or far from it, so that the siderostat slews at full speed."""
-    if random.random() > _FAR:
-        return Acquire()
+    return Acquire() if random.random() > _FAR else _far_search(random)
+
+
+def _far_search(random: Random) -> Acquire:
     az_arcsec, el_arcsec = (random.uniform(-_FAR_ARCSEC, _FAR_ARCSEC) for _ in range(2))
     return Acquire(expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec)
 
@@ -279,7 +284,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     faults = random.sample(kinds, random.randint(1, len(kinds)))
     struck = random.sample(devices, random.randint(1, len(devices)))
     words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
-    strikes: list[Callable[[Random, float], Happening]] = []
+    strikes: list[Callable[[Random, float], list[Happening]]] = []
     for make, part in (
         (_stall, 0.4),
         (_kill, 0.3),
@@ -290,9 +295,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         (_sequence, 0.3),
     ):
         strikes += [make] * (random.random() < part)
-    fault_free = random.random() < _WITHOUT_FAULTS
-    if not fault_free:
+    if random.random() >= _WITHOUT_FAULTS:
         strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
+        strikes += [partial(_interrupted_slew, loops=loops)] * random.randint(0, 4)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
     # The service refuses commands from operators without the lease.
     people = OPERATORS[: random.randint(1, len(OPERATORS))]
@@ -312,7 +317,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         if at_s >= duration_s:
             break
         if strikes and random.random() < fault_part:
-            happenings.append(random.choice(strikes)(random, at_s))
+            happenings += random.choice(strikes)(random, at_s)
         else:
             command = _drawn_command(random, random.choice(words), places, loops)
             who, again_s = random.choice(people), at_s
@@ -354,43 +359,61 @@ def _drawn_command(
     return command
 
 
-def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> Happening:
+def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> list[Happening]:
     device, fault = random.choice(devices), random.choice(faults)
     if fault == "power cut" and not device.endswith("siderostat"):
         fault = "reset"  # only encoders forget anything
-    return Strike(
-        at_s=at_s,
-        device=device,
-        fault=fault,
-        lasts_s=0.0 if fault in {"reset", "power cut"} else 10 ** random.uniform(-2.0, 1.0),
-        size=drawn_slowness(random) if fault == "slow" else 0.0,
-    )
+    return [
+        Strike(
+            at_s=at_s,
+            device=device,
+            fault=fault,
+            lasts_s=0.0 if fault in {"reset", "power cut"} else 10 ** random.uniform(-2.0, 1.0),
+            size=drawn_slowness(random) if fault == "slow" else 0.0,
+        )
+    ]
 
 
-def _stall(random: Random, at_s: float) -> Happening:
-    return Stall(at_s=at_s, lasts_s=10 ** random.uniform(-2.5, 0.5))
+def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
+    """A loop lets its star go and searches far away; its amplifiers fail, or the computer stalls, meanwhile."""
+    loop, who = random.choice(loops), OPERATORS[0]
+    far = msgspec.structs.replace(_far_search(random), loop=loop)
+    fault = "slow" if random.random() < _SLOW_SLEW else random.choice(FAULTS)
+    struck_s = at_s + 0.1 + random.uniform(0.0, _SLEW_S)
+    failing = _strike(random, struck_s, [f"{loop} siderostat"], [fault])
+    stall = _stall(random, struck_s + random.uniform(0.0, _MEETS_S))
+    return [
+        Order(at_s=at_s, who=who, command=Release(loop=loop)),
+        Order(at_s=at_s + 0.1, who=who, command=far),
+        *failing,
+        *random.choice(([], stall)),
+    ]
 
 
-def _kill(random: Random, at_s: float) -> Happening:
-    return Kill(at_s=at_s, back_after_s=10 ** random.uniform(-1.0, 0.7))
+def _stall(random: Random, at_s: float) -> list[Happening]:
+    return [Stall(at_s=at_s, lasts_s=10 ** random.uniform(-2.5, 0.5))]
 
 
-def _cloud(random: Random, at_s: float) -> Happening:
-    return Cloud(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.8), part=random.random() ** 2)
+def _kill(random: Random, at_s: float) -> list[Happening]:
+    return [Kill(at_s=at_s, back_after_s=10 ** random.uniform(-1.0, 0.7))]
 
 
-def _recorder_death(random: Random, at_s: float) -> Happening:
-    return RecorderDeath(at_s=at_s)
+def _cloud(random: Random, at_s: float) -> list[Happening]:
+    return [Cloud(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.8), part=random.random() ** 2)]
 
 
-def _full_disk(random: Random, at_s: float) -> Happening:
-    return FullDisk(at_s=at_s, lasts_s=10 ** random.uniform(0.0, 1.3))
+def _recorder_death(random: Random, at_s: float) -> list[Happening]:
+    return [RecorderDeath(at_s=at_s)]
 
 
-def _clock_step(random: Random, at_s: float) -> Happening:
-    return ClockStep(at_s=at_s, by_s=random.uniform(-2.0, 2.0))
+def _full_disk(random: Random, at_s: float) -> list[Happening]:
+    return [FullDisk(at_s=at_s, lasts_s=10 ** random.uniform(0.0, 1.3))]
 
 
-def _sequence(random: Random, at_s: float) -> Happening:
+def _clock_step(random: Random, at_s: float) -> list[Happening]:
+    return [ClockStep(at_s=at_s, by_s=random.uniform(-2.0, 2.0))]
+
+
+def _sequence(random: Random, at_s: float) -> list[Happening]:
     steps = [random.choice(_STEPS) for _ in range(random.randint(1, 4))]
-    return Sequence(at_s=at_s, who=random.choice(OPERATORS), steps=steps)
+    return [Sequence(at_s=at_s, who=random.choice(OPERATORS), steps=steps)]
