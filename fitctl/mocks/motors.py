@@ -15,7 +15,8 @@ AXIS_FAULTS = {
     "amplifier_fault": FaultKind(
         "an amplifier is in fault, after the end of the fault until it is reset", parts=AXES
     ),
-    "encoder_jump": FaultKind("an encoder counts this much more", "counts", 1000, AXES),
+    # Half a turn: twice the position error that the Ensemble has for a fault.
+    "encoder_jump": FaultKind("an encoder counts this much more", "counts", 2000, AXES),
     "stuck_axis": FaultKind("a motor does not turn, whatever its amplifier does", parts=AXES),
 }
 

@@ -6,10 +6,6 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.logging.verifying import verify
 
-MAY_BE_LOST_S = (
-    1.5  # before a supervisor is killed: what the recorder was not yet sent, and a stall
-)
-
 
 def settle(rig):
     """Compare what was shown with what is in all logs of a rig; the figures.
@@ -28,7 +24,7 @@ def settle(rig):
     excused = {
         time_s
         for time_s in missing
-        if any(dead_s - MAY_BE_LOST_S < time_s < dead_s for dead_s in rig.deaths_s)
+        if any(from_s < time_s < dead_s for from_s, dead_s in rig.lost_s)
     }
     counted = sum(rig.lost_of.values())
     assert not problems

@@ -61,7 +61,7 @@ def killed(rig, entry):
         rig.mocks.wait()
     if entry.struck == "supervisor":
         rig.supervisor.wait()
-        rig.deaths_s.append(time.monotonic())
+        rig.note_death()
     try:
         yield
     finally:

@@ -41,6 +41,9 @@ REACH_S = 60.0
 ANSWER_S = 5.0  # to a command that is accepted
 OPENING_S = 20.0
 CALM_S = 10.0
+MAY_BE_LOST_S = (
+    1.5  # before a supervisor is killed: what the recorder was not yet sent, and a stall
+)
 HIDDEN = {
     "right": SetFault("camera", "star_fading", value=0.001),
     "metrology": SetFault("metrology.labjack", "laser_dim", value=0.0),
@@ -104,7 +107,11 @@ class WatchedRig(Rig):
         self.heard = []  # what was answered to strange commands
         self.shown = set()  # times of all ticks in telemetry
         self.lost_of = {}  # records lost, by each supervisor's own count
-        self.deaths_s = []  # when supervisors ended without a chance to see their records written
+        self.lost_s = []  # from when until when, what supervisors still had when they were killed
+        self.started_s, self.recorded = (
+            0.0,
+            False,
+        )  # when the supervisor was; its recorder has reported
 
     def receive(self, timeout_s):
         telemetry = super().receive(min(timeout_s, LOOK_S))
@@ -112,6 +119,7 @@ class WatchedRig(Rig):
             self.telemetry.append(telemetry)
             self.shown.update(tick.time_s for tick in telemetry.ticks)
             self.lost_of[telemetry.pid] = telemetry.losses.records_lost
+            self.recorded = self.recorded or telemetry.recorder is not None
         self.look()
         return telemetry
 
@@ -131,7 +139,16 @@ class WatchedRig(Rig):
         if self.client is not None:
             self.client.close()
             self.supervisor.stdout.close()
+        self.started_s, self.recorded = time.monotonic(), False
         super().start_supervisor()
+
+    def note_death(self):
+        """The supervisor was killed: what its recorder had not been sent is lost, and nobody counts it.
+
+        A recorder that was still starting had been sent nothing.
+        """
+        dead_s = time.monotonic()
+        self.lost_s.append((dead_s - MAY_BE_LOST_S if self.recorded else self.started_s, dead_s))
 
     def restart_mocks(self):
         self.mocks.stdout.close()
