@@ -348,7 +348,7 @@ class StellarLoop(Loop):
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
             self._search_due = source in FOLLOWING
-            if not self._why_wait(self._clock.now_s()):
+            if not self._why_wait(self._clock.now_s(), motor_rad):
                 self._start_search(motor_rad)
         elif self.mode is Mode.COARSE:
             self.pointing.start_coarse(self.target_px)
@@ -440,19 +440,26 @@ class StellarLoop(Loop):
             loop for loop in loops.values() if isinstance(loop, StellarLoop) and loop is not self
         ]
 
-    def _why_wait(self, now_s: float) -> str:
-        """What the stages wait for where they are; empty if for nothing."""
+    def _why_wait(self, now_s: float, motor_rad: Floats) -> str:
+        """What the loop waits for; empty if for nothing."""
         if self.mode not in TRACKING:
             return ""
         if self.link is not None and not self.link.settled(now_s):
             loop = self.link.loop
             return f"the link of {loop.name}, which is in {loop.mode.name}"
+        if self.link is not None and self.waits_for and not self._has_arrived(motor_rad):
+            return "its siderostat, which is on its way to the star"
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
             # Two stars look alike: only the own one moves while the other loop's stages stand still.
             busy = [other.name for other in self.others if other.is_acquiring]
             if busy:
                 return f"{', '.join(busy)}, which searches for its star"
         return ""
+
+    def _has_arrived(self, motor_rad: Floats) -> bool:
+        """Whether the siderostat is near where it was sent: after a link's return that may be far."""
+        away_rad = float(np.abs(motor_rad - self.siderostat.setpoint_rad).max())
+        return away_rad * self._scale.motor_px_per_rad <= self.search.near_px
 
     @property
     def is_acquiring(self) -> bool:
@@ -467,7 +474,7 @@ class StellarLoop(Loop):
             self._link_counts = False
             self.link.set_origin()
             self.star_finder.estimator.forget()
-        before, waits_for = self.waits_for, self._why_wait(observation.now_s)
+        before, waits_for = self.waits_for, self._why_wait(observation.now_s, observation.motor_rad)
         self.waits_for = waits_for
         if waits_for and not before:
             self._report_event("warning", f"waits for {waits_for}; the stages stay where they are")

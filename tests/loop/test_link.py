@@ -222,6 +222,29 @@ def test_when_the_laser_is_cut_left_holds_in_the_same_tick_and_goes_on_by_itself
     assert held.rms_px(LEFT, since_s).max() < 0.05
 
 
+def test_after_the_links_return_left_waits_until_its_own_siderostat_is_back_too(held):
+    """A link that ran away before it was given up took left's siderostat along: 70 rad, more than a second."""
+    held.laser(0.0)
+    held.until(limit_s=1.0, metrology=Mode.ACQUISITION)
+    left = held.loop(LEFT)
+    left.siderostat.move_by(np.array([70.0, 0.0]))
+    held.run(3.0)
+    held.laser(1.0)
+    held.until(limit_s=10.0, metrology=Mode.LOCKED)
+    left.siderostat.move_by(np.array([-70.0, 0.0]))
+
+    held.run(1.0)
+    assert left.waits_for == "its siderostat, which is on its way to the star"
+    held.run(2.0)
+
+    assert left.waits_for == ""
+    assert held.modes()[LEFT] is Mode.VERNIER
+    assert "no longer waits for its siderostat" in str(held.events(LEFT)[-3:])
+    since_s = held.clock.now_s() + 2.0
+    held.run(7.0)
+    assert held.rms_px(LEFT, since_s).max() < 0.05
+
+
 def test_a_metrology_loop_that_is_stopped_and_brought_back_finds_left_waiting(held):
     assert held.command(Stop(loop=METROLOGY)).accepted
     held.run(3.0)

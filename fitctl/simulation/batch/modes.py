@@ -207,6 +207,13 @@ def is_acquiring(r: Any) -> bool:
 
 
 @compilable()
+def is_there(s: Any, r: Any) -> bool:
+    """``StellarLoop._has_arrived``."""
+    away_rad = max(abs(r.motor_rad[0] - r.setpoint_rad[0]), abs(r.motor_rad[1] - r.setpoint_rad[1]))
+    return bool(away_rad * s.scale.motor_px_per_rad <= s.near_px)
+
+
+@compilable()
 def must_wait(ss: Any, rr: Any, i: int) -> bool:
     """Whether ``StellarLoop._why_wait`` has a reason."""
     s, r = ss.stars[i], rr.stars[i]
@@ -215,6 +222,8 @@ def must_wait(ss: Any, rr: Any, i: int) -> bool:
     if s.link >= 0:
         link = rr.beams[s.link]
         if link.mode != LOCKED or r.now_s - link.mode_since_s < s.acquisition.settle_s:
+            return True
+        if r.waits and not is_there(s, r):
             return True
     if r.mode == ACQUISITION and r.search_due != NOT_DUE:
         for j in range(len(ss.stars)):
