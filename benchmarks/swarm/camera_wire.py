@@ -24,7 +24,12 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
-from benchmarks.swarm.threads import VirtualEvent, VirtualThreading, VirtualTime
+from benchmarks.swarm.threads import (
+    VirtualEvent,
+    VirtualThreading,
+    VirtualTime,
+    standing_for,
+)
 from benchmarks.swarm.wires import Timer, Trouble
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Command
@@ -342,8 +347,7 @@ def on(network: Network) -> Iterator[None]:
         EFD_CLOEXEC=0,
         EFD_NONBLOCK=0,
     )
-    constants = {name: getattr(socket, name) for name in dir(socket) if name.isupper()}
-    host = SimpleNamespace(socket=lambda *_: Udp(network), inet_aton=socket.inet_aton, **constants)
+    host = standing_for(socket, socket=lambda *_: Udp(network), inet_aton=socket.inet_aton)
     stand_ins = {
         "time": clock,
         "threading": VirtualThreading(time),
@@ -372,7 +376,7 @@ def on(network: Network) -> Iterator[None]:
         for module, names in uses.items():
             for name in names:
                 stack.enter_context(patch(f"fitctl.{module}.{name}", stand_ins[name]))
-        own = SimpleNamespace(socket=lambda *_: StreamSource(network), **constants)
+        own = standing_for(socket, socket=lambda *_: StreamSource(network))
         stack.enter_context(patch("fitctl.mocks.gige.stream.socket", own))
         stack.enter_context(patch("fitctl.mocks.gige.camera.listen", listen))
         before = asyncio._get_running_loop()

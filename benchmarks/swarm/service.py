@@ -16,7 +16,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from random import Random
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -25,7 +24,7 @@ import zmq
 
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.telemetry_wire import Publisher
-from benchmarks.swarm.threads import VirtualEvent, VirtualTime
+from benchmarks.swarm.threads import VirtualEvent, VirtualTime, standing_for
 from fitctl.logging.records import AnyRecord, Event
 from fitctl.messages.commands import (
     AnyCommand,
@@ -293,8 +292,8 @@ class SwarmService(Service):
     def _receive(self, waiting: Waiting, payload: bytes) -> None:
         sender, _, _ = self._sent[waiting.tag]
         if waiting.sender != sender:
-            told = f"{waiting.sender} is taken for the sender, {sender} is"
-            self._invariants.violated("a command is its sender's", told)
+            detail = f"{sender} sent it, and it counts as sent by {waiting.sender}"
+            self._invariants.violated("a command is its sender's", detail)
         super()._receive(waiting, payload)
 
     def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
@@ -314,13 +313,12 @@ class SwarmService(Service):
 @contextmanager
 def installed(time: VirtualTime, random: Random) -> Iterator[None]:
     """Services have sockets in memory meanwhile."""
-    names: dict[str, Any] = {name: getattr(zmq, name) for name in dir(zmq) if name.isupper()}
-    stand_in = SimpleNamespace(
+    stand_in = standing_for(
+        zmq,
         Context=lambda: _Wire(time, random),
         Poller=_Poller,
         Again=zmq.Again,
         ZMQError=zmq.ZMQError,
-        **names,
     )
     with ExitStack() as stack:
         for module in ("service", "doors"):

@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from random import Random
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest.mock import patch
 
 import msgspec
 import zmq
 
 from benchmarks.swarm.invariants import Invariants
-from benchmarks.swarm.threads import VirtualEvent, VirtualTime
+from benchmarks.swarm.threads import VirtualEvent, VirtualTime, standing_for
 from fitctl.messages.client import Client
 from fitctl.messages.keys import RemoteKey
 from fitctl.messages.telemetry import Telemetry
@@ -190,10 +190,7 @@ def drawn_subscribers(time: VirtualTime, random: Random, number: int) -> list[Su
 def installed(time: VirtualTime, subscribers: list[Subscriber]) -> Iterator[None]:
     """Clients use virtual time meanwhile, and each new one the next of these sockets."""
     coming = iter(subscribers)
-    names: dict[str, Any] = {name: getattr(zmq, name) for name in dir(zmq) if name.isupper()}
-    stand_in = SimpleNamespace(
-        Context=lambda: SimpleNamespace(socket=lambda _kind: next(coming)), **names
-    )
+    stand_in = standing_for(zmq, Context=lambda: SimpleNamespace(socket=lambda _kind: next(coming)))
     clock = SimpleNamespace(monotonic=time.now_s, sleep=time.sleep)
     with (
         patch("fitctl.messages.client.zmq", stand_in),

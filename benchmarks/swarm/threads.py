@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack, contextmanager
 from itertools import count
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -362,6 +362,12 @@ class VirtualExecutor(Executor):
                     future.set_result(work())
                 except Exception as error:
                     future.set_exception(error)
+
+
+def standing_for(module: ModuleType, **stand_ins: Any) -> SimpleNamespace:
+    """The constants of a module, with stand-ins for what else of it is used."""
+    constants = {name: getattr(module, name) for name in dir(module) if name.isupper()}
+    return SimpleNamespace(**(constants | stand_ins))
 
 
 @contextmanager

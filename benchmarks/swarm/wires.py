@@ -20,6 +20,8 @@ from unittest.mock import MagicMock, patch
 
 import can
 
+from benchmarks.swarm.threads import standing_for
+
 KINDS = ("late", "lost", "deaf", "twice", "torn", "broken", "reboot")
 """An answer comes late, or never; a request is not heard; an answer comes twice, or in two pieces; the line
 breaks; the device restarts, and the line breaks with it."""
@@ -368,11 +370,7 @@ def virtual(time: WireTime, wire: Wire) -> Iterator[None]:
     def serial_for_url(_url: str, **options: Any) -> Port:
         return Port(wire, options["timeout"])
 
-    sockets = SimpleNamespace(
-        create_connection=create_connection,
-        socket=Socket,
-        **{name: getattr(real_socket, name) for name in dir(real_socket) if name.isupper()},
-    )
+    sockets = standing_for(real_socket, create_connection=create_connection, socket=Socket)
     adapter = {  # what an SLCAN bus reads its port by
         "select": SimpleNamespace(
             select=lambda ports, writers, _errors, left_s: (

@@ -444,22 +444,20 @@ class StellarLoop(Loop):
         """What the loop waits for; empty if for nothing."""
         if self.mode not in TRACKING:
             return ""
-        if self.link is not None and not self.link.settled(now_s):
-            loop = self.link.loop
-            return f"the link of {loop.name}, which is in {loop.mode.name}"
-        if self.link is not None and self.waits_for and not self._has_arrived(motor_rad):
-            return "its siderostat, which is on its way to the star"
+        if self.link is not None:
+            if not self.link.settled(now_s):
+                loop = self.link.loop
+                return f"the link of {loop.name}, which is in {loop.mode.name}"
+            # After a link's return the siderostat may have far to go.
+            setpoint_rad = self.siderostat.setpoint_rad
+            if self.waits_for and not self.search.is_near(motor_rad, setpoint_rad):
+                return "its siderostat, which is on its way to the star"
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
             # Two stars look alike: only the own one moves while the other loop's stages stand still.
             busy = [other.name for other in self.others if other.is_acquiring]
             if busy:
                 return f"{', '.join(busy)}, which searches for its star"
         return ""
-
-    def _has_arrived(self, motor_rad: Floats) -> bool:
-        """Whether the siderostat is near where it was sent: after a link's return that may be far."""
-        away_rad = float(np.abs(motor_rad - self.siderostat.setpoint_rad).max())
-        return away_rad * self._scale.motor_px_per_rad <= self.search.near_px
 
     @property
     def is_acquiring(self) -> bool:

@@ -41,9 +41,7 @@ REACH_S = 60.0
 ANSWER_S = 5.0  # to a command that is accepted
 OPENING_S = 20.0
 CALM_S = 10.0
-MAY_BE_LOST_S = (
-    1.5  # before a supervisor is killed: what the recorder was not yet sent, and a stall
-)
+MAY_BE_LOST_S = 1.5  # before a kill: what the recorder has not yet received, and a stall
 HIDDEN = {
     "right": SetFault("camera", "star_fading", value=0.001),
     "metrology": SetFault("metrology.labjack", "laser_dim", value=0.0),
@@ -108,10 +106,8 @@ class WatchedRig(Rig):
         self.shown = set()  # times of all ticks in telemetry
         self.lost_of = {}  # records lost, by each supervisor's own count
         self.lost_s = []  # from when until when, what supervisors still had when they were killed
-        self.started_s, self.recorded = (
-            0.0,
-            False,
-        )  # when the supervisor was; its recorder has reported
+        self.started_s = 0.0  # when this supervisor was started
+        self.recorded = False  # whether its recorder has reported
 
     def receive(self, timeout_s):
         telemetry = super().receive(min(timeout_s, LOOK_S))
@@ -143,10 +139,7 @@ class WatchedRig(Rig):
         super().start_supervisor()
 
     def note_death(self):
-        """The supervisor was killed: what its recorder had not been sent is lost, and nobody counts it.
-
-        A recorder that was still starting had been sent nothing.
-        """
+        """Note what a killed supervisor lost uncounted: what its recorder had not received, or everything."""
         dead_s = time.monotonic()
         self.lost_s.append((dead_s - MAY_BE_LOST_S if self.recorded else self.started_s, dead_s))
 

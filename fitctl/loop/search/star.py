@@ -66,10 +66,10 @@ class StarSearch(SpiralSearch):
         self._overlap: float | None = None
         super().__init__(_STAR, loop.acquisition, self._plan_spiral, scale.motor_rad)
 
-    @property
-    def near_px(self) -> float:
-        """So near to its place the siderostat has arrived there."""
-        return NEAR * self._plan.field_radius_px
+    def is_near(self, motor_rad: Floats, place_rad: Floats) -> bool:
+        """Whether the siderostat, at `motor_rad`, is so near to a place that it has arrived there."""
+        away_px = float(np.abs(motor_rad - place_rad).max()) * self._scale.motor_px_per_rad
+        return away_px <= NEAR * self._plan.field_radius_px
 
     def _plan_spiral(self, radius_sky_arcsec: float) -> SpiralPlan:
         return plan_spiral(
@@ -116,8 +116,7 @@ class StarSearch(SpiralSearch):
         if not self._arrived:
             own_rad = self._spiral_place_rad() - self.sky_rad
             place_rad = np.clip(own_rad, -self._travel_rad, self._travel_rad) + self.sky_rad
-            away_px = float(np.abs(motor_rad - place_rad).max()) * self._scale.motor_px_per_rad
-            self._arrived = away_px <= self.near_px
+            self._arrived = self.is_near(motor_rad, place_rad)
         return self._arrived
 
     def evaluate(self, star: Star | None, now_s: float) -> Finding | None:

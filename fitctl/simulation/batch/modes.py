@@ -208,7 +208,7 @@ def is_acquiring(r: Any) -> bool:
 
 @compilable()
 def is_there(s: Any, r: Any) -> bool:
-    """``StellarLoop._has_arrived``."""
+    """``StarSearch.is_near`` of the set-point."""
     away_rad = max(abs(r.motor_rad[0] - r.setpoint_rad[0]), abs(r.motor_rad[1] - r.setpoint_rad[1]))
     return bool(away_rad * s.scale.motor_px_per_rad <= s.near_px)
 

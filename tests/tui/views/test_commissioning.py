@@ -247,7 +247,7 @@ def test_without_a_rig_file_the_screen_says_so():
 
 ASKING = """
 import signal, time
-for number in signal.SIGINT, signal.SIGTERM:  # whoever starts the tests may have it ignored
+for number in signal.SIGINT, signal.SIGTERM:  # a shell's background job ignores SIGINT
     signal.signal(number, signal.default_int_handler)
 def main():
     print("moves: a motor", flush=True)

@@ -316,7 +316,7 @@ def test_the_error_budget_tells_which_part_of_the_stages_is_not_identified():
     assert "hysteresis not identified" in plain(ErrorBudget(state, "", figures).draw(118, 3))[0]
 
 
-def test_the_error_budget_waits_for_ticks_and_for_the_rig_file():
+def test_the_error_budget_waits_for_ticks_and_for_the_designs_figures():
     state = loop_of(np.full((100, 2), math.nan))
     (line,) = plain(ErrorBudget(state, "", known_design(state)).draw(80, 3))
     assert "64 ticks with a star" in line
