@@ -1,10 +1,9 @@
 """What a loop leaves that learns while it observes, on nights that its rig file does not know.
 
-For each night and seed, two runs of the whole instrument on the virtual clock: with the rig's
-minimum-variance design throughout (compiled batch), and with `learn = "on"`. Both see the same air and the
-same lines. True residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them
-the bound of the night, which knows everything about it. With `--random`, nights are drawn: see
-:func:`random_night`.
+For each night and seed, two runs of the whole instrument in the compiled batch: with the rig's
+minimum-variance design throughout, and with `learn = "on"`. Both see the same air and the same lines. True
+residual in continuous time, of the worst axis, from 120 s after the beginning on. Beside them the bound of the
+night, which knows everything about it. With `--random`, nights are drawn: see :func:`random_night`.
 """
 
 from __future__ import annotations
@@ -26,10 +25,8 @@ from benchmarks.learn import AIR, FIT, LOOP, truth_of
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound
-from fitctl.logging.records import AnyRecord, ControllerChange
 from fitctl.simulation.batch.batch import Batch
-from fitctl.simulation.simulation import Simulation
-from fitctl.simulation.statistics import true_residual_rms
+from fitctl.simulation.batch.learning import Change
 
 BEGIN_S, END_S = 120.0, 300.0
 LIGHT = ("camera.electrons_per_dn=1.0",)
@@ -174,38 +171,26 @@ class Outcome(NamedTuple):
     ways_back: int
 
 
-def fixed_residual(settings: Sequence[str], seed: int) -> float:
-    """Of a run without learning, in the compiled batch, which does the same as a simulation."""
-    batch = Batch(load_rig(default_rig_path(), [CONTROLLER, *settings]))
-    states = [batch.run(seed, end_s).loops[LOOP].state for end_s in (BEGIN_S, END_S)]
+def residual_px(batch: Batch, seed: int, changes: Sequence[Change]) -> float:
+    """Of a run with such changes of designs."""
+    states = [
+        batch.run(seed, end_s, changes=changes).loops[LOOP].state for end_s in (BEGIN_S, END_S)
+    ]
     sums, steps = (np.diff([state[name] for state in states], axis=0)[0] for name in _SUMS)
     return float(np.sqrt(sums.max() / steps))
 
 
-def residual(settings: Sequence[str], seed: int) -> tuple[float, int, int]:
-    """Of one simulation, with its changes of design, and those back."""
-    changes: list[ControllerChange] = []
-
-    def record(made: AnyRecord) -> None:
-        if isinstance(made, ControllerChange):
-            changes.append(made)
-
-    rig = load_rig(default_rig_path(), [CONTROLLER, *settings])
-    simulation = Simulation(rig, seed, record=record, history_s=END_S + 1.0)
-    simulation.acquire()
-    simulation.run(END_S - simulation.clock.now_s())
-    target_px = simulation.supervisor.stellar_loops[LOOP].target_px
-    left_px = true_residual_rms(simulation.plants[LOOP], target_px, BEGIN_S, END_S)
-    back = sum(change.target != "learnt" for change in changes)
-    return float(left_px.max()), len(changes), back
-
-
 def outcome(night: Night, seed: int) -> Outcome:
     """Both runs of one seed."""
-    settings = [*night.known, *night.unknown]
-    fixed_px = fixed_residual(settings, seed)
-    learnt_px, changes, back = residual([*settings, f"loops.{LOOP}.learn=on"], seed)
-    return Outcome(fixed_px, learnt_px, changes, back)
+    settings = [CONTROLLER, *night.known, *night.unknown, f"loops.{LOOP}.learn=on"]
+    batch = Batch(load_rig(default_rig_path(), settings))
+    changes = batch.run(seed, END_S).changes
+    return Outcome(
+        residual_px(batch, seed, ()),
+        residual_px(batch, seed, changes),
+        len(changes),
+        sum(not change.design.learnt for change in changes),
+    )
 
 
 def random_night(number: int) -> Night:

@@ -28,7 +28,7 @@ from scipy.linalg import expm, hankel, svd, toeplitz
 from scipy.optimize import minimize
 
 from benchmarks.learn import FIT, LOOP
-from benchmarks.learn_online import SIX, fixed_residual, shaken
+from benchmarks.learn_online import SIX, residual_px, shaken
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Basis, basis
 from fitctl.controllers.design.files import save_design
@@ -37,6 +37,7 @@ from fitctl.controllers.design.linear_loop.disturbance import disturbance, hold
 from fitctl.controllers.design.linear_loop.sampled import timing
 from fitctl.controllers.design.margins import Required, design_with_margins, frequencies_hz
 from fitctl.controllers.pair import INPUTS, Design
+from fitctl.simulation.batch.batch import Batch
 
 Floats = NDArray[np.float64]
 TAPS = 200
@@ -142,7 +143,8 @@ def on_the_plant(design: Design, seeds: int, folder: Path) -> tuple[float, float
     file = folder / f"{design.name}.json"
     save_design(design, file)
     controller = f"loops.{LOOP}.vernier.controller={file}"
-    left_px = [fixed_residual([*FIT, SIX, controller], seed) for seed in range(seeds)]
+    batch = Batch(load_rig(default_rig_path(), [*FIT, SIX, controller]))
+    left_px = [residual_px(batch, seed, ()) for seed in range(seeds)]
     return float(np.mean(left_px)), float(np.std(left_px, ddof=1) / math.sqrt(seeds))
 
 

@@ -187,6 +187,11 @@ class Pair:
         self.target_origin_px = target_px
 
     @property
+    def state(self) -> Floats:
+        """Of both axes, shape (n + 1, 2): the design's, and last what it found held."""
+        return self._given[len(INPUTS) :]
+
+    @property
     def holds_by_itself(self) -> bool:
         """At rest, the design commands what it measures of the mirror: all that it remembers was measured."""
         return abs(self.left_at_rest) < 0.1

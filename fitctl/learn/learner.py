@@ -7,6 +7,7 @@ virtual clock. It decides nothing: what becomes of its reports, the loop does (:
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,18 +34,33 @@ WINDOW_S = 240.0
 """A night is estimated from the last frames: what is older was another night."""
 SETTLE_S = 5.0
 """After the star was caught, or the target was moved, frames say more of that than of the night."""
-_FIELDS = tuple(
-    f"{name}_{axis}_{unit}"
-    for name, unit in (
-        ("error", "px"),
-        ("mirror", "rad"),
-        ("fsm", "rad"),
-        ("siderostat", "rad"),
-        ("link", "rad"),
-    )
-    for axis in ("az", "el")
-)
 _STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
+
+
+class Shown(NamedTuple):
+    """What the learner takes of a :class:`fitctl.logging.records.Tick`; fields from `time_s` on are kept."""
+
+    number: int
+    mode: str
+    fsm_saturated: bool
+    star_visible: bool
+    target_az_px: float
+    target_el_px: float
+    time_s: float
+    mid_exposure_s: float
+    error_az_px: float
+    error_el_px: float
+    mirror_az_rad: float
+    mirror_el_rad: float
+    fsm_az_rad: float
+    fsm_el_rad: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+    link_az_rad: float
+    link_el_rad: float
+
+
+_KEPT = Shown._fields[Shown._fields.index("time_s") :]
 
 
 class Learner:
@@ -61,8 +77,7 @@ class Learner:
         self._loop_name = loop_name
         period_s = rig.camera.period_s
         self._period_s = period_s
-        self._columns = ("time_s", "mid_exposure_s", *_FIELDS)
-        self._ring = np.empty((round(WINDOW_S / period_s), len(self._columns)))
+        self._ring = np.empty((round(WINDOW_S / period_s), len(_KEPT)))
         self._added = 0
         self._new = 0
         self._due_after = round(FIRST_S / period_s)
@@ -76,7 +91,7 @@ class Learner:
         if design != self._design:
             self._design, self._since_s = design, now_s
 
-    def add(self, tick: Tick) -> None:
+    def add(self, tick: Tick | Shown) -> None:
         """One tick, in their order; kept if it shows the loop undisturbed."""
         target_px = tick.target_az_px, tick.target_el_px
         moved = not math.dist(target_px, self._target_px) <= _STILL_PX_PER_S * self._period_s
@@ -85,7 +100,7 @@ class Learner:
             self._unsettled_s = tick.time_s
         elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
             row = self._added % len(self._ring)
-            self._ring[row] = [getattr(tick, name) for name in self._columns]
+            self._ring[row] = [getattr(tick, name) for name in _KEPT]
             self._added += 1
             self._new += 1
 
@@ -116,7 +131,7 @@ class Learner:
     def _advice(self, present: Design) -> Advice:
         oldest = self._added % len(self._ring) if self._added > len(self._ring) else 0
         table = np.roll(self._ring[: self.frames], -oldest, axis=0)
-        ticks = dict(zip(self._columns, table.T, strict=True))
+        ticks = dict(zip(_KEPT, table.T, strict=True))
         pieces = pieces_of(ticks["mid_exposure_s"], np.ones(len(table), bool))
         theory = loop_theory(self._rig, self._loop_name, present)
         error_px = np.stack([ticks["error_az_px"], ticks["error_el_px"]], axis=-1)

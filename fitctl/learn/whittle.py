@@ -167,6 +167,7 @@ class _Problem:
             hints += [10.0, _FACTOR_20, *[_FACTOR_20] * self.axes]
         self.begin = np.array(first)
         self._centre, self._hints = np.array(centre), np.array(hints)
+        self._last: tuple[Floats, tuple[Guess, Floats, list[Floats]]] | None = None
 
     def guess(self, values: Floats) -> Guess:
         """What a vector stands for."""
@@ -217,10 +218,17 @@ class _Problem:
             slopes += [2 * unit * power * row for row in np.eye(self.axes)]
         return np.broadcast_to(total, opened.disturbance.shape), slopes
 
+    def _density_at(self, values: Floats) -> tuple[Guess, Floats, list[Floats]]:
+        """Of a vector, with its guess; the last is kept: cost and information of one follow each other."""
+        if self._last is None or not np.array_equal(values, self._last[0]):
+            guess = self.guess(values)
+            self._last = values.copy(), (guess, *self.density(guess))
+        return self._last[1]
+
     def cost(self, values: Floats) -> tuple[float, Floats]:
         """Negative logarithm of the likelihood, and its gradient."""
-        guess, opened = self.guess(values), self.opened
-        total, slopes = self.density(guess)
+        opened = self.opened
+        guess, total, slopes = self._density_at(values)
         inverse = 1 / total
         ratio = opened.with_mirror(guess.gain, guess.overshoot) * inverse
         away = (values - self._centre) / self._hints
@@ -237,8 +245,8 @@ class _Problem:
 
     def information(self, values: Floats) -> Floats:
         """Fisher's information, with what the mirror and the spectrum share."""
-        guess, opened = self.guess(values), self.opened
-        total, slopes = self.density(guess)
+        opened = self.opened
+        guess, total, slopes = self._density_at(values)
         weight = self._weight / total
         step = opened.step_response()
         left = opened.cross + (1 - guess.gain - guess.overshoot * step) * opened.mirror

@@ -82,7 +82,7 @@ class Pointing:
 
     def start_pair(self, held_rad: Floats, motor_rad: Floats) -> None:
         """Go on with the mirror held at `held_rad` and the motors at `motor_rad`, each shape (2,)."""
-        self._recent.clear()
+        self.forget()
         self.pair.start(held_rad, motor_rad, self.command_px)
 
     def start_knowing(self) -> bool:
@@ -104,14 +104,22 @@ class Pointing:
         """One frame: what both stages shall do; None where no star is visible."""
         command_px = self.prefilter.step(target_px)
         if observation.star is None:
-            self._recent.clear()
+            self.forget()
             return None
         error_px = error_from(command_px, observation.star)
         measured = Measurement(
             error_px, command_px, observation.law_mirror_rad, observation.beam_rad
         )
-        self._recent.append(measured)
+        self.remember(measured)
         return self.pair.step(measured)
+
+    def remember(self, measured: Measurement) -> None:
+        """Keep a frame for a design that follows."""
+        self._recent.append(measured)
+
+    def forget(self) -> None:
+        """Frames are missing: those before tell a design that follows nothing."""
+        self._recent.clear()
 
 
 def error_from(target_px: AzEl, star: Star) -> AzEl:

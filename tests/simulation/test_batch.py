@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import StackHysteresis, default_rig_path, load_rig
-from fitctl.logging.records import MetrologyTick
+from fitctl.logging.records import ControllerChange, MetrologyTick
 from fitctl.messages.modes import Mode
 from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
@@ -45,7 +45,7 @@ def both(rig, seed, duration_s):
     return simulation, Batch(rig).run(seed, duration_s, keep=True)
 
 
-def assert_same_run(simulation, batch_run, loop="right"):
+def assert_same_run(simulation, batch_run, loop="right", within=1e-9):
     run = batch_run.loops[loop]
     ticks = [tick for tick in simulation.ticks if tick.number > 0 and tick.loop == loop]
     assert len(run.ticks) == len(ticks)
@@ -55,10 +55,10 @@ def assert_same_run(simulation, batch_run, loop="right"):
     for ours, theirs in FIELDS.items():
         expected = np.array([[getattr(tick, name) for name in theirs] for tick in ticks])
         rows = seen if ours == "star_px" else slice(None)
-        assert np.all(np.abs(run.ticks[ours] - expected)[rows] < 1e-9), ours
+        assert np.all(np.abs(run.ticks[ours] - expected)[rows] < within), ours
     plant = simulation.plants[loop]
     true_px = plant.history_px(0.0, plant.time_s)[:, 0, 0]
-    assert np.abs(run.true - true_px).max() < 1e-9
+    assert np.abs(run.true - true_px).max() < within
 
 
 @pytest.mark.parametrize("controller", ["eq20", "lqg-ltr", "minimum-variance", "fslq"])
@@ -475,6 +475,68 @@ def test_servos_of_different_rates_are_refused():
         Batch(rig_of_testbed("loops.left.siderostat.servo.rate_hz=1000.0"))
 
 
-def test_a_loop_that_learns_is_refused():
-    with pytest.raises(BatchRefusalError, match="loop right learns"):
-        Batch(rig_with("loops.right.learn=on"))
+@pytest.fixture
+def learns_at_once(monkeypatch):
+    """A learner that reports after half a minute, and a loop that goes back seconds after a change."""
+    monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 25.0)
+    monkeypatch.setattr("fitctl.learn.learner.EVERY_S", 10.0)
+    monkeypatch.setattr("fitctl.loop.comparison.OVER_S", 2.0)
+    monkeypatch.setattr("fitctl.loop.comparison.MOST_ON_PAPER", 0.1)
+
+
+SIX_HZ = (
+    "plant.loops.right.lines=["
+    "{frequency_hz=6.0, rms_px=0.07, direction_deg=45.0, damping=0.005, drift_hz_per_min=0.0}]"
+)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        pytest.param(["loops.right.vernier.controller=minimum-variance"], id="knows recent frames"),
+        pytest.param(["loops.right.vernier.controller=eq20"], id="the one before begins from rest"),
+        pytest.param(
+            [
+                "loops.right.vernier.controller=minimum-variance",
+                "loops.right.fsm.dac.writes_per_frame=5",
+            ],
+            id="five writes of the D/A a frame",
+        ),
+        pytest.param(
+            ["loops.right.vernier.controller=minimum-variance", PLANT_RATE, LOOP_RATE],
+            id="a star that moves",
+        ),
+    ],
+)
+def test_a_loop_that_learns_changes_its_design_and_goes_back_at_the_same_ticks(
+    overrides, learns_at_once
+):
+    rig = rig_with("loops.right.learn=on", SIX_HZ, *overrides)
+    changes = []
+    simulation = Simulation(
+        rig,
+        3,
+        history_s=61.0,
+        record=lambda made: changes.append(made) if isinstance(made, ControllerChange) else None,
+    )
+    simulation.acquire()
+    while simulation.clock.now_s() < 60.0:
+        simulation.run(rig.camera.period_s)
+
+    run = Batch(rig).run(3, 60.0, keep=True)
+
+    assert [change.target for change in changes] == ["learnt", changes[0].source]
+    assert [change.design.title for change in run.changes] == [one.target for one in changes]
+    assert [change.time_s for change in run.changes] == pytest.approx(
+        [one.time_s for one in changes], abs=1e-9
+    )
+    assert_same_run(simulation, run, within=1e-8)  # rounding adds up in a minute
+
+
+def test_a_loop_that_learns_has_the_result_of_its_simulation(learns_at_once):
+    rig = rig_with("loops.right.learn=on", SIX_HZ, CONTROLLER.format("minimum-variance"))
+
+    ours, theirs = Batch(rig).result(3, 50.0), simulate_rig(rig, 3, 50.0)
+
+    left_px = [result.loops["right"].rms_px for result in (ours, theirs)]
+    assert [left_px[0].az, left_px[0].el] == pytest.approx([left_px[1].az, left_px[1].el], abs=1e-6)

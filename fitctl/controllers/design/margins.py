@@ -13,6 +13,7 @@ instead of 11 %.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -35,11 +36,17 @@ _ABOUT_LINE = 24  # points on each side of a line, which lie closer towards it
 _GAINS = 5  # looked at, from the least to the greatest
 _PENALTY = 10.0  # of a residual, for missing a margin by its whole size
 _TRIES = 250
+_REMEMBERED = 16  # frequencies of a basis, for the hundreds of designs of one search
 KEPT = 1.001
 """A search ends at a margin only within rounding."""
 # Where the search for a guard begins: noise and the guard's RMS in the sensor's noise, and its damping.
 _NOISE, _GUARD, _DAMPING = 1.02, 2.0, 0.5
 _WIDEST, _NARROWEST = 0.95, 0.02  # damping of a guard
+# Where the second search begins, and how far it goes: noise, guard's frequency in Hz, damping and RMS. A value
+# that misses by more than the farthest counts as that: a loop that is unstable has infinite ones.
+_STRONG_NOISE, _STRONG_GUARD = 1.5, 20.0
+_BOUNDS = ((1.0, 20.0), (0.5, math.inf), (_NARROWEST, _WIDEST), (0.05, 1e5))
+_FARTHEST = 3.0
 
 
 class Required(NamedTuple):
@@ -84,12 +91,16 @@ class Margins(NamedTuple):
 
     def excess(self, required: Required) -> float:
         """By what factor the worst of them misses what is required; at most 1 where all are kept."""
-        ratios = (
+        return max(self.ratios(required))
+
+    def ratios(self, required: Required) -> tuple[float, float, float, float]:
+        """By what factor each of them misses what is required, stability last."""
+        return (
             self.peak_sensitivity / required.peak_sensitivity,
             required.gain_margin_db / max(self.gain_margin_db, 1e-3),
             required.phase_margin_deg / max(self.phase_margin_deg, 1e-3),
+            1.0 if self.stable else 2.0,
         )
-        return max(*ratios, 1.0 if self.stable else 2.0)
 
 
 def margins(design: Design, basis: Basis, required: Required | None = None) -> Margins:
@@ -129,9 +140,13 @@ def margins(design: Design, basis: Basis, required: Required | None = None) -> M
 
 def frequencies_hz(basis: Basis) -> Floats:
     """From slow to half the frame rate, ascending, and closer together about each line."""
-    highest_hz = 0.5 / basis.period_s
+    return _frequencies_hz(0.5 / basis.period_s, basis.lines)
+
+
+@functools.lru_cache(_REMEMBERED)
+def _frequencies_hz(highest_hz: float, lines: tuple[Line, ...]) -> Floats:
     found = [np.geomspace(_LOWEST_HZ, highest_hz, _POINTS)]
-    for line in basis.lines:
+    for line in lines:
         away = line.frequency_hz * np.geomspace(line.damping / 10, 0.3, _ABOUT_LINE)
         found += [line.frequency_hz - away, line.frequency_hz + np.append(0.0, away)]
     every = np.unique(np.concatenate(found))
@@ -149,6 +164,77 @@ def _stable(design: Design, basis: Basis, required: Required) -> bool:
     return True
 
 
+class _Guards(NamedTuple):
+    """Designs with a guard, by the logarithms of noise, and of the guard's frequency, damping and RMS."""
+
+    basis: Basis
+    required: Required
+    least_px: float
+
+    def design(self, logs: Floats) -> Design:
+        noise, guard_hz, damping, rms = np.exp(logs).tolist()
+        basis = self.basis
+        guard = Line(
+            frequency_hz=min(guard_hz, 0.5 / basis.period_s),
+            damping=min(max(damping, _NARROWEST), _WIDEST),
+            rms_px=rms * basis.noise_px,
+        )
+        guarded = dataclasses.replace(basis, noise_px=max(noise, 1.0) * basis.noise_px, guard=guard)
+        return design_minimum_variance(guarded)
+
+    def residual_and_ratios(self, logs: Floats) -> tuple[float, Floats]:
+        """In the least residual, and by what factor each margin is missed."""
+        try:
+            design = self.design(logs)
+        except (ValueError, ArithmeticError):  # no solution so far out
+            return math.inf, np.full(4, math.inf)
+        ratios = margins(design, self.basis, self.required).ratios(self.required)
+        return linear_residual(design, self.basis) / self.least_px, np.array(ratios)
+
+
+def _by_simplex(guards: _Guards, worst_hz: float) -> Floats:
+    """What comes nearest to the least residual on most nights."""
+
+    def cost(logs: Floats) -> float:
+        residual, ratios = guards.residual_and_ratios(logs)
+        return float(residual + _PENALTY * max(0.0, ratios.max() - 1.0))
+
+    begin = np.log([_NOISE, worst_hz, _DAMPING, _GUARD])
+    corners = np.vstack([begin, begin + 0.4 * np.eye(len(begin))])
+    options = {"maxfev": _TRIES, "initial_simplex": corners, "fatol": 1e-4, "xatol": 1e-2}
+    return np.asarray(minimize(cost, begin, method="Nelder-Mead", options=options).x)
+
+
+def _from_a_strong_guard(guards: _Guards, worst_hz: float) -> Floats:
+    """From the other side, by a model of residual and margins: some nights have designs only there."""
+    low, high = np.log(_BOUNDS).T
+    high[1] = math.log(0.5 / guards.basis.period_s)
+    begin = np.clip(np.log([_STRONG_NOISE, worst_hz, _DAMPING, _STRONG_GUARD]), low, high)
+    known: dict[bytes, tuple[float, Floats]] = {}
+
+    def tried(logs: Floats) -> tuple[float, Floats]:
+        place = (
+            logs.tobytes()
+        )  # the search asks for residual and margins, and for some places again
+        if place not in known:
+            known[place] = guards.residual_and_ratios(logs)
+        return known[place]
+
+    return np.asarray(
+        minimize(
+            lambda logs: min(tried(logs)[0], _FARTHEST),
+            begin,
+            method="COBYQA",
+            bounds=list(zip(low, high, strict=True)),
+            constraints={
+                "type": "ineq",
+                "fun": lambda logs: 1.0 - np.minimum(tried(logs)[1], _FARTHEST),
+            },
+            options={"maxfev": _TRIES, "initial_tr_radius": 0.4, "final_tr_radius": 5e-3},
+        ).x
+    )
+
+
 def design_with_margins(basis: Basis, required: Required | None = None) -> Design:
     """The minimum-variance pair of a basis if it has the margins; otherwise the one nearest to it that has.
 
@@ -161,42 +247,20 @@ def design_with_margins(basis: Basis, required: Required | None = None) -> Desig
     design = design_minimum_variance(basis)
     if margins(design, basis, asked).excess(asked) <= 1.0:
         return design
-    least_px = linear_residual(design, basis)
-    highest_hz = 0.5 / basis.period_s
     frequency_hz = frequencies_hz(basis)
     response = sampled_response(design, basis)(2 * math.pi * frequency_hz)
     worst_hz = float(frequency_hz[np.argmin(np.abs(1 + response))])
-
-    def made(logs: Floats) -> Design:
-        noise, guard_hz, damping, rms = np.exp(logs).tolist()
-        guard = Line(
-            frequency_hz=min(guard_hz, highest_hz),
-            damping=min(max(damping, _NARROWEST), _WIDEST),
-            rms_px=rms * basis.noise_px,
-        )
-        guarded = dataclasses.replace(basis, noise_px=max(noise, 1.0) * basis.noise_px, guard=guard)
-        return design_minimum_variance(guarded)
-
-    def cost(logs: Floats) -> float:
-        try:
-            tried = made(logs)
-        except (ValueError, ArithmeticError):  # no solution so far out
-            return math.inf
-        missed = max(0.0, margins(tried, basis, asked).excess(asked) - 1.0)
-        return linear_residual(tried, basis) / least_px + _PENALTY * missed
-
-    begin = np.log([_NOISE, worst_hz, _DAMPING, _GUARD])
-    corners = np.vstack([begin, begin + 0.4 * np.eye(len(begin))])
-    options = {"maxfev": _TRIES, "initial_simplex": corners, "fatol": 1e-4, "xatol": 1e-2}
-    design = made(minimize(cost, begin, method="Nelder-Mead", options=options).x)
-    kept = margins(design, basis, asked)
-    if kept.excess(asked) > KEPT:
-        msg = (
-            f"design: no minimum-variance pair with sensitivity at most {asked.peak_sensitivity:g}, gain "
-            f"margin {asked.gain_margin_db:g} dB and phase margin {asked.phase_margin_deg:g} deg was found at "
-            f"{basis.delay_s * 1e3:g} ms of delay; the best has {kept.peak_sensitivity:.2f}, "
-            f"{kept.gain_margin_db:.1f} dB and {kept.phase_margin_deg:.0f} deg; measure the delay with "
-            "fitctl identify delay, or take another design"
-        )
-        raise ConfigError(msg)
-    return design
+    guards = _Guards(basis, asked, linear_residual(design, basis))
+    for search in (_by_simplex, _from_a_strong_guard):
+        design = guards.design(search(guards, worst_hz))
+        kept = margins(design, basis, asked)
+        if kept.excess(asked) <= KEPT:
+            return design
+    msg = (
+        f"design: no minimum-variance pair with sensitivity at most {asked.peak_sensitivity:g}, gain "
+        f"margin {asked.gain_margin_db:g} dB and phase margin {asked.phase_margin_deg:g} deg was found at "
+        f"{basis.delay_s * 1e3:g} ms of delay; the best has {kept.peak_sensitivity:.2f}, "
+        f"{kept.gain_margin_db:.1f} dB and {kept.phase_margin_deg:.0f} deg; measure the delay with "
+        "fitctl identify delay, or take another design"
+    )
+    raise ConfigError(msg)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_discrete_are
+from scipy.linalg import solve_discrete_are
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.linear_loop.disturbance import disturbance
+from fitctl.controllers.design.linear_loop.disturbance import blocks, disturbance
 from fitctl.controllers.design.linear_loop.sampled import timing
 from fitctl.controllers.pair import Design, mirror_outputs
 
@@ -43,8 +43,9 @@ def star_filter(basis: Basis, drift_px_per_sqrt_s: float) -> Filter:
     """The filter for a loop's air path, lines and noise, with a drift that walks at random."""
     moving = disturbance(basis)
     own, own_noise = moving.over(basis.period_s)
-    transition = block_diag(own, 1.0)
-    noise = block_diag(own_noise, drift_px_per_sqrt_s**2 * basis.period_s)
+    drift_px2 = drift_px_per_sqrt_s**2 * basis.period_s
+    transition = blocks(own, np.ones((1, 1)))
+    noise = blocks(own_noise, np.full((1, 1), drift_px2))
     seen = np.append(moving.seen, 1.0)
     variance = basis.noise_px**2
     before = solve_discrete_are(transition.T, seen[:, None], noise, np.array([[variance]]))

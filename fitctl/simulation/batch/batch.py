@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +20,11 @@ from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import PlantState
 from fitctl.model.randomness import loop_seeds, place_star, run_randomness
 from fitctl.simulation.batch.course import STILL, Course, collector_course
+from fitctl.simulation.batch.learning import Change, changes_of
 from fitctl.simulation.batch.records import (
     BEAM,
     BEAM_WORK,
+    DESIGN,
     DONE,
     REFUSED_COURSE,
     STAR,
@@ -67,11 +70,23 @@ class LoopRun(NamedTuple):
 
 
 class BatchRun(NamedTuple):
-    """A run: how it ended, each loop's, and how far the stars of the fringes were apart, shape (n, 2)."""
+    """A run.
+
+    Attributes
+    ----------
+    ended : int
+        How.
+    loops : dict of str to LoopRun
+    tilt_px : array, shape (n, 2)
+        How far the stars of the fringes were apart.
+    changes : sequence of Change
+        Of designs, which loops that learn made.
+    """
 
     ended: int
     loops: dict[str, LoopRun]
     tilt_px: Floats
+    changes: Sequence[Change] = ()
 
 
 class Batch:
@@ -110,6 +125,7 @@ class Batch:
             for index, (name, constants) in enumerate(self._beams.items())
         ]
         self._settings = rig_settings(rig, stars, beams)
+        self._learns = any(loop.learn == "on" for loop in rig.stellar_loops.values())
         self._constants = self._room(next(iter(self._stars.values())).packed.dtype, BEAM_CONSTANTS)
         for index, star in enumerate(self._stars.values()):
             self._constants["stars"][0, index] = star.packed[0]
@@ -118,8 +134,88 @@ class Batch:
         self._frames_dn = np.empty((2, rig.camera.height_px, rig.camera.width_px))
         self._courses: dict[float, Course] = {}
 
-    def run(self, seed: int, duration_s: float, *, keep: bool = False) -> BatchRun:
-        """One run; with `keep`, every frame's states and the true places at every step are kept."""
+    def run(
+        self,
+        seed: int,
+        duration_s: float,
+        *,
+        keep: bool = False,
+        changes: Sequence[Change] | None = None,
+    ) -> BatchRun:
+        """One run.
+
+        Parameters
+        ----------
+        seed : int
+        duration_s : float
+        keep : bool
+            Keep every frame's states, and the true places at every step.
+        changes : sequence of Change, optional
+            Of designs; by default those that its loops make by themselves, which takes seconds to find out.
+        """
+        if changes is None and self._learns:
+
+            def ticks_with(changes: Sequence[Change]) -> dict[str, NDArray[np.void]]:
+                made = self._run_with(changes, seed, duration_s, keep=True)
+                done = made.ended == DONE
+                return {name: made.loops[name].ticks for name in self._stars} if done else {}
+
+            changes = changes_of(self._rig, ticks_with)
+        return self._run_with(changes or (), seed, duration_s, keep=keep)
+
+    def _run_with(
+        self, changes: Sequence[Change], seed: int, duration_s: float, *, keep: bool
+    ) -> BatchRun:
+        """One run with such changes of designs."""
+        state, work, plant, air_random = self._beginning(seed)
+        try:
+            course = self._course(seed, duration_s)
+        except (DeviceError, ConfigError):  # the simulation reports what is wrong
+            return BatchRun(REFUSED_COURSE, {}, np.empty((0, 2)))
+        settings = self._settings.copy() if changes else self._settings
+        designs = np.array([change.settings for change in changes], DESIGN)
+        shared = settings[0]
+        frames = math.ceil(duration_s / shared["period_s"]) if keep else 0
+        steps = math.ceil((duration_s + 1) / shared["step_s"])
+        kept = steps if keep else 0
+        stars, beams = len(self._stars), len(self._beams)
+        tilts = 0 if self._rig.fringes is None else steps // TILT_EVERY
+        tilt_px = np.empty((tilts, 2))
+        ticks, samples = np.zeros((frames, stars), STAR), np.zeros((frames, beams), BEAM)
+        true_px, beam_m = np.empty((kept, stars, 2)), np.empty((kept, beams, 2))
+        ended = self._run(
+            settings,
+            state,
+            work,
+            self._constants,
+            plant,
+            designs,
+            tuple(air_random),
+            *course,
+            *self._frames_dn,
+            tilt_px,
+            ticks,
+            true_px,
+            samples,
+            beam_m,
+            duration_s,
+        )
+        last = {}
+        done = state["stars"][0, 0]["frames"]
+        for names, kind, every, true in (
+            (self._stars, "stars", ticks, true_px),
+            (self._beams, "beams", samples, beam_m),
+        ):
+            for index, name in enumerate(names):
+                r = state[kind][0, index]
+                last[name] = LoopRun(r, every[:done, index], true[: r["steps"], index])
+        loops = {name: last[name] for name in self._rig.loops}
+        return BatchRun(ended, loops, tilt_px[: state["tilts"][0]], changes)
+
+    def _beginning(
+        self, seed: int
+    ) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void], list[np.random.Generator]]:
+        """State, work, the plant's state, and what draws the air, as a run begins."""
         state = self._room(STAR, BEAM, ("tilts", "i8"))
         work = self._room(STAR_WORK, BEAM_WORK)
         plant = self._room(PlantState(1, 0).rows.dtype, BeamState(1).rows.dtype)
@@ -155,46 +251,7 @@ class Batch:
             initial = self._beams[name].air.initial.T
             w["air"][0] = streams.air[0].standard_normal((2, 2)) @ initial
             air_random += streams.air
-        try:
-            course = self._course(seed, duration_s)
-        except (DeviceError, ConfigError):  # the simulation reports what is wrong
-            return BatchRun(REFUSED_COURSE, {}, np.empty((0, 2)))
-        shared = self._settings[0]
-        frames = math.ceil(duration_s / shared["period_s"]) if keep else 0
-        steps = math.ceil((duration_s + 1) / shared["step_s"])
-        kept = steps if keep else 0
-        stars, beams = len(self._stars), len(self._beams)
-        tilts = 0 if self._rig.fringes is None else steps // TILT_EVERY
-        tilt_px = np.empty((tilts, 2))
-        ticks, samples = np.zeros((frames, stars), STAR), np.zeros((frames, beams), BEAM)
-        true_px, beam_m = np.empty((kept, stars, 2)), np.empty((kept, beams, 2))
-        ended = self._run(
-            self._settings,
-            state,
-            work,
-            self._constants,
-            plant,
-            tuple(air_random),
-            *course,
-            *self._frames_dn,
-            tilt_px,
-            ticks,
-            true_px,
-            samples,
-            beam_m,
-            duration_s,
-        )
-        last = {}
-        done = state["stars"][0, 0]["frames"]
-        for names, kind, every, true in (
-            (self._stars, "stars", ticks, true_px),
-            (self._beams, "beams", samples, beam_m),
-        ):
-            for index, name in enumerate(names):
-                r = state[kind][0, index]
-                last[name] = LoopRun(r, every[:done, index], true[: r["steps"], index])
-        loops = {name: last[name] for name in self._rig.loops}
-        return BatchRun(ended, loops, tilt_px[: state["tilts"][0]])
+        return state, work, plant, air_random
 
     def _room(self, star: np.dtype, beam: np.dtype, *more: tuple[str, str]) -> NDArray[np.void]:
         return of_all_loops(star, len(self._stars), beam, len(self._beams), *more)

@@ -249,6 +249,32 @@ def evaluate_waiting(ss: Any, rr: Any, i: int) -> None:
         start_search(s, r, rr, r.motor_rad[0], r.motor_rad[1])
 
 
+@compilable()
+def use_design(s: Any, rr: Any, d: Any) -> None:
+    """``StellarLoop.use``."""
+    r = rr.stars[d.star]
+    s.pair_states, s.pair_left_at_rest = d.pair_states, d.pair_left_at_rest
+    s.inverse_wanted = d.inverse_wanted
+    for column in range(5 + d.pair_states):
+        for row in range(2 + d.pair_states):
+            s.pair_system[row, column] = d.pair_system[row, column]
+        for write in range(s.later_writes):
+            s.pair_later[write, column] = d.pair_later[write, column]
+    for state in range(d.pair_states):
+        s.pair_at_rest[state] = d.pair_at_rest[state]
+    if d.knows:
+        for axis in range(2):
+            for state in range(d.pair_states):
+                r.pair_state[axis, state] = d.pair_state[axis, state]
+            r.excess_px[axis] = 0.0
+            r.motor_origin_rad[axis] = d.motor_origin_rad[axis]
+            r.target_origin_px[axis] = d.target_origin_px[axis]
+    elif r.mode == VERNIER:
+        read_link(s, r, rr)
+        az_rad, el_rad = linked_rad(s, r, r.position_rad[0], r.position_rad[1])
+        start_pair(s, r, az_rad, el_rad)
+
+
 # ---------------------------------------------------------------- findings
 
 

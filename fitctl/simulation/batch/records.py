@@ -85,6 +85,7 @@ STAR = np.dtype(
         ("frames", "i8"),
         ("pixel_key", "u8"),
         ("line_key", "u8"),
+        ("exposed_s", "f8"),
         ("exposed_step", "i8", (MOST_INSTANTS,)),
         ("exposed_px", "f8", (MOST_INSTANTS, 2)),
         ("noise_dn", "f8"),
@@ -200,6 +201,25 @@ BEAM_WORK = np.dtype(
     ]
 )
 
+
+# A design at work, by the names of the settings that it replaces, and from which frame of which star on.
+DESIGN = np.dtype(
+    [
+        ("star", "i8"),
+        ("frame", "i8"),
+        ("pair_states", "i8"),
+        ("pair_system", "f8", (MOST_STATES + 2, MOST_STATES + 5)),
+        ("pair_later", "f8", (MOST_WRITES - 1, MOST_STATES + 5)),
+        ("pair_at_rest", "f8", (MOST_STATES,)),
+        ("pair_left_at_rest", "f8"),
+        ("inverse_wanted", "i8"),
+        # Where it knows recent frames, what they leave it in; otherwise it begins from rest.
+        ("knows", "i8"),
+        ("pair_state", "f8", (2, MOST_STATES)),
+        ("motor_origin_rad", "f8", (2,)),
+        ("target_origin_px", "f8", (2,)),
+    ]
+)
 
 # fitctl.model.plant_constants.Epoch; of those that are not used, `from_node` is never reached.
 EPOCH = np.dtype(

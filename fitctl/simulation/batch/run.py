@@ -36,6 +36,7 @@ from fitctl.simulation.batch.modes import (
     follow_sky,
     linked_rad,
     observe,
+    use_design,
 )
 from fitctl.simulation.batch.plant import (
     advance_to,
@@ -100,6 +101,7 @@ def expose(ss: Any, rr: Any, ww: Any, exposed_s: float) -> None:
     for i in range(len(ss.stars)):
         s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
         r.frames += 1
+        r.exposed_s = exposed_s
         for instant in range(ss.instants):
             seen_s = exposed_s + ss.instants_s[instant]
             r.exposed_step[instant] = max(1, int(np.rint(seen_s / ss.step_s)))
@@ -202,6 +204,7 @@ def tick(
     ww: Any,
     cc: Any,
     pp: Any,
+    designs: Any,
     came: bool,
     exposed_s: float,
     air_random: Any,
@@ -209,6 +212,10 @@ def tick(
     search_dn: Floats,
 ) -> bool:
     """A tick of all loops, the metrology loops first; False where a search has ended with nothing found."""
+    if came:
+        for d in range(len(designs)):
+            if designs[d].frame == rr.stars[designs[d].star].frames:
+                use_design(ss.stars[designs[d].star], rr, designs[d])
     for i in range(len(ss.beams)):
         if not tick_beam(ss, ss.beams[i], rr.beams[i], ww.beams[i], ss.stars[0].quantiles):
             return False
@@ -277,6 +284,7 @@ def run(
     work: Any,
     constants: Any,
     plant_state: Any,
+    designs: Any,
     air_random: Any,
     array_m: Floats,
     star_rad: Floats,
@@ -294,7 +302,9 @@ def run(
     Parameters
     ----------
     settings, state, work, constants, plant_state : structured arrays, shape (1,)
-        Of all loops. The state is the result.
+        Of all loops. The state is the result; designs that change are written into the settings.
+    designs : structured array of DESIGN, shape (n,)
+        That replace those before them, in the order of their frames.
     air_random : tuple of Generator
         One for each spot of the camera, then one for each metrology beam.
     array_m, star_rad : arrays, shape (steps, 2)
@@ -352,7 +362,7 @@ def run(
         if came:
             frames += 1
             expose(ss, rr, ww, exposed_s)
-        if not tick(ss, rr, ww, cc, pp, came, exposed_s, air_random, frame_dn, search_dn):
+        if not tick(ss, rr, ww, cc, pp, designs, came, exposed_s, air_random, frame_dn, search_dn):
             return NOT_FOUND
         keep_run(ss, rr, ww, before, ticks, true_px, samples, beam_m)
         mode = rr.stars[0].mode

@@ -17,7 +17,7 @@ from fitctl.controllers.centroid import StarSensor, sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.mirror import Mirror
-from fitctl.controllers.pair import INPUTS
+from fitctl.controllers.pair import Pair
 from fitctl.controllers.photodiodes import PhotodiodeArray
 from fitctl.controllers.position_servo import position_servo
 from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
@@ -39,6 +39,7 @@ from fitctl.simulation.batch.interlocks import acting_interlocks
 from fitctl.simulation.batch.records import (
     BEAM_SETTINGS,
     BLOCK_NODES,
+    DESIGN,
     EPOCH,
     MOST_EPOCHS,
     MOST_HISTORY,
@@ -89,7 +90,6 @@ def star_settings(
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
     pointing = Pointing(rig, loop_name, target_px, design_for(rig, loop_name))
     pair = pointing.pair
-    states = pair.system.shape[1] - len(INPUTS)
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     noise_px = sensor_noise_px(rig.camera, loop, plant.spots[0].flux_dn)
     if pointing.design.uses_noise and noise_ratio(pointing.design, noise_px) > _MOST_NOISE_RATIO:
@@ -180,14 +180,10 @@ def star_settings(
             # control laws
             "prefilter": _fields(pointing.prefilter, "periods", "decay"),
             "coarse_step_rad_per_px": pointing.coarse_step_rad_per_px,
-            "pair_states": states,
-            "pair_system": _padded(pair.system[: 2 + states], MOST_STATES + 2, MOST_STATES + 5),
-            "pair_later": _padded(pair.system[2 + states :], MOST_WRITES - 1, MOST_STATES + 5),
+            **_pair(pair),
             "later_writes": pair.design.writes - 1,
             "later_every_s": camera.period_s / pair.design.writes,
             "later_after_s": camera.frame_delay_s + camera.period_s / pair.design.writes,
-            "pair_at_rest": _padded(pair.at_rest, MOST_STATES),
-            "pair_left_at_rest": pair.left_at_rest,
             # mirror
             "range_rad": fsm.range_rad,
             "bias_v": fsm.bias_v,
@@ -199,7 +195,6 @@ def star_settings(
             "stack_radius_m": fsm.stack_radius_m,
             "stack_matrix": mirror.stack_matrix,
             "rad_per_stack_v": mirror.rad_per_stack_v,
-            "inverse_wanted": pair.design.hysteresis_inverse,
             "hysteresis_known": mirror.hysteresis_known,
             "known_plays": len(mirror.half_width_v),
             "known_half_v": _padded(mirror.half_width_v, MOST_PLAYS),
@@ -296,10 +291,6 @@ def rig_settings(
     if acting:
         msg = f"interlock {acting[0]} may act, and the batch has no interlocks"
         raise BatchRefusalError(msg)
-    learning = [name for name, loop in rig.stellar_loops.items() if loop.learn == "on"]
-    if learning:
-        msg = f"loop {learning[0]} learns, and the batch's designs stay as they are"
-        raise BatchRefusalError(msg)
     camera = rig.true_camera
     truth, _ = rig.mock_parts()
     if truth.hot_pixels or camera.dark_file is not None:
@@ -343,6 +334,44 @@ def rig_settings(
             "tilt_every": TILT_EVERY,
         }
     )[None]
+
+
+def design_settings(star: int, frame: int, pair: Pair, *, knows: bool) -> NDArray[np.void]:
+    """Another design's pair from a frame of a star on, shape ().
+
+    Parameters
+    ----------
+    star, frame : int
+        The number of the stellar loop, and of its frame, which count from 0 and from 1.
+    pair : Pair
+    knows : bool
+        Whether the pair is in a state to go on from; otherwise it begins from rest.
+    """
+    return filled(
+        DESIGN,
+        {
+            "star": star,
+            "frame": frame,
+            **_pair(pair),
+            "knows": knows,
+            "pair_state": _padded(pair.state.T, 2, MOST_STATES),
+            "motor_origin_rad": pair.motor_origin_rad,
+            "target_origin_px": pair.target_origin_px,
+        },
+    )
+
+
+def _pair(pair: Pair) -> dict[str, Any]:
+    """What the ticks of a design's pair need."""
+    states = len(pair.state)
+    return {
+        "pair_states": states,
+        "pair_system": _padded(pair.system[: 2 + states], MOST_STATES + 2, MOST_STATES + 5),
+        "pair_later": _padded(pair.system[2 + states :], MOST_WRITES - 1, MOST_STATES + 5),
+        "pair_at_rest": _padded(pair.at_rest, MOST_STATES),
+        "pair_left_at_rest": pair.left_at_rest,
+        "inverse_wanted": int(pair.design.hysteresis_inverse),
+    }
 
 
 def _rings(air: AirConstants) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from fitctl.controllers.design.basis import Basis
-from fitctl.controllers.design.linear_loop.disturbance import disturbance, holds
+from fitctl.controllers.design.linear_loop.disturbance import blocks, disturbance, holds
 from fitctl.controllers.design.linear_loop.sampled import sampled_loop, timing
 from fitctl.controllers.pair import Design, mirror_outputs
 
@@ -91,13 +91,11 @@ def linear_residual(design: Design, basis: Basis) -> float:
     moving = disturbance(basis)
     transition, noise = moving.over(basis.period_s)
     own = len(transition)
-    closed = block_diag(transition, loop.a + np.outer(loop.b, loop.star))
+    closed = blocks(transition, loop.a + np.outer(loop.b, loop.star))
     closed[own:, :own] = np.outer(loop.b, moving.seen)
     measured = np.concatenate([moving.seen, loop.star])
     variance = basis.noise_px**2
-    covariance = solve_discrete_lyapunov(
-        closed, block_diag(noise, np.outer(loop.b, loop.b) * variance)
-    )
+    covariance = solve_discrete_lyapunov(closed, blocks(noise, np.outer(loop.b, loop.b) * variance))
     outputs = np.hstack([np.zeros((len(loop.command), own)), loop.command])
     stages = outputs + np.outer(loop.command_error, measured)
     writes = design.writes
@@ -111,10 +109,6 @@ def linear_residual(design: Design, basis: Basis) -> float:
         left[:, :own] += acts.star
         left[:, own:] += loop.motor_held
         from_noise = (share @ loop.command_error[both]) ** 2 * variance
-        at_nodes = (
-            np.einsum("ni,ij,nj->n", left, covariance, left)
-            + from_noise
-            + moving.new_px2(acts.star)
-        )
+        at_nodes = ((left @ covariance) * left).sum(axis=1) + from_noise + moving.new_px2(acts.star)
         left_px2 += acts.weight @ at_nodes
     return math.sqrt(left_px2 / writes)

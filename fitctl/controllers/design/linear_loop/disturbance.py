@@ -2,68 +2,119 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, expm, solve_continuous_lyapunov
+from scipy.linalg import expm, solve_continuous_lyapunov
 
+from fitctl.config import AirPathModel
 from fitctl.controllers.design.basis import Basis, Line
 from fitctl.model.air_path import discretize, state_space
 
 Floats = NDArray[np.float64]
 # Of Gauss-Legendre: exact to rounding for anything smooth over one period.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(8)
+_REMEMBERED = 256  # of what parts are, and do in a time
 
 
-class Disturbance(NamedTuple):
-    """x' = a x + w, of which the camera sees ``seen @ x``, in pixels.
+class Oscillator(NamedTuple):
+    """One part of a disturbance: x' = a x + w, of which the camera sees ``seen @ x``, in pixels.
 
     Attributes
     ----------
-    a, noise : arrays, shape (n, n)
-        `noise` is the intensity of the white noise w. The first two states are the air path.
-    seen : array, shape (n,)
+    a, noise, covariance : arrays, shape (2, 2)
+        `noise` is the intensity of the white noise w, `covariance` the stationary one of the states.
+    seen : array, shape (2,)
     """
 
     a: Floats
     noise: Floats
+    covariance: Floats
     seen: Floats
 
-    def over(self, time_s: float) -> tuple[Floats, Floats]:
-        """Transition matrix and the covariance of what comes new, over a time."""
-        return discretize(self.a, self.noise, time_s)
 
-    def later(self, times_s: Floats) -> Floats:
-        """What of the states now is the star's own motion after these times, shape (times, n)."""
-        first = np.arange(0, len(self.a), 2)
-        pair = np.add.outer(first, np.arange(2))
-        oscillators = self.a[pair[:, :, None], pair[:, None, :]]  # nothing couples them
-        each = expm(times_s[:, None, None, None] * oscillators)
-        return np.asarray(
-            np.einsum("oi,toij->toj", self.seen[pair], each).reshape(len(times_s), -1)
-        )
+class Disturbance(NamedTuple):
+    """All that moves a star: parts that nothing couples, each with two states.
 
-    def new_px2(self, later: Floats) -> Floats:
-        """Variance of what comes new until then, shape (times,); `later` is of :meth:`later`."""
-        everything = self.covariance
-        known = np.einsum("ti,ij,tj->t", later, everything, later)
-        return np.asarray(self.seen @ everything @ self.seen - known)
+    Attributes
+    ----------
+    parts : tuple of AirPathModel or Line
+        The air path first.
+    """
+
+    parts: tuple[AirPathModel | Line, ...]
+
+    @property
+    def a(self) -> Floats:
+        """Of x' = a x + w, shape (n, n)."""
+        return blocks(*(_oscillator(part).a for part in self.parts))
+
+    @property
+    def seen(self) -> Floats:
+        """The camera sees ``seen @ x``, shape (n,)."""
+        return np.concatenate([_oscillator(part).seen for part in self.parts])
 
     @property
     def covariance(self) -> Floats:
-        """Of the states, stationary."""
-        return np.asarray(solve_continuous_lyapunov(self.a, -self.noise))
+        """Of the states, stationary, shape (n, n)."""
+        return blocks(*(_oscillator(part).covariance for part in self.parts))
+
+    def over(self, time_s: float) -> tuple[Floats, Floats]:
+        """Transition matrix and the covariance of what comes new, over a time, shapes (n, n)."""
+        transitions, noises = zip(*(_over(part, time_s) for part in self.parts), strict=True)
+        return blocks(*transitions), blocks(*noises)
+
+    def later(self, times_s: tuple[float, ...]) -> Floats:
+        """What of the states now is the star's own motion after these times, shape (times, n)."""
+        return np.hstack([_later(part, times_s) for part in self.parts])
+
+    def new_px2(self, later: Floats) -> Floats:
+        """Variance of what comes new until then, shape (times,); `later` is of :meth:`later`."""
+        everything, seen = self.covariance, self.seen
+        known = ((later @ everything) * later).sum(axis=1)
+        return np.asarray(seen @ everything @ seen - known)
 
 
 def disturbance(basis: Basis) -> Disturbance:
     """The air path of a basis, its lines, and its guard if it has one."""
-    a, b, c = state_space(basis.air_path)
-    lines = basis.lines if basis.guard is None else (*basis.lines, basis.guard)
-    parts = [(a, b @ b.T, c[0]), *map(_line, lines)]
-    blocks, noises, outputs = zip(*parts, strict=True)
-    return Disturbance(block_diag(*blocks), block_diag(*noises), np.concatenate(outputs))
+    guard = () if basis.guard is None else (basis.guard,)
+    return Disturbance((basis.air_path, *basis.lines, *guard))
+
+
+def blocks(*parts: Floats) -> Floats:
+    """Square matrices along a diagonal; scipy's takes five times as long."""
+    made = np.zeros((sum(map(len, parts)),) * 2)
+    first = 0
+    for part in parts:
+        made[first : first + len(part), first : first + len(part)] = part
+        first += len(part)
+    return made
+
+
+# A search for a design tries hundreds of guards beside the same air path and lines.
+@functools.lru_cache(_REMEMBERED)
+def _oscillator(part: AirPathModel | Line) -> Oscillator:
+    if isinstance(part, Line):
+        a, noise, seen = _line(part)
+    else:
+        a, b, c = state_space(part)
+        noise, seen = b @ b.T, c[0]
+    return Oscillator(a, noise, np.asarray(solve_continuous_lyapunov(a, -noise)), seen)
+
+
+@functools.lru_cache(_REMEMBERED)
+def _over(part: AirPathModel | Line, time_s: float) -> tuple[Floats, Floats]:
+    own = _oscillator(part)
+    return discretize(own.a, own.noise, time_s)
+
+
+@functools.lru_cache(_REMEMBERED)
+def _later(part: AirPathModel | Line, times_s: tuple[float, ...]) -> Floats:
+    own = _oscillator(part)
+    return np.asarray(own.seen @ expm(np.array(times_s)[:, None, None] * own.a))
 
 
 def _line(line: Line) -> tuple[Floats, Floats, Floats]:
@@ -113,7 +164,7 @@ class Hold(NamedTuple):
 def hold(moving: Disturbance, period_s: float, delay_s: float) -> Hold:
     """The time from `delay_s` after mid-exposure to one period later."""
     part = (_NODE + 1) / 2
-    return Hold(part, _WEIGHT / 2, moving.later(delay_s + part * period_s))
+    return Hold(part, _WEIGHT / 2, moving.later(tuple((delay_s + part * period_s).tolist())))
 
 
 def holds(moving: Disturbance, writes: int, period_s: float, delay_s: float) -> list[Hold]:

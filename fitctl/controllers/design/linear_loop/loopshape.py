@@ -90,7 +90,7 @@ def sampled_response(design: Design, basis: Basis) -> Response:
         z = np.exp(1j * np.asarray(omega_rad_s) * basis.period_s)
         states = np.zeros((len(drive), *z.shape), dtype=complex)
         for n in reversed(range(len(drive))):
-            others = np.tensordot(triangle[n, n + 1 :], states[n + 1 :], axes=1)
+            others = triangle[n, n + 1 :] @ states[n + 1 :]
             states[n] = (drive[n] + others) / (z - triangle[n, n])
         return np.asarray(-np.tensordot(star, states, axes=1))
 

@@ -1,0 +1,212 @@
+"""Batched runs whose loops learn: the live loop's learner and its decisions, on the frames of a compiled run.
+
+A run is the same until a design changes, and costs less than one of the learner's reports. So it is made again
+from its beginning with each change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ConfigError, Rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.pair import Design, Measurement
+from fitctl.learn.learner import Learner, Shown
+from fitctl.loop.learning import Learning
+from fitctl.loop.pointing import Pointing
+from fitctl.messages.commands import LearnerReport
+from fitctl.messages.modes import Mode
+from fitctl.simulation.batch.settings import design_settings
+
+Records = NDArray[np.void]
+_LEAST_EXCESS_PX = 1e-9  # as in fitctl.controllers.pair
+_NAMES = {int(mode): mode.name for mode in Mode}
+# Of mirror, fsm, siderostat and link, in the order of Shown.
+_FIELDS = ("exposed_mirror_rad", "mirror_command_rad", "motor_rad", "link_motor_rad")
+
+
+class Change(NamedTuple):
+    """A change of design that a loop makes by itself.
+
+    Attributes
+    ----------
+    loop : str
+    time_s : float
+    design : Design
+    settings : structured array of DESIGN, shape ()
+    """
+
+    loop: str
+    time_s: float
+    design: Design
+    settings: Records
+
+
+class _Frame(NamedTuple):
+    """A tick on a frame; `beam_rad` is as :class:`fitctl.loop.observation.Observation` has it, shape (2,)."""
+
+    shown: Shown
+    waits: bool
+    beam_rad: NDArray[np.float64]
+
+
+def changes_of(rig: Rig, run: Callable[[Sequence[Change]], dict[str, Records]]) -> list[Change]:
+    """All changes of design that the loops of a run make by themselves, in their order.
+
+    Parameters
+    ----------
+    rig : Rig
+    run : callable
+        Makes the run with such changes, and returns the states after each frame by stellar loop; none if the
+        run met what the batch does not model.
+    """
+    loops = [
+        _Loop(rig, index, name)
+        for index, (name, loop) in enumerate(rig.stellar_loops.items())
+        if loop.learn == "on"
+    ]
+    changes: list[Change] = []
+    ticks = run(changes)
+    number = 0
+    while ticks and number < min(map(len, ticks.values())):
+        new = [change for loop in loops for change in loop.decide(ticks[loop.name], number)]
+        if new:
+            changes += new
+            ticks = run(changes)
+        for loop in loops if ticks else ():
+            loop.finish(ticks[loop.name], number)
+        number += 1
+    return changes
+
+
+class _Loop:
+    """What a live loop has for learning."""
+
+    def __init__(self, rig: Rig, index: int, name: str) -> None:
+        target_px = rig.stellar_loops[name].target_px
+        self.name = name
+        self._rig = rig
+        self._index = index
+        self._linked = rig.stellar_loops[name].link is not None
+        self._learner = Learner(rig, name)
+        self._learning = Learning(rig, name)
+        self._pointing = Pointing(
+            rig, name, np.array([target_px.az, target_px.el]), design_for(rig, name)
+        )
+        self._report: LearnerReport | None = None
+        self._held = self._saturated = False
+        self._ticks: Records | None = None
+        self._frames: list[_Frame] = []
+        self._first = 0
+
+    def decide(self, ticks: Records, number: int) -> list[Change]:
+        """What the loop changes on a frame before it acts on it: as it is told, or back to what was before."""
+        frame, learning = self._frame(ticks, number), self._learning
+        shown, made = frame.shown, []
+        report, self._report = self._report, None
+        if report is not None:
+            learning.accept(report)
+            if learning.wants_change(shown.time_s):
+                made += self._designed(number, shown.time_s, report)
+        holds = shown.mode == Mode.VERNIER.name and not frame.waits
+        if holds and not self._held:
+            self._pointing.forget()
+            self._saturated = False
+        self._held = holds
+        why_back = learning.observe(
+            shown.time_s,
+            (shown.error_az_px, shown.error_el_px) if shown.star_visible else None,
+            (shown.target_az_px, shown.target_el_px),
+            (np.array([shown.mirror_az_rad, shown.mirror_el_rad]), frame.beam_rad),
+            saturated=self._saturated,
+            hindered=not holds,
+        )
+        if why_back and learning.before is not None:
+            learning.fell_back(why_back, shown.time_s)
+            made.append(self._use(number, shown.time_s, learning.before, None))
+        return made
+
+    def finish(self, ticks: Records, number: int) -> None:
+        """The loop has acted on a frame."""
+        frame, pointing = self._frame(ticks, number), self._pointing
+        shown = frame.shown
+        if self._held and shown.star_visible:
+            pointing.remember(
+                Measurement(
+                    (shown.error_az_px, shown.error_el_px),
+                    (shown.target_az_px, shown.target_el_px),
+                    np.array([shown.mirror_az_rad, shown.mirror_el_rad]),
+                    frame.beam_rad,
+                )
+            )
+        elif self._held:
+            pointing.forget()
+        self._saturated = shown.fsm_saturated
+        self._learner.add(shown)
+        self._learner.watch(pointing.design.title, shown.time_s)
+        if self._learner.due:
+            self._report = self._learner.report(pointing.design)
+
+    def _designed(self, number: int, now_s: float, report: LearnerReport) -> list[Change]:
+        """As the supervisor has it made and used; none if it is rejected."""
+        try:
+            design = design_for(self._rig, self.name, report.design_json)
+        except ConfigError:
+            return []
+        return [self._use(number, now_s, design, report)]
+
+    def _use(
+        self, number: int, now_s: float, design: Design, report: LearnerReport | None
+    ) -> Change:
+        pointing = self._pointing
+        self._learning.changed(pointing.design, design, report, pointing.recent, by_itself=True)
+        pointing.use(design)
+        knows = pointing.start_knowing()
+        if not knows:
+            pointing.forget()
+        self._saturated = False
+        settings = design_settings(self._index, number + 1, pointing.pair, knows=knows)
+        return Change(self.name, now_s, design, settings)
+
+    def _frame(self, ticks: Records, number: int) -> _Frame:
+        if ticks is not self._ticks:
+            self._ticks, self._first = ticks, number
+            self._frames = _frames(ticks[number:], linked=self._linked)
+        return self._frames[number - self._first]
+
+
+def _frames(ticks: Records, *, linked: bool) -> list[_Frame]:
+    """The ticks of one loop, as its records have them."""
+    saturated = np.abs(ticks["excess_px"]).max(axis=1, initial=0.0) > _LEAST_EXCESS_PX
+    holds = ticks["mode"] == Mode.VERNIER
+    stages = np.hstack([ticks[name] for name in _FIELDS])
+    if not linked:
+        stages[:, -2:] = np.nan
+    columns = np.column_stack(
+        [
+            ticks["command_px"],
+            ticks["now_s"],
+            ticks["exposed_s"],
+            ticks["star_px"] - ticks["command_px"],
+            stages,
+        ]
+    )
+    return [
+        _Frame(
+            Shown(number, _NAMES[mode], is_saturated, visible == 1, *values), waits == 1, beam_rad
+        )
+        for number, mode, is_saturated, visible, values, waits, beam_rad in zip(
+            ticks["frames"].tolist(),
+            ticks["mode"].tolist(),
+            (saturated & holds).tolist(),
+            ticks["star_visible"].tolist(),
+            columns.tolist(),
+            ticks["waits"].tolist(),
+            ticks["beam_rad"],
+            strict=True,
+        )
+    ]
