@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +19,7 @@ import msgspec
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.controllers.pair import LEARNT, Designer
+from fitctl.controllers.pair import Designer
 from fitctl.drivers.interface import DeviceError, Devices, Frame, LoopDevices
 from fitctl.logging.records import (
     CAMERA,
@@ -54,12 +54,13 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import POINTING, Mode, Trigger
-from fitctl.stages.journal import Journal, error_text
+from fitctl.stages.journal import Journal
 from fitctl.stages.periodic import Periodic
 from fitctl.stages.servo_group import servo_groups
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.collector import CollectorWatch
-from fitctl.supervisor.device_jobs import DeviceJobs, Ended, Job
+from fitctl.supervisor.design_jobs import DesignJobs
+from fitctl.supervisor.device_jobs import DeviceJobs
 from fitctl.supervisor.health import (
     camera_health,
     hexapod_health,
@@ -71,7 +72,6 @@ from fitctl.supervisor.loop_commands import LOOP_COMMANDS, obey_loop_command, wh
 from fitctl.supervisor.outcomes import Outcomes
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.sequence_board import SequenceBoard
-from fitctl.supervisor.starlight import Starlight
 from fitctl.supervisor.timing import TimingBook
 
 _COMMANDS: dict[type[AnyCommand], Trigger] = {
@@ -157,21 +157,21 @@ class Supervisor:
         self.shutdown_wanted = False
         self._closed = False
         self._clock = clock
-        self._executor = executor
-        self._design_executor = design_executor or executor
-        self._journal = journal
         self._record = record
         self._record_frames = record_frames
-        self._design = design
         self._commands: deque[Posted] = deque()
         self._left: deque[AnyRecord] = deque()
         self._quantities: deque[QuantityReading] = deque()
-        self._designs: deque[Job] = deque()
-        self._wanted_designs: dict[
-            str, Future
-        ] = {}  # of each loop, by its last `controller` command
+        self._design_jobs = DesignJobs(
+            rig,
+            self.stellar_loops,
+            clock,
+            design_executor or executor,
+            journal,
+            self.outcomes,
+            design,
+        )
         self._mirrors = [loop.mirror for loop in self.stellar_loops.values()]
-        self._starlight = [Starlight(rig, loop, journal) for loop in self.stellar_loops.values()]
         self._reported_s = clock.now_s()
         self.piezos = {
             name: PiezoWatch(loop, piezo, executor, journal)
@@ -285,7 +285,7 @@ class Supervisor:
                 self._record(tick)
             self._timing.add(tick)
             self._make_safer(loop, was_safe=was_safe)
-        self._design_for_light()
+        self._design_jobs.observe_light()
         self.outcomes.observe(self.loops)
         if self.collector is not None:
             self.collector.check()
@@ -475,36 +475,11 @@ class Supervisor:
         return f"{trigger.name.lower()} is not available in {mode.name}. Available: {can}"
 
     def _set_controller(self, command: SetController, names: list[str]) -> Reply:
-        names = [name for name in names if name in self.stellar_loops]
-        if not names:
-            return _refusal(f"loop {command.loop} holds a metrology beam and has no design")
-        learnt: dict[str, LearnerReport] = {}
-        if command.name == LEARNT:
-            for name in names:
-                report = self.stellar_loops[name].learning.report
-                if report is None or not report.design_json:
-                    return _refusal(_nothing_learnt(name, report))
-                learnt[name] = report
-        number = self.outcomes.begin(command, names)
-        for name in names:
-            # A design takes longer than a tick.
-            report = learnt.get(name)
-            chosen = command.name if report is None else report.design_json
-            if name in self._wanted_designs:
-                self._wanted_designs[
-                    name
-                ].cancel()  # designs that nobody waits for hold up those that follow
-            future = self._design_executor.submit(self._design, self.rig, name, chosen)
-            self._wanted_designs[name] = future
-            ended = partial(self.outcomes.end, number, [name])
-            done = partial(self._designed, name, command.name, report, ended)
-            self._designs.append(Job(future, done))
-        self._finish_jobs()
-        return Reply(
-            accepted=True,
-            number=number,
-            text="designing; fitctl status shows the controller in force",
-        )
+        number = self._design_jobs.begin(command, names)
+        if isinstance(number, str):
+            return _refusal(number)
+        text = "designing; fitctl status shows the controller in force"
+        return Reply(accepted=True, number=number, text=text)
 
     def _learn(self, report: LearnerReport, names: list[str]) -> Reply:
         loop = self.stellar_loops.get(report.loop)
@@ -513,55 +488,8 @@ class Supervisor:
         why_not = refused_report(report)
         if why_not:
             return _refusal(why_not)
-        news = loop.learning.accept(report)
-        if news:
-            self._journal.event("info", loop.name, news)
-        if loop.learning.wants_change(self._clock.now_s()):
-            future = self._design_executor.submit(
-                self._design, self.rig, loop.name, report.design_json
-            )
-            self._designs.append(Job(future, partial(self._designed_by_itself, loop, report)))
-            self._finish_jobs()
+        self._design_jobs.learn(loop, report)
         return Reply(accepted=True)
-
-    def _designed_by_itself(self, loop: StellarLoop, report: LearnerReport, future: Future) -> None:
-        """Use a learnt design, if the loop is still calm; the learner's next report comes soon."""
-        error = future.exception()
-        if error is not None:
-            self._journal.event("warning", loop.name, f"no learnt design: {error_text(error)}")
-        elif loop.learning.wants_change(self._clock.now_s()):
-            reason = loop.learning.what_is_gained(report)
-            loop.use(future.result(), reason, report=report, by_itself=True)
-
-    def _designed(
-        self,
-        name: str,
-        controller: str,
-        report: LearnerReport | None,
-        ended: Ended,
-        future: Future,
-    ) -> None:
-        if self._wanted_designs[name] is not future:
-            return  # another command replaced it
-        error = future.exception()
-        if error is None:
-            self.stellar_loops[name].use(future.result(), report=report)
-            ended(f"controller {controller} is in force", failed=False)
-        else:
-            why = error_text(error)
-            self._journal.event("error", name, f"no design {controller}: {why}")
-            ended(f"no design {controller}: {why}", failed=True)
-
-    def _design_for_light(self) -> None:
-        """Have designs made for the light of their stars, where that has become another."""
-        for light in self._starlight:
-            noise_px = light.observe()
-            if noise_px is not None:
-                name, loop = light.loop.name, light.loop
-                future = self._design_executor.submit(
-                    self._design, self.rig, name, loop.pointing.design.name, noise_px
-                )
-                self._designs.append(Job(future, partial(light.designed, noise_px)))
 
     # ------------------------------------------------------------ beside the ticks
 
@@ -581,9 +509,7 @@ class Supervisor:
         self._device_jobs.finish()
         if were_busy and not self._device_jobs.busy:
             self._reported_s = -math.inf  # consoles show at once what was opened or closed
-        while self._designs and self._designs[0].future.done():
-            design = self._designs.popleft()
-            design.done(design.future)
+        self._design_jobs.finish()
         for piezo in self.piezos.values():
             piezo.collect()
 
@@ -620,15 +546,6 @@ class Supervisor:
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)
         self._record(record)
-
-
-def _nothing_learnt(name: str, report: LearnerReport | None) -> str:
-    if report is None:
-        return (
-            f"nothing is learnt of loop {name} yet; it takes a minute in VERNIER, and loops.{name}.learn must "
-            'not be "off"'
-        )
-    return f"nothing is learnt of loop {name}: {report.text}"
 
 
 def _refusal(text: str) -> Reply:

@@ -225,7 +225,9 @@ def test_a_lost_star_that_does_not_come_back_in_time_is_a_failure_of_the_search(
 
 def test_a_design_that_cannot_be_made_fails_and_the_old_one_stays(fresh, monkeypatch):
     before = state(fresh).controller
-    monkeypatch.setattr(fresh.supervisor, "_design", failing(ValueError("no such plant")))
+    monkeypatch.setattr(
+        fresh.supervisor._design_jobs, "_design", failing(ValueError("no such plant"))
+    )
 
     found = ended(fresh, fresh.command(SetController(name="lqg-ltr")))
 
@@ -237,17 +239,17 @@ def test_a_design_that_cannot_be_made_fails_and_the_old_one_stays(fresh, monkeyp
 
 def test_a_newer_controller_command_replaces_one_whose_design_is_not_there_yet(fresh, monkeypatch):
     made, may_go_on = [], threading.Event()
-    design = fresh.supervisor._design
+    design = fresh.supervisor._design_jobs._design
 
     def slow(rig, name, controller):
         assert may_go_on.wait(10.0)
         made.append(controller)
         return design(rig, name, controller)
 
-    monkeypatch.setattr(fresh.supervisor, "_design", slow)
+    monkeypatch.setattr(fresh.supervisor._design_jobs, "_design", slow)
     before = state(fresh).controller
     with ThreadPoolExecutor(1) as executor:
-        monkeypatch.setattr(fresh.supervisor, "_design_executor", executor)
+        monkeypatch.setattr(fresh.supervisor._design_jobs, "_executor", executor)
         names = ["lqg-ltr", "minimum-variance", "lqg-ltr", "eq20", "minimum-variance"]
         replies = [fresh.command(SetController(name=name)) for name in names]
         may_go_on.set()

@@ -160,8 +160,8 @@ def test_a_design_from_a_file_stays_as_it_is(tmp_path):
 
 def test_a_design_that_comes_too_late_is_not_used():
     simulation = held(rig_of(28000.0))
-    supervisor, loop = simulation.supervisor, loop_of(simulation)
-    light = Starlight(simulation.rig, loop, supervisor._journal)
+    loop = loop_of(simulation)
+    light = Starlight(simulation.rig, loop, loop._journal)
     late = Future()
     late.set_result(design_for(simulation.rig, "right", "minimum-variance", 0.02))
 
@@ -173,12 +173,12 @@ def test_a_design_that_comes_too_late_is_not_used():
 
 def test_where_no_design_can_be_made_the_loop_keeps_its_own():
     simulation = held(rig_of(28000.0))
-    supervisor, loop = simulation.supervisor, loop_of(simulation)
+    loop = loop_of(simulation)
     before = loop.pointing.design
     failed = Future()
     failed.set_exception(ValueError("no solution"))
 
-    Starlight(simulation.rig, loop, supervisor._journal).designed(0.02, failed)
+    Starlight(simulation.rig, loop, loop._journal).designed(0.02, failed)
 
     assert loop.pointing.design is before
     assert "no design for the star's light" in events_of(simulation)[-1].message
