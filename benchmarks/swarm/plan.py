@@ -77,6 +77,8 @@ _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many
 _SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
 _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
+_AT_ONCE_S = 0.004  # mean delay between hurried commands
+_LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
@@ -298,6 +300,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     if random.random() >= _WITHOUT_FAULTS:
         strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
         strikes += [partial(_interrupted_slew, loops=loops)] * random.randint(0, 4)
+        strikes += [partial(_disturbed_rest, loops=loops)] * random.randint(0, 2)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
     # The service refuses commands from operators without the lease.
     people = OPERATORS[: random.randint(1, len(OPERATORS))]
@@ -326,6 +329,20 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
                 again_s += random.expovariate(1 / _REPEATED_S)
                 happenings.append(Order(at_s=again_s, who=who, command=command))
     happenings.sort(key=lambda happening: happening.at_s)
+    console_loss = random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0
+    remote_consoles = random.randint(1, 3) if random.random() < _REMOTE else 0
+    return Plan(
+        seed=seed,
+        rig=rig,
+        settings=_drawn_settings(random, rig, fast=fast),
+        duration_s=duration_s,
+        happenings=happenings,
+        console_loss=console_loss,
+        remote_consoles=remote_consoles,
+    )
+
+
+def _drawn_settings(random: Random, rig: str, *, fast: bool) -> list[str]:
     # At the rig's own rate, telemetry takes a tenth of the run's time.
     settings = ["supervisor.telemetry_hz=5.0"]
     settings += [text for text in _SETTINGS if random.random() < _SETTING]
@@ -333,19 +350,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         settings += _FAST_FRAMES
     elif random.random() < _SLOW.get(rig, 0.0):
         settings += slow_servos(rig, random.randrange(2))
-    console_loss = random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0
-    remote_consoles = random.randint(1, 3) if random.random() < _REMOTE else 0
     if not fast and random.random() < _SEVERAL_WRITES:
         settings += several_writes(rig)
-    return Plan(
-        seed=seed,
-        rig=rig,
-        settings=settings,
-        duration_s=duration_s,
-        happenings=happenings,
-        console_loss=console_loss,
-        remote_consoles=remote_consoles,
-    )
+    return settings
 
 
 def _drawn_command(
@@ -388,6 +395,34 @@ def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> li
         *failing,
         *random.choice(([], stall)),
     ]
+
+
+def _disturbed_rest(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
+    """A loop without its star is moved, and at once `off` comes several times, or the machine stalls long.
+
+    Its piezo amplifier may be silent meanwhile.
+    """
+    loop, who = random.choice(loops), OPERATORS[0]
+    moves = (_COMMANDS["jog"](random), _COMMANDS["bias-offset"](random))
+    moved_s = at_s + random.uniform(0.2, 2.0)
+    meets_s = moved_s + random.uniform(0.0, _MEETS_S)
+    given = [(at_s, Release()), (moved_s, random.choice(moves))]
+    others: list[Happening] = []
+    if random.random() < _LONG_STALL:
+        others.append(Stall(at_s=meets_s + random.uniform(0.0, 1.0), lasts_s=random.uniform(1, 3)))
+    else:
+        for _ in range(random.randint(1, 5)):
+            given.append((meets_s, Off()))
+            meets_s += random.expovariate(1 / _AT_ONCE_S)
+    if loop != "metrology" and random.random() < _SILENT:
+        lasts_s = random.uniform(1, 8)
+        others.append(Strike(at_s=at_s, device=f"{loop} piezo", fault="mute", lasts_s=lasts_s))
+    orders = [
+        Order(at_s=given_s, who=who, command=msgspec.structs.replace(command, loop=loop))
+        for given_s, command in given
+        if command is not None
+    ]
+    return [*orders, *others]
 
 
 def _stall(random: Random, at_s: float) -> list[Happening]:
