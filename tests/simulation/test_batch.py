@@ -533,6 +533,27 @@ def test_a_loop_that_learns_changes_its_design_and_goes_back_at_the_same_ticks(
     assert_same_run(simulation, run, within=1e-8)  # rounding adds up in a minute
 
 
+def test_each_loop_of_the_testbed_learns_at_the_same_ticks(learns_at_once):
+    rig = rig_of_testbed(
+        *(
+            setting
+            for loop in ("right", "left")
+            for setting in (
+                f"loops.{loop}.learn=on",
+                f"loops.{loop}.vernier.controller=minimum-variance",
+                SIX_HZ.replace("loops.right", f"loops.{loop}"),
+            )
+        )
+    )
+
+    simulation, _, run = both_of_all(rig, 3, 42.0)
+
+    learnt = [change.loop for change in run.changes if change.design.learnt]
+    assert sorted(learnt) == ["left", "right"]
+    for loop in learnt:
+        assert_same_run(simulation, run, loop, within=1e-8)
+
+
 def test_a_loop_that_learns_has_the_result_of_its_simulation(learns_at_once):
     rig = rig_with("loops.right.learn=on", SIX_HZ, CONTROLLER.format("minimum-variance"))
 
