@@ -559,5 +559,6 @@ def test_a_loop_that_learns_has_the_result_of_its_simulation(learns_at_once):
 
     ours, theirs = Batch(rig).result(3, 50.0), simulate_rig(rig, 3, 50.0)
 
-    left_px = [result.loops["right"].rms_px for result in (ours, theirs)]
-    assert [left_px[0].az, left_px[0].el] == pytest.approx([left_px[1].az, left_px[1].el], abs=1e-6)
+    for axis in ("az", "el"):
+        left_px, expected_px = (one.loops["right"].rms_px[axis] for one in (ours, theirs))
+        assert left_px == pytest.approx(expected_px, abs=1e-6)
