@@ -230,6 +230,7 @@ def advise(
     rig_basis: Basis,
     present: Design,
     required: Required | None = None,
+    like: Design | None = None,
 ) -> Advice:
     """Estimate a night and design for it.
 
@@ -245,6 +246,8 @@ def advise(
         In use.
     required : Required, optional
         Margins of the learnt design.
+    like : Design, optional
+        That was learnt from nearly the same frames: the search begins there.
 
     Raises
     ------
@@ -254,7 +257,7 @@ def advise(
     night, truth = estimated(series, rig_basis)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     parts = safe_parts(truth, present)
-    design = design_with_margins(expecting(parts, truth), required)
+    design = design_with_margins(expecting(parts, truth), required, like)
     both = present, design
     present_px, learnt_px = (if_aliases(one, truth, suspects) for one in both)
     return Advice(

@@ -85,6 +85,7 @@ class Learner:
         self._target_px = (math.nan, math.nan)
         self._design = ""
         self._since_s = 0.0
+        self._learnt: Design | None = None  # last
 
     def watch(self, design: str, now_s: float) -> None:
         """The design in force now, by its key."""
@@ -141,12 +142,15 @@ class Learner:
             if len(own) * self._period_s >= LEAST_S
             else (0.0, 0.0)
         )
-        return advise(
+        advice = advise(
             rebuild(theory, ticks, pieces),
             (az_px, el_px),
             basis(self._rig, self._loop_name),
             present,
+            like=self._learnt,
         )
+        self._learnt = advice.design
+        return advice
 
     def _report(self, advice: Advice) -> LearnerReport:
         return LearnerReport(

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import AirPathModel
-from fitctl.controllers.design.linear_loop.disturbance import line_px2_per_hz
 
 Floats = NDArray[np.float64]
 _ALIASES = (
@@ -55,12 +52,7 @@ def air_of(model: AirPathModel) -> Air:
 
 def air_px2_per_hz(air: Air, frequency_hz: Floats, period_s: float) -> Floats:
     """One-sided density of the air path on frames, shape as `frequency_hz`."""
-
-    def continuous(at_hz: Floats) -> Floats:
-        omega2 = (2 * math.pi * at_hz) ** 2
-        return 2 * air.strength**2 / ((air.stiffness - omega2) ** 2 + air.damping**2 * omega2)
-
-    return _sampled(continuous, frequency_hz, period_s)
+    return air_slopes(air, frequency_hz, period_s)[0]
 
 
 def framed_line_px2_per_hz(
@@ -75,13 +67,40 @@ def framed_line_px2_per_hz(
     half_width_hz : array
         At half power, with what the segments' length adds; shape as `frequency_hz`.
     """
-    return _sampled(partial(line_px2_per_hz, own_hz, half_width_hz), frequency_hz, period_s)
+    return framed_line_slopes(own_hz, half_width_hz, frequency_hz, period_s)[0]
 
 
-def _sampled(
-    continuous: Callable[[Floats], Floats], frequency_hz: Floats, period_s: float
-) -> Floats:
-    return np.asarray(sum(continuous(frequency_hz + alias / period_s) for alias in _ALIASES))
+def air_slopes(air: Air, frequency_hz: Floats, period_s: float) -> tuple[Floats, Floats, Floats]:
+    """As :func:`air_px2_per_hz`, and its derivatives by the logarithms of damping and stiffness."""
+    total = by_damping = by_stiffness = np.zeros_like(frequency_hz)
+    for omega2 in _omegas2(frequency_hz, period_s):
+        away, broad = air.stiffness - omega2, air.damping**2 * omega2
+        below = 1 / (away**2 + broad)
+        density = 2 * air.strength**2 * below
+        total = total + density
+        by_damping = by_damping - 2 * broad * below * density
+        by_stiffness = by_stiffness - 2 * air.stiffness * away * below * density
+    return total, by_damping, by_stiffness
+
+
+def framed_line_slopes(
+    own_hz: float, half_width_hz: Floats, frequency_hz: Floats, period_s: float
+) -> tuple[Floats, Floats, Floats]:
+    """As :func:`framed_line_px2_per_hz`, and its derivatives by its frequency and its half width, 1/Hz each."""
+    own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
+    total = by_own = by_width = np.zeros_like(frequency_hz)
+    for omega2 in _omegas2(frequency_hz, period_s):
+        away, broad = own**2 - omega2, width**2 * omega2
+        below = 1 / (away**2 + broad)
+        density = 4 * width * own**2 * below
+        total = total + density
+        by_own = by_own + density * (2 / own - 4 * own * away * below)
+        by_width = by_width + density * (1 - 2 * broad * below) / width
+    return total, 2 * math.pi * by_own, 4 * math.pi * by_width
+
+
+def _omegas2(frequency_hz: Floats, period_s: float) -> list[Floats]:
+    return [(2 * math.pi * (frequency_hz + alias / period_s)) ** 2 for alias in _ALIASES]
 
 
 def white_px2_per_hz(noise_px: float, period_s: float) -> float:

@@ -24,12 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.learn.opened import Opened
-from fitctl.learn.spectrum import (
-    Air,
-    air_px2_per_hz,
-    framed_line_px2_per_hz,
-    white_px2_per_hz,
-)
+from fitctl.learn.spectrum import Air, air_slopes, framed_line_slopes, white_px2_per_hz
 
 Floats = NDArray[np.float64]
 BROADEST = 0.1
@@ -39,7 +34,6 @@ _FARTHEST = 25.0  # from where a line was first seen, in half widths of a pure s
 _MOST_LOG_GAIN, _MOST_OVERSHOOT = 1.0, 0.5
 _MOST_STEPS, _LONGEST_STEP, _MOST_DAMPING = 100, 2.0, 1e6
 _ENOUGH = 1e-3  # of the cost, which is a logarithm of a probability
-_STEP = 1e-4  # of a logarithm, for derivatives
 _PROBE = 1e-2  # of a parameter, for the likelihood's curvature
 # How far from where the search begins a logarithm is expected, one standard deviation: no more than a hint, so
 # that what the periodograms do not show stays finite.
@@ -193,28 +187,17 @@ class _Problem:
         """The spectrum, shape (rows, axes), and its derivatives by all parameters but the mirror's."""
         opened = self.opened
         hz, period_s = opened.frequency_hz, opened.period_s
-        logs = np.log(guess.air)
-
-        def air(values: Floats) -> Floats:
-            return air_px2_per_hz(Air(*np.exp(values).tolist()), hz, period_s)[:, None]
-
-        total, white = air(logs), white_px2_per_hz(guess.noise_px, period_s)
-        slopes = [2 * total, *(_slope(air, logs, index) for index in (1, 2))]
-        total = total + white
-        slopes.append(np.full((len(hz), 1), 2 * white))
+        air, *by_air = (each[:, None] for each in air_slopes(guess.air, hz, period_s))
+        white = white_px2_per_hz(guess.noise_px, period_s)
+        total = air + white
+        slopes = [2 * air, *by_air, np.full((len(hz), 1), 2 * white)]
         for line in guess.lines:
-
-            def shape(values: Floats) -> Floats:
-                width_hz = math.exp(values[1]) + opened.resolution_hz
-                return framed_line_px2_per_hz(float(values[0]), width_hz, hz, period_s)[:, None]
-
-            at = np.array([line.frequency_hz, math.log(line.half_width_hz)])
-            unit, power = shape(at), np.square(line.rms_px)
+            width_hz = line.half_width_hz + opened.resolution_hz
+            shapes = framed_line_slopes(line.frequency_hz, width_hz, hz, period_s)
+            unit, by_hz, by_width = (each[:, None] for each in shapes)
+            power = np.square(line.rms_px)
             total = total + unit * power
-            step_hz = 0.01 * self._resolution_hz
-            step = np.array([step_hz, 0.0])
-            by_hz = (shape(at + step) - shape(at - step)) / (2 * step_hz)
-            slopes += [by_hz * power * self._resolution_hz, _slope(shape, at, 1) * power]
+            slopes += [by_hz * power * self._resolution_hz, by_width * power * line.half_width_hz]
             slopes += [2 * unit * power * row for row in np.eye(self.axes)]
         return np.broadcast_to(total, opened.disturbance.shape), slopes
 
@@ -283,8 +266,3 @@ class _Problem:
         scale = np.ones(n)
         scale[_FIRST_LINE :: 2 + self.axes] = self._resolution_hz
         return np.asarray(covariance * np.outer(scale, scale))
-
-
-def _slope(function: Callable[[Floats], Floats], values: Floats, index: int) -> Floats:
-    step = _STEP * np.eye(len(values))[index]
-    return np.asarray((function(values + step) - function(values - step)) / (2 * _STEP))

@@ -171,6 +171,7 @@ class _Guards(NamedTuple):
     basis: Basis
     required: Required
     least_px: float
+    near: Floats | None
 
     def design(self, logs: Floats) -> Design:
         noise, guard_hz, damping, rms = np.exp(logs).tolist()
@@ -200,8 +201,10 @@ def _by_simplex(guards: _Guards, worst_hz: float) -> Floats:
         residual, ratios = guards.residual_and_ratios(logs)
         return float(residual + _PENALTY * max(0.0, ratios.max() - 1.0))
 
-    begin = np.log([_NOISE, worst_hz, _DAMPING, _GUARD])
-    corners = np.vstack([begin, begin + 0.4 * np.eye(len(begin))])
+    begin, size = np.log([_NOISE, worst_hz, _DAMPING, _GUARD]), 0.4
+    if guards.near is not None:
+        begin, size = guards.near, 0.1
+    corners = np.vstack([begin, begin + size * np.eye(len(begin))])
     options = {"maxfev": _TRIES, "initial_simplex": corners, "fatol": 1e-4, "xatol": 1e-2}
     return np.asarray(minimize(cost, begin, method="Nelder-Mead", options=options).x)
 
@@ -236,8 +239,32 @@ def _from_a_strong_guard(guards: _Guards, worst_hz: float) -> Floats:
     )
 
 
-def design_with_margins(basis: Basis, required: Required | None = None) -> Design:
+def _near(basis: Basis, design: Design | None) -> Floats | None:
+    """Where the search for a design like another begins; None if that has no guard, or is for other lines."""
+    made_from = {} if design is None else design.parameters
+    if "guard" not in made_from or len(made_from.get("lines", ())) != len(basis.lines):
+        return None
+    noise_px, guard = made_from["noise_px"], made_from["guard"]
+    found = (
+        max(1.0, noise_px / basis.noise_px),
+        guard["frequency_hz"],
+        guard["damping"],
+        guard["rms_px"] / basis.noise_px,
+    )
+    return np.log(found)
+
+
+def design_with_margins(
+    basis: Basis, required: Required | None = None, like: Design | None = None
+) -> Design:
     """The minimum-variance pair of a basis if it has the margins; otherwise the one nearest to it that has.
+
+    Parameters
+    ----------
+    basis : Basis
+    required : Required, optional
+    like : Design, optional
+        For nearly the same basis, and the best that was found there: the search begins at its guard.
 
     Raises
     ------
@@ -251,14 +278,14 @@ def design_with_margins(basis: Basis, required: Required | None = None) -> Desig
     frequency_hz = frequencies_hz(basis)
     response = sampled_response(design, basis)(2 * math.pi * frequency_hz)
     worst_hz = float(frequency_hz[np.argmin(np.abs(1 + response))])
-    guards = _Guards(basis, asked, linear_residual(design, basis))
+    guards = _Guards(basis, asked, linear_residual(design, basis), _near(basis, like))
     found: list[tuple[float, Design]] = []
     for search in (_by_simplex, _from_a_strong_guard):
         design = guards.design(search(guards, worst_hz))
         kept = margins(design, basis, asked)
         if kept.excess(asked) <= KEPT:
             found.append((linear_residual(design, basis), design))
-            if found[-1][0] <= _NEAR * guards.least_px:
+            if guards.near is not None or found[-1][0] <= _NEAR * guards.least_px:
                 break
     if found:
         return min(found, key=lambda each: each[0])[1]

@@ -13,10 +13,11 @@ from fitctl.controllers.design.basis import Line, basis, basis_of, design_parame
 from fitctl.controllers.design.choose import DESIGNS
 from fitctl.controllers.design.files import load_design, save_design
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
-from fitctl.controllers.design.linear_loop.disturbance import disturbance, line_px2_per_hz
+from fitctl.controllers.design.linear_loop.disturbance import disturbance
 from fitctl.controllers.design.linear_loop.loopshape import loop_shape, sampled_response
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
+from fitctl.learn.spectrum import framed_line_px2_per_hz
 
 SIX_HZ = Line(frequency_hz=6.0, damping=0.005, rms_px=0.05)
 
@@ -41,7 +42,9 @@ def test_a_line_has_its_rms_in_time_and_in_its_spectrum(fit, frequency_hz, dampi
     at_hz = frequency_hz + away_hz[away_hz > -frequency_hz]
 
     assert moving.covariance[2, 2] == pytest.approx(rms_px**2, rel=1e-6)
-    density = rms_px**2 * line_px2_per_hz(frequency_hz, damping * frequency_hz, at_hz)
+    width_hz = np.full(len(at_hz), damping * frequency_hz)
+    often_s = 1e-5  # frames so often that aliases are far away
+    density = rms_px**2 * framed_line_px2_per_hz(frequency_hz, width_hz, at_hz, often_s)
     assert np.trapezoid(density, at_hz) == pytest.approx(rms_px**2, rel=0.1)
 
 
@@ -108,6 +111,27 @@ def test_a_night_that_needs_a_strong_guard_has_its_design(fit):
 
     assert margins(design, shaky).excess(Required()) < 1.002
     assert linear_residual(design, shaky) < 1.06 * least_px
+
+
+def test_a_search_that_begins_at_a_design_for_nearly_the_same_night_finds_as_good_a_one(fit):
+    night = dataclasses.replace(fit, lines=(SIX_HZ,), noise_px=0.003)
+    later = dataclasses.replace(night, noise_px=0.0029)
+    like, anew = design_with_margins(night), design_with_margins(later)
+
+    design = design_with_margins(later, like=like)
+
+    assert margins(design, later).excess(Required()) < 1.002
+    assert linear_residual(design, later) < 1.002 * linear_residual(anew, later)
+
+
+def test_a_search_does_not_begin_at_a_design_for_other_lines(fit):
+    quiet = design_with_margins(dataclasses.replace(fit, noise_px=0.002))
+    shaken = dataclasses.replace(fit, lines=(SIX_HZ,), noise_px=0.002)
+
+    like, anew = design_with_margins(shaken, like=quiet), design_with_margins(shaken)
+
+    assert "guard" in quiet.parameters
+    assert np.array_equal(like.a, anew.a)
 
 
 def test_where_the_margins_cost_much_the_better_of_two_searches_counts(fit, monkeypatch):

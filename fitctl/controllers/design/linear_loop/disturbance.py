@@ -129,22 +129,6 @@ def _line(line: Line) -> tuple[Floats, Floats, Floats]:
     return a, np.diag([0.0, intensity]), np.array([1.0, 0.0])
 
 
-def line_px2_per_hz(own_hz: float, half_width_hz: float | Floats, frequency_hz: Floats) -> Floats:
-    """One-sided power spectral density of a line of 1 px RMS, in continuous time.
-
-    Parameters
-    ----------
-    own_hz : float
-        Of the oscillator.
-    half_width_hz : float or array
-        At half power: ``damping * own_hz``; an array has the shape of `frequency_hz`.
-    frequency_hz : array
-    """
-    own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
-    omega2 = (2 * math.pi * frequency_hz) ** 2
-    return np.asarray(4 * width * own**2 / ((own**2 - omega2) ** 2 + width**2 * omega2))
-
-
 class Hold(NamedTuple):
     """The time for which a command acts, as nodes of a quadrature.
 
