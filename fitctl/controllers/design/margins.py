@@ -166,7 +166,10 @@ def _stable(design: Design, basis: Basis, required: Required) -> bool:
 
 
 class _Guards(NamedTuple):
-    """Designs with a guard, by the logarithms of noise, and of the guard's frequency, damping and RMS."""
+    """Designs with a guard, by the logarithms of noise, and of the guard's frequency, damping and RMS.
+
+    Their residuals count in the least one; a search may begin near those of another design.
+    """
 
     basis: Basis
     required: Required
@@ -214,12 +217,11 @@ def _from_a_strong_guard(guards: _Guards, worst_hz: float) -> Floats:
     low, high = np.log(_BOUNDS).T
     high[1] = math.log(0.5 / guards.basis.period_s)
     begin = np.clip(np.log([_STRONG_NOISE, worst_hz, _DAMPING, _STRONG_GUARD]), low, high)
+    # The search asks for residual and margins of each place, and for some places again.
     known: dict[bytes, tuple[float, Floats]] = {}
 
     def tried(logs: Floats) -> tuple[float, Floats]:
-        place = (
-            logs.tobytes()
-        )  # the search asks for residual and margins, and for some places again
+        place = logs.tobytes()
         if place not in known:
             known[place] = guards.residual_and_ratios(logs)
         return known[place]
