@@ -58,7 +58,9 @@ def discretize(a: Floats, noise_intensity: Floats, step_s: float) -> tuple[Float
     block[n:, n:] = a.T
     exponential = expm(block * step_s)
     transition = exponential[n:, n:].T
-    return transition, transition @ exponential[:n, n:]
+    covariance = transition @ exponential[:n, n:]
+    # Rounding leaves it so little symmetric that scipy may refuse it.
+    return transition, (covariance + covariance.T) / 2
 
 
 def step_matrices(air: AirPathModel, step_s: float) -> tuple[Floats, Floats]:

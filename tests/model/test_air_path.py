@@ -65,6 +65,8 @@ def test_van_loan_agrees_with_fine_integration(dynamics):
     assert transition == pytest.approx(np.linalg.matrix_power(fine, nodes), rel=1e-9)
     integral = np.trapezoid(np.array(integrand), dx=step_s / nodes, axis=0)
     assert covariance == pytest.approx(integral, rel=1e-5)
+    # scipy refuses what is not symmetric.
+    assert np.array_equal(covariance, covariance.T)
 
 
 @given(step_s=steps_s)
