@@ -58,9 +58,10 @@ class Job:
 
     def text(self) -> str:
         """What it has printed so far; of very much, the end."""
-        size = self._output.seek(0, 2)
-        self._output.seek(max(0, size - MOST_BYTES))
-        return self._output.read().decode(errors="replace")
+        # Both have one place in the file: a read that moved it would have the child write over what it wrote.
+        size = os.fstat(self._output.fileno()).st_size
+        read = os.pread(self._output.fileno(), MOST_BYTES, max(0, size - MOST_BYTES))
+        return read.decode(errors="replace")
 
     def question(self) -> str:
         """What it has asked and waits for: a line that it has not ended. Empty without one."""

@@ -286,6 +286,23 @@ def until(condition):
         time.sleep(0.02)
 
 
+def test_reading_what_a_process_prints_does_not_make_it_write_over_it(tmp_path, monkeypatch):
+    program = tmp_path / "printing.py"
+    program.write_text("for number in range(20000): print(number, flush=True)")
+    popen = jobs.subprocess.Popen
+    monkeypatch.setattr(
+        jobs.subprocess,
+        "Popen",
+        lambda _arguments, **options: popen([sys.executable, str(program)], **options),
+    )
+    job = Job(["commission"], asks=True)
+    while job.status is None:
+        job.text()
+
+    assert job.text() == "".join(f"{number}\n" for number in range(20000))[-jobs.MOST_BYTES :]
+    job.end()
+
+
 def test_a_question_is_an_unfinished_line_and_stop_ends_what_moves(asking):
     until(asking.question)
     assert asking.question() == "Go? [no]: "
