@@ -22,6 +22,9 @@ Floats = NDArray[np.float64]
 HAND_OVER_S = 10.0
 """Time constant with which the siderostat takes over what a design found the mirror holding (choice)."""
 
+LEAST_EXCESS_PX = 1e-9
+"""A wanted mirror angle that passes the diamond by less has only been rounded."""
+
 LEARNT: Final = "learnt"
 """The controller that stands for the design that was learnt last."""
 _NO_EXCESS = np.zeros(2)
@@ -210,7 +213,7 @@ class Pair:
     def saturated(self) -> bool:
         """The last wanted mirror angle was outside the diamond."""
         az_px, el_px = self.excess_px.tolist()
-        return abs(az_px) > 1e-9 or abs(el_px) > 1e-9
+        return max(abs(az_px), abs(el_px)) > LEAST_EXCESS_PX
 
     def step(self, measured: Measurement) -> PairCommand:
         """One period."""

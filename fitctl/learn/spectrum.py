@@ -72,15 +72,7 @@ def framed_line_px2_per_hz(
 
 def air_slopes(air: Air, frequency_hz: Floats, period_s: float) -> tuple[Floats, Floats, Floats]:
     """As :func:`air_px2_per_hz`, and its derivatives by the logarithms of damping and stiffness."""
-    total = by_damping = by_stiffness = np.zeros_like(frequency_hz)
-    for omega2 in _omegas2(frequency_hz, period_s):
-        away, broad = air.stiffness - omega2, air.damping**2 * omega2
-        below = 1 / (away**2 + broad)
-        density = 2 * air.strength**2 * below
-        total = total + density
-        by_damping = by_damping - 2 * broad * below * density
-        by_stiffness = by_stiffness - 2 * air.stiffness * away * below * density
-    return total, by_damping, by_stiffness
+    return _oscillator(2 * air.strength**2, air.damping, air.stiffness, frequency_hz, period_s)
 
 
 def framed_line_slopes(
@@ -88,19 +80,31 @@ def framed_line_slopes(
 ) -> tuple[Floats, Floats, Floats]:
     """As :func:`framed_line_px2_per_hz`, and its derivatives by its frequency and its half width, 1/Hz each."""
     own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
-    total = by_own = by_width = np.zeros_like(frequency_hz)
-    for omega2 in _omegas2(frequency_hz, period_s):
-        away, broad = own**2 - omega2, width**2 * omega2
+    total, by_damping, by_stiffness = _oscillator(
+        4 * width * own**2, width, own**2, frequency_hz, period_s
+    )
+    # The power of a line of 1 px grows with its width and with the square of its frequency.
+    return total, 2 * (total + by_stiffness) / own_hz, (total + by_damping) / half_width_hz
+
+
+def _oscillator(
+    power: float | Floats,
+    damping: float | Floats,
+    stiffness: float,
+    frequency_hz: Floats,
+    period_s: float,
+) -> tuple[Floats, Floats, Floats]:
+    """``power / |s² + damping s + stiffness|²`` on frames; derivatives by logarithms of the last two."""
+    total = by_damping = by_stiffness = np.zeros_like(frequency_hz)
+    for alias in _ALIASES:
+        omega2 = (2 * math.pi * (frequency_hz + alias / period_s)) ** 2
+        away, broad = stiffness - omega2, damping**2 * omega2
         below = 1 / (away**2 + broad)
-        density = 4 * width * own**2 * below
+        density = power * below
         total = total + density
-        by_own = by_own + density * (2 / own - 4 * own * away * below)
-        by_width = by_width + density * (1 - 2 * broad * below) / width
-    return total, 2 * math.pi * by_own, 4 * math.pi * by_width
-
-
-def _omegas2(frequency_hz: Floats, period_s: float) -> list[Floats]:
-    return [(2 * math.pi * (frequency_hz + alias / period_s)) ** 2 for alias in _ALIASES]
+        by_damping = by_damping - 2 * broad * below * density
+        by_stiffness = by_stiffness - 2 * stiffness * away * below * density
+    return total, by_damping, by_stiffness
 
 
 def white_px2_per_hz(noise_px: float, period_s: float) -> float:

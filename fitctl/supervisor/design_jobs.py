@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from functools import partial
+from typing import Any
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT, Designer
 from fitctl.loop.stellar import StellarLoop
-from fitctl.messages.commands import LearnerReport, SetController
+from fitctl.messages.commands import LearnerReport, Reply, SetController
 from fitctl.stages.journal import Journal, error_text
 from fitctl.supervisor.device_jobs import Ended, Job
 from fitctl.supervisor.outcomes import Outcomes
@@ -56,45 +57,45 @@ class DesignJobs:
         self._starlight = [Starlight(rig, loop, journal) for loop in loops.values()]
 
     def finish(self) -> None:
-        """Use what has been made, in the order in which it was asked for."""
+        """Have the loops use the designs that are ready, in the order of the requests."""
         while self._jobs and self._jobs[0].future.done():
             job = self._jobs.popleft()
             job.done(job.future)
 
     # ------------------------------------------------------------ by command
 
-    def begin(self, command: SetController, names: Iterable[str]) -> int | str:
-        """Make the design that a command asks for, in each of these loops.
-
-        Returns
-        -------
-        int or str
-            The command's number, or why it is refused.
-        """
+    def begin(self, command: SetController, names: Iterable[str]) -> Reply:
+        """Make the design that a command asks for, in each of these loops."""
         names = [name for name in names if name in self._loops]
         if not names:
-            return f"loop {command.loop} holds a metrology beam and has no design"
+            why_not = f"loop {command.loop} holds a metrology beam and has no design"
+            return Reply(accepted=False, text=why_not)
         learnt: dict[str, LearnerReport] = {}
         if command.name == LEARNT:
             for name in names:
                 report = self._loops[name].learning.report
                 if report is None or not report.design_json:
-                    return _nothing_learnt(name, report)
+                    return Reply(accepted=False, text=_nothing_learnt(name, report))
                 learnt[name] = report
         number = self._outcomes.begin(command, names)
         for name in names:
             asked_for = learnt.get(name)
             chosen = command.name if asked_for is None else asked_for.design_json
             if name in self._wanted:
-                # Designs that nobody waits for hold up those that follow.
+                # A design that nobody waits for any more would delay those after it.
                 self._wanted[name].cancel()
-            future = self._executor.submit(self._design, self._rig, name, chosen)
-            self._wanted[name] = future
             ended = partial(self._outcomes.end, number, [name])
             done = partial(self._designed, name, command.name, asked_for, ended)
-            self._jobs.append(Job(future, done))
+            self._wanted[name] = self._make(done, name, chosen)
         self.finish()
-        return number
+        text = "designing; fitctl status shows the controller in force"
+        return Reply(accepted=True, number=number, text=text)
+
+    def _make(self, done: Callable[[Future], None], *wanted: Any) -> Future:
+        """Have a design made: of a loop, by its name or parameters, perhaps for a noise of the sensor."""
+        future = self._executor.submit(self._design, self._rig, *wanted)
+        self._jobs.append(Job(future, done))
+        return future
 
     def _designed(
         self,
@@ -123,8 +124,7 @@ class DesignJobs:
         if news:
             self._journal.event("info", loop.name, news)
         if loop.learning.wants_change(self._clock.now_s()):
-            future = self._executor.submit(self._design, self._rig, loop.name, report.design_json)
-            self._jobs.append(Job(future, partial(self._learnt, loop, report)))
+            self._make(partial(self._learnt, loop, report), loop.name, report.design_json)
             self.finish()
 
     def _learnt(self, loop: StellarLoop, report: LearnerReport, future: Future) -> None:
@@ -142,8 +142,7 @@ class DesignJobs:
             noise_px = light.observe()
             if noise_px is not None:
                 name, controller = light.loop.name, light.loop.pointing.design.name
-                future = self._executor.submit(self._design, self._rig, name, controller, noise_px)
-                self._jobs.append(Job(future, partial(light.designed, noise_px)))
+                self._make(partial(light.designed, noise_px), name, controller, noise_px)
 
 
 def _nothing_learnt(name: str, report: LearnerReport | None) -> str:

@@ -406,7 +406,7 @@ class Supervisor:
     def _obey_for(self, command: AnyCommand, names: list[str]) -> Reply:
         match command:
             case SetController():
-                return self._set_controller(command, names)
+                return self._design_jobs.begin(command, names)
             case SequenceReport():
                 return self.sequences.report(command.status)
             case SequenceControl():
@@ -473,13 +473,6 @@ class Supervisor:
             return f"{trigger.name.lower()} is not available while devices are opened; wait for STANDBY"
         mode, can = loop.mode, ", ".join(t.name.lower() for t in loop.usable_commands)
         return f"{trigger.name.lower()} is not available in {mode.name}. Available: {can}"
-
-    def _set_controller(self, command: SetController, names: list[str]) -> Reply:
-        number = self._design_jobs.begin(command, names)
-        if isinstance(number, str):
-            return _refusal(number)
-        text = "designing; fitctl status shows the controller in force"
-        return Reply(accepted=True, number=number, text=text)
 
     def _learn(self, report: LearnerReport, names: list[str]) -> Reply:
         loop = self.stellar_loops.get(report.loop)

@@ -36,9 +36,9 @@ def rig_with(*overrides):
     return load_rig(default_rig_path(), overrides)
 
 
-def both(rig, seed, duration_s):
+def both(rig, seed, duration_s, record=None):
     """One run of the simulation, tick by tick, and of the batch."""
-    simulation = Simulation(rig, seed, history_s=duration_s + 1.0)
+    simulation = Simulation(rig, seed, history_s=duration_s + 1.0, record=record)
     simulation.acquire()
     while simulation.clock.now_s() < duration_s:
         simulation.run(rig.camera.period_s)
@@ -493,17 +493,17 @@ SIX_HZ = (
 @pytest.mark.parametrize(
     "overrides",
     [
-        pytest.param(["loops.right.vernier.controller=minimum-variance"], id="knows recent frames"),
-        pytest.param(["loops.right.vernier.controller=eq20"], id="the one before begins from rest"),
+        pytest.param([CONTROLLER.format("minimum-variance")], id="knows recent frames"),
+        pytest.param([CONTROLLER.format("eq20")], id="the one before begins from rest"),
         pytest.param(
             [
-                "loops.right.vernier.controller=minimum-variance",
+                CONTROLLER.format("minimum-variance"),
                 "loops.right.fsm.dac.writes_per_frame=5",
             ],
             id="five writes of the D/A a frame",
         ),
         pytest.param(
-            ["loops.right.vernier.controller=minimum-variance", PLANT_RATE, LOOP_RATE],
+            [CONTROLLER.format("minimum-variance"), PLANT_RATE, LOOP_RATE],
             id="a star that moves",
         ),
     ],
@@ -513,17 +513,12 @@ def test_a_loop_that_learns_changes_its_design_and_goes_back_at_the_same_ticks(
 ):
     rig = rig_with("loops.right.learn=on", SIX_HZ, *overrides)
     changes = []
-    simulation = Simulation(
+    simulation, run = both(
         rig,
         3,
-        history_s=61.0,
-        record=lambda made: changes.append(made) if isinstance(made, ControllerChange) else None,
+        60.0,
+        lambda made: changes.append(made) if isinstance(made, ControllerChange) else None,
     )
-    simulation.acquire()
-    while simulation.clock.now_s() < 60.0:
-        simulation.run(rig.camera.period_s)
-
-    run = Batch(rig).run(3, 60.0, keep=True)
 
     assert [change.target for change in changes] == ["learnt", changes[0].source]
     assert [change.design.title for change in run.changes] == [one.target for one in changes]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design.choose import design_for
-from fitctl.controllers.pair import Design, Measurement
+from fitctl.controllers.pair import LEAST_EXCESS_PX, Design, Measurement
 from fitctl.learn.learner import Learner, Shown
 from fitctl.loop.learning import Learning
 from fitctl.loop.pointing import Pointing
@@ -23,7 +23,6 @@ from fitctl.messages.modes import Mode
 from fitctl.simulation.batch.settings import design_settings
 
 Records = NDArray[np.void]
-_LEAST_EXCESS_PX = 1e-9  # as in fitctl.controllers.pair
 _NAMES = {int(mode): mode.name for mode in Mode}
 # Of mirror, fsm, siderostat and link, in the order of Shown.
 _FIELDS = ("exposed_mirror_rad", "mirror_command_rad", "motor_rad", "link_motor_rad")
@@ -104,7 +103,7 @@ class _Loop:
         self._first = 0
 
     def decide(self, ticks: Records, number: int) -> list[Change]:
-        """What the loop changes on a frame before it acts on it: as it is told, or back to what was before."""
+        """Change the design before the loop acts on a frame: to a learnt one, or back to the one before."""
         frame, learning = self._frame(ticks, number), self._learning
         shown, made = frame.shown, []
         report, self._report = self._report, None
@@ -181,7 +180,7 @@ class _Loop:
 
 def _frames(ticks: Records, *, linked: bool) -> list[_Frame]:
     """The ticks of one loop, as its records have them."""
-    saturated = np.abs(ticks["excess_px"]).max(axis=1, initial=0.0) > _LEAST_EXCESS_PX
+    saturated = np.abs(ticks["excess_px"]).max(axis=1, initial=0.0) > LEAST_EXCESS_PX
     holds = ticks["mode"] == Mode.VERNIER
     stages = np.hstack([ticks[name] for name in _FIELDS])
     if not linked:

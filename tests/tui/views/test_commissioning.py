@@ -263,17 +263,26 @@ main()
 
 
 @pytest.fixture
-def asking(tmp_path, monkeypatch):
-    """A process that asks, in place of fitctl."""
-    program = tmp_path / "asking.py"
-    program.write_text(ASKING)
-    popen = jobs.subprocess.Popen
+def started(tmp_path, monkeypatch):
+    """Starts a process that runs the given text in place of fitctl."""
+    program, popen = tmp_path / "program.py", jobs.subprocess.Popen
 
-    def start(arguments, **options):
-        return popen([sys.executable, str(program)], **options)
+    def start(text):
+        program.write_text(text)
+        monkeypatch.setattr(
+            jobs.subprocess,
+            "Popen",
+            lambda _arguments, **options: popen([sys.executable, str(program)], **options),
+        )
+        return Job(["commission"], asks=True)
 
-    monkeypatch.setattr(jobs.subprocess, "Popen", start)
-    job = Job(["commission"], asks=True)
+    return start
+
+
+@pytest.fixture
+def asking(started):
+    """A process that asks."""
+    job = started(ASKING)
     yield job
     job._process.kill()
     job._process.wait()
@@ -286,16 +295,8 @@ def until(condition):
         time.sleep(0.02)
 
 
-def test_reading_what_a_process_prints_does_not_make_it_write_over_it(tmp_path, monkeypatch):
-    program = tmp_path / "printing.py"
-    program.write_text("for number in range(20000): print(number, flush=True)")
-    popen = jobs.subprocess.Popen
-    monkeypatch.setattr(
-        jobs.subprocess,
-        "Popen",
-        lambda _arguments, **options: popen([sys.executable, str(program)], **options),
-    )
-    job = Job(["commission"], asks=True)
+def test_reading_what_a_process_prints_does_not_make_it_write_over_it(started):
+    job = started("for number in range(20000): print(number, flush=True)")
     while job.status is None:
         job.text()
 
