@@ -23,10 +23,10 @@ from fitctl.controllers.design.margins import (
 )
 from fitctl.controllers.pair import Design
 from fitctl.learn.aliases import (
-    MOST_IF_ALIAS,
+    IfAliases,
+    both_if_aliases,
     can_be_alias,
     expecting,
-    if_aliases,
     safe_parts,
 )
 from fitctl.learn.intervals import Interval
@@ -60,15 +60,14 @@ class LineAdvice(NamedTuple):
         Of the line's RMS that the learnt design expects: 1 counteracts the line in full, 0 leaves it alone.
     can_be_alias : bool
         The rig may have vibrations as fast as its aliases.
-    present_px, learnt_px : float
+    if_alias : IfAliases
         Residual of both designs if the line is one of its aliases.
     """
 
     found: LearntLine
     part: float
     can_be_alias: bool
-    present_px: float
-    learnt_px: float
+    if_alias: IfAliases
 
     @property
     def counteracted(self) -> bool:
@@ -115,8 +114,8 @@ class Advice(NamedTuple):
         The learnt one.
     lately_px : tuple of float
         RMS on frames that present and learnt design would leave of the last minute as it was, worst axis.
-    if_aliases_px : tuple of float
-        Residual of both if all lines that can be aliases are.
+    if_aliases : IfAliases
+        All lines that can be aliases.
     """
 
     night: Night
@@ -127,7 +126,7 @@ class Advice(NamedTuple):
     lines: tuple[LineAdvice, ...]
     design: Design
     lately_px: tuple[float, float]
-    if_aliases_px: tuple[float, float]
+    if_aliases: IfAliases
 
     @property
     def worth_it(self) -> bool:
@@ -136,18 +135,13 @@ class Advice(NamedTuple):
             self.night.test.fits
             and self.learnt.residual_px <= WORTH_IT * self.present.residual_px
             and self._better_lately
-            and self._safe_if_aliases
+            and self.if_aliases.harmless
         )
 
     @property
     def _better_lately(self) -> bool:
         present_px, learnt_px = self.lately_px
         return learnt_px <= BETTER_LATELY * present_px
-
-    @property
-    def _safe_if_aliases(self) -> bool:
-        present_px, learnt_px = self.if_aliases_px
-        return learnt_px <= MOST_IF_ALIAS * present_px
 
     def lines_of_text(self) -> list[str]:
         """For an operator."""
@@ -182,12 +176,11 @@ class Advice(NamedTuple):
             )
         elif not self._better_lately:
             text.append("Keep the present design: in the last minute it would have left as little.")
-        elif not self._safe_if_aliases:
+        elif not self.if_aliases.harmless:
             text.append(
                 "Keep the present design: if the lines are faster than they look, the learnt one would leave "
-                "{1:.4f} px instead of {0:.4f}. If you know that they are not, set fastest_line_hz.".format(
-                    *self.if_aliases_px
-                )
+                f"{self.if_aliases.learnt_px:.4f} px instead of {self.if_aliases.present_px:.4f}. If you know "
+                "that they are not, set fastest_line_hz."
             )
         elif not self.worth_it:
             text.append("Keep the present design: the learnt one would leave hardly less.")
@@ -256,10 +249,13 @@ def advise(
     """
     night, truth = estimated(series, rig_basis)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
-    parts = safe_parts(truth, present)
-    design = design_with_margins(expecting(parts, truth), required, like)
-    both = present, design
-    present_px, learnt_px = (if_aliases(one, truth, suspects) for one in both)
+    worth_px = WORTH_IT * linear_residual(present, truth)
+    gain = _shown_gain(night)
+    for parts in safe_parts(truth, present, gain):
+        design = design_with_margins(expecting(parts, truth), required, like)
+        if_aliases = both_if_aliases(present, design, truth, suspects, gain)
+        if if_aliases.harmless or linear_residual(design, truth) > worth_px:
+            break
     return Advice(
         night=night,
         measured_px=measured_px,
@@ -271,13 +267,13 @@ def advise(
                 found,
                 part,
                 line in suspects,
-                *(if_aliases(one, truth, (line,)) for one in both),
+                both_if_aliases(present, design, truth, (line,), gain),
             )
             for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
         ),
         design=design,
         lately_px=_lately_px(series, truth, present, design),
-        if_aliases_px=(present_px, learnt_px),
+        if_aliases=if_aliases,
     )
 
 
@@ -352,6 +348,12 @@ def _gain_for_design(night: Night) -> float:
     return found.value
 
 
+def _shown_gain(night: Night) -> float:
+    """Of the mirror, for a comparison that less motion decides: the estimate, where it is known to be below 1."""
+    found = night.mirror_gain
+    return found.value if found.high < 1 else 1.0
+
+
 def _overshoot_for_design(night: Night) -> float:
     """Of the mirror, where it is known to differ from 0; a large one means that the delay is wrong."""
     found = night.overshoot
@@ -392,8 +394,8 @@ def _line_text(line: LineAdvice) -> str:
     if 0 < line.part < 1:
         done += f", as {line.part:.0%} of its RMS"
     if_alias = (
-        f"\n             if it is at {fast} Hz instead: present {line.present_px:.4f}, "
-        f"learnt {line.learnt_px:.4f} px"
+        f"\n             if it is at {fast} Hz instead: present {line.if_alias.present_px:.4f}, "
+        f"learnt {line.if_alias.learnt_px:.4f} px"
     )
     return (
         f"line         {found.frequency_hz} Hz, half width {found.half_width_hz} Hz{done}\n"
@@ -425,5 +427,8 @@ def _line_numbers(line: LineAdvice) -> dict[str, Any]:
         "counteracted": line.counteracted,
         "part": line.part,
         "can_be_alias": line.can_be_alias,
-        "residual_if_alias_px": {"present": line.present_px, "learnt": line.learnt_px},
+        "residual_if_alias_px": {
+            "present": line.if_alias.present_px,
+            "learnt": line.if_alias.learnt_px,
+        },
     }
