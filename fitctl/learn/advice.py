@@ -349,7 +349,7 @@ def _gain_for_design(night: Night) -> float:
 
 
 def _shown_gain(night: Night) -> float:
-    """Of the mirror, for a comparison that less motion decides: the estimate, where it is known to be below 1."""
+    """Of the mirror, where less motion speaks against a design: the estimate, if it is known to be below 1."""
     found = night.mirror_gain
     return found.value if found.high < 1 else 1.0
 
