@@ -145,6 +145,20 @@ NIGHTS = [
         (lines(48.9, rms_px=0.05, damping=0.0005),),
         shaken(48.9, rms_px=0.05, damping=0.0005),
     ),
+    *(
+        Night(
+            f"{hz:g} Hz, {rms_px} px, {100 * width:.0f} % hysteresis",
+            "5 % above fixed",
+            (),
+            (
+                lines(hz, rms_px=rms_px, damping=0.0007),
+                f"plant.loops.{LOOP}.hysteresis.loop_width_fraction={width}",
+            ),
+            shaken(hz, rms_px=rms_px, damping=0.0007),
+        )
+        for hz, rms_px in ((40.0, 0.02), (44.0, 0.05), (60.0, 0.02))
+        for width in (0.19, 0.25)
+    ),
     Night(
         "6 Hz, 0.05 px, drifts 0.05 Hz a minute",
         "2 % above fixed",
