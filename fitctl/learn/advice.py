@@ -116,6 +116,9 @@ class Advice(NamedTuple):
         RMS on frames that present and learnt design would leave of the last minute as it was, worst axis.
     if_aliases : IfAliases
         All lines that can be aliases.
+    shown_px : tuple of float
+        Residual of present and learnt design with the mirror's gain that the night shows, where it is known to
+        be below the rig file's.
     """
 
     night: Night
@@ -127,6 +130,7 @@ class Advice(NamedTuple):
     design: Design
     lately_px: tuple[float, float]
     if_aliases: IfAliases
+    shown_px: tuple[float, float]
 
     @property
     def worth_it(self) -> bool:
@@ -134,9 +138,15 @@ class Advice(NamedTuple):
         return (
             self.night.test.fits
             and self.learnt.residual_px <= WORTH_IT * self.present.residual_px
+            and self._better_as_shown
             and self._better_lately
             and self.if_aliases.harmless
         )
+
+    @property
+    def _better_as_shown(self) -> bool:
+        present_px, learnt_px = self.shown_px
+        return learnt_px <= WORTH_IT * present_px
 
     @property
     def _better_lately(self) -> bool:
@@ -173,6 +183,11 @@ class Advice(NamedTuple):
             text.append(
                 f"The present design leaves less, with a peak sensitivity of {peak:.2f}; the learnt one keeps "
                 "its margins."
+            )
+        elif not self._better_as_shown:
+            text.append(
+                "Keep the present design: the mirror moves less than the rig file has it, and so the present "
+                "design leaves {:.4f} px, the learnt one {:.4f}.".format(*self.shown_px)
             )
         elif not self._better_lately:
             text.append("Keep the present design: in the last minute it would have left as little.")
@@ -251,6 +266,7 @@ def advise(
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     worth_px = WORTH_IT * linear_residual(present, truth)
     gain = _shown_gain(night)
+    shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, gain))
     for parts in safe_parts(truth, present, gain):
         design = design_with_margins(expecting(parts, truth), required, like)
         if_aliases = both_if_aliases(present, design, truth, suspects, gain)
@@ -274,6 +290,7 @@ def advise(
         design=design,
         lately_px=_lately_px(series, truth, present, design),
         if_aliases=if_aliases,
+        shown_px=(linear_residual(present, shown), linear_residual(design, shown)),
     )
 
 

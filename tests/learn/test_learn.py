@@ -250,6 +250,31 @@ def test_a_design_that_would_do_harm_if_lines_are_aliases_is_not_worth_it(six_hz
     assert "set fastest_line_hz" in harmful.lines_of_text()[-1]
 
 
+def test_a_design_that_is_no_better_with_the_gain_that_the_night_shows_is_not_worth_it(six_hz):
+    _, advice = six_hz
+    present_px, learnt_px = advice.shown_px
+    no_better = advice._replace(shown_px=(present_px, 0.99 * present_px))
+
+    assert learnt_px < 0.5 * present_px
+    assert not no_better.worth_it
+    assert "the mirror moves less" in no_better.lines_of_text()[-1]
+
+
+def test_a_mirror_that_moves_a_little_less_is_designed_for_as_known_and_judged_as_shown(
+    paper, fixed
+):
+    _, series = held(paper, fixed, TWO_MINUTES_S, 5, mirror_gain=0.9)
+    advice = advise([series], (0.0, 0.0), paper, fixed)
+    shown = dataclasses.replace(paper, mirror_gain=advice.night.mirror_gain.value)
+    shown = dataclasses.replace(
+        shown, air_path=advice.night.air_path, noise_px=advice.night.noise_px.value
+    )
+
+    assert advice.night.mirror_gain.high < 1
+    assert advice.shown_px[0] == pytest.approx(linear_residual(fixed, shown), rel=0.02)
+    assert advice.shown_px[0] != pytest.approx(advice.present.residual_px, rel=0.001)
+
+
 def test_a_design_that_would_not_have_been_better_lately_is_not_worth_it(six_hz):
     _, advice = six_hz
     present_px, learnt_px = advice.lately_px
