@@ -264,19 +264,20 @@ def advise(
     """
     night, truth = estimated(series, rig_basis)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
-    worth_px = WORTH_IT * linear_residual(present, truth)
+    present_stands = standing(present, truth)
     gain = _shown_gain(night)
     shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, gain))
     for parts in safe_parts(truth, present, gain):
         design = design_with_margins(expecting(parts, truth), required, like)
+        learnt_stands = standing(design, truth)
         if_aliases = both_if_aliases(present, design, truth, suspects, gain)
-        if if_aliases.harmless or linear_residual(design, truth) > worth_px:
+        if if_aliases.harmless or learnt_stands.residual_px > WORTH_IT * present_stands.residual_px:
             break
     return Advice(
         night=night,
         measured_px=measured_px,
-        present=standing(present, truth),
-        learnt=standing(design, truth),
+        present=present_stands,
+        learnt=learnt_stands,
         bound_px=bound(truth).residual_px,
         lines=tuple(
             LineAdvice(

@@ -61,11 +61,11 @@ def if_aliases(design: Design, truth: Basis, lines: tuple[Line, ...], mirror_gai
     The mirror's response is added to such a line. Its steps between frames also have a part at the line's own
     frequency, which makes the line larger or smaller, and differently on both sides.
     """
-    kept = tuple(line for line in truth.lines if line not in lines)
+    kept = _without(lines, truth)
     nights = [
         dataclasses.replace(
-            truth,
-            lines=kept + tuple(_alias(line, truth, side) for line in lines),
+            kept,
+            lines=kept.lines + tuple(_alias(line, truth, side) for line in lines),
             mirror_gain=mirror_gain,
         )
         for side in (-1, 1)
@@ -93,18 +93,17 @@ def both_if_aliases(
     slow_present_px, slow_learnt_px = (linear_residual(one, truth) for one in (present, learnt))
     if not lines:
         return IfAliases(slow_present_px, slow_learnt_px, math.inf)
-    gains_little = slow_learnt_px > LITTLE * slow_present_px
-    motions = [(LESS_MOTION, MOST_IF_ALIAS), *([(LEAST_MOTION, 1.0)] if gains_little else [])]
-    cases = [
-        IfAliases(present_px, learnt_px, most)
-        for motion, most in motions
-        for gain in [min(motion * truth.mirror_gain, shown_gain)]
-        for present_px, learnt_px in zip(
-            if_aliases(present, truth, lines, gain).tolist(),
-            if_aliases(learnt, truth, lines, gain).tolist(),
-            strict=True,
-        )
-    ]
+    motions = {LESS_MOTION: MOST_IF_ALIAS}
+    if slow_learnt_px > LITTLE * slow_present_px:
+        motions[LEAST_MOTION] = 1.0
+    cases = []
+    for motion, most in motions.items():
+        gain = min(motion * truth.mirror_gain, shown_gain)
+        present_px, learnt_px = (if_aliases(one, truth, lines, gain) for one in (present, learnt))
+        cases += [
+            IfAliases(float(one_px), float(other_px), most)
+            for one_px, other_px in zip(present_px, learnt_px, strict=True)
+        ]
     return max(cases, key=lambda case: case.learnt_px / (case.most * case.present_px))
 
 

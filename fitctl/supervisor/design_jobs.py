@@ -82,7 +82,7 @@ class DesignJobs:
             asked_for = learnt.get(name)
             chosen = command.name if asked_for is None else asked_for.design_json
             if name in self._wanted:
-                # A design that nobody waits for any more would delay those after it.
+                # The command before asked for another design, which would delay this one.
                 self._wanted[name].cancel()
             ended = partial(self._outcomes.end, number, [name])
             done = partial(self._designed, name, command.name, asked_for, ended)

@@ -265,12 +265,15 @@ def test_a_mirror_that_moves_a_little_less_is_designed_for_as_known_and_judged_a
 ):
     _, series = held(paper, fixed, TWO_MINUTES_S, 5, mirror_gain=0.9)
     advice = advise([series], (0.0, 0.0), paper, fixed)
-    shown = dataclasses.replace(paper, mirror_gain=advice.night.mirror_gain.value)
+    night = advice.night
     shown = dataclasses.replace(
-        shown, air_path=advice.night.air_path, noise_px=advice.night.noise_px.value
+        paper,
+        air_path=night.air_path,
+        noise_px=night.noise_px.value,
+        mirror_gain=night.mirror_gain.value,
     )
 
-    assert advice.night.mirror_gain.high < 1
+    assert night.mirror_gain.high < 1
     assert advice.shown_px[0] == pytest.approx(linear_residual(fixed, shown), rel=0.02)
     assert advice.shown_px[0] != pytest.approx(advice.present.residual_px, rel=0.001)
 
