@@ -67,3 +67,41 @@ class VirtualClock:
         """Move the time on, at once."""
         if deadline_s > self._now_s:  # noqa: PLR1730 - max takes thrice as long, 700 times a second
             self._now_s = deadline_s
+
+
+class Watchdog:
+    """Expires when nothing has come for too long, although it was looked for until the end.
+
+    While this computer stands still, nothing is looked for, and what was sent meanwhile is there at the next
+    look. So after a pause the sender still has `again_s`.
+
+    Parameters
+    ----------
+    limit_s : float
+    again_s : float
+        How long it must have been looked for in vain before the watchdog expires; at most `limit_s`.
+    now_s : float
+    """
+
+    def __init__(self, limit_s: float, again_s: float, now_s: float) -> None:
+        self.limit_s = limit_s
+        self._again_s = again_s
+        self.feed(now_s)
+
+    def feed(self, now_s: float) -> None:
+        """It has come."""
+        self._fed_s = now_s
+        self._in_vain_s: float | None = None
+
+    def silent_s(self, now_s: float) -> float:
+        """How long nothing has come."""
+        return now_s - self._fed_s
+
+    def expired(self, now_s: float) -> bool:
+        """Look at the watchdog; to be called as often as it is looked for what feeds it."""
+        silent_s = now_s - self._fed_s
+        if silent_s < self.limit_s - self._again_s:
+            return False
+        if self._in_vain_s is None:
+            self._in_vain_s = now_s
+        return silent_s > self.limit_s and now_s - self._in_vain_s >= self._again_s

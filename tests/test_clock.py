@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.clock import MonotonicClock, VirtualClock
+from fitctl.clock import MonotonicClock, VirtualClock, Watchdog
 
 
 def test_the_machines_clock_is_the_one_that_all_processes_share():
@@ -63,3 +63,33 @@ def test_virtual_waiting_takes_no_time():
     before_s = time.monotonic()
     VirtualClock().sleep_until(3600.0)
     assert time.monotonic() - before_s < 1.0
+
+
+def first_expired_s(watchdog, looks_s):
+    return next((now_s for now_s in looks_s if watchdog.expired(now_s)), None)
+
+
+def every(step_s, begin_s, end_s):
+    return [begin_s + step_s * n for n in range(round((end_s - begin_s) / step_s) + 1)]
+
+
+def test_a_watchdog_expires_when_its_limit_has_passed():
+    watchdog = Watchdog(0.3, 0.1, now_s=10.0)
+    assert first_expired_s(watchdog, every(0.002, 10.0, 11.0)) == pytest.approx(10.3, abs=0.005)
+    assert watchdog.silent_s(10.5) == pytest.approx(0.5)
+
+
+def test_a_watchdog_that_is_fed_starts_anew():
+    watchdog = Watchdog(0.3, 0.1, now_s=10.0)
+    assert first_expired_s(watchdog, every(0.002, 10.0, 10.28)) is None
+    watchdog.feed(10.28)
+    expired_s = first_expired_s(watchdog, every(0.002, 10.28, 11.0))
+    assert expired_s == pytest.approx(10.58, abs=0.005)
+
+
+@given(st.floats(0.3, 100.0))
+def test_after_a_pause_a_watchdog_gives_the_sender_more_time(pause_s):
+    watchdog = Watchdog(0.3, 0.1, now_s=10.0)
+    assert not watchdog.expired(10.0)
+    expired_s = first_expired_s(watchdog, every(0.002, 10.0 + pause_s, 11.0 + pause_s))
+    assert expired_s == pytest.approx(10.1 + pause_s, abs=0.005)

@@ -106,7 +106,10 @@ class ServoGroup:
         now_s, busy = self._clock.now_s(), self._busy
         if now_s < self._due_s or busy is None:
             return
-        self._due_s = now_s + self.period_s
+        next_s = (
+            self._due_s + self.period_s
+        )  # as PeriodicThread: late ones are skipped, and shift no other
+        self._due_s = next_s if next_s > now_s else now_s + self.period_s
         self._made_meanwhile += 1
         bus = self._bus_of[busy]
         bus.meanwhile = None

@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from fitctl.clock import Watchdog
 from fitctl.config import Cia402Device, Siderostat
 from fitctl.drivers.amplifiers import AXES, LinkedAmplifiers
 from fitctl.drivers.cia402 import protocol
@@ -37,7 +38,7 @@ else:
     _Base = LinkedAmplifiers
 
 _POLL_S = 0.001
-_STATUS_LIMIT_S = 5 * protocol.STATUS_EVERY_MS / 1e3
+_STATUS_EVERY_S = protocol.STATUS_EVERY_MS / 1e3
 _BEHIND_PERIODS = 10
 _SHARED_BUS = (
     0.75  # of a period: a silent drive must not cost the others on its bus their next period
@@ -86,7 +87,7 @@ class Cia402Amplifiers(_Base):
         self._position_limit_counts = int(self._device.position_limit_rad / self._rad_per_count)
         self._encoders = Encoders(siderostat.velocity_limit_rad_s / self._rad_per_count)
         self._statuswords = [0, 0]
-        self._status_s = 0.0
+        self._status = Watchdog(5 * _STATUS_EVERY_S, _STATUS_EVERY_S, 0.0)
         self._behind = 0
         self._bus = bus
         self._bus_link: BusLink | None = None
@@ -128,7 +129,7 @@ class Cia402Amplifiers(_Base):
             node.start()
             for axis in range(2):
                 self._state(axis)
-            self._status_s = time.monotonic()
+            self._status.feed(time.monotonic())
         return identity
 
     def enable(self) -> None:
@@ -360,15 +361,15 @@ class Cia402Amplifiers(_Base):
     def _on_statuswords(self, data: bytes) -> None:
         sized = self._sized(data, _STATUS_PAIR.size, "both statuswords")
         self._statuswords[:] = _STATUS_PAIR.unpack(sized)
-        self._status_s = time.monotonic()
+        self._status.feed(time.monotonic())
 
     def _check_status(self) -> None:
-        silent_s = time.monotonic() - self._status_s
-        if silent_s > _STATUS_LIMIT_S:
+        now_s = time.monotonic()
+        if self._status.expired(now_s):
             raise self._endpoint.error(
                 DeviceTimeout,
-                f"the TPDO with the statuswords within {_STATUS_LIMIT_S:g} s",
-                f"none for {silent_s:.2f} s",
+                f"the TPDO with the statuswords within {self._status.limit_s:g} s",
+                f"none for {self._status.silent_s(now_s):.2f} s",
                 "another CANopen master changed it; recover",
             )
 

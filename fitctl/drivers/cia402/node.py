@@ -11,6 +11,7 @@ import struct
 import time
 from collections.abc import Callable
 
+from fitctl.clock import Watchdog
 from fitctl.config import Cia402Device
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.bus import BusLink
@@ -57,7 +58,8 @@ class Node:
             protocol.SDO_RESPONSE_BASE + device.node_id: self._on_sdo,
         }
         self._device = device
-        self._heard_s = time.monotonic()
+        heartbeat_s = device.drive_heartbeat_s
+        self._heartbeats = Watchdog(_MISSED_HEARTBEATS * heartbeat_s, heartbeat_s, time.monotonic())
         self._answer: bytes | None = None
         self._guarded = False
         self._beat_period_s = device.master_heartbeat_timeout_s / 3
@@ -124,13 +126,12 @@ class Node:
         DeviceFault
             If the drive has left OPERATIONAL: it restarted, or another master took it.
         """
-        silent_s = time.monotonic() - self._heard_s
-        limit_s = _MISSED_HEARTBEATS * self._device.drive_heartbeat_s
-        if silent_s > limit_s:
+        now_s = time.monotonic()
+        if self._heartbeats.expired(now_s):
             raise self.endpoint.error(
                 DeviceTimeout,
-                f"the drive's heartbeat within {limit_s:g} s",
-                f"none for {silent_s:.2f} s",
+                f"the drive's heartbeat within {self._heartbeats.limit_s:g} s",
+                f"none for {self._heartbeats.silent_s(now_s):.2f} s",
                 "check the drive's power and its bus cable, then recover",
             )
         if self.nmt_state != NmtState.OPERATIONAL:
@@ -276,7 +277,7 @@ class Node:
 
     # ------------------------------------------------------------ handlers
     def _on_heartbeat(self, data: bytes) -> None:
-        self._heard_s = time.monotonic()
+        self._heartbeats.feed(time.monotonic())
         self.nmt_state = data[0] & 0x7F if data else None
 
     def _on_emcy(self, data: bytes) -> None:

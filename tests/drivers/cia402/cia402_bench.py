@@ -73,6 +73,10 @@ class Bench:
 
         self._run(run())
 
+    def stand_still(self, seconds: float) -> None:
+        """Have the drive's computer stand still from now on."""
+        self._loop.call_soon_threadsafe(time.sleep, seconds)
+
     def fault(self, kind: str, **settings) -> None:
         """Begin a fault of the drive."""
         self.call(self.mock.faults.set, config.Fault(device="right.drive", kind=kind, **settings))

@@ -97,6 +97,16 @@ def test_a_missing_drive_heartbeat_times_out(bench, amplifiers):
         other.shutdown()
 
 
+def test_a_heartbeat_that_is_late_because_the_computer_stood_still_is_not_missing(
+    bench, amplifiers
+):
+    amplifiers.open()
+    exchange_for(amplifiers, 0.1)
+    bench.stand_still(0.4)
+    time.sleep(0.36)  # this one goes on a little earlier
+    exchange_for(amplifiers, 0.5)
+
+
 def test_a_drive_taken_out_of_operation_is_a_fault(bench, amplifiers):
     amplifiers.open()
     other = other_master(bench)
