@@ -48,6 +48,7 @@ LATELY_S = 60.0
 TOLERATED_GAIN = 0.15
 """A mirror's gain so far from 1 is left to the margins."""
 _AXES = ("az", "el")
+_DESIGNS = ("present", "learnt")
 
 
 class LineAdvice(NamedTuple):
@@ -227,7 +228,9 @@ class Advice(NamedTuple):
             "present": _standing_numbers(self.present),
             "learnt": _standing_numbers(self.learnt),
             "bound_px": self.bound_px,
-            "lately_px": {"present": self.lately_px[0], "learnt": self.lately_px[1]},
+            "lately_px": dict(zip(_DESIGNS, self.lately_px, strict=True)),
+            "shown_gain_px": dict(zip(_DESIGNS, self.shown_px, strict=True)),
+            "if_aliases_px": dict(zip(_DESIGNS, self.if_aliases[:2], strict=True)),
             "worth_it": self.worth_it,
         }
 

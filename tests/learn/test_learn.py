@@ -297,6 +297,8 @@ def test_advice_is_the_same_for_people_and_for_programs(six_hz):
         assert f"{value:.4f}" in text
     assert numbers["lines"][0]["frequency_hz"]["value"] == pytest.approx(6.0, abs=0.05)
     assert numbers["worth_it"]
+    for reason in ("lately_px", "shown_gain_px", "if_aliases_px"):
+        assert numbers[reason]["learnt"] < numbers[reason]["present"]
 
 
 def test_too_short_a_hold_is_an_error(paper, fixed):
