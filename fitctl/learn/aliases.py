@@ -110,12 +110,12 @@ def both_if_aliases(
 def safe_parts(truth: Basis, present: Design, shown_gain: float) -> Iterator[tuple[float, ...]]:
     """The parts of each line's RMS that a design may expect, so that it does no harm if lines are aliases.
 
-    Each line for itself does no harm beside a design that does not expect the line. All that can be aliases
-    together do none beside the present design; otherwise the largest parts are reduced, more and more: what a
-    design does that must keep margins is for the caller to find out.
+    Each line for itself does no harm beside the present design, or beside one that does not expect the line if
+    that leaves more. All that can be aliases together do none beside the present design; otherwise the largest
+    parts are reduced, more and more: what a design does that must keep margins is for the caller to find out.
     """
     gain = min(LESS_MOTION * truth.mirror_gain, shown_gain)
-    parts = [_safe_part(line, truth, gain) for line in truth.lines]
+    parts = [_safe_part(line, truth, present, gain) for line in truth.lines]
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     limits_px = MOST_IF_ALIAS * if_aliases(present, truth, suspects, gain)
     reductions = dict.fromkeys(  # each once: a limit above all parts changes none
@@ -143,11 +143,13 @@ def expecting(parts: tuple[float, ...], truth: Basis) -> Basis:
     return dataclasses.replace(truth, lines=lines)
 
 
-def _safe_part(line: Line, truth: Basis, gain: float) -> float:
+def _safe_part(line: Line, truth: Basis, present: Design, gain: float) -> float:
     """Of one line, the others expected in full; 0 where no part would leave less than leaving it alone."""
     alone = design_minimum_variance(_without((line,), truth))
     alone_px = linear_residual(alone, truth)
-    limits_px = MOST_IF_ALIAS * if_aliases(alone, truth, (line,), gain)
+    limits_px = MOST_IF_ALIAS * np.maximum(
+        *(if_aliases(one, truth, (line,), gain) for one in (alone, present))
+    )
     suspect = can_be_alias(line, truth)
     for part in PARTS[:-1]:
         parts = tuple(part if other == line else 1.0 for other in truth.lines)

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.error_budget import Columns, LoopTheory, motion, regular, taper
+from fitctl.error_budget import Columns, LoopTheory, motion, taper
+from fitctl.learn.gaps import filled
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -27,6 +28,9 @@ TAPERED = 0.2
 """Part of a segment over which its window rises and falls (Tukey): the spectrum falls by five decades, and
 without a taper the leakage of slow motion covers the fast."""
 _FIRST_BINS = 2.5  # below, the mean that was removed and the taper leave too little
+_OFF_TIME = 0.1
+"""Of a frame period: a command that comes so much earlier or later than usual is not timely,"""
+_OFF_SPREAD = 6.0  # unless commands always come at times that differ, by their median deviation
 _HALF_WIDTH_BINS = 0.5  # of a pure sine, as the window shows it
 
 
@@ -104,7 +108,7 @@ def rebuild(
     ticks : mapping of str to array, shape (ticks,)
         Fields of :class:`fitctl.logging.records.Tick`, from a log or from telemetry.
     pieces : sequence of array of int
-        Rows with a star in VERNIER; gaps within one are bridged.
+        Rows with a star in VERNIER; frames that one lacks, or that a late command met, are filled.
     mirror_rad : array, shape (ticks, 2), optional
         As :func:`fitctl.error_budget.motion` takes it.
     """
@@ -115,9 +119,30 @@ def rebuild(
     both = np.hstack([disturbance_px, mirror_rad @ theory.mirror_px_per_rad.T])
     series = []
     for rows in pieces:
-        values = regular(ticks["mid_exposure_s"][rows], both[rows], theory.period_s)
+        apart = np.diff(ticks["mid_exposure_s"][rows]) / theory.period_s
+        at = np.concatenate([[0], np.cumsum(np.maximum(1, np.rint(apart)).astype(int))])
+        known = np.zeros(at[-1] + 1, bool)
+        values = np.zeros((len(known), both.shape[1]))
+        known[at] = _timely(ticks, rows, theory.period_s)
+        values[at] = both[rows]
+        values = filled(values, known)
         series.append(Series(values[:, :2], values[:, 2:]))
     return series
+
+
+def _timely(ticks: Columns, rows: NDArray[np.intp], period_s: float) -> NDArray[np.bool_]:
+    """Whether the command in force at mid-exposure had come at its usual time, shape (rows,).
+
+    If not, the mirror's place is not known well: a late command may have acted before it was confirmed, or
+    during the exposure. With 6 such frames in a thousand, the mirror's gain was found by 0.05 too small, with
+    80 by 0.3 (line of 0.05 px at 6 Hz, over wires).
+    """
+    exposed_s, commanded_s = ticks["mid_exposure_s"][rows], ticks["time_s"]
+    before = np.searchsorted(commanded_s, exposed_s, side="right") - 1
+    in_force_s = np.where(before < 0, np.nan, exposed_s - commanded_s[before])
+    off_s = np.abs(in_force_s - np.nanmedian(in_force_s))
+    usual_s = max(_OFF_TIME * period_s, _OFF_SPREAD * np.nanmedian(off_s))
+    return np.isnan(off_s) | (off_s <= usual_s)
 
 
 def periodograms(series: Sequence[Series], period_s: float) -> Opened | None:

@@ -10,8 +10,12 @@ from instruments.fake_supervisor import FakeSupervisor
 from samples.learner_reports import SHAKEN, learnt_json
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.theory import loop_theory
+from fitctl.learn.advice import estimated
 from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, WINDOW_S, Learner
+from fitctl.learn.opened import rebuild
 from fitctl.learn.process import LoopLearner
 from fitctl.messages.commands import MAX_COMMAND_BYTES
 from fitctl.messages.telemetry import LearningState
@@ -188,3 +192,29 @@ def test_reports_follow_each_other_by_their_time(rig, vernier):
     assert not learner.due
     learner.add(later[-1])
     assert learner.due
+
+
+def gain_of(rig, ticks):
+    """The mirror's, as estimated from the frames of ticks."""
+    columns = {
+        name: np.array([getattr(tick, name) for tick in ticks])
+        for name in ticks[0].__struct_fields__
+    }
+    theory = loop_theory(rig, "right", design_for(rig, "right"))
+    series = rebuild(theory, columns, [np.arange(len(ticks))])
+    return estimated(series, basis(rig, "right"))[0].mirror_gain
+
+
+def test_commands_that_were_confirmed_late_do_not_change_the_mirrors_gain(rig, vernier):
+    """The D/A had acted in time: its answer came after the next frame had been exposed."""
+    late = np.random.default_rng(0).choice(len(vernier) - 4, len(vernier) // 20, replace=False)
+    seen = list(vernier)
+    for row in late:
+        seen[row] = msgspec.structs.replace(seen[row], time_s=seen[row].time_s + 0.006)
+        before, met = seen[row + 1], seen[row + 2]
+        seen[row + 2] = msgspec.structs.replace(
+            met, mirror_az_rad=before.mirror_az_rad, mirror_el_rad=before.mirror_el_rad
+        )
+    known, found = gain_of(rig, vernier), gain_of(rig, seen)
+
+    assert found.value == pytest.approx(known.value, abs=0.1)
