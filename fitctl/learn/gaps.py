@@ -14,6 +14,7 @@ from scipy.sparse.linalg import spsolve
 Floats = NDArray[np.float64]
 _ORDER = 60
 _ROUNDS = 4
+_ENOUGH = 2  # known frames for each coefficient; with fewer, straight lines have to do
 
 
 def filled(values: Floats, known: NDArray[np.bool_]) -> Floats:
@@ -30,7 +31,7 @@ def filled(values: Floats, known: NDArray[np.bool_]) -> Floats:
         What unknown frames hold does not count.
     known : array of bool, shape (frames,)
     """
-    if known.all() or np.count_nonzero(known) <= 2 * _ORDER:
+    if known.all():
         return values
     draw = np.random.default_rng(0)
     return np.column_stack([_filled(column, known, draw) for column in values.T])
@@ -41,6 +42,8 @@ def _filled(column: Floats, known: NDArray[np.bool_], draw: np.random.Generator)
     mean = column[at].mean()
     guess = np.where(known, column, 0.0) - mean
     guess[unknown_at] = np.interp(unknown_at, at, guess[at])
+    if len(at) <= _ENOUGH * _ORDER:
+        return np.asarray(guess + mean)
     for _ in range(_ROUNDS):
         errors = _prediction_errors(guess)
         of_unknown, of_known = errors[:, unknown_at], errors[:, at]
@@ -49,9 +52,8 @@ def _filled(column: Floats, known: NDArray[np.bool_], draw: np.random.Generator)
     error = errors @ guess
     # The errors of unknown frames were made least: only those of known ones show how large they are.
     variance = error @ error / (len(error) * np.mean(known))
-    spread = np.sqrt(
-        2 * variance / normal.diagonal()
-    )  # two, as each error counts forwards and backwards
+    # Twice, because each error counts forwards and backwards.
+    spread = np.sqrt(2 * variance / normal.diagonal())
     guess[unknown_at] += spread * draw.normal(size=len(unknown_at))
     return np.asarray(guess + mean)
 
