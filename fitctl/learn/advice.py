@@ -120,6 +120,8 @@ class Advice(NamedTuple):
     shown_px : tuple of float
         Residual of present and learnt design with the mirror's gain that the night shows, where it is known to
         be below the rig file's.
+    filled : int
+        Frames that are missing, or that a late command met.
     """
 
     night: Night
@@ -132,6 +134,7 @@ class Advice(NamedTuple):
     lately_px: tuple[float, float]
     if_aliases: IfAliases
     shown_px: tuple[float, float]
+    filled: int
 
     @property
     def worth_it(self) -> bool:
@@ -158,7 +161,7 @@ class Advice(NamedTuple):
         """For an operator."""
         night = self.night
         text = [
-            f"{night.duration_s:.0f} s of frames in VERNIER",
+            f"{night.duration_s:.0f} s of frames in VERNIER{self._filled_text()}",
             f"air path     k/b1 {night.strength} px/s², b2/b1 {night.fast_pole} 1/s",
             f"             gain {night.gain_px} px, b1 {night.b1_s2} s², b2 {night.b2_s} s",
             f"noise        {night.noise_px} px a frame",
@@ -205,6 +208,11 @@ class Advice(NamedTuple):
             text.append(f"The learnt design would leave {gained:.0%} less.")
         return text
 
+    def _filled_text(self) -> str:
+        if not self.filled:
+            return ""
+        return f"; {self.filled} frames are missing or met a late command, and were filled"
+
     def _gain_text(self) -> str:
         if self.night.mirror_gain.covers(1.0):
             return ""
@@ -215,6 +223,7 @@ class Advice(NamedTuple):
         night = self.night
         return {
             "duration_s": night.duration_s,
+            "frames_filled": self.filled,
             "air_path": {
                 name: getattr(night, name)._asdict()
                 for name in ("gain_px", "b1_s2", "b2_s", "strength", "fast_pole")
@@ -295,6 +304,7 @@ def advise(
         lately_px=_lately_px(series, truth, present, design),
         if_aliases=if_aliases,
         shown_px=(linear_residual(present, shown), linear_residual(design, shown)),
+        filled=sum(one.filled for one in series),
     )
 
 

@@ -43,10 +43,13 @@ class Series(NamedTuple):
         Rebuilt, with a mirror that moves as the rig file has it.
     mirror_px : array
         Where the mirror had moved the star at mid-exposure.
+    filled : int
+        How many frames are missing, or were met by a late command: they are like those beside them.
     """
 
     disturbance_px: Floats
     mirror_px: Floats
+    filled: int = 0
 
 
 class Opened(NamedTuple):
@@ -126,7 +129,7 @@ def rebuild(
         known[at] = _timely(ticks, rows, theory.period_s)
         values[at] = both[rows]
         values = filled(values, known)
-        series.append(Series(values[:, :2], values[:, 2:]))
+        series.append(Series(values[:, :2], values[:, 2:], int(np.count_nonzero(~known))))
     return series
 
 

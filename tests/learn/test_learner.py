@@ -194,15 +194,19 @@ def test_reports_follow_each_other_by_their_time(rig, vernier):
     assert learner.due
 
 
-def gain_of(rig, ticks):
-    """The mirror's, as estimated from the frames of ticks."""
+def rebuilt(rig, ticks):
     columns = {
         name: np.array([getattr(tick, name) for tick in ticks])
         for name in ticks[0].__struct_fields__
     }
     theory = loop_theory(rig, "right", design_for(rig, "right"))
-    series = rebuild(theory, columns, [np.arange(len(ticks))])
-    return estimated(series, basis(rig, "right"))[0].mirror_gain
+    (series,) = rebuild(theory, columns, [np.arange(len(ticks))])
+    return series
+
+
+def gain_of(rig, ticks):
+    """The mirror's, as estimated from the frames of ticks."""
+    return estimated([rebuilt(rig, ticks)], basis(rig, "right"))[0].mirror_gain
 
 
 def test_commands_that_were_confirmed_late_do_not_change_the_mirrors_gain(rig, vernier):
@@ -217,4 +221,6 @@ def test_commands_that_were_confirmed_late_do_not_change_the_mirrors_gain(rig, v
         )
     known, found = gain_of(rig, vernier), gain_of(rig, seen)
 
+    assert rebuilt(rig, vernier).filled == 0
+    assert rebuilt(rig, seen).filled == len(late)
     assert found.value == pytest.approx(known.value, abs=0.1)
