@@ -389,9 +389,9 @@ class SiderostatServo:
         A drive that stopped answering may have turned on at any velocity that it was sent since; its encoders
         count on from the same zero. Any other difference means that they count from elsewhere now.
         """
-        deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
+        self._timely.feed(self._clock.now_s())
         while (reading := self._amplifiers.exchange(_STILL)) is None:
-            if self._clock.now_s() > deadline_s:
+            if self._timely.expired(self._clock.now_s()):
                 raise self._no_reading()
         knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
         recalled_rad, self._recalled_rad = self._recalled_rad, None
