@@ -9,6 +9,7 @@ import asyncio
 import math
 import queue
 import socket
+import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -183,7 +184,7 @@ def exchange(data: bytes) -> None:
     node.nmt_state = protocol.NmtState.OPERATIONAL
     node.handlers |= {0x181: amplifiers._on_positions, 0x281: amplifiers._on_statuswords}
     amplifiers._link = node
-    amplifiers._status_s = node._heard_s
+    amplifiers._status.feed(time.monotonic())
     for _ in range(1 + len(data) // 8):
         try:
             reading = amplifiers.exchange((1.0, -1.0))
