@@ -70,16 +70,16 @@ class VirtualClock:
 
 
 class Watchdog:
-    """Expires when nothing has come for too long, although it was looked for until the end.
+    """Expires when nothing has come for too long, and this computer has looked for it in the last `again_s`.
 
-    While this computer stands still, nothing is looked for, and what was sent meanwhile is there at the next
-    look. So after a pause the sender still has `again_s`.
+    A computer that stands still reads nothing; what was sent meanwhile it reads afterwards. So after a pause it
+    looks for `again_s` more before the watchdog expires.
 
     Parameters
     ----------
     limit_s : float
     again_s : float
-        How long it must have been looked for in vain before the watchdog expires; at most `limit_s`.
+        How long the computer must have looked in vain; at most `limit_s`.
     now_s : float
     """
 
@@ -98,7 +98,7 @@ class Watchdog:
         return now_s - self._fed_s
 
     def expired(self, now_s: float) -> bool:
-        """Look at the watchdog; to be called as often as it is looked for what feeds it."""
+        """Whether it has expired; call it whenever you have looked for what feeds it."""
         silent_s = now_s - self._fed_s
         if silent_s < self.limit_s - self._again_s:
             return False

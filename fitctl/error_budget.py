@@ -147,11 +147,10 @@ def motion(theory: LoopTheory, ticks: Columns, mirror_rad: Floats | None = None)
         Where the mirror was at mid-exposure, by the identified hysteresis; by default as the ticks have it.
     """
     error_px = _pair(ticks, "error_{}_px")
-    exposed_s, at_s = ticks["mid_exposure_s"], ticks["time_s"]
+    exposed_s = ticks["mid_exposure_s"]
     if mirror_rad is None:
         mirror_rad = _pair(ticks, "mirror_{}_rad")
-    in_force = np.maximum(np.searchsorted(at_s, exposed_s, side="right") - 1, 0)
-    commanded_rad = _pair(ticks, "fsm_{}_rad")[in_force]
+    commanded_rad = _pair(ticks, "fsm_{}_rad")[in_force(ticks)]
     motor_rad = _pair(ticks, "siderostat_{}_rad")
     played_px = (_played(motor_rad, theory.backlash_rad) - motor_rad) @ theory.motor_px_per_rad.T
     stages_px = mirror_rad @ theory.mirror_px_per_rad.T + motor_rad @ theory.motor_px_per_rad.T
@@ -167,6 +166,15 @@ def motion(theory: LoopTheory, ticks: Columns, mirror_rad: Floats | None = None)
         error_px - stages_px - played_px,
         (mirror_rad - commanded_rad) @ theory.mirror_px_per_rad.T + played_px,
     )
+
+
+def in_force(ticks: Columns) -> NDArray[np.intp]:
+    """Row of the tick whose command the mirror had at mid-exposure, shape (ticks,); 0 where none is earlier.
+
+    A command acts from its tick's end until the next one's.
+    """
+    rows = np.searchsorted(ticks["time_s"], ticks["mid_exposure_s"], side="right") - 1
+    return np.asarray(np.maximum(rows, 0))
 
 
 def _pair(ticks: Columns, field: str) -> Floats:

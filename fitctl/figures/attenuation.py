@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from fitctl.config import Fsm, Rig
+from fitctl.error_budget import in_force
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.record import axis_pair
 from fitctl.messages.modes import Mode
@@ -92,10 +93,7 @@ def stages_px(rig: Rig, loop_name: str, ticks: Ticks) -> Floats:
 
 def mirror_at_exposure_rad(fsm: Fsm, ticks: Ticks) -> Floats:
     """Where the mirror was at mid-exposure, by its hysteresis where that is known, shape (ticks, 2)."""
-    angles_rad = _mirror_angles_rad(fsm, ticks)
-    # A command acts from its tick's end until the next.
-    in_force = np.searchsorted(ticks["time_s"], ticks["mid_exposure_s"], side="right") - 1
-    return angles_rad[np.maximum(in_force, 0)]
+    return _mirror_angles_rad(fsm, ticks)[in_force(ticks)]
 
 
 def stacks_m(ticks: Ticks, fsm: Fsm, half_widths_v: Floats, gains_m_per_v: Floats) -> Floats:

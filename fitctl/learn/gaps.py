@@ -1,7 +1,7 @@
-"""Frames of which it is not known what they would have shown: the frames beside them tell.
+"""Fills unknown frames of a series from the frames beside them.
 
-Straight lines across such frames are no substitute where a loop is shaken: of a line at 6 Hz, frames at 50 Hz,
-they miss a quarter, and the mirror's estimated gain is too large.
+Straight lines do not serve where a vibration shakes the loop: of a line at 6 Hz, with frames at 50 Hz, they
+miss a quarter, and then the mirror's estimated gain is too large.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _ENOUGH = 2  # known frames for each coefficient; with fewer, straight lines hav
 
 
 def filled(values: Floats, known: NDArray[np.bool_]) -> Floats:
-    """Series whose unknown frames are likely ones, given all others.
+    """The series, with likely values for its unknown frames.
 
-    Each column is taken for an autoregressive process (Janssen, Veldhuis and Vries 1986, IEEE Trans. ASSP 34,
-    317): its coefficients and the unknown values are found in turn, both so that the squares of what the
-    process does not predict are least. As much as it does not predict is drawn and added, the same for the same
-    series: without it, the camera's noise would be missing on these frames.
+    Models each column as an autoregressive process, and finds its coefficients and the unknown values in turn,
+    both so that the squares of the prediction's errors are least (Janssen, Veldhuis and Vries 1986, IEEE Trans.
+    ASSP 34, 317). Adds random errors of the same size, the same for the same series: without them, these frames
+    would lack the camera's noise.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def _filled(column: Floats, known: NDArray[np.bool_], draw: np.random.Generator)
 
 
 def _prediction_errors(series: Floats) -> sp.csc_matrix:
-    """What gives, from a series, the errors of its prediction by the frames before, and by those after."""
+    """The matrix that turns a series into its prediction errors, from frames before and from frames after."""
     windows = np.lib.stride_tricks.sliding_window_view(series, _ORDER + 1)
     before, last = windows[:, :-1], windows[:, -1]
     weights = np.linalg.lstsq(before.T @ before, before.T @ last, rcond=None)[0]

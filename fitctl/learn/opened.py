@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.error_budget import Columns, LoopTheory, motion, taper
+from fitctl.error_budget import Columns, LoopTheory, in_force, motion, taper
 from fitctl.learn.gaps import filled
 
 Floats = NDArray[np.float64]
@@ -29,8 +29,9 @@ TAPERED = 0.2
 without a taper the leakage of slow motion covers the fast."""
 _FIRST_BINS = 2.5  # below, the mean that was removed and the taper leave too little
 _OFF_TIME = 0.1
-"""Of a frame period: a command that comes so much earlier or later than usual is not timely,"""
-_OFF_SPREAD = 6.0  # unless commands always come at times that differ, by their median deviation
+"""Of a frame period: commands may come so much earlier or later than usual and still be timely."""
+_OFF_SPREAD = 6.0
+"""Times their median deviation: so may commands that never come at quite the same time."""
 _HALF_WIDTH_BINS = 0.5  # of a pure sine, as the window shows it
 
 
@@ -44,7 +45,7 @@ class Series(NamedTuple):
     mirror_px : array
         Where the mirror had moved the star at mid-exposure.
     filled : int
-        How many frames are missing, or were met by a late command: they are like those beside them.
+        How many frames are missing or met a late command; they were filled from those beside them.
     """
 
     disturbance_px: Floats
@@ -137,12 +138,11 @@ def _timely(ticks: Columns, rows: NDArray[np.intp], period_s: float) -> NDArray[
     """Whether the command in force at mid-exposure had come at its usual time, shape (rows,).
 
     If not, the mirror's place is not known well: a late command may have acted before it was confirmed, or
-    during the exposure. With 6 such frames in a thousand, the mirror's gain was found by 0.05 too small, with
-    80 by 0.3 (line of 0.05 px at 6 Hz, over wires).
+    during the exposure. Six such frames in a thousand made the mirror's estimated gain 0.05 too small, 80 made
+    it 0.3 too small (line of 0.05 px at 6 Hz, over wires).
     """
-    exposed_s, commanded_s = ticks["mid_exposure_s"][rows], ticks["time_s"]
-    before = np.searchsorted(commanded_s, exposed_s, side="right") - 1
-    in_force_s = np.where(before < 0, np.nan, exposed_s - commanded_s[before])
+    exposed_s, commanded_s = ticks["mid_exposure_s"][rows], ticks["time_s"][in_force(ticks)[rows]]
+    in_force_s = np.where(commanded_s > exposed_s, np.nan, exposed_s - commanded_s)
     off_s = np.abs(in_force_s - np.nanmedian(in_force_s))
     usual_s = max(_OFF_TIME * period_s, _OFF_SPREAD * np.nanmedian(off_s))
     return np.isnan(off_s) | (off_s <= usual_s)

@@ -106,9 +106,8 @@ class ServoGroup:
         now_s, busy = self._clock.now_s(), self._busy
         if now_s < self._due_s or busy is None:
             return
-        next_s = (
-            self._due_s + self.period_s
-        )  # as PeriodicThread: late ones are skipped, and shift no other
+        # As in PeriodicThread: a late period shifts none after it, and those that are missed are skipped.
+        next_s = self._due_s + self.period_s
         self._due_s = next_s if next_s > now_s else now_s + self.period_s
         self._made_meanwhile += 1
         bus = self._bus_of[busy]

@@ -103,7 +103,7 @@ def test_a_heartbeat_that_is_late_because_the_computer_stood_still_is_not_missin
     amplifiers.open()
     exchange_for(amplifiers, 0.1)
     bench.stand_still(0.4)
-    time.sleep(0.36)  # this one goes on a little earlier
+    time.sleep(0.36)  # this thread stands still too, and looks before the drive can send
     exchange_for(amplifiers, 0.5)
 
 
