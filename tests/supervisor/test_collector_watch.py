@@ -41,10 +41,13 @@ def watched(in_loop, monkeypatch):
 
     mock, ends = in_loop(made())
     clock, events = MonotonicClock(), []
+
+    def report(*event):
+        events.append(event)
+        print(event)  # pytest shows it with a test that fails
+
     settings = device(f"socket://127.0.0.1:{ends.tcp_port}", response_timeout_s=RESPONSE_TIMEOUT_S)
-    watch = CollectorWatch(
-        RIG.collector, C887Hexapod(settings), clock, lambda *event: events.append(event)
-    )
+    watch = CollectorWatch(RIG.collector, C887Hexapod(settings), clock, report)
     watch.events = events
     watch.strike = lambda kind: in_loop(struck(kind))
     thread = PeriodicThread(watch.drive, clock)
