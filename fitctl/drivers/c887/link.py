@@ -178,7 +178,8 @@ class C887Link:
         deadline_s = time.monotonic() + self._limit_s
         answer = b""
         while not protocol.is_complete(answer):
-            if time.monotonic() > deadline_s:
+            # What came while this computer stood still is in time.
+            if time.monotonic() > deadline_s and not self._waiting(name):
                 raise self._silent(f"an answer to {name}", repr(answer[:80]) if answer else "none")
             if len(answer) > protocol.ANSWER_BYTES_MAX:
                 self._nonsense(f"an answer to {name}", f"{len(answer)} bytes without an end")
@@ -187,6 +188,12 @@ class C887Link:
             except OSError as error:
                 raise self._broken(name, error) from error
         return answer
+
+    def _waiting(self, name: str) -> int:
+        try:
+            return int(self._port.in_waiting)
+        except OSError as error:
+            raise self._broken(name, error) from error
 
     def _raise_why_unanswered(self, name: str) -> None:
         """A question that the controller cannot answer leaves an error number instead."""

@@ -12,6 +12,7 @@ from scripted_server import scripted_server
 from serial.urlhandler import protocol_socket
 
 from fitctl.config import Fault
+from fitctl.drivers.c887 import link
 from fitctl.drivers.c887.driver import C887Hexapod, probe_c887
 from fitctl.drivers.interface import (
     DeviceError,
@@ -283,6 +284,22 @@ def test_silence_ends_within_the_time_limit(scripted):
     with pytest.raises(DeviceTimeout, match=r"\*IDN\? within 0\.2 s"):
         driver.open()
     assert time.monotonic() - started_s < 1.0
+
+
+def test_an_answer_that_came_while_the_computer_stood_still_is_in_time(scripted, monkeypatch):
+    driver, _ = scripted({})
+    driver.open()
+    since_s = time.monotonic()
+
+    def stands_still():
+        """Each look at the clock is 0.3 s after the one before, and the time limit 0.2 s."""
+        nonlocal since_s
+        since_s += 0.3
+        time.sleep(0.02)  # while the answer comes
+        return since_s
+
+    monkeypatch.setattr(link, "time", SimpleNamespace(monotonic=stands_still))
+    driver.move_to(Pose(), 8.0)
 
 
 def test_a_move_that_is_not_confirmed_is_named(scripted):
