@@ -106,7 +106,7 @@ def _open_unread(self: SiderostatServo) -> Any:
     self._amplifiers.reset_fault()
     self._amplifiers.enable()
     self.opened = self.enabled = True
-    self._timely_s = self._clock.now_s()
+    self._timely.feed(self._clock.now_s())
     return identity
 
 

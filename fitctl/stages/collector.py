@@ -62,6 +62,8 @@ class CollectorDrive:
         self._endpoint = Endpoint("hexapod", collector.hexapod.endpoint)
         self._origin = Pose()
         self._started_s = 0.0
+        self._sent_s = 0.0
+        self._late = False  # a target, since the last check
         self._targets = 0
         self._running = threading.Event()
         self._turn = threading.Lock()  # held while a target is on its way
@@ -104,6 +106,7 @@ class CollectorDrive:
         self._check(course, reading.pose)
         self.fault, self._motion, self._course = None, motion, course
         self._origin, self._started_s, self._targets = reading.pose, self._clock.now_s(), 0
+        self._sent_s, self._late = self._started_s, False
         self._running.set()
 
     def stop(self) -> None:
@@ -126,8 +129,11 @@ class CollectorDrive:
         with self._turn:
             if not self.running:
                 return
+            now_s = self._clock.now_s()
+            self._late = self._late or now_s - self._sent_s > _FOLLOW_PERIODS * PERIOD_S
+            self._sent_s = now_s
             try:
-                place = self._course(self._clock.now_s() - self._started_s + PERIOD_S)
+                place = self._course(now_s - self._started_s + PERIOD_S)
                 self._hexapod.move_to(self._pose(self._origin, place), self._velocity_mm_s)
                 self._targets += 1
                 if self._targets % _PERIODS_A_CHECK == 0:
@@ -176,6 +182,9 @@ class CollectorDrive:
         if reading.error or not reading.referenced:
             got = reading.error or "a hexapod that is no longer referenced"
             raise self._fault("a hexapod that follows its course", got)
+        late, self._late = self._late, False
+        if late:
+            return  # this computer stood still, and the hexapod catches up
         place = self._course(reading.time_s - self._started_s)
         off_mm = math.dist(reading.pose[:3], self._pose(self._origin, place)[:3])
         limit_mm = _FOLLOW_MM + _FOLLOW_PERIODS * PERIOD_S * self._course.velocity_mm_s

@@ -93,7 +93,7 @@ class MirrorStage:
         self._mirror = Mirror(fsm)
         self._most_slew_v = fsm.slew_v_per_s * rig.camera.period_s
         self._begun_s = math.nan  # of a write that is not confirmed yet
-        self._known_s = -math.inf  # when the outputs were last written, or read
+        self._known_s = -math.inf  # the last write or reading of the outputs began then
         self._lowest_v = self._highest_v = self.stack_v
         write_s = rig.camera.period_s / fsm.dac.writes_per_frame
         shortest_s = min(write_s, self.injector.period_s)
@@ -249,8 +249,9 @@ class MirrorStage:
         self.ready = False
         self._dac.confirm()
         self.ready = True
-        self.written_s = self._known_s = self._clock.now_s()
+        self.written_s = self._clock.now_s()
         self.round_trip_s = self.written_s - begun_s
+        self._known_s = begun_s  # a confirmation that is read late tells what was, not what is
         self._extend_commanded_range(self.stack_v)
         self._mirror.written(self.stack_v)
         self._history.append((self.written_s, self._mirror.angles_rad))
@@ -300,5 +301,5 @@ class MirrorStage:
             self._extend_commanded_range(stack_v)
             self.stack_v, self.command_rad = stack_v, self._mirror.angles_rad
             self._history.append((time_s, self.command_rad))
-            self.written_s = self._known_s = time_s
+            self.written_s = time_s
         return between + injections if between else injections

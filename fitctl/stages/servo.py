@@ -16,7 +16,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.clock import Clock
+from fitctl.clock import Clock, Watchdog
 from fitctl.config import AnyLoop
 from fitctl.controllers.position_servo import position_servo
 from fitctl.drivers.interface import (
@@ -39,6 +39,7 @@ _ENCODER_JUMP_RAD = 0.5  # while nobody looked: more than a motor coasts
 _ON_ITS_OWN_S = (
     3.0  # motors may have turned for so long after a supervisor last wrote where they were
 )
+_LOOK_AGAIN = 0.2  # of the time limit for readings: after a pause of this computer's own
 _SPEED_MARGIN = 1.2  # of a motor that turns on, over its last velocity command
 
 
@@ -117,7 +118,9 @@ class SiderostatServo:
         self._blind_s = 1.0 / siderostat.servo.gain_per_s  # an older reading would make it swing
         self._read_s = -math.inf
         self._blind = False
-        self._timely_s = 0.0
+        self._timely = Watchdog(
+            self._settings.reading_timeout_s, _LOOK_AGAIN * self._settings.reading_timeout_s, 0.0
+        )
         self._missed_readings = 0
         self._drained = (0, 0)  # missed and skipped, as last asked
         self._followed_s = 0.0
@@ -285,7 +288,7 @@ class SiderostatServo:
             shown_s = 2 * reading.time_s - now_s
             while len(self._unread) > 1 and self._unread[1][0] <= shown_s:
                 del self._unread[0]
-        if now_s - self._timely_s > self._settings.reading_timeout_s:
+        if self._timely.expired(now_s):
             raise self._no_reading()
         if reading is None:
             return
@@ -333,7 +336,7 @@ class SiderostatServo:
     def _accept_reading(self, reading: ServoReading, now_s: float) -> None:
         self._read_s = reading.time_s
         if now_s - reading.time_s <= self._blind_s:
-            self._timely_s = now_s
+            self._timely.feed(now_s)
         self._position_rad = reading.position_rad
         self._history.append(reading)
 
@@ -377,7 +380,7 @@ class SiderostatServo:
         self._find_position()
         self._amplifiers.enable()
         self.opened = self.enabled = True
-        self._timely_s = self._clock.now_s()
+        self._timely.feed(self._clock.now_s())
         return identity
 
     def _find_position(self) -> None:
@@ -386,9 +389,9 @@ class SiderostatServo:
         A drive that stopped answering may have turned on at any velocity that it was sent since; its encoders
         count on from the same zero. Any other difference means that they count from elsewhere now.
         """
-        deadline_s = self._clock.now_s() + self._settings.reading_timeout_s
+        self._timely.feed(self._clock.now_s())
         while (reading := self._amplifiers.exchange(_STILL)) is None:
-            if self._clock.now_s() > deadline_s:
+            if self._timely.expired(self._clock.now_s()):
                 raise self._no_reading()
         knew, last_rad, last_s = bool(self._history), self._position_rad, self._read_s
         recalled_rad, self._recalled_rad = self._recalled_rad, None

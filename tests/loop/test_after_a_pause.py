@@ -72,6 +72,23 @@ def test_a_mirror_that_was_moved_while_other_devices_were_opened_goes_on_from_th
     assert max(steps) <= fsm.slew_v_per_s * off_bias.rig.camera.period_s + fsm.dac.step_v
 
 
+def test_a_confirmation_that_waited_for_the_computer_does_not_tell_where_the_mirror_is(off_bias):
+    fsm = off_bias.rig.stellar_loops["right"].fsm
+    dac = off_bias.devices.loops["right"].dac
+    confirm = dac.confirm
+    steps = steps_v(dac)
+
+    def confirm_late():
+        confirm()
+        stall(off_bias, 1.3, SAFE_V)  # the D/A has obeyed; nobody reads its answer
+        dac.confirm = confirm
+
+    dac.confirm = confirm_late
+    off_bias.run(2.0)
+
+    assert max(steps) <= fsm.slew_v_per_s * off_bias.rig.camera.period_s + fsm.dac.step_v
+
+
 def test_outputs_that_stayed_are_no_news(off_bias):
     stall(off_bias, 0.45)
     off_bias.run(0.5)

@@ -231,6 +231,10 @@ def test_a_hexapod_that_is_not_ready_is_not_moved(reading, why):
 
 def run(clock, drive, periods):
     drive.start()
+    run_on(clock, drive, periods)
+
+
+def run_on(clock, drive, periods):
     for _ in range(periods):
         drive.period()
         clock.sleep_until(clock.now_s() + PERIOD_S)
@@ -272,6 +276,18 @@ def test_a_stuck_hexapod_is_noticed():
     hexapod.stuck = True
     run(clock, drive, 60)
     assert isinstance(drive.fault, DeviceFault)
+
+
+def test_a_hexapod_that_waited_for_this_computer_follows():
+    clock, hexapod, drive = driven(kind="drift", velocity_mm_s=1.0)
+    run(clock, drive, 19)
+    hexapod.stuck = True
+    clock.sleep_until(clock.now_s() + 0.5)
+    drive.period()
+    assert drive.running
+
+    run_on(clock, drive, 20)
+    assert isinstance(drive.fault, DeviceFault), "at the next check, should it still be behind"
 
 
 def test_a_target_that_cannot_be_sent_ends_the_course():

@@ -174,6 +174,19 @@ def test_motors_that_turned_on_while_this_computer_stood_still_are_no_following_
     assert amplifiers.position_rad[0] == pytest.approx(6.0, abs=2e-3)
 
 
+def test_a_drive_may_answer_late_after_this_computer_stood_still(servo, amplifiers):
+    """A drive that stood still with it, as a mock on the same computer, has to catch up."""
+    servo.hold(servo.position_rad)
+    run(servo, 20)
+    amplifiers.clock.sleep_until(amplifiers.clock.now_s() + 0.3)
+    amplifiers.silent = True
+    run(servo, 20)  # 40 ms
+    amplifiers.silent = False
+    run(servo, 20)
+
+    assert servo.fault is None
+
+
 def test_late_readings_of_motors_that_turned_on_are_no_following_error(servo, amplifiers):
     """A busy computer: commands and readings come late, one after the other, for 100 ms."""
     servo.hold(servo.position_rad)
