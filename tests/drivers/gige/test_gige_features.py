@@ -6,6 +6,7 @@ import io
 import struct
 import tracemalloc
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -95,13 +96,13 @@ def lying(size: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("content", "why"),
-    [(bomb(300 << 20), "314572800 bytes once unpacked"), (lying(300 << 20), "Bad CRC-32")],
-    ids=["honest", "lying"],
+    ("archive", "why"),
+    [(bomb, "314572800 bytes once unpacked"), (lying, "Bad CRC-32")],
 )
 def test_an_archive_that_unpacks_to_an_absurd_size_takes_no_memory(
-    content: bytes, why: str
+    archive: Callable[[int], bytes], why: str
 ) -> None:
+    content = archive(300 << 20)
     assert len(content) < 1 << 20
     tracemalloc.start()
     try:
