@@ -132,15 +132,18 @@ def estimate(opened: Opened, expected: AirPathModel, noise_px: float) -> Night:
     """
     # Lines first, with the mirror as the rig file has it: it would explain a line that the model lacks. Then
     # with the mirror free, lines that explained the mirror are no longer worth their price.
-    found = likeliest(opened, Guess(air_of(expected), noise_px), free_mirror=False)
-    found = _with_more_lines(opened, found, free_mirror=False)
+    first = Guess(air_of(expected), noise_px)
+    found = likeliest(opened, first, free_mirror=False)
+    found = _with_more_lines(opened, found, first, free_mirror=False)
     found = likeliest(opened, found.guess)
     found = _without_needless_lines(opened, found)
-    found = _with_more_lines(opened, found, free_mirror=True)
+    found = _with_more_lines(opened, found, first, free_mirror=True)
     return _night(opened, found)
 
 
-def _with_more_lines(opened: Opened, found: Likeliest, *, free_mirror: bool) -> Likeliest:
+def _with_more_lines(
+    opened: Opened, found: Likeliest, first: Guess, *, free_mirror: bool
+) -> Likeliest:
     """One line after the other, as long as each is worth its price."""
     refused: list[float] = []
     while len(found.guess.lines) < MOST_LINES:
@@ -148,7 +151,12 @@ def _with_more_lines(opened: Opened, found: Likeliest, *, free_mirror: bool) -> 
         if line is None:
             break
         guess = found.guess._replace(lines=(*found.guess.lines, line))
-        more = likeliest(opened, guess, free_mirror=free_mirror)
+        # An air path that had to explain the line is far from its own, and the search may not find back.
+        begins = (guess, guess._replace(air=first.air, noise_px=first.noise_px))
+        more = min(
+            (likeliest(opened, begin, free_mirror=free_mirror) for begin in begins),
+            key=lambda end: end.cost,
+        )
         newest = more.guess.lines[-1]
         if found.cost - more.cost < _price(opened):
             break

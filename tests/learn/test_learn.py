@@ -132,6 +132,17 @@ def test_a_line_is_not_taken_for_air(shaken, shaken_opened, paper):
     assert night.test.fits
 
 
+def test_a_strong_line_in_quiet_air_does_not_keep_the_search_from_the_air(paper, fixed):
+    """Without lines, an air path of 100 times the strength explains such a line best."""
+    quiet = paper.air_path.model_copy(update={"gain_px": 0.3, "b1_s2": 0.66})
+    lines = (Line(3.86, 0.012, 0.046), Line(56.34, 0.00136, 0.0151))
+    truth = dataclasses.replace(paper, air_path=quiet, noise_px=0.0174, lines=lines)
+    night = estimate(opened(truth, fixed), paper.air_path, paper.noise_px)
+
+    assert night.strength.value == pytest.approx(air_of(quiet).strength, rel=0.2)
+    assert night.test.fits
+
+
 def test_a_model_that_lacks_a_line_does_not_fit(shaken_opened, paper):
     without = likeliest(shaken_opened, Guess(air_of(paper.air_path), paper.noise_px))
     test = fit_test(shaken_opened, without.density, without.guess.gain, without.guess.overshoot)
