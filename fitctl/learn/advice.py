@@ -169,6 +169,7 @@ class Advice(NamedTuple):
             f"overshoot    {night.overshoot} of the mirror's last step, at mid-exposure",
             *(_line_text(line) for line in self.lines),
             *([] if self.lines else ["lines        none"]),
+            *self._alias_hint(),
             f"test of fit  {night.test.text}",
             f"measured     {' '.join(f'{a} {px:.4f}' for a, px in zip(_AXES, self.measured_px, strict=True))}"
             " px RMS on frames, noise included",
@@ -207,6 +208,15 @@ class Advice(NamedTuple):
             gained = 1 - self.learnt.residual_px / self.present.residual_px
             text.append(f"The learnt design would leave {gained:.0%} less.")
         return text
+
+    def _alias_hint(self) -> list[str]:
+        """For who knows the rig's vibrations; one that is faster than it looks must not be counteracted."""
+        if all(line.part == 1 or not line.can_be_alias for line in self.lines):
+            return []
+        return [
+            "             if you know how fast vibrations are at most, set fastest_line_hz: lines that are "
+            "then no aliases are counteracted in full"
+        ]
 
     def _filled_text(self) -> str:
         if not self.filled:

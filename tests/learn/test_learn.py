@@ -246,7 +246,9 @@ def test_a_line_that_may_be_a_faster_one_is_counteracted_only_as_far_as_that_doe
     in_full = fastest_line_hz == 30.0
 
     assert line.part == 1.0 if in_full else 0.0 < line.part < 0.5
-    assert ("counteracted in part, as " in "\n".join(advice.lines_of_text())) == (not in_full)
+    text = "\n".join(advice.lines_of_text())
+    assert ("counteracted in part, as " in text) == (not in_full)
+    assert ("set fastest_line_hz: lines" in text) == (not in_full)
     assert advice.if_aliases.harmless
     assert line.can_be_alias == math.isinf(fastest_line_hz)
 
