@@ -44,7 +44,7 @@ demo: $(READY)  ## Run the whole instrument on mock devices
 BESIDE := $(MAKE) --no-print-directory --jobs 2 --output-sync=target
 
 test: lint contract  ## Run lint, import contract, types, and all tests without a target of their own
-	@echo "Types and tests, less than five minutes ..."
+	@echo "Types and tests, about eight minutes on two cores ..."
 	@$(BESIDE) types test-parts
 
 lint: $(READY)
@@ -73,7 +73,7 @@ test-instrument: $(READY)  ## Test the whole instrument in real time, as process
 	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system/alone tests/system
 	$(BIN)/pytest tests/system/alone
 
-test-long: compiled  ## Run batches, campaigns, whole nights, and the commands of the documents (three minutes)
+test-long: compiled  ## Run batches, campaigns, whole nights, and the commands of the documents (ten minutes)
 	$(BIN)/pytest -m long --numprocesses 3 --dist loadfile $(ARGS)
 
 # Each takes a minute of one core; workers that begin at once would each compile the same, and not be done in time.
