@@ -210,8 +210,8 @@ class Advice(NamedTuple):
         return text
 
     def _alias_hint(self) -> list[str]:
-        """For who knows the rig's vibrations; one that is faster than it looks must not be counteracted."""
-        if all(line.part == 1 or not line.can_be_alias for line in self.lines):
+        """Tells an operator who knows the rig's vibrations how to have such lines counteracted in full."""
+        if not any(line.can_be_alias and line.part < 1 for line in self.lines):
             return []
         return [
             "             if you know how fast vibrations are at most, set fastest_line_hz: lines that are "

@@ -151,7 +151,7 @@ def _with_more_lines(
         if line is None:
             break
         guess = found.guess._replace(lines=(*found.guess.lines, line))
-        # An air path that had to explain the line is far from its own, and the search may not find back.
+        # Without this line, fast air may explain it best; a search that begins there may not come back.
         begins = (guess, guess._replace(air=first.air, noise_px=first.noise_px))
         more = min(
             (likeliest(opened, begin, free_mirror=free_mirror) for begin in begins),

@@ -251,7 +251,7 @@ class MirrorStage:
         self.ready = True
         self.written_s = self._clock.now_s()
         self.round_trip_s = self.written_s - begun_s
-        self._known_s = begun_s  # a confirmation that is read late tells what was, not what is
+        self._known_s = begun_s  # the confirmation may be read long after the D/A obeyed
         self._extend_commanded_range(self.stack_v)
         self._mirror.written(self.stack_v)
         self._history.append((self.written_s, self._mirror.angles_rad))

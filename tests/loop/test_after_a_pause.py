@@ -80,7 +80,7 @@ def test_a_confirmation_that_waited_for_the_computer_does_not_tell_where_the_mir
 
     def confirm_late():
         confirm()
-        stall(off_bias, 1.3, SAFE_V)  # the D/A has obeyed; nobody reads its answer
+        stall(off_bias, 1.3, SAFE_V)  # the D/A has obeyed; this computer reads its answer later
         dac.confirm = confirm
 
     dac.confirm = confirm_late

@@ -261,9 +261,7 @@ def test_a_hexapod_that_does_not_follow_ends_the_course_and_is_stopped(reading, 
     clock, hexapod, drive = driven(kind="sine", amplitude_mm=1.0, frequency_hz=0.05)
     drive.start()
     hexapod.reading = reading
-    for _ in range(25):
-        drive.period()
-        clock.sleep_until(clock.now_s() + PERIOD_S)
+    run_on(clock, drive, 25)
     assert isinstance(drive.fault, DeviceFault)
     assert why in str(drive.fault)
     assert not drive.running

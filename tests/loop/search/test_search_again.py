@@ -106,7 +106,7 @@ def test_a_long_search_is_reported_once_and_consoles_are_shown_since_when(held):
     simulation = held()
     darken(simulation)
 
-    simulation.run(150.0)
+    simulation.run(300.0)
 
     told = [event for event in events_of(simulation) if "the search repeats" in event.message]
     assert [event.severity for event in told] == ["warning"]
