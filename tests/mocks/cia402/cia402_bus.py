@@ -66,6 +66,12 @@ class Bus:
             self.passed_over.append(frame)
         assert frame[1] == data
 
+    async def see_after(self, can_id, before, data):
+        """The same, but some with the data from before may have been sent already."""
+        while (frame := await self.frame()) == (can_id, before):
+            pass
+        assert frame == (can_id, data)
+
     async def ask(self, request, answer):
         """One SDO round trip."""
         self.send(0x601, request)

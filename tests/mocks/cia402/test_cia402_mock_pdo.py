@@ -114,16 +114,14 @@ def test_the_heartbeat_says_the_nmt_state():
         await bus.write(protocol.HEARTBEAT_PRODUCER, (20).to_bytes(2, "little"))
         await bus.see(0x701, "7f")
         bus.send(0x000, "01 00")
-        await bus.see(0x701, "05")
+        await bus.see_after(0x701, "7f", "05")
         bus.send(0x000, "02 01")
-        await bus.see(0x701, "04")
+        await bus.see_after(0x701, "05", "04")
         bus.send(0x601, "40 00 10 00 00000000")
         assert (await bus.frame())[0] == 0x701  # stopped: no SDO
         bus.send(0x000, "81 02")  # another node's reset
         bus.send(0x000, "81 01")
-        while (state := (await bus.frame())[1]) == "04":
-            pass
-        assert state == "00"  # boot-up, and the producer is off again
+        await bus.see_after(0x701, "04", "00")  # boot-up, and the producer is off again
         await bus.ask("40 17 10 00 00000000", "4b 17 10 00 00 00 00 00")
 
     on_drive(script)
