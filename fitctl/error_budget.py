@@ -61,11 +61,11 @@ class LoopTheory(NamedTuple):
         Error over disturbance, by the linear loop with delay and hold.
     undelayed : array, shape (n,)
         Magnitude of the same for a loop of the same kind without delay and hold.
-    air_px2_per_hz : array, shape (n,)
-        One-sided power spectral density of the air path that the loop is designed for.
+    disturbance_px2_per_hz : array, shape (n,)
+        One-sided power spectral density, on frames, of what is expected to move the star: air path and lines.
     noise_px, flux_dn : float
-        One standard deviation of a centroid of a star of so much light. Less light means more noise, in
-        proportion.
+        One standard deviation of the place of a star of so much light. Less light means more noise, in
+        proportion; a noise of any light (nan) is taken as it is.
     period_s : float
         Of frames.
     mirror_px_per_rad, motor_px_per_rad : arrays, shape (2, 2)
@@ -84,7 +84,7 @@ class LoopTheory(NamedTuple):
     frequency_hz: Floats
     sensitivity: Complexes
     undelayed: Floats
-    air_px2_per_hz: Floats
+    disturbance_px2_per_hz: Floats
     noise_px: float
     flux_dn: float
     period_s: float
@@ -408,8 +408,10 @@ def budget(
     followed, disturbance = _power(theory, density.frequency_hz), density.disturbance.mean(axis=1)
     linear = float(followed.sensitivity @ disturbance * step_hz)
     # White: the same density at every frequency up to half the frame rate.
-    flux_dn = np.asarray(ticks["star_flux_dn"], dtype=float)[rows]
-    noise_px2 = float(np.mean((theory.noise_px * theory.flux_dn / flux_dn) ** 2))
+    dimmer = np.ones(1)
+    if not math.isnan(theory.flux_dn):
+        dimmer = theory.flux_dn / np.asarray(ticks["star_flux_dn"], dtype=float)[rows]
+    noise_px2 = float(np.mean((theory.noise_px * dimmer) ** 2))
     white = 2 * theory.period_s * noise_px2
     noise = float(followed.sensitivity.sum() * step_hz * white)
     undelayed = float(followed.undelayed @ (disturbance - white) * step_hz)
@@ -437,22 +439,22 @@ def _power(theory: LoopTheory, frequency_hz: Floats) -> _Power:
 
 
 def _expected(theory: LoopTheory) -> dict[str, float]:
-    frequency_hz, air = theory.frequency_hz, theory.air_px2_per_hz
+    frequency_hz, moving = theory.frequency_hz, theory.disturbance_px2_per_hz
     sensitivity, undelayed = np.abs(theory.sensitivity) ** 2, theory.undelayed**2
     white = 2 * theory.period_s * theory.noise_px**2
     return {
         **dict.fromkeys(CAUSES, 0.0),
-        "air": float(np.trapezoid(undelayed * air, frequency_hz)),
-        "delay and hold": float(np.trapezoid((sensitivity - undelayed) * air, frequency_hz)),
+        "air": float(np.trapezoid(undelayed * moving, frequency_hz)),
+        "delay and hold": float(np.trapezoid((sensitivity - undelayed) * moving, frequency_hz)),
         "camera noise": float(np.trapezoid(sensitivity * white, frequency_hz)),
     }
 
 
 def predicted(theory: LoopTheory, frequency_hz: Floats) -> Floats:
-    """Density of the error that the design leaves of its air path and the camera's noise, px²/Hz."""
+    """Density of the error that the design leaves of what it expects and the camera's noise, px²/Hz."""
     white = 2 * theory.period_s * theory.noise_px**2
-    air = np.exp(_at(theory.frequency_hz, np.log(theory.air_px2_per_hz), frequency_hz))
-    return np.asarray(_power(theory, frequency_hz).sensitivity * (air + white))
+    moving = np.exp(_at(theory.frequency_hz, np.log(theory.disturbance_px2_per_hz), frequency_hz))
+    return np.asarray(_power(theory, frequency_hz).sensitivity * (moving + white))
 
 
 def pieces_of(at_s: Floats, usable: NDArray[np.bool_]) -> list[NDArray[np.intp]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import LEAST_GAIN, MOST_OVERSHOOT, Basis
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.disturbance import framed_px2_per_hz
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, left_on_paper
 from fitctl.controllers.design.margins import (
@@ -32,12 +33,7 @@ from fitctl.learn.aliases import (
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night, estimate
 from fitctl.learn.opened import LEAST_S, Series, periodograms
-from fitctl.learn.spectrum import (
-    air_of,
-    air_px2_per_hz,
-    framed_line_px2_per_hz,
-    white_px2_per_hz,
-)
+from fitctl.learn.spectrum import white_px2_per_hz
 
 Floats = NDArray[np.float64]
 WORTH_IT = 0.98
@@ -415,14 +411,8 @@ def standing(design: Design, truth: Basis) -> Standing:
 
 def _camera_px(design: Design, truth: Basis) -> float:
     """RMS of the error on frames that a design leaves, noise included."""
-    hz, period_s = frequencies_hz(truth), truth.period_s
-    density = air_px2_per_hz(air_of(truth.air_path), hz, period_s)
-    density = density + white_px2_per_hz(truth.noise_px, period_s)
-    for line in truth.lines:
-        width_hz = np.full(len(hz), line.damping * line.frequency_hz)
-        density = density + line.rms_px**2 * framed_line_px2_per_hz(
-            line.frequency_hz, width_hz, hz, period_s
-        )
+    hz = frequencies_hz(truth)
+    density = framed_px2_per_hz(truth, hz) + white_px2_per_hz(truth.noise_px, truth.period_s)
     sensitivity = 1 / np.abs(1 + sampled_response(design, truth)(2 * math.pi * hz))
     return math.sqrt(float(np.trapezoid(sensitivity**2 * density, hz)))
 

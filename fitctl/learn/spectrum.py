@@ -55,21 +55,6 @@ def air_px2_per_hz(air: Air, frequency_hz: Floats, period_s: float) -> Floats:
     return air_slopes(air, frequency_hz, period_s)[0]
 
 
-def framed_line_px2_per_hz(
-    own_hz: float, half_width_hz: Floats, frequency_hz: Floats, period_s: float
-) -> Floats:
-    """One-sided density on frames of a line of 1 px RMS.
-
-    Parameters
-    ----------
-    own_hz : float
-        Of the oscillator.
-    half_width_hz : array
-        At half power, with what the segments' length adds; shape as `frequency_hz`.
-    """
-    return framed_line_slopes(own_hz, half_width_hz, frequency_hz, period_s)[0]
-
-
 def air_slopes(air: Air, frequency_hz: Floats, period_s: float) -> tuple[Floats, Floats, Floats]:
     """As :func:`air_px2_per_hz`, and its derivatives by the logarithms of damping and stiffness."""
     return _oscillator(2 * air.strength**2, air.damping, air.stiffness, frequency_hz, period_s)
@@ -78,7 +63,15 @@ def air_slopes(air: Air, frequency_hz: Floats, period_s: float) -> tuple[Floats,
 def framed_line_slopes(
     own_hz: float, half_width_hz: Floats, frequency_hz: Floats, period_s: float
 ) -> tuple[Floats, Floats, Floats]:
-    """As :func:`framed_line_px2_per_hz`, and its derivatives by its frequency and its half width, 1/Hz each."""
+    """One-sided density on frames of a line of 1 px RMS, and its derivatives, 1/Hz each.
+
+    Parameters
+    ----------
+    own_hz : float
+        Of the oscillator; the first derivative is by it,
+    half_width_hz : array
+        and the second by this: at half power, with what the segments' length adds; shape as `frequency_hz`.
+    """
     own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
     total, by_damping, by_stiffness = _oscillator(
         4 * width * own**2, width, own**2, frequency_hz, period_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import ConfigError, Rig
-from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
+from fitctl.controllers.design.basis import Basis, basis, night_of
 from fitctl.controllers.design.choose import DESIGNS, design_for
 from fitctl.controllers.design.files import design_of
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
@@ -225,7 +226,7 @@ def _predicted(
     try:
         its_basis = basis(gathered.run.rig, loop_name)
         design = _design(gathered, loop_name, name, its_basis)
-        its_basis = on_its_mirror(its_basis, design.parameters)
+        its_basis = night_of(design, its_basis)
     except ConfigError as error:
         return None, None, str(error)
     rejection = np.abs(1 + sampled_response(design, its_basis)(2 * math.pi * frequency_hz))
@@ -239,7 +240,8 @@ def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> 
     rig: Rig = gathered.run.rig
     logged = _logged_design(gathered, loop_name, name)
     if _title(logged) == name:
-        return design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
+        design = design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
+        return dataclasses.replace(design, learnt=name == LEARNT)
     if name not in DESIGNS:  # a text of the log, which must never become a path
         msg = f"{name}: its matrices are not in the log"
         raise ConfigError(msg)

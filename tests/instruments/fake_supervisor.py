@@ -164,6 +164,7 @@ class FakeSupervisor:
         self.bias_offset_urad = (0.0, 0.0)
         self.controller = "minimum-variance"
         self.controller_file = ""
+        self.noise_px: float | None = None
         self.search_again: SearchAgain | None = None
         self.last_failure: LoopFailure | None = None
 
@@ -269,6 +270,7 @@ class FakeSupervisor:
             search_centre_sky_arcsec=(100.0, -40.0) if mode == "ACQUISITION" else None,
             other_spots=[] if is_beam else [self._fringe(loop)],
             controller_file=self.controller_file,
+            noise_px=self.noise_px,
             search_again=self.search_again if mode == "ACQUISITION" else None,
             last_failure=self.last_failure,
             kind="metrology" if is_beam else "stellar",

@@ -17,7 +17,7 @@ from fitctl.learn.aliases import IfAliases
 from fitctl.learn.goodness_of_fit import fit_test
 from fitctl.learn.night import estimate
 from fitctl.learn.opened import Series, periodograms
-from fitctl.learn.spectrum import Air, air_of, framed_line_px2_per_hz
+from fitctl.learn.spectrum import Air, air_of, framed_line_slopes
 from fitctl.learn.whittle import Guess, LineGuess, _Problem, likeliest
 
 TWO_MINUTES_S = 120.0
@@ -97,7 +97,7 @@ def test_the_likelihoods_slope_is_its_own(shaken, shaken_opened):
 def test_a_fast_line_has_its_place_among_slow_frequencies(paper):
     at_hz = np.linspace(0.5, 24.5, 4801)
     width_hz = np.full(len(at_hz), 0.05)
-    density = framed_line_px2_per_hz(48.9, width_hz, at_hz, paper.period_s)
+    density = framed_line_slopes(48.9, width_hz, at_hz, paper.period_s)[0]
 
     assert at_hz[density.argmax()] == pytest.approx(1.1, abs=0.01)
     assert np.trapezoid(density, at_hz) == pytest.approx(1.0, rel=0.1)

@@ -18,7 +18,7 @@ from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, lqg_ltr
-from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
+from fitctl.controllers.design.basis import Basis, basis, night_of
 from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
@@ -28,7 +28,7 @@ from fitctl.controllers.design.linear_loop import loopshape
 from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.controllers.design.standing import Standing, standing
 from fitctl.controllers.design.theory import loop_theory
-from fitctl.controllers.pair import Design
+from fitctl.controllers.pair import LEARNT, Design
 from fitctl.error_budget import theory_to_plain
 from fitctl.model.optics import scales
 
@@ -44,7 +44,8 @@ def design(
         str,
         typer.Argument(
             help="vernier, coarse, bound, compare, learn, or a design: eq20, lqg-ltr, minimum-variance, "
-            "fslq, a saved file (*.json), or a Python file of your own (*.py)."
+            "fslq, a saved file (*.json), a Python file of your own (*.py), or the parameters of a learnt "
+            "design, as fitctl status --json has them."
         ),
     ],
     logs: Annotated[
@@ -96,7 +97,7 @@ def design(
         "compare": lambda rig, loop: _compare(rig, loop, logs or []),
         **{name: _one(name) for name in DESIGNS},
     }
-    if what.endswith((".json", ".py")):
+    if what.endswith((".json", ".py")) or what.startswith("{"):
         reports[what] = _saved(what)
     if what not in reports:
         msg = (
@@ -279,8 +280,8 @@ def _one(name: str) -> Callable[[Rig, str], Report]:
 def _saved(file: str) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
         design = design_for(rig, loop, file)
-        its_basis = on_its_mirror(basis(rig, loop), design.parameters)
-        return _stands(f"{design.name} of {file}", design, its_basis, rig, loop)
+        title = LEARNT if design.learnt else f"{design.name} of {file}"
+        return _stands(title, design, night_of(design, basis(rig, loop)), rig, loop)
 
     return report
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from fitctl.config import AirPathModel, ConfigError, Rig, Vernier
 from fitctl.controllers.centroid import sensor_noise_px
+from fitctl.controllers.pair import Design
 from fitctl.model.optics import scales
 
 LEAST_GAIN = 0.4
@@ -158,6 +159,13 @@ def on_its_mirror(basis: Basis, parameters: Mapping[str, Any]) -> Basis:
         mirror_gain=float(parameters.get("mirror_gain", 1.0)),
         overshoot=float(parameters.get("overshoot", 0.0)),
     )
+
+
+def night_of(design: Design, rig_basis: Basis) -> Basis:
+    """What is expected of the night: for a learnt design what was learnt, for others what the rig file says."""
+    if not design.learnt:
+        return on_its_mirror(rig_basis, design.parameters)
+    return replace(basis_of(design.parameters, rig_basis), guard=None)
 
 
 def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:

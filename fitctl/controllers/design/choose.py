@@ -83,7 +83,14 @@ def _learnt(document_json: str, its_basis: Basis) -> Design:
         document = json.loads(document_json)
         its_basis = basis_of(document["parameters"], its_basis)
         design = DESIGNS[document["name"]](its_basis)
-    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         msg = f"controller {LEARNT}: its parameters cannot be used: {error!r}; {advice}"
         raise ConfigError(msg) from None
     required = Required()

@@ -8,16 +8,16 @@ import math
 import numpy as np
 
 from fitctl.config import ARCSEC_PER_RAD, Rig
-from fitctl.controllers.design.basis import Basis, basis, basis_of, on_its_mirror
+from fitctl.controllers.design.basis import Basis, basis, basis_of, night_of
 from fitctl.controllers.design.choose import DESIGNS
+from fitctl.controllers.design.linear_loop.disturbance import framed_px2_per_hz
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
+from fitctl.controllers.design.margins import frequencies_hz
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import LoopTheory
 from fitctl.model.optics import motor_sky_rad_per_rad, scales, star_rate_px_s
 
-_LOWEST_HZ = 0.005
-_POINTS = 300
 _QUICKER = 20
 """So many times the frame rate stands for a loop without hold."""
 
@@ -25,18 +25,19 @@ _QUICKER = 20
 def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
     """Sensitivity, disturbance and scales of a rig's loop with a design.
 
+    A learnt design expects the night that it was made for, every other design that of the rig file.
+
     Raises
     ------
     ConfigError
         If the rig file knows of no disturbance.
     """
     loop = rig.stellar_loops[loop_name]
-    its_basis = on_its_mirror(basis(rig, loop_name), design.parameters)
+    its_basis = night_of(design, basis(rig, loop_name))
     scale = scales(rig, loop)
-    frequency_hz = np.geomspace(_LOWEST_HZ, 0.5 / its_basis.period_s, _POINTS)
+    frequency_hz = frequencies_hz(its_basis)
     omega_rad_s = 2 * math.pi * frequency_hz
     quick = _without_delay_and_hold(its_basis)
-    air = its_basis.air_path
     motor_px_per_rad = scale.motor_px(np.eye(2)).T
     link_px_per_rad, link_backlash_rad = np.zeros((2, 2)), math.nan
     if loop.link is not None:
@@ -60,12 +61,9 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
         frequency_hz=frequency_hz,
         sensitivity=sensitivity,
         undelayed=undelayed,
-        # Eq. 8 and 9 with white noise of unit intensity, on both sides of zero.
-        air_px2_per_hz=2
-        * air.gain_px**2
-        / np.abs(1 - air.b1_s2 * omega_rad_s**2 + 1j * air.b2_s * omega_rad_s) ** 2,
+        disturbance_px2_per_hz=framed_px2_per_hz(its_basis, frequency_hz),
         noise_px=its_basis.noise_px,
-        flux_dn=loop.star_flux_dn,
+        flux_dn=math.nan if design.learnt else loop.star_flux_dn,
         period_s=its_basis.period_s,
         mirror_px_per_rad=scale.mirror_px(np.eye(2)).T,
         motor_px_per_rad=motor_px_per_rad,

@@ -183,15 +183,17 @@ class Axis:
 
     # ------------------------------------------------------------ time
     def step(self, feedback: float, period_s: float) -> None:
-        """One period of the controller, with what the encoder reads now.
+        """What the controller did in a period, with what the encoder reads at its end.
 
-        After a longer period than `LONGEST_STEP_S` the trajectory goes on from where it was.
+        A real controller goes on while this computer stands still: the trajectory makes up for it, in steps of
+        at most `LONGEST_STEP_S`, as the motors did.
         """
         self.feedback = feedback - self._home
         self._measure_velocity(feedback, period_s)
-        period_s = min(period_s, LONGEST_STEP_S)
         if self.enabled:
-            self._advance(period_s)
+            steps = math.ceil(period_s / LONGEST_STEP_S)
+            for _ in range(steps):
+                self._advance(period_s / steps)
         else:
             self.command = feedback
         self._update_faults()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
+import numpy as np
 from textual.app import ComposeResult
 from textual.binding import BindingType
 
+from fitctl.config import is_name
 from fitctl.messages.telemetry import LoopState
 from fitctl.tui.commands import keys_of
 from fitctl.tui.jobs import Job
@@ -19,13 +22,12 @@ NEEDS_RIG = (
     "The console computes margins from the rig file and does not have it here. Start the console again with "
     "--rig FILE."
 )
-LEARNT_HERE = (
-    "A learnt design has a sensitivity of at most 2, and margins of at least 6 dB and 35°."
-)
-FOR_THE_LIGHT = (
-    "Made for the star's measured light, {:.4f} px of noise: its margins are not known here."
-)
+NO_DESIGN = "What the supervisor says of it cannot be evaluated here."
 FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known here."
+
+
+LONGEST_PARAMETERS = 50_000
+"""Characters, a dozen times what a design with many lines has; no process takes an argument of 131072."""
 
 
 class LoopScreen(View):
@@ -59,19 +61,27 @@ class LoopScreen(View):
         if loop is None or rig_arguments is None or self._job is not None:
             return
         wanted = design_in_use(loop.state)
-        if wanted != self._asked and wanted.design and not self._why_unknown(loop.state):
-            self._asked = wanted
-            options = ["--json", "--loop", wanted.loop, *rig_arguments]
-            self._job = self.console.start_job(["design", wanted.design, *options])
+        if wanted == self._asked or not wanted.design or self._why_unknown(loop.state):
+            return
+        options = ["--json", "--loop", wanted.loop, *rig_arguments]
+        if wanted.noise_px is not None:
+            flux_dn = loop.past.since(-math.inf, "star_flux_dn")
+            flux_dn = flux_dn[np.isfinite(flux_dn)]
+            if not len(flux_dn):
+                return  # until the star is seen
+            options += ["--set", f"loops.{wanted.loop}.star_flux_dn={np.median(flux_dn):.6g}"]
+        self._asked = wanted
+        self._job = self.console.start_job(["design", *options, "--", wanted.design])
 
     def _why_unknown(self, loop: LoopState) -> str:
-        if loop.learning is not None and loop.learning.design_json:
-            return LEARNT_HERE
-        if loop.controller_file and self.console.remote_arguments:
-            return FILE_ELSEWHERE
-        if loop.noise_px is not None:
-            return FOR_THE_LIGHT.format(loop.noise_px)
-        return NEEDS_RIG if self.console.rig_arguments is None else ""
+        if self.console.rig_arguments is None:
+            return NEEDS_RIG
+        design = design_in_use(loop).design
+        learnt = design.startswith("{")
+        if loop.controller_file and not learnt:
+            return FILE_ELSEWHERE if self.console.remote_arguments else ""
+        usable = len(design) <= LONGEST_PARAMETERS if learnt else is_name(design)
+        return "" if usable or not design else NO_DESIGN
 
     def on_unmount(self) -> None:
         """Leave no child behind."""

@@ -23,15 +23,20 @@ _NAME_COLUMNS = 14
 
 
 class DesignInUse(NamedTuple):
-    """A loop, and the name or the file of the design that it works with."""
+    """What a loop works with: a design's name, its file or its parameters, and the noise that it is made for.
+
+    The noise is None where it is the rig file's, or among the parameters.
+    """
 
     loop: str
     design: str
+    noise_px: float | None = None
 
 
 def design_in_use(loop: LoopState) -> DesignInUse:
     """The design that a loop works with."""
-    return DesignInUse(loop.name, loop.controller_file or loop.controller)
+    learnt = "" if loop.learning is None else loop.learning.design_json
+    return DesignInUse(loop.name, learnt or loop.controller_file or loop.controller, loop.noise_px)
 
 
 class DesignFigures:
@@ -60,8 +65,11 @@ class DesignFigures:
         if status != 0:
             self.problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
             return
-        self.figures = json.loads(output.strip().splitlines()[-1])
-        theory = self.figures.pop("theory", None)
+        figures = json.loads(output.strip().splitlines()[-1])
+        if "stable" not in figures:
+            self.problem = f"{design.design} is no design"  # a name from elsewhere, such as "bound"
+            return
+        self.figures, theory = figures, figures.pop("theory", None)
         self.theory = None if theory is None else theory_from_plain(theory)
 
     def theory_of(self, loop: LoopState) -> LoopTheory | None:

@@ -17,7 +17,7 @@ from fitctl.controllers.design.linear_loop.disturbance import disturbance
 from fitctl.controllers.design.linear_loop.loopshape import loop_shape, sampled_response
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.learn.spectrum import framed_line_px2_per_hz
+from fitctl.learn.spectrum import framed_line_slopes
 
 SIX_HZ = Line(frequency_hz=6.0, damping=0.005, rms_px=0.05)
 
@@ -44,7 +44,7 @@ def test_a_line_has_its_rms_in_time_and_in_its_spectrum(fit, frequency_hz, dampi
     assert moving.covariance[2, 2] == pytest.approx(rms_px**2, rel=1e-6)
     width_hz = np.full(len(at_hz), damping * frequency_hz)
     often_s = 1e-5  # frames so often that aliases are far away
-    density = rms_px**2 * framed_line_px2_per_hz(frequency_hz, width_hz, at_hz, often_s)
+    density = rms_px**2 * framed_line_slopes(frequency_hz, width_hz, at_hz, often_s)[0]
     assert np.trapezoid(density, at_hz) == pytest.approx(rms_px**2, rel=0.1)
 
 

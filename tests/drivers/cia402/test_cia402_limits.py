@@ -135,3 +135,25 @@ def test_an_upload_has_one_time_limit_for_all_its_segments(siderostat):
         return True
 
     assert within(5.0, fails)
+
+
+class StallingComputer:
+    """A link whose computer stands still for longer than any time limit, while the answer comes."""
+
+    endpoint = Endpoint("drive", "nowhere")
+    _answer = None
+
+    def send(self, frame):
+        self._answer = bytes.fromhex("43 0010 00 92010200")
+
+    def receive(self, timeout_s):
+        if timeout_s > 0:
+            time.sleep(timeout_s + 0.01)
+            return None
+        answer, self._answer = self._answer, None
+        return (protocol.SDO_RESPONSE_BASE + 1, answer) if answer else None
+
+
+def test_an_answer_that_came_while_the_computer_stood_still_is_in_time(siderostat):
+    device = siderostat.device.model_copy(update={"response_timeout_s": 0.02})
+    assert Node(StallingComputer(), device).read(protocol.DEVICE_TYPE, 0, "I") == 0x20192

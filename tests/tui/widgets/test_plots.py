@@ -278,7 +278,7 @@ def test_a_cell_in_which_both_axes_lie_has_a_colour_of_its_own():
 
 def known_design(state, controller="eq20"):
     figures = DesignFigures()
-    output = json.dumps({"theory": theory_to_plain(theory_of(controller))})
+    output = json.dumps({"stable": True, "theory": theory_to_plain(theory_of(controller))})
     figures.accept(design_in_use(state.loop.state), output, 0)
     return figures
 
