@@ -40,6 +40,8 @@ WORTH_IT = 0.98
 """A design that leaves more than this part of what the present one leaves is not worth the change."""
 BETTER_LATELY = 0.995
 """On the last frames it must leave at most this part: what is only true of the mean of minutes is past."""
+UNEXPLAINED = 0.8
+"""Both of these where the model does not explain the frames: what is much better on them is so all the same."""
 LATELY_S = 60.0
 TOLERATED_GAIN = 0.15
 """A mirror's gain so far from 1 is left to the margins."""
@@ -134,24 +136,26 @@ class Advice(NamedTuple):
 
     @property
     def worth_it(self) -> bool:
-        """The model fits, and the learnt design leaves clearly less, also lately."""
+        """The learnt design leaves clearly less, also lately; much less if the model does not fit."""
         return (
-            self.night.test.fits
-            and self.learnt.residual_px <= WORTH_IT * self.present.residual_px
+            self.learnt.residual_px <= self._allowed(WORTH_IT) * self.present.residual_px
             and self._better_as_shown
             and self._better_lately
             and self.if_aliases.harmless
         )
 
+    def _allowed(self, part: float) -> float:
+        return part if self.night.test.fits else UNEXPLAINED
+
     @property
     def _better_as_shown(self) -> bool:
         present_px, learnt_px = self.shown_px
-        return learnt_px <= WORTH_IT * present_px
+        return learnt_px <= self._allowed(WORTH_IT) * present_px
 
     @property
     def _better_lately(self) -> bool:
         present_px, learnt_px = self.lately_px
-        return learnt_px <= BETTER_LATELY * present_px
+        return learnt_px <= self._allowed(BETTER_LATELY) * present_px
 
     def lines_of_text(self) -> list[str]:
         """For an operator."""
@@ -177,7 +181,7 @@ class Advice(NamedTuple):
                 *self.lately_px
             ),
         ]
-        if not night.test.fits:
+        if not night.test.fits and not self.worth_it:
             text.append("The model does not explain this night: do not use the learnt design.")
         elif self.learnt.residual_px > self.present.residual_px:
             peak = self.present.margins.peak_sensitivity
@@ -202,7 +206,13 @@ class Advice(NamedTuple):
             text.append("Keep the present design: the learnt one would leave hardly less.")
         else:
             gained = 1 - self.learnt.residual_px / self.present.residual_px
-            text.append(f"The learnt design would leave {gained:.0%} less.")
+            lately = 1 - self.lately_px[1] / self.lately_px[0]
+            text.append(
+                f"The learnt design would leave {gained:.0%} less."
+                if night.test.fits
+                else "The model does not explain this night in full, but of the last minute's frames the "
+                f"learnt design would have left {lately:.0%} less."
+            )
         return text
 
     def _alias_hint(self) -> list[str]:

@@ -76,10 +76,12 @@ class Learning:
         if abs(gained - self._told) < _NEWS or (self.setting == "on" and not self._by_hand):
             return ""
         self._told = gained
-        if not report.fits:
-            return "the learner's model no longer explains the frames; the design in force is kept"
         if not gained:
-            return "the design in force leaves as little as a learnt one would"
+            return (
+                "the design in force leaves as little as a learnt one would"
+                if report.fits
+                else "the learner's model no longer explains the frames; the design in force is kept"
+            )
         return f"{self.what_is_gained(report)}; to apply it: {self.command}"
 
     def wants_change(self, now_s: float) -> bool:
@@ -108,6 +110,7 @@ class Learning:
         return (
             f"a design learnt from {report.evaluated_s:.0f} s of frames would leave {report.learnt_px:.4f} px "
             f"instead of {report.present_px:.4f} ({_gained(report):.0%} less; bound {report.bound_px:.4f})"
+            f"{'' if report.fits else ', though its model does not explain the frames in full'}"
         )
 
     # ------------------------------------------------------------ changes

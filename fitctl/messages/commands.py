@@ -189,7 +189,7 @@ class LearnerReport(Command, frozen=True, kw_only=True):
     measured_px : float
         The same, measured with the design in force; of the worst axis.
     worth_it : bool
-        The model fits the frames, and the learnt design leaves clearly less.
+        The learnt design leaves clearly less; much less where the model does not fit the frames.
     fits : bool
         The model fits the frames.
     """
