@@ -301,6 +301,21 @@ def test_a_design_that_would_not_have_been_better_lately_is_not_worth_it(six_hz)
     assert "in the last minute" in past.lines_of_text()[-1]
 
 
+@pytest.mark.parametrize(("part", "worth_it"), [(0.7, True), (0.9, False)])
+def test_a_model_that_does_not_fit_is_used_only_if_its_design_is_much_better_on_the_frames(
+    six_hz, part, worth_it
+):
+    _, advice = six_hz
+    unfit = advice.night._replace(test=advice.night.test._replace(band=1e-9))
+    present_px, _ = advice.lately_px
+    found = advice._replace(night=unfit, lately_px=(present_px, part * present_px))
+
+    assert found._replace(night=advice.night).worth_it
+    assert found.worth_it == worth_it
+    assert "does not explain this night" in found.lines_of_text()[-1]
+    assert ("30% less" in found.lines_of_text()[-1]) == worth_it
+
+
 def test_advice_is_the_same_for_people_and_for_programs(six_hz):
     _, advice = six_hz
     numbers = msgspec.json.decode(msgspec.json.encode(advice.numbers()))

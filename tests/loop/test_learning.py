@@ -95,6 +95,14 @@ def test_advice_is_withdrawn_with_its_reason(shaken):
     assert any("no longer explains the frames" in text for text in night.events())
 
 
+def test_advice_of_a_model_that_does_not_fit_says_so(shaken):
+    night = Night(*SHAKEN, learn="advise")
+    night.report(fits=False)
+
+    assert any("does not explain the frames in full" in text for text in night.events())
+    assert night.loop.state(0.0).learning.state == "advice"
+
+
 def test_the_operator_applies_what_was_advised():
     night = Night(*SHAKEN, learn="advise")
     refused = night.simulation.command(SetController(name="learnt"))
