@@ -44,7 +44,7 @@ demo: $(READY)  ## Run the whole instrument on mock devices
 BESIDE := $(MAKE) --no-print-directory --jobs 2 --output-sync=target
 
 test: lint contract  ## Run lint, import contract, types, and all tests without a target of their own
-	@echo "Types and tests, about eight minutes on two cores ..."
+	@echo "Types and tests, about five minutes on two cores ..."
 	@$(BESIDE) types test-parts
 
 lint: $(READY)
@@ -73,7 +73,7 @@ test-instrument: $(READY)  ## Test the whole instrument in real time, as process
 	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system/alone tests/system
 	$(BIN)/pytest tests/system/alone
 
-test-long: compiled  ## Run batches, campaigns, whole nights, and the commands of the documents (ten minutes)
+test-long: compiled  ## Run batches, campaigns, whole nights, the commands of the documents: all that takes seconds (15 minutes)
 	$(BIN)/pytest -m long --numprocesses 3 --dist loadfile $(ARGS)
 
 # Each takes a minute of one core; workers that begin at once would each compile the same, and not be done in time.
@@ -93,10 +93,18 @@ test-console: $(READY)  ## Test the tutorial as typed, and the console by keys (
 test-faults: $(READY)  ## Run the fault catalogue on the instrument, in real time
 	$(BIN)/pytest -m "fault and not testbed" $(FAULTS) $(ARGS)
 
-# As many as fit into continuous integration; `make test-faults-part FAULT_SEED=...` repeats a run.
-test-faults-part: FAULT_SEED ?= $(shell od -An -N2 -tu2 /dev/urandom | tr -d ' ')
-test-faults-part: $(READY)  ## Run 80 entries of the whole fault catalogue, drawn at random
-	FITCTL_FAULT_COUNT=80 FITCTL_FAULT_SEED=$(FAULT_SEED) $(BIN)/pytest -m fault $(FAULTS) $(ARGS)
+test-faults-all: $(READY)
+	$(BIN)/pytest -m fault $(FAULTS) $(ARGS)
+
+# As much as fits into continuous integration; with the PART_SEED that it prints, a run is repeated.
+PART_SEED := $(or $(PART_SEED),$(shell od -An -N2 -tu2 /dev/urandom | tr -d ' '))
+test-long-part: export FITCTL_TESTS_PART = 250
+test-instrument-part: export FITCTL_TESTS_PART = 20
+test-faults-part: export FITCTL_TESTS_PART = 50
+%-part: export FITCTL_TESTS_SEED = $(PART_SEED)
+test-long-part: test-long  ## Run 250 of the tests of test-long, drawn at random
+test-instrument-part: test-instrument  ## Run 20 tests of test-instrument, drawn at random, and those that must run alone
+test-faults-part: test-faults-all  ## Run 50 entries of the whole fault catalogue, drawn at random
 
 test-faults-testbed: $(READY)  ## Run the fault catalogue's entries for the whole testbed
 	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)

@@ -1,6 +1,7 @@
 import asyncio
 import gc
 import os
+import random
 import threading
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as fitctl.cli
@@ -20,6 +21,25 @@ hypothesis.settings.register_profile(
     "fitctl", hypothesis.settings.get_profile("default"), deadline=None, print_blob=True
 )
 hypothesis.settings.load_profile("fitctl")
+
+
+PART, PART_SEED = os.environ.get("FITCTL_TESTS_PART"), os.environ.get("FITCTL_TESTS_SEED", "0")
+"""How many tests are drawn at random, all without it, and what decides which."""
+
+
+def pytest_report_header():
+    """How to repeat a run of a part."""
+    return f"{PART} tests, drawn by PART_SEED={PART_SEED}" if PART else None
+
+
+@pytest.hookimpl(trylast=True)  # after markers have chosen
+def pytest_collection_modifyitems(config, items):
+    """Leave out what was not drawn; what is left keeps its order, so that what tests share is made once."""
+    if not PART:
+        return
+    drawn = set(random.Random(PART_SEED).sample(items, min(int(PART), len(items))))
+    config.hook.pytest_deselected(items=[item for item in items if item not in drawn])
+    items[:] = [item for item in items if item in drawn]
 
 
 def pytest_collection_finish():

@@ -56,6 +56,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_records_count_once_whatever_two_files_hold_and_the_recorders_own_do_not(folder):
     audit = logs.Audit(folder)
     audit.finish()

@@ -182,6 +182,7 @@ def test_an_exception_that_ends_a_thread_is_kept(time):
     assert [(name, type(error)) for name, error in time.escaped] == [("divides", ZeroDivisionError)]
 
 
+@pytest.mark.long
 def test_a_stop_is_obeyed_while_a_device_does_not_answer():
     happenings = [
         Order(at_s=0.1, who="ada"),

@@ -226,6 +226,7 @@ def test_the_steps_of_sequences_are_those_that_plans_draw():
     assert set(plans._STEPS) == STEPS.keys()
 
 
+@pytest.mark.long
 def test_a_console_that_shows_another_mode_is_noticed(monkeypatch):
     accept = ConsoleState.accept
 
@@ -254,6 +255,7 @@ REMOTE = msgspec.structs.replace(
 )
 
 
+@pytest.mark.long
 def test_consoles_far_away_receive_what_was_sent_and_change_nothing(monkeypatch):
     missed, take = [], RemoteConsole._take
 
@@ -270,6 +272,7 @@ def test_consoles_far_away_receive_what_was_sent_and_change_nothing(monkeypatch)
     assert result.digest == run_plan(msgspec.structs.replace(REMOTE, remote_consoles=0)).digest
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("owner", "name", "mistake"),
     [
@@ -349,6 +352,7 @@ def test_a_power_cut_at_any_instant_of_an_opening_is_noticed(rig):
     assert [int((at_s - 1.0) / 3.0) for at_s in noticed] == list(range(times))
 
 
+@pytest.mark.long
 def test_encoders_that_lost_their_zero_unnoticed_are_a_violation(monkeypatch):
     never = property(lambda _: False, lambda _, jumped: None)
     monkeypatch.setattr(SiderostatServo, "encoders_jumped", never, raising=False)
@@ -357,6 +361,7 @@ def test_encoders_that_lost_their_zero_unnoticed_are_a_violation(monkeypatch):
     assert "encoders that count from elsewhere are noticed" in violated
 
 
+@pytest.mark.long
 def test_a_stage_that_moves_by_a_zero_that_is_lost_is_a_violation(monkeypatch):
     # As if the link outlived the loss of power. Analogue amplifiers do not report that they have none.
     monkeypatch.setattr(SwarmAmplifiers, "reset", SwarmAmplifiers._power_down)

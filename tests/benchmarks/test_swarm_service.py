@@ -39,10 +39,12 @@ def violated():
     return {one.invariant for one in run_plan(PLAN).violations}
 
 
+@pytest.mark.long
 def test_people_here_and_elsewhere_are_answered_and_nothing_is_violated():
     assert violated() == set()
 
 
+@pytest.mark.long
 def test_what_is_no_command_is_refused_and_reported(monkeypatch):
     monkeypatch.setattr(swarm_service, "_GARBAGE", 1.0)
     told = []
@@ -70,6 +72,7 @@ def everybody_a_commander(payload):
     return msgspec.structs.replace(decode_envelope(payload), role="commander")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("owner", "name", "mistake", "invariant"),
     [
@@ -100,6 +103,7 @@ def test_a_mistake_of_the_service_is_found(monkeypatch, owner, name, mistake, in
     assert invariant in violated()
 
 
+@pytest.mark.long
 def test_garbage_that_is_taken_for_a_command_is_found(monkeypatch):
     monkeypatch.setattr(swarm_service, "_GARBAGE", 1.0)
     decoded = intake.decode_command

@@ -54,6 +54,7 @@ def test_help_and_completion_of_commands_do_not_import_what_is_slow():
     assert result.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.long
 def test_a_console_without_a_terminal_says_what_to_use_instead():
     result = fitctl("console", timeout_s=20)
 
@@ -147,6 +148,7 @@ def test_bad_input_gets_a_clear_line_and_status_2(what, capfd):
     assert printed.out == ""
 
 
+@pytest.mark.long
 def test_bad_input_ends_a_process_with_a_clear_line_and_status_2():
     arguments, complaint = BAD_INPUT["an unknown key"]
     result = fitctl(*arguments)
@@ -157,6 +159,7 @@ def test_bad_input_ends_a_process_with_a_clear_line_and_status_2():
     assert result.stdout == ""
 
 
+@pytest.mark.long
 def test_a_rig_file_that_is_not_toml_or_not_text_gets_a_clear_line(tmp_path):
     for content in (b"[camera\nwidth", b"\xff\xfe\x00"):
         path = tmp_path / "bad.toml"
@@ -169,6 +172,7 @@ def test_a_rig_file_that_is_not_toml_or_not_text_gets_a_clear_line(tmp_path):
         assert names_a_next_step(result.stderr), result.stderr
 
 
+@pytest.mark.long
 def test_simulate_prints_one_json_object_on_its_last_line():
     result = fitctl("simulate", "--duration", 25, "--seed", 4, "--json")
 
@@ -178,6 +182,7 @@ def test_simulate_prints_one_json_object_on_its_last_line():
     assert sum(summary["mode_times"].values()) == pytest.approx(25, abs=0.1)
 
 
+@pytest.mark.long
 def test_simulate_that_finds_no_star_says_so_by_its_status_and_null():
     result = fitctl(
         "simulate", "--duration", 12, "--json", "--set", "loops.right.star_flux_dn=120000.0"
@@ -187,6 +192,7 @@ def test_simulate_that_finds_no_star_says_so_by_its_status_and_null():
     assert json.loads(result.stdout.splitlines()[-1])["vernier_s"] is None
 
 
+@pytest.mark.long
 def test_console_and_send_without_a_supervisor_say_how_to_start_one(tmp_path):
     result = fitctl("send", "status", "--set", f"service.folder={tmp_path}")
 
@@ -194,6 +200,7 @@ def test_console_and_send_without_a_supervisor_say_how_to_start_one(tmp_path):
     assert "fitctl run" in result.stderr
 
 
+@pytest.mark.long
 def test_mocks_on_a_taken_port_say_so():
     import socket
 

@@ -116,6 +116,7 @@ def test_a_later_step_works_with_what_earlier_ones_found_and_a_repeat_without_it
     assert first == [25.0]
 
 
+@pytest.mark.long
 def test_another_result_of_a_repeat_makes_what_depends_on_it_to_do_again(course, table):
     well = step(lambda _site: Outcome(), "gear")
     table(gear=step(corrects_the_gear), later=well, aside=step(lambda _site: Outcome()))

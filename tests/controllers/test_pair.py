@@ -74,6 +74,7 @@ def loop_of_eq_16(rig):
     return omega, both * np.exp(-1j * omega * rig.camera.frame_delay_s)
 
 
+@pytest.mark.long
 def test_the_loop_of_eq_16_has_the_margins_computed_for_it(loop_of_eq_16):
     omega, response = loop_of_eq_16
     gain, phase_deg, closest, _, crossover, _ = control.stability_margins(

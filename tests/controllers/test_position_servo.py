@@ -47,6 +47,7 @@ def test_speed_and_acceleration_stay_within_their_limits(targets):
     assert change.max() <= ACCELERATION_RAD_S2 * PERIOD_S * (1 + 1e-12)
 
 
+@pytest.mark.long
 @given(targets=moves)
 def test_the_motors_arrive_and_stay(targets):
     last = targets[-1]

@@ -90,6 +90,7 @@ def hot(dn, *, known):
     return spoil
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("dn", "known"), [(3000.0, False), (400.0, False), (3000.0, True), (-5000.0, True)]
 )

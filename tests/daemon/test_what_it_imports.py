@@ -3,9 +3,12 @@
 import subprocess
 import sys
 
+import pytest
+
 NOT_FOR_THE_LOOP = {"control", "matplotlib", "numba", "rich", "scipy", "textual"}
 
 
+@pytest.mark.long
 def test_a_supervisor_imports_no_library_of_designs_and_pictures():
     code = "import sys, fitctl.daemon.run; print(*sys.modules)"
     done = subprocess.run(

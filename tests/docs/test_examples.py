@@ -29,6 +29,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MODULES)
 def test_the_examples_of_a_module_do_what_they_show(name, folder, monkeypatch):
     monkeypatch.chdir(folder)

@@ -180,11 +180,13 @@ def find(name, mistakes):
     return str(found.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_driver_that_takes_any_answer_is_found(name):
     find(name, MISTAKES[name])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mistake", "shows"),
     [

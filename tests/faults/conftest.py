@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import time
 from pathlib import Path
 
@@ -15,23 +14,6 @@ RESULTS = {}
 BEGUN_S = time.monotonic()
 RUN = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 """Which run of several this is, by when it began."""
-PART, SEED = os.environ.get("FITCTL_FAULT_COUNT"), os.environ.get("FITCTL_FAULT_SEED", "0")
-"""How many entries are drawn at random, all without it, and what decides which."""
-
-
-def pytest_report_header():
-    """How to repeat a run of a part."""
-    return f"{PART} entries of the fault catalogue, drawn by SEED={SEED}" if PART else None
-
-
-@pytest.hookimpl(trylast=True)  # after markers have chosen
-def pytest_collection_modifyitems(config, items):
-    """Leave out what was not drawn; what is left keeps its order, so each instrument is started once."""
-    if not PART:
-        return
-    drawn = set(random.Random(SEED).sample(items, min(int(PART), len(items))))
-    config.hook.pytest_deselected(items=[item for item in items if item not in drawn])
-    items[:] = [item for item in items if item in drawn]
 
 
 @pytest.fixture(scope="module")

@@ -61,6 +61,7 @@ def test_noise_that_the_loop_turns_into_motion_does_not_spoil_the_measure():
     assert attenuation(spectra(series_of(0.2 * both, both), 0.02), 1.0) == pytest.approx(5.0)
 
 
+@pytest.mark.long
 def test_the_open_loop_is_rebuilt_to_what_the_star_does_above_stages_at_rest(rig, held):
     """The same seed on a plant that nobody touches is the truth."""
     alone = Plant(rig, [1], star_offset_px=NEAR_PX[None]).stellar_loops["right"]

@@ -35,6 +35,7 @@ def stack(rig, folder):
     return figure_3(rig, "right", 0, folder)[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["loops", "stack"])
 def test_a_figure_comes_as_png_and_as_svg_with_a_caption(request, folder, name):
     plate = request.getfixturevalue(name)
@@ -45,6 +46,7 @@ def test_a_figure_comes_as_png_and_as_svg_with_a_caption(request, folder, name):
     assert all(np.isfinite(row.ours) for row in plate.rows)
 
 
+@pytest.mark.long
 def test_the_same_data_give_the_same_svg(rig, folder, stack, tmp_path):
     figure_3(rig, "right", 0, tmp_path)
 

@@ -10,6 +10,7 @@ def near(rig):
     return star_step(rig, "right", 0, (0.0, 3.0), 20.0)
 
 
+@pytest.mark.long
 def test_the_star_truly_jumps_and_in_one_axis_only(near):
     before, jumped = np.searchsorted(near.time_s, [STEP_AT_S - 0.1, STEP_AT_S])
     moved_px = near.star_px[jumped] - near.star_px[before]
@@ -42,6 +43,7 @@ def test_a_step_within_range_is_judged_without_leaving_vernier(near):
     assert found.saturated_s == 0.0
 
 
+@pytest.mark.long
 def test_a_step_beyond_the_mirror_goes_through_coarse_and_comes_back(rig):
     found = step_response(
         star_step(rig, "right", 0, (-20.0, 0.0), 25.0), AZ, STEP_AT_S, within_px=0.1
@@ -52,6 +54,7 @@ def test_a_step_beyond_the_mirror_goes_through_coarse_and_comes_back(rig):
     assert 0.0 < found.saturated_s < 1.0
 
 
+@pytest.mark.long
 def test_a_target_off_the_frame_is_refused(rig):
     held = Held(rig, "right", 0, history_s=2.0)
 

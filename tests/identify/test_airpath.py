@@ -77,6 +77,7 @@ def covered_by_intervals(seeds):
     return covered
 
 
+@pytest.mark.long
 def test_the_intervals_hold_the_truth():
     assert np.all(covered_by_intervals(range(6)) >= 5)
 
@@ -90,6 +91,7 @@ def test_the_95_percent_intervals_hold_the_truth_as_often_as_they_say():
     assert covered.sum() < 4 * 60
 
 
+@pytest.mark.long
 def test_where_the_search_begins_does_not_matter():
     px = centroids_px(1)
     far = AirPathModel(gain_px=3.0, b1_s2=0.1, b2_s=0.4)
@@ -119,6 +121,7 @@ def result(rig):
     return airpath.analyse(rig, "right", tracks)
 
 
+@pytest.mark.long
 def test_the_joint_fit_holds_the_plants_air_path(rig, result):
     truth = rig.plant.loops["right"].air_path
     assert result.joint.gain_px.covers(truth.gain_px)
@@ -156,6 +159,7 @@ def test_the_fragment_makes_a_rig_with_the_measured_air_path(rig, result):
     assert found.gain_px == result.joint.gain_px.value
 
 
+@pytest.mark.long
 def test_the_operator_reads_values_with_intervals_and_sees_a_plot(result, tmp_path):
     text = "\n".join(result.lines())
     assert "64 s of frames, 2 spots" in text
@@ -184,6 +188,7 @@ def test_air_alone_passes_the_test_of_fit(result):
     assert any(line.startswith("test of fit: the model fits") for line in result.lines())
 
 
+@pytest.mark.long
 def test_a_vibration_is_not_taken_for_air_without_a_warning(rig, result):
     """It makes the air look several times as strong."""
     tracks, line = result.tracks, Line(frequency_hz=3.1, damping=0.01, rms_px=0.02)

@@ -100,6 +100,7 @@ def test_a_lost_frame_is_filled_by_a_straight_line(rig, loop):
     assert tracks.px[50, 0] == pytest.approx(tracks.px[[49, 51], 0].mean(axis=0))
 
 
+@pytest.mark.long
 def test_too_many_frames_without_the_spot_are_refused(rig, loop):
     empty = np.full((40, 40), 1000, dtype=np.uint16)
     frames = [

@@ -52,6 +52,7 @@ def test_a_width_is_found_within_its_uncertainty(rig, diameter_px):
     assert found.excess == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.long
 def test_the_uncertainty_is_that_of_repeated_measurements(rig):
     each = [spot.analyse(rig, "right", frames(rig, 3.0, seed=seed)) for seed in range(12)]
     told = np.mean([one.diameter_sd_px for one in each])
@@ -80,6 +81,7 @@ def test_too_few_frames_are_an_error(rig):
         spot.analyse(rig, "right", frames(rig, 3.0, count=50))
 
 
+@pytest.mark.long
 def test_on_the_instrument_it_finds_the_plants_spot(tmp_path):
     """The rig file believes in another width."""
     known = load_rig(default_rig_path(), ["loops.right.spot_diameter_px=2.6"])

@@ -10,6 +10,7 @@ def correlation(values, lag):
     return np.corrcoef(values[:-lag], values[lag:])[0, 1]
 
 
+@pytest.mark.long
 def test_what_air_and_pixels_do_to_a_star_becomes_white_noise_of_unit_variance(rig):
     record = record_of(rig, "right", [], seed=3, extra_s=60.0)
     seen_px = record.star_px
@@ -22,6 +23,7 @@ def test_what_air_and_pixels_do_to_a_star_becomes_white_noise_of_unit_variance(r
     assert abs(correlation(white[:, 1], 5)) < 0.06
 
 
+@pytest.mark.long
 def test_lost_frames_make_it_no_less_white(rig):
     record = record_of(rig, "right", [], seed=4, extra_s=60.0)
     kept = np.random.default_rng(0).uniform(size=len(record.star_px)) > 0.3
@@ -30,6 +32,7 @@ def test_lost_frames_make_it_no_less_white(rig):
     assert abs(correlation(white[:, 0], 1)) < 0.06
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap_s", [2.0, 10.0, 60.0])
 def test_a_gap_of_any_length_makes_it_no_less_white(rig, gap_s):
     record = record_of(rig, "right", [], seed=3, extra_s=70.0)

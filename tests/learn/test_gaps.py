@@ -66,6 +66,7 @@ def test_unknown_frames_have_as_much_noise_as_the_others(share):
     assert np.std(found[at]) == pytest.approx(1.0, rel=0.2)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=15)
 @given(st.lists(st.tuples(st.integers(0, FRAMES - 1), st.integers(1, 25)), min_size=1, max_size=20))
 def test_wherever_frames_are_missing_they_are_like_the_others(gaps):

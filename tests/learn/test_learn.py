@@ -132,6 +132,7 @@ def test_a_line_is_not_taken_for_air(shaken, shaken_opened, paper):
     assert night.test.fits
 
 
+@pytest.mark.long
 def test_a_strong_line_in_quiet_air_does_not_keep_the_search_from_the_air(paper, fixed):
     """Without lines, an air path of 100 times the strength explains such a line best."""
     quiet = paper.air_path.model_copy(update={"gain_px": 0.3, "b1_s2": 0.66})
@@ -176,6 +177,7 @@ def test_a_mirror_that_moves_less_than_believed_is_noticed(paper, fixed):
     assert night.strength.covers(air_of(paper.air_path).strength)
 
 
+@pytest.mark.long
 def test_air_of_another_shape_does_not_fit(paper, fixed):
     random = np.random.default_rng(0)
     pink = np.fft.irfft(
@@ -200,6 +202,7 @@ def six_hz(paper, fixed):
     return truth, advise([series], rms_px, paper, fixed)
 
 
+@pytest.mark.long
 def test_the_learnt_design_comes_near_the_bound_of_the_true_night(six_hz, fixed):
     truth, advice = six_hz
     least_px = bound(truth).residual_px
@@ -233,6 +236,7 @@ def test_a_line_is_marked_with_the_faster_lines_that_look_like_it(six_hz):
     assert "if it is at 44.0 or 56.0 Hz instead" in "\n".join(advice.lines_of_text())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fastest_line_hz", [math.inf, 30.0])
 def test_a_line_that_may_be_a_faster_one_is_counteracted_only_as_far_as_that_does_no_harm(
     paper, fixed, fastest_line_hz
@@ -349,6 +353,7 @@ def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed)
     assert margins(advice.design, truth).excess(Required()) < 1.02
 
 
+@pytest.mark.long
 def test_a_mirror_that_rings_gets_a_design_whose_margins_hold_on_it(paper, fixed):
     """With the noise of the fit: with that of the centroid, margins are ample anyway."""
     night = dataclasses.replace(paper, noise_px=0.0024, lines=(SIX_HZ,))

@@ -52,6 +52,7 @@ def fed(rig, ticks):
     return learner
 
 
+@pytest.mark.long
 def test_a_first_report_is_due_after_a_minute_of_frames(rig, vernier):
     settle = round(SETTLE_S / PERIOD_S)
     assert not fed(rig, vernier[: round(FIRST_S / PERIOD_S)]).due
@@ -83,6 +84,7 @@ def test_after_a_step_of_the_target_frames_are_left_out(rig, vernier):
     assert fed(rig, before + stepped).frames == kept + 500 - round(SETTLE_S / PERIOD_S)
 
 
+@pytest.mark.long
 def test_a_long_night_is_learnt_from_its_last_minutes_in_as_much_memory(rig, vernier):
     """A year of frames needs no more than four minutes of them, and what is older is forgotten."""
     frames = round(WINDOW_S / PERIOD_S)
@@ -100,6 +102,7 @@ def test_a_long_night_is_learnt_from_its_last_minutes_in_as_much_memory(rig, ver
     assert report.evaluated_s == pytest.approx(WINDOW_S, rel=0.01)
 
 
+@pytest.mark.long
 def test_a_report_has_the_night_and_a_design_that_can_be_made_again(rig, ticks):
     learner = fed(rig, ticks)
     learner.watch("minimum-variance", 0.0)
@@ -151,6 +154,7 @@ def message(ticks, **state):
     return msgspec.structs.replace(telemetry, ticks=list(ticks), loops=[loop])
 
 
+@pytest.mark.long
 def test_the_process_reports_once_it_has_heard_enough(rig, ticks):
     learner = LoopLearner(rig, "right")
     reports = []
@@ -167,6 +171,7 @@ def test_the_process_reports_once_it_has_heard_enough(rig, ticks):
     assert report.worth_it
 
 
+@pytest.mark.long
 def test_the_process_knows_the_learnt_design_in_force(rig, ticks):
     learning = LearningState(setting="on", state="in force", design_json=learnt_json())
     heard = message(ticks, controller="learnt", learning=learning)
@@ -182,6 +187,7 @@ def test_the_process_knows_the_learnt_design_in_force(rig, ticks):
     )  # it was made for a night without the line
 
 
+@pytest.mark.long
 def test_reports_follow_each_other_by_their_time(rig, vernier):
     learner = fed(rig, vernier)
     learner.report(design_for(rig, "right"))
@@ -209,6 +215,7 @@ def gain_of(rig, ticks):
     return estimated([rebuilt(rig, ticks)], basis(rig, "right"))[0].mirror_gain
 
 
+@pytest.mark.long
 def test_commands_that_were_confirmed_late_do_not_change_the_mirrors_gain(rig, vernier):
     """The D/A had acted in time: its answer came after the next frame had been exposed."""
     late = np.random.default_rng(0).choice(len(vernier) - 4, len(vernier) // 20, replace=False)

@@ -32,6 +32,7 @@ def bomb(path, compression, *, finished):
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
 @pytest.mark.parametrize("finished", [True, False])
 def test_a_chunk_that_unpacks_to_too_much_is_damage(compression, finished, tmp_path):
@@ -52,6 +53,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_damage(compression, finished, tmp_p
     assert peak < BOMB_BYTES
 
 
+@pytest.mark.long
 def test_a_dark_frame_in_a_log_is_bounded_too():
     text = base64.b64encode(zlib.compress(bytes(BOMB_BYTES))).decode()
     with pytest.raises(ValueError, match="more than 64 MiB"):

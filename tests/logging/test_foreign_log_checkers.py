@@ -61,6 +61,7 @@ def rerun_finds_every_topic_in_order(run, path):
     assert {row[0] for row in rows} == {"ok"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("content", "compression"),
     [("full", "zstd"), ("full", "lz4"), ("no run info", "none"), ("empty", "zstd")],
@@ -82,6 +83,7 @@ def halved_and_merged(path, target):
     merge(halves, target)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("change", [recovered, halved_and_merged])
 def test_both_accept_what_is_made_from_a_log(tmp_path, run, change):
     target = tmp_path / "changed.mcap"

@@ -65,6 +65,7 @@ def test_a_log_cut_anywhere_is_recovered_up_to_the_cut(whole, data):
         assert result[0].damaged_chunks == 0
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=60, deadline=None)
 def test_of_a_log_damaged_anywhere_only_sound_records_are_recovered(whole, data):

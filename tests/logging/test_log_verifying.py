@@ -32,6 +32,7 @@ def test_a_finished_log_is_whole(tmp_path, compression):
     assert (verdict.records, verdict.problems) == (26, ())
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=150, deadline=None)
 def test_any_changed_byte_is_noticed(tmp_path_factory, data):

@@ -147,6 +147,7 @@ def test_a_recorder_that_is_gone_is_noticed_at_the_next_record(queue, recorders)
     assert queue.unsent > 0
 
 
+@pytest.mark.long
 def test_a_new_recorder_is_sent_nothing_that_is_confirmed_however_much_that_is(endpoint, recorders):
     many = 2000
     queue = RecordQueue(endpoint, many)
@@ -178,6 +179,7 @@ def test_only_the_newest_recorder_is_spoken_to(queue, recorders):
     assert old.receive(0.1) is None
 
 
+@pytest.mark.long
 def test_a_recorder_that_hangs_costs_records_but_never_time(queue, recorders):
     recorder = recorders()
     queue.offer(tick(0))

@@ -70,6 +70,7 @@ def events(path):
     return [entry.message.message for entry in read_records(path, ["/fit/events"])]
 
 
+@pytest.mark.long
 def test_everything_offered_is_in_the_finished_log(queue, recorder, folder):
     process = recorder()
     queue.offer(RUN_INFO)
@@ -89,6 +90,7 @@ def test_everything_offered_is_in_the_finished_log(queue, recorder, folder):
     assert process.stdout.read().splitlines()[-1] == b"101 0"
 
 
+@pytest.mark.long
 def test_a_killed_recorder_leaves_its_flushes_and_its_successor_gets_the_rest(
     queue, recorder, folder
 ):
@@ -117,6 +119,7 @@ def test_a_killed_recorder_leaves_its_flushes_and_its_successor_gets_the_rest(
     assert queue.lost == 0
 
 
+@pytest.mark.long
 def test_what_overflowed_while_no_recorder_ran_is_counted_in_the_log(queue, recorder, folder):
     size = SETTINGS.queue_records
     for number in range(size + 30):

@@ -46,6 +46,7 @@ def followed(rig, truth, learnt, comparison, seed):
     return ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_does_not_hide_a_design_that_is_worse(rig, noisy, seed):
     """The residual is 4.8 % larger; on frames that is 1.7 %, for most of it is noise."""

@@ -195,6 +195,7 @@ def test_motions_at_one_time_are_taken_together(rig):
 # ---------------------------------------------------------------- another controller
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("after", ["lqg-ltr", "minimum-variance", "fslq", "eq20"])
 def test_controllers_are_exchanged_on_a_running_loop_without_a_bump(held, after):
     before = "eq20" if after != "eq20" else "minimum-variance"

@@ -47,6 +47,7 @@ def test_a_spot_that_runs_away_from_the_stages_is_not_the_loops_star(following):
     assert judged(following, [(22.0 + 0.05 * i, 20.0, -0.05 * i, 0.0) for i in range(200)])
 
 
+@pytest.mark.long
 @given(
     start_px=st.tuples(st.floats(3.0, 36.0), st.floats(3.0, 36.0)),
     answer=st.floats(0.7, 1.3),  # hysteresis, and a plate scale that is a little wrong

@@ -65,6 +65,7 @@ def shaken():
 # ---------------------------------------------------------------- advice
 
 
+@pytest.mark.long
 def test_advice_tells_the_gain_and_the_command_once(shaken):
     night = Night(*SHAKEN, learn="advise")
     for _ in range(3):
@@ -87,6 +88,7 @@ def test_a_night_that_the_design_in_force_suits_gives_no_event():
     assert night.loop.state(0.0).learning.state == "kept"
 
 
+@pytest.mark.long
 def test_advice_is_withdrawn_with_its_reason(shaken):
     night = Night(*SHAKEN, learn="advise")
     night.report()
@@ -95,6 +97,7 @@ def test_advice_is_withdrawn_with_its_reason(shaken):
     assert any("no longer explains the frames" in text for text in night.events())
 
 
+@pytest.mark.long
 def test_advice_of_a_model_that_does_not_fit_says_so(shaken):
     night = Night(*SHAKEN, learn="advise")
     night.report(fits=False)
@@ -123,6 +126,7 @@ def test_parameters_without_margins_are_refused():
     assert "controller learnt: its margins are not those" in night.events()[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "figures",
     [
@@ -143,6 +147,7 @@ def test_a_report_that_cannot_be_is_refused_and_changes_nothing(shaken, figures)
 # ---------------------------------------------------------------- the change
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("before", ["eq20", "minimum-variance"])
 def test_the_change_is_without_a_bump(before):
     night = Night(*SHAKEN, f"loops.right.vernier.controller={before}")
@@ -159,6 +164,7 @@ def test_the_change_is_without_a_bump(before):
     assert np.sqrt(np.mean(held_px**2, axis=0)).max() < 0.03  # 0.1 px before
 
 
+@pytest.mark.long
 def test_the_same_design_goes_on_where_it_was():
     """Had it begun from rest, it would not know the line for seconds."""
     nights = [Night(*SHAKEN) for _ in range(2)]
@@ -175,6 +181,7 @@ def test_the_same_design_goes_on_where_it_was():
     assert np.abs(changed_px - unchanged_px).max() < 0.03  # 0.12 px if it began from rest
 
 
+@pytest.mark.long
 def test_a_change_says_why_and_has_the_design(shaken):
     shaken.report()
     (change,) = shaken.changes()
@@ -184,6 +191,7 @@ def test_a_change_says_why_and_has_the_design(shaken):
     assert '"learnt": true' in change.design_json
 
 
+@pytest.mark.long
 def test_the_same_night_on_the_same_report_is_changed_at_once_and_only_once(shaken):
     shaken.report()
     shaken.report(worth_it=False)
@@ -192,6 +200,7 @@ def test_the_same_night_on_the_same_report_is_changed_at_once_and_only_once(shak
     assert len(shaken.changes()) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("learn", ["off", "advise"])
 def test_nothing_changes_unless_the_rig_file_says_on(learn):
     night = Night(*SHAKEN, learn=learn)
@@ -200,6 +209,7 @@ def test_nothing_changes_unless_the_rig_file_says_on(learn):
     assert not night.changes()
 
 
+@pytest.mark.long
 def test_what_the_operator_chose_stays(shaken):
     shaken.simulation.command(SetController(name="fslq"))
     shaken.report()
@@ -208,6 +218,7 @@ def test_what_the_operator_chose_stays(shaken):
     assert any(shaken.loop.learning.command in text for text in shaken.events())
 
 
+@pytest.mark.long
 def test_while_the_target_moves_nothing_changes(shaken):
     shaken.simulation.command(SetTarget(az_px=24.5, el_px=19.5))
     shaken.simulation.run(0.2)
@@ -222,6 +233,7 @@ def test_while_the_target_moves_nothing_changes(shaken):
 # ---------------------------------------------------------------- the way back
 
 
+@pytest.mark.long
 def test_a_design_that_does_worse_is_left_within_a_second():
     """It was made for another night: it expects a strong line where there is none."""
     night = Night("loops.right.vernier.controller=minimum-variance")
@@ -234,6 +246,7 @@ def test_a_design_that_does_worse_is_left_within_a_second():
     assert night.loop.state(0.0).learning.state == "fell back"
 
 
+@pytest.mark.long
 def test_a_design_that_is_only_a_little_worse_is_left_too():
     """It was made for three times the noise, so it leaves a sixth more, which no quick look at frames shows."""
     night = Night("loops.right.vernier.controller=minimum-variance")
@@ -247,6 +260,7 @@ def test_a_design_that_is_only_a_little_worse_is_left_too():
     assert "the design before would have left" in back.reason
 
 
+@pytest.mark.long
 def test_a_line_that_beats_is_no_reason_to_go_back():
     """For a third of a second it is thrice what it is over a minute, with either design."""
     night = Night(*SHAKEN)
@@ -258,6 +272,7 @@ def test_a_line_that_beats_is_no_reason_to_go_back():
     assert np.abs(night.error_px(20.0)).max() > 2 * 0.06
 
 
+@pytest.mark.long
 def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
     """The design before would leave more, too."""
     louder = (
@@ -274,6 +289,7 @@ def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
     assert state.before_px == pytest.approx(state.measured_px, rel=0.1)
 
 
+@pytest.mark.long
 def test_after_a_way_back_there_is_a_pause():
     night = Night(*SHAKEN)
     night.report(lines=(), measured_px=0.02, learnt_camera_px=0.02)
@@ -286,6 +302,7 @@ def test_after_a_way_back_there_is_a_pause():
     assert night.loop.controller == "learnt"
 
 
+@pytest.mark.long
 def test_a_design_that_does_as_expected_stays(shaken):
     shaken.report()
     shaken.simulation.run(60.0)

@@ -136,6 +136,7 @@ def test_one_command_brings_all_up_in_the_order_in_which_they_depend_on_each_oth
     assert testbed.clock.now_s() < 60.0
 
 
+@pytest.mark.long
 def test_the_left_star_stays_while_the_collector_drifts(held):
     held.drift(0.1)
     held.run(10.0)
@@ -145,6 +146,7 @@ def test_the_left_star_stays_while_the_collector_drifts(held):
     assert held.rms_px(RIGHT, since_s).max() < 0.03
 
 
+@pytest.mark.long
 def test_with_a_gain_of_0_the_drift_is_left_to_the_mirror():
     testbed = Testbed("loops.left.feedforward.gain=0.0").held()
     testbed.drift(0.1)
@@ -160,6 +162,7 @@ UNEQUAL = (
 )
 
 
+@pytest.mark.long
 def test_plays_that_are_not_alike_are_made_up_for_by_the_mirror_if_it_is_told_to():
     rms_px = {}
     for signal in ("encoders", "encoders+backlash"):
@@ -174,6 +177,7 @@ def test_plays_that_are_not_alike_are_made_up_for_by_the_mirror_if_it_is_told_to
     assert rms_px["encoders+backlash"] < 0.5 * rms_px["encoders"]
 
 
+@pytest.mark.long
 def test_the_mirror_does_not_jump_as_it_begins_to_make_up_for_backlash():
     testbed = Testbed(*UNEQUAL, "loops.left.feedforward.signal=encoders+backlash").held()
     testbed.run(5.0)
@@ -184,6 +188,7 @@ def test_the_mirror_does_not_jump_as_it_begins_to_make_up_for_backlash():
     assert mirror.command_rad == pytest.approx(before_rad, abs=4e-6)  # 0.15 px
 
 
+@pytest.mark.long
 def test_the_siderostats_turn_against_each_other(held):
     before = {name: held.loop(name).siderostat.setpoint_rad.copy() for name in (METROLOGY, LEFT)}
     held.drift(0.5)
@@ -195,6 +200,7 @@ def test_the_siderostats_turn_against_each_other(held):
     assert turned[LEFT] == pytest.approx(-turned[METROLOGY], abs=0.15)
 
 
+@pytest.mark.long
 def test_when_the_laser_is_cut_left_holds_in_the_same_tick_and_goes_on_by_itself(held):
     held.drift(0.1)
     held.run(5.0)
@@ -222,6 +228,7 @@ def test_when_the_laser_is_cut_left_holds_in_the_same_tick_and_goes_on_by_itself
     assert held.rms_px(LEFT, since_s).max() < 0.05
 
 
+@pytest.mark.long
 def test_after_the_links_return_left_waits_until_its_own_siderostat_is_back_too(held):
     """A link that ran away before it was given up took left's siderostat along: 70 rad, more than a second."""
     held.laser(0.0)
@@ -245,6 +252,7 @@ def test_after_the_links_return_left_waits_until_its_own_siderostat_is_back_too(
     assert held.rms_px(LEFT, since_s).max() < 0.05
 
 
+@pytest.mark.long
 def test_a_metrology_loop_that_is_stopped_and_brought_back_finds_left_waiting(held):
     assert held.command(Stop(loop=METROLOGY)).accepted
     held.run(3.0)
@@ -262,6 +270,7 @@ def test_a_metrology_loop_that_is_stopped_and_brought_back_finds_left_waiting(he
     held.until(limit_s=20.0, left=Mode.VERNIER)
 
 
+@pytest.mark.long
 def test_hold_ends_the_waiting(held):
     held.command(Release(loop=METROLOGY))
     held.run(0.1)
@@ -272,6 +281,7 @@ def test_hold_ends_the_waiting(held):
     assert not held.loop(LEFT).waits_for
 
 
+@pytest.mark.long
 def test_neither_loop_takes_the_others_star_while_one_is_away(held):
     for away, stays in ((RIGHT, LEFT), (LEFT, RIGHT)):
         uncover = held.darken(away)
@@ -287,6 +297,7 @@ def test_neither_loop_takes_the_others_star_while_one_is_away(held):
         assert held.rms_px(away, since_s).max() < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_each_loop_finds_its_own_star_though_both_are_in_the_field(seed):
     testbed = Testbed(seed=seed).held()
@@ -297,6 +308,7 @@ def test_each_loop_finds_its_own_star_though_both_are_in_the_field(seed):
         assert testbed.rms_px(name, since_s).max() < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fringe_az_px", [26.5, 25.0, 23.5])
 def test_a_loop_is_not_pulled_by_the_other_loops_fringe_spot(held, fringe_az_px):
     """Left is pointed so that its fringe spot, 8 px beside its star, lies near right's star at az 28 px."""
@@ -308,6 +320,7 @@ def test_a_loop_is_not_pulled_by_the_other_loops_fringe_spot(held, fringe_az_px)
     assert held.rms_px(RIGHT, since_s).max() < 0.03
 
 
+@pytest.mark.long
 def test_each_frames_tilt_between_the_stars_and_its_visibility_are_recorded(held):
     held.run(5.0)
     overlaps = [record for record in held.records if isinstance(record, Overlap)][-100:]
@@ -329,6 +342,7 @@ def test_before_both_stars_are_followed_there_is_no_visibility():
     assert np.isnan([overlap.visibility for overlap in overlaps]).all()
 
 
+@pytest.mark.long
 def test_what_was_turned_before_the_links_encoders_lost_their_zero_is_not_undone(held):
     stood_rad = held.loop(LEFT).siderostat.setpoint_rad.copy()
     for command in (Stop(loop=METROLOGY), Off(loop=METROLOGY)):

@@ -61,6 +61,7 @@ def test_without_a_beam_the_search_ends_in_standby_and_says_so():
     assert any("no beam within 930 arcsec" in text for text in events(one))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("collector_m", "bound_arcsec"),
     [
@@ -77,6 +78,7 @@ def test_the_beam_is_held_within_its_requirement(collector_m, bound_arcsec):
     assert one.loop.mode is Mode.LOCKED
 
 
+@pytest.mark.long
 def test_the_second_integrator_removes_the_standing_error_of_a_drift():
     without = bench(collector_m=drift)
     without.loop.hold.second_per_s = 0.0

@@ -55,6 +55,7 @@ def test_a_star_moves_at_its_rate_when_nothing_follows_it():
     assert moved_px == pytest.approx(np.array([expected_px, expected_px]), rel=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", ["eq20", "minimum-variance"])
 def test_a_star_at_the_sidereal_rate_is_held_as_one_that_stands(controller):
     still, moving = (
@@ -67,12 +68,14 @@ def test_a_star_at_the_sidereal_rate_is_held_as_one_that_stands(controller):
     assert moving.vernier_s < still.vernier_s + 5.0
 
 
+@pytest.mark.long
 def test_a_star_whose_rate_is_not_known_is_not_held():
     moving = simulate(rig_with(TRUE, CONTROLLER.format("eq20")), 1, 35.0)["right"]
 
     assert not moving.rms_px["az"] < 0.5
 
 
+@pytest.mark.long
 def test_a_rate_that_is_a_little_wrong_is_learned_as_drift():
     true = TRUE.replace("12.0", "12.2")
 
@@ -81,6 +84,7 @@ def test_a_rate_that_is_a_little_wrong_is_learned_as_drift():
     assert moving["right"].rms_px["az"] < 0.03
 
 
+@pytest.mark.long
 def test_the_siderostat_stands_in_standby_and_the_next_search_begins_where_the_star_has_gone(held):
     held.command(Release())
     held.run(0.5)
@@ -102,6 +106,7 @@ def asked_for(simulation, az=RATE_ARCSEC_S[0], el=RATE_ARCSEC_S[1]):
     return simulation.command(Acquire(rate_az_sky_arcsec_s=az, rate_el_sky_arcsec_s=el))
 
 
+@pytest.mark.long
 def test_a_command_gives_the_rate_of_a_star_which_holds_until_the_next_search_by_command():
     simulation = Simulation(rig_with(TRUE), 1, star_offset_px=np.array([10.0, -6.0]))
     simulation.command(Standby())

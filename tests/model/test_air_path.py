@@ -178,6 +178,7 @@ def test_axes_and_runs_move_independently(motion_px):
     assert np.abs(off_diagonal.mean()) < 0.1
 
 
+@pytest.mark.long
 def test_the_fringe_spot_follows_the_pointing_spot_up_to_its_relative_motion(rig, air):
     plant = Plant(rig, range(64)).stellar_loops["right"]
     spots = np.concatenate([plant.spots_px(time_s) for time_s in np.arange(1, 11) * 3.0])

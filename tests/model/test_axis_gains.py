@@ -46,6 +46,7 @@ def test_angles_on_the_sky_are_as_without_gains():
     assert uneven.sky_arcsec(uneven.sky_px(RADIANS)) == pytest.approx(RADIANS, abs=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", ["eq20", "minimum-variance"])
 def test_a_loop_that_knows_its_gains_holds_the_star_as_one_of_even_axes(controller):
     chosen = f"loops.right.vernier.controller={controller}"
@@ -56,6 +57,7 @@ def test_a_loop_that_knows_its_gains_holds_the_star_as_one_of_even_axes(controll
         assert known.rms_px[axis] == pytest.approx(even_px, rel=0.15), axis
 
 
+@pytest.mark.long
 def test_a_loop_that_does_not_know_its_gains_holds_the_star_worse():
     even = simulate(rig_with(), 1, 35.0)["right"]
     unknown = simulate(rig_with(*TRUE), 1, 35.0)["right"]

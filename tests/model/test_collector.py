@@ -75,6 +75,7 @@ def test_both_mirrors_send_the_starlight_along_the_link(geometry):
     assert np.linalg.det(turns_light) == pytest.approx(1.0), "two reflections are a rotation"
 
 
+@pytest.mark.long
 @given(geometry=geometries(), axis=directions)
 def test_c_is_what_rays_through_turned_mirrors_do(geometry, axis):
     psi = TURN_RAD * axis

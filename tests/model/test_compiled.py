@@ -62,6 +62,7 @@ def run_kernel(package):
     return float(value), int(hits)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
 def test_machine_code_is_kept_until_a_constant_in_any_imported_module_changes(package):
     assert run_kernel(package) == (6.0, 0)
@@ -73,6 +74,7 @@ def test_machine_code_is_kept_until_a_constant_in_any_imported_module_changes(pa
     assert run_kernel(package) == (10.0, 0)
 
 
+@pytest.mark.long
 def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():
     program = (
         "import sys, fitctl.simulation.batch.run\n"

@@ -84,6 +84,7 @@ def test_pose_and_velocity_are_continuous_where_a_move_is_planned_anew(moves):
         assert np.allclose(before.velocity_at(began_s), after.velocity_at(began_s), atol=1e-9)
 
 
+@pytest.mark.long
 @example(
     moves=[  # planned anew while it brakes already, onto the same target: rounding decides
         ((0, 0, 0, 0, 0, 0), 0.0),
@@ -132,6 +133,7 @@ def test_a_stop_brakes_all_axes_together_along_their_line(moves, after_s):
     assert np.array_equal(stop.pose_at(stop.ends_s), stop.target)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate_hz", [20, 50])
 def test_targets_streamed_along_a_sine_are_followed_smoothly(rate_hz):
     """1 mm at 0.05 Hz, as the collector moves: the platform stays within a period's way of the sine."""

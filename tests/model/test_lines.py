@@ -60,6 +60,7 @@ def pointing_px(plant, until_s):
 # ---------------------------------------------------------------- one line
 
 
+@pytest.mark.long
 def test_a_lines_spectrum_is_that_of_an_oscillator_which_white_noise_drives():
     one = line(frequency_hz=20.0, damping=0.05)
     moved = motion_px(one, 100_000)[:, 0]  # 500 s
@@ -77,6 +78,7 @@ def test_a_lines_spectrum_is_that_of_an_oscillator_which_white_noise_drives():
         assert ratio[band].mean() == pytest.approx(1.0, abs=4 / math.sqrt(independent) + 0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damping", [0.0, 0.05])
 def test_a_line_has_its_rms_along_its_direction(damping):
     one = line(frequency_hz=10.0, damping=damping, direction_deg=30.0)
@@ -110,6 +112,7 @@ def test_a_sine_is_a_sine_of_any_phase():
     assert np.hypot(*parts) == pytest.approx(0.05 * math.sqrt(2), rel=1e-9)
 
 
+@pytest.mark.long
 def test_a_line_drifts_and_its_motion_does_not_jump():
     moved = motion_px(line(damping=0.0, drift_hz_per_min=6.0), 24_000)[:, 0]  # 120 s
 

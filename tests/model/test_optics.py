@@ -96,6 +96,7 @@ def test_a_turned_stage_moves_the_star_along_its_own_axes():
     assert scale.mirror_px(along_az) / scale.mirror_px_per_rad == pytest.approx([0.0, -1.0])
 
 
+@pytest.mark.long
 @given(st.floats(-180, 180), st.floats(-180, 180), angle_pairs)
 def test_what_moves_the_star_and_back_is_the_identity(siderostat_deg, mirror_deg, motor_rad):
     scale = turned_scale(siderostat_deg, mirror_deg)
@@ -106,6 +107,7 @@ def test_what_moves_the_star_and_back_is_the_identity(siderostat_deg, mirror_deg
     assert motor_arcsec == pytest.approx(motor_rad * scale.motor_sky_arcsec_per_rad, abs=1e-12)
 
 
+@pytest.mark.long
 @given(angle_pairs)
 def test_without_a_rotation_nothing_is_rounded(pair):
     scale = turned_scale(0.0, 0.0)

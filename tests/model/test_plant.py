@@ -87,6 +87,7 @@ def test_the_step_does_what_the_reference_does(machine_code, seed, runs, steps, 
         assert found == pytest.approx(reference, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.long
 @settings(max_examples=20)
 @given(cuts=st.lists(st.integers(1, 1500), max_size=12))
 @example(cuts=[21])  # compiled, the steps after an odd cut round otherwise

@@ -47,6 +47,7 @@ def test_the_air_is_as_it_was_until_it_changes():
     assert np.abs(changed_px[2000:] - unchanged_px[2000:]).max() > 0.05
 
 
+@pytest.mark.long
 def test_the_air_moves_by_its_new_variance_and_never_jumps():
     star = star_of(rig_with(timeline(at(1.0, AIR))), runs=64)
     moved = moved_px(star, 61.0)

@@ -166,6 +166,7 @@ def test_the_right_loop_is_the_one_of_a_rig_that_has_no_other():
     assert np.array_equal(one, other)
 
 
+@pytest.mark.long
 @settings(max_examples=15)
 @given(cuts=st.lists(st.integers(1, 1500), max_size=12))
 def test_the_motion_does_not_depend_on_how_the_time_is_cut(cuts):
@@ -243,6 +244,7 @@ def test_without_numba_the_beam_is_the_same(monkeypatch):
 # ---------------------------------------------------------------- photodiodes
 
 
+@pytest.mark.long
 @given(az_m=st.floats(-0.03, 0.03), el_m=st.floats(-0.03, 0.03), laser=st.sampled_from([1.0, 0.3]))
 def test_the_ratio_of_two_photodiodes_is_exponential_in_the_beams_place(az_m, el_m, laser):
     sensor = load_rig(TESTBED).plant.loops["metrology"].sensor

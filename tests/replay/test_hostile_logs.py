@@ -76,6 +76,7 @@ def test_a_loop_s_name_in_the_designs_is_no_path_to_write_to(tmp_path, monkeypat
     assert victim.read_text() == "mine"
 
 
+@pytest.mark.long
 def test_no_file_that_a_log_names_is_opened(tmp_path, monkeypatch, opened_paths):
     folder = tmp_path / PLANTED
     folder.mkdir()

@@ -96,6 +96,7 @@ def test_what_was_lost_late_and_when_is_counted(findings):
     assert loop.timing["age_median_s"] == pytest.approx(0.035, abs=1e-4)
 
 
+@pytest.mark.long
 def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
     def course(simulation):
         simulation.acquire()
@@ -122,6 +123,7 @@ def test_each_controller_of_a_run_is_judged_by_itself(rig, tmp_path):
     assert found[1].evaluated_s == pytest.approx(12.0, abs=1.0)
 
 
+@pytest.mark.long
 def test_a_learnt_design_is_judged_as_it_was_logged(rig, tmp_path):
     def course(simulation):
         simulation.acquire()

@@ -80,6 +80,7 @@ def made(findings, tmp_path_factory):
     return folder, page.read_text()
 
 
+@pytest.mark.long
 def test_the_page_is_sound_html_and_needs_nothing_from_elsewhere(made):
     _, page = made
     read = Reader(page)
@@ -175,6 +176,7 @@ def test_what_safe_does_to_the_mirror_does_not_set_the_scale_of_its_piston(findi
     assert high_nm - low_nm < 2 * max(2.0, np.ptp(counted_nm))
 
 
+@pytest.mark.long
 def test_a_plot_without_data_is_a_line_that_says_why(rig, tmp_path):
     path = tmp_path / "standby.mcap"
 
@@ -255,6 +257,7 @@ def test_a_run_with_nothing_in_it_makes_a_page_that_says_so(rig, tmp_path):
     assert "none of" not in page
 
 
+@pytest.mark.long
 def test_nights_are_put_side_by_side(findings, rig, tmp_path):
     path = tmp_path / "short.mcap"
     record(rig, path, lambda simulation: simulation.run(1.0))

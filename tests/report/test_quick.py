@@ -11,6 +11,7 @@ def labels(series):
     return [one.label for one in series]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("wanted", "found"),
     [

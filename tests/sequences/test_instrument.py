@@ -23,6 +23,7 @@ def mode(instrument):
     return instrument.telemetry().loops[0].mode
 
 
+@pytest.mark.long
 def test_a_script_acquires_holds_and_gets_figures():
     with Instrument(NEAR, simulate=True) as instrument:
         acquired = instrument.acquire()
@@ -157,6 +158,7 @@ def test_the_blocking_form_works_where_an_event_loop_runs():
     assert asyncio.run(cell())["acquired_s"] > 0
 
 
+@pytest.mark.long
 def test_an_awaited_step_leaves_the_event_loop_free():
     async def night():
         beats = 0
@@ -209,6 +211,7 @@ def test_a_step_that_is_cancelled_as_soon_as_it_begins_is_ended_too():
     assert asyncio.run(night()) < 500.0
 
 
+@pytest.mark.long
 def test_a_step_that_is_cancelled_before_its_turn_leaves_the_one_that_runs_alone():
     async def night():
         async with AsyncInstrument(NEAR, simulate=True) as instrument:

@@ -40,6 +40,7 @@ def test_every_shipped_sequence_runs_to_its_end(path):
     assert list(last.values()) == ["done"] * len(sequence.steps)
 
 
+@pytest.mark.long
 def test_a_held_star_is_judged_against_the_requirement(tried):
     run = tried()
 
@@ -202,6 +203,7 @@ def test_ctrl_c_ends_the_step_and_holds_the_stages(tried, when_s):
     assert run.link.target_px() == [target.az, target.el]
 
 
+@pytest.mark.long
 def test_a_long_hold_remembers_no_more_frames_than_a_message_brings(tried, monkeypatch):
     remembered = []
 
@@ -218,6 +220,7 @@ def test_a_long_hold_remembers_no_more_frames_than_a_message_brings(tried, monke
     assert max(remembered) < 10
 
 
+@pytest.mark.long
 def test_a_pause_within_a_hold_is_not_judged_and_not_counted(tried):
     run = tried()
     run.link.meddling = [
@@ -233,6 +236,7 @@ def test_a_pause_within_a_hold_is_not_judged_and_not_counted(tried):
     assert run.states == ["running", "paused", "running", "done"]
 
 
+@pytest.mark.long
 def test_a_pause_within_a_motion_takes_effect_after_it(tried):
     run = tried()
     run.link.meddling = [
@@ -248,6 +252,7 @@ def test_a_pause_within_a_motion_takes_effect_after_it(tried):
     assert wait.ended_s > 100.0
 
 
+@pytest.mark.long
 def test_a_target_that_fails_goes_back_to_the_rig_files(tried):
     run = tried()
     away = {"step": "offset", "offset_az_px": 2.0, "offset_el_px": -1.0, "dwell_s": 12.0}
@@ -259,6 +264,7 @@ def test_a_target_that_fails_goes_back_to_the_rig_files(tried):
     assert run.link.target_px() == [target.az, target.el]
 
 
+@pytest.mark.long
 def test_motions_that_a_lost_star_ends_are_not_taken_for_whole_but_made_again(tried):
     def jump(link):
         link._simulation.plants["right"].constants.spot_origin_px[:] += np.array([40.0, 0.0])

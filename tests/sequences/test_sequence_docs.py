@@ -44,6 +44,7 @@ def nothing_runs(monkeypatch, tmp_path):
     monkeypatch.setattr(running, "supervisor_names", lambda: f"fitctl-test:{os.getpid()}:")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("block", shown("python"), ids=str)
 def test_a_program_that_is_shown_runs(block, nothing_runs, capsys):
     names, program = {}, compile(block.text, str(block), "exec")

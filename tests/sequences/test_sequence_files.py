@@ -266,6 +266,7 @@ documents = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.long
 @given(documents)
 def test_any_document_is_a_sequence_or_a_list_of_mistakes(document):
     mistakes_told, sequence = [], None

@@ -185,6 +185,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.long
 def test_a_gateway_that_hangs_is_ended_by_its_alarm(tmp_path):
     rig = rig_in(tmp_path, "service.tcp_address=127.0.0.1")
     make_service_folder(rig)

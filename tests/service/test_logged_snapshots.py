@@ -4,6 +4,7 @@ import itertools
 import time
 
 import msgspec
+import pytest
 from instruments.served import Served
 
 from fitctl.logging.records import Snapshot
@@ -18,6 +19,7 @@ class Snapped(Served):
             self.snapshots.append(record)
 
 
+@pytest.mark.long
 def test_a_snapshot_a_second_has_the_loops_with_their_readings(tmp_path):
     Snapped.snapshots = []
     served = Snapped(tmp_path)

@@ -188,6 +188,7 @@ def test_a_python_program_elsewhere_has_the_instrument(served):
         assert instrument.send(TakeOver()).accepted
 
 
+@pytest.mark.long
 def test_ports_that_are_taken_are_named(served):
     with pytest.raises(ConfigError, match=r"service\.tcp_address.*choose others"):
         Gateway(served.rig, served.folder, MonotonicClock())

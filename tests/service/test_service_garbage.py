@@ -23,6 +23,7 @@ def served(tmp_path_factory):
     served.close()
 
 
+@pytest.mark.long
 @settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 @given(messages=st.lists(FRAMES, max_size=8), kind=KINDS, which=st.integers(0, 3))
 def test_any_messages_from_any_kind_of_socket_leave_it_well(served, messages, kind, which):

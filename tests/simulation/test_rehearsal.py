@@ -51,6 +51,7 @@ def siderostat_of(present):
     return present.tick.siderostat_az_sky_arcsec, present.tick.siderostat_el_sky_arcsec
 
 
+@pytest.mark.long
 def test_a_new_target_is_foreseen_with_both_stages(instrument):
     foreseen, after = instrument.foresee_and_do(SetTarget(az_px=22.0, el_px=21.0))
     (end,) = foreseen.ends
@@ -65,6 +66,7 @@ def test_a_new_target_is_foreseen_with_both_stages(instrument):
     assert math.dist(*end.mirror_urad) > 40.0
 
 
+@pytest.mark.long
 def test_the_interlock_that_trips_is_foreseen_and_when(instrument):
     far = SetTarget(az_px=20.0, el_px=24.0)
     foreseen = rehearse(instrument.rig, instrument.present(), far, LIMIT_S)
@@ -80,6 +82,7 @@ def test_the_interlock_that_trips_is_foreseen_and_when(instrument):
     assert trip.after_s == pytest.approx(instrument.simulation.clock.now_s() - began_s, abs=2.0)
 
 
+@pytest.mark.long
 def test_a_jog_is_foreseen_to_its_place_or_to_its_refusal(instrument):
     instrument.simulation.command(Release())
     instrument.simulation.run(1.0)
@@ -93,6 +96,7 @@ def test_a_jog_is_foreseen_to_its_place_or_to_its_refusal(instrument):
     assert "at most a field of view" in far.refused
 
 
+@pytest.mark.long
 def test_recover_from_safe_is_foreseen(instrument):
     instrument.simulation.command(Stop())
     instrument.simulation.run(1.0)
@@ -101,11 +105,13 @@ def test_recover_from_safe_is_foreseen(instrument):
     assert after["right"].state.mode == "STANDBY"
 
 
+@pytest.mark.long
 def test_a_rehearsal_is_given_up_in_time(instrument):
     with pytest.raises(RehearsalError, match="the instrument was not touched"):
         rehearse(instrument.rig, instrument.present(), Recover(), 0.0)
 
 
+@pytest.mark.long
 def test_the_instrument_is_not_touched(instrument):
     present = instrument.present()
     state = instrument.simulation.plant.stellar_loops["right"].state

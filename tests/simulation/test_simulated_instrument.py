@@ -25,6 +25,7 @@ from fitctl.simulation.simulation import Simulation, simulate
 from fitctl.simulation.statistics import pair, true_residual_rms
 
 
+@pytest.mark.long
 def test_the_star_is_found_pulled_in_and_held(simulate_with):
     simulation = simulate_with(star_offset_px=(60.0, 30.0))
     simulation.acquire()
@@ -142,6 +143,7 @@ def test_hold_keeps_the_siderostat_where_it_is(vernier):
     assert np.all(np.abs(vernier.supervisor.servos["right"].position_rad - before) < 0.01)
 
 
+@pytest.mark.long
 def test_a_new_target_is_reached_smoothly_and_without_saturation(vernier):
     vernier.run(5.0)
     assert vernier.command(SetTarget(az_px=25.0, el_px=19.5)).accepted
@@ -296,6 +298,7 @@ def test_the_siderostat_stays_within_its_travel(simulate_with):
     assert max(sky) < 62.0
 
 
+@pytest.mark.long
 def test_the_supervisor_runs_at_the_flight_designs_500_hz(simulate_with):
     simulation = simulate_with(
         "camera.frame_rate_hz=500.0",
@@ -308,6 +311,7 @@ def test_the_supervisor_runs_at_the_flight_designs_500_hz(simulate_with):
     until(simulation, Mode.VERNIER, limit_s=20.0)
 
 
+@pytest.mark.long
 def test_eq_20_with_the_full_plant_leaves_0_019_px():
     rig = load_rig(default_rig_path())
 
@@ -339,6 +343,7 @@ def test_rms_helpers_say_nan_when_there_is_nothing_to_judge(simulate_with):
     )
 
 
+@pytest.mark.long
 def test_the_whole_run_is_judged_however_short_the_rigs_history():
     short = load_rig(default_rig_path(), ["plant.history_s=2.0"])
 

@@ -29,6 +29,7 @@ def a_cycle():
     return node, weakref.ref(node)
 
 
+@pytest.mark.long
 def test_nothing_is_collected_between_two_calls(collector):
     node, alive = a_cycle()
     del node
@@ -37,6 +38,7 @@ def test_nothing_is_collected_between_two_calls(collector):
     assert alive() is not None
 
 
+@pytest.mark.long
 def test_a_cycle_that_dies_young_is_collected_at_the_next_call(collector):
     node, alive = a_cycle()
     del node
@@ -44,6 +46,7 @@ def test_a_cycle_that_dies_young_is_collected_at_the_next_call(collector):
     assert alive() is None
 
 
+@pytest.mark.long
 def test_a_cycle_that_lived_through_collections_is_collected_once_it_dies(collector):
     node, alive = a_cycle()
     for _ in range(5):
@@ -54,6 +57,7 @@ def test_a_cycle_that_lived_through_collections_is_collected_once_it_dies(collec
     assert alive() is None
 
 
+@pytest.mark.long
 def test_many_new_objects_are_looked_at_once(collector):
     library = [[] for _ in range(10_000)]
     collector.collect(pointing=True)
@@ -61,6 +65,7 @@ def test_many_new_objects_are_looked_at_once(collector):
     assert len(library) == 10_000
 
 
+@pytest.mark.long
 def test_what_was_set_aside_is_collected_when_the_stages_come_to_rest(collector):
     node, alive = a_cycle()
     library = [[] for _ in range(10_000)]
@@ -72,6 +77,7 @@ def test_what_was_set_aside_is_collected_when_the_stages_come_to_rest(collector)
     assert alive() is None
 
 
+@pytest.mark.long
 def test_a_rig_at_rest_is_not_held_up_each_second(collector):
     node, alive = a_cycle()
     library = [[] for _ in range(10_000)]

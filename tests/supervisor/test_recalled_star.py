@@ -70,6 +70,7 @@ def search_from_arcsec(simulation, held_arcsec):
 MOVING = "loops.right.star_rate_sky_arcsec_s={az=0.4, el=-0.3}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "overrides",
     [[], [MOVING, MOVING.replace("loops.", "plant.loops.")]],
@@ -135,6 +136,7 @@ def test_encoders_that_lost_their_zero_lead_nowhere(simulate_with):
     assert simulation.supervisor.star_places == []
 
 
+@pytest.mark.long
 def test_encoders_that_lost_their_zero_lead_nowhere_though_opening_failed_after_they_were_read(
     simulate_with,
 ):

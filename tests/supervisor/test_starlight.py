@@ -80,6 +80,7 @@ def test_a_faint_star_is_held_by_a_design_for_its_noise(tmp_path):
     assert for_its_noise_px < 0.0275
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", ["minimum-variance", "fslq"])
 def test_after_acquire_with_another_flux_the_design_is_for_that_noise(controller):
     rig = rig_of(FAINT_DN, controller)
@@ -115,6 +116,7 @@ def test_the_fits_noise_is_told_within_what_matters_and_without_another_fit(elec
     assert sensor.fit is fit
 
 
+@pytest.mark.long
 def test_a_star_that_fades_later_gets_its_design_within_a_minute():
     simulation = held(rig_of(28000.0))
     assert not changes_of(simulation)

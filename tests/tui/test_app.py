@@ -118,6 +118,7 @@ async def chosen_in_palette(app, pilot, typed):
     await until(pilot, lambda: not isinstance(app.screen, CommandPalette))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("typed", "command"),
     [
@@ -141,6 +142,7 @@ def test_what_has_no_key_is_typed_into_the_palette(typed, command):
     assert run(scenario, supervisor=supervisor).sent == [command]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("answer", "sent"), [("y", [Shutdown()]), ("n", []), ("escape", [])])
 def test_the_supervisor_is_shut_down_through_the_palette_and_asks_once(answer, sent):
     async def scenario(app, pilot, link):

@@ -4,6 +4,8 @@ import signal
 import sys
 import time
 
+import pytest
+
 from fitctl.tui.jobs import Job
 
 LIMIT_S = 60.0
@@ -17,6 +19,7 @@ def finished(job):
     return job.status
 
 
+@pytest.mark.long
 def test_a_job_tells_how_it_ended_and_what_it_printed():
     job = Job(["check", "no-such-rig.toml"])
     try:
@@ -26,6 +29,7 @@ def test_a_job_tells_how_it_ended_and_what_it_printed():
         job.end()
 
 
+@pytest.mark.long
 def test_a_job_is_ended_with_the_console_unless_it_is_to_outlive_it(tmp_path, monkeypatch):
     other = Job(["check", "no-such.toml"], outlives=True)
     endless = tmp_path / "python"

@@ -68,15 +68,18 @@ def test_every_screen_in_every_mode(changed, mode):
     assert changed(FixedApp(FakeSupervisor(mode)), views=views) == []
 
 
+@pytest.mark.long
 def test_the_steps_on_a_console_of_operation(changed):
     assert changed(FixedApp(FakeSupervisor()), views=[COMMISSIONING]) == []
 
 
+@pytest.mark.long
 def test_a_step_of_the_commissioning_asks(changed):
     app = commissioning(printed=OUTPUT)
     assert changed(app, "g") == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "keys", ["e", "v", "o", "t", "j"], ids=["events", "alarms", "off", "target", "jog"]
 )
@@ -94,6 +97,7 @@ def test_alarms_of_a_fault(changed):
     assert changed(FixedApp(fault_and_lost_records()), "v", sizes=SMALL) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loops", [("right",), TESTBED], ids=["one", "three"])
 def test_stale(changed, loops):
     assert changed(FixedApp(FakeSupervisor(loops=loops), silent_s=7.2)) == []
@@ -105,6 +109,7 @@ def test_no_data_since_the_start(changed):
     assert changed(app, sizes=SMALL) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["VERNIER", "fault", "stopped"])
 def test_without_colour(changed, monkeypatch, state):
     monkeypatch.setenv("NO_COLOR", "1")
@@ -125,6 +130,7 @@ LEARNT = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("learnt", LEARNT)
 def test_what_was_learnt(changed, learnt):
     supervisor = FakeSupervisor()
@@ -140,11 +146,13 @@ def test_what_was_learnt(changed, learnt):
     assert changed(FixedApp(supervisor), views=views) == []
 
 
+@pytest.mark.long
 def test_three_loops(changed):
     views = [view for view in VIEWS if view.name in {"operate", "devices", "loop"}]
     assert changed(FixedApp(FakeSupervisor(loops=TESTBED)), views=views) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("chosen", ["right", "metrology"])
 @pytest.mark.parametrize("state", ["OFF", "ACQUISITION", "link_lost", "stopped"])
 def test_three_loops_on_operate(changed, state, chosen):
@@ -159,6 +167,7 @@ def test_two_loops_on_a_wide_and_low_terminal(changed):
     assert changed(app, "l", sizes=[(120, 24)]) == []
 
 
+@pytest.mark.long
 def test_the_past_while_an_alarm_of_now_rings(changed):
     supervisor = FakeSupervisor(loops=TESTBED)
     app = FixedApp(supervisor)

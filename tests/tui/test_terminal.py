@@ -115,6 +115,7 @@ def console(tmp_path):
         console.process.wait()
 
 
+@pytest.mark.long
 def test_a_console_that_is_stopped_and_continued_has_as_many_threads_as_before(console):
     until(lambda: console.threads() == 6, "its own threads, and none of a command")
     for _ in range(3):
@@ -122,6 +123,7 @@ def test_a_console_that_is_stopped_and_continued_has_as_many_threads_as_before(c
     until(lambda: console.threads() == 6, f"6 threads; there are {console.threads()}")
 
 
+@pytest.mark.long
 def test_a_console_that_was_stopped_and_continued_ends_and_leaves_the_terminal_as_it_was(console):
     console.stop_and_continue()
     console.press(b"q")
@@ -129,6 +131,7 @@ def test_a_console_that_was_stopped_and_continued_ends_and_leaves_the_terminal_a
     assert termios.tcgetattr(console.inside) == console.modes_before
 
 
+@pytest.mark.long
 def test_a_console_that_is_continued_while_it_writes_goes_on(tmp_path):
     console = OnTerminal(tmp_path / "nobody", CONTINUED_WHILE_IT_WRITES + CONSOLE)
     try:

@@ -164,6 +164,7 @@ def test_a_supervisor_of_another_version_is_a_connection_error(tmp_path, payload
                 client.receive(DEADLINE_S)
 
 
+@pytest.mark.long
 def test_quitting_leaves_no_thread_and_closes_the_link():
     async def scenario(app, pilot, link):
         await pilot.press("h")

@@ -77,6 +77,7 @@ def test_a_log_too_short_for_an_expected_rms_says_so(replay, log):
     assert "loop right: no expected RMS: learn: the longest piece in VERNIER is" in text
 
 
+@pytest.mark.long
 def test_another_controller_stays_to_the_end_whatever_the_log_changed(replay, changed_log):
     _, text, _ = replay(changed_log)
     assert text.splitlines()[-1] == "the same, to the last bit"  # with the log's own change
@@ -90,6 +91,7 @@ def test_another_controller_stays_to_the_end_whatever_the_log_changed(replay, ch
     assert 30.0 < stacks["first_s"] < 32.0
 
 
+@pytest.mark.long
 def test_the_rms_of_each_controller_and_of_the_wanted_one(replay, changed_log):
     status, text, _ = replay(changed_log, "--controller", "lqg-ltr", "--json")
     (loop,) = json.loads(text)["controllers"]

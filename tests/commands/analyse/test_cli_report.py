@@ -59,6 +59,7 @@ def test_a_report_stands_beside_its_log_and_is_opened_in_the_browser(off, fitctl
     assert opened == [(folder / "report.html").as_uri()]
 
 
+@pytest.mark.long
 def test_nights_side_by_side_and_a_line_that_says_what_a_pdf_needs(
     off, fitctl, tmp_path, monkeypatch
 ):
@@ -119,6 +120,7 @@ def test_the_browser_never_runs_without_its_sandbox_unless_asked(
     assert "--no-sandbox" in said.read_text()
 
 
+@pytest.mark.long
 @pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
 def test_a_browser_that_is_there_prints_the_page(tmp_path):
     page = tmp_path / "report.html"

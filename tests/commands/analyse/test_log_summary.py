@@ -26,6 +26,7 @@ def printed(capsys, *arguments):
     return end.value.code, capsys.readouterr().out.splitlines()
 
 
+@pytest.mark.long
 def test_start_duration_rms_and_verdict_are_printed(log, tmp_path, capsys):
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(log.read_bytes()[:200])
@@ -41,6 +42,7 @@ def test_start_duration_rms_and_verdict_are_printed(log, tmp_path, capsys):
     assert "none.mcap" in none["error"]
 
 
+@pytest.mark.long
 def test_a_log_that_is_too_large_is_only_named(log, capsys):
     _, (line,) = printed(capsys, "--json", "--most-bytes", "1000", log)
     known = json.loads(line)
@@ -49,6 +51,7 @@ def test_a_log_that_is_too_large_is_only_named(log, capsys):
     assert known["rms"] == {}
 
 
+@pytest.mark.long
 def test_a_line_for_people_has_them_too(log, capsys):
     _, (line,) = printed(capsys, log)
     assert "requirement met: right 0.0" in line

@@ -26,6 +26,7 @@ def design(capsys):
     return run
 
 
+@pytest.mark.long
 def test_the_vernier_in_json_has_what_the_paper_prints(design):
     status, out, _ = design("vernier", "--json")
     found = json.loads(out)
@@ -43,6 +44,7 @@ def test_the_vernier_in_json_has_what_the_paper_prints(design):
         assert found[key] > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "magic"), [("fig9.png", b"\x89PNG"), ("fig9.svg", b"<?xml")])
 def test_the_vernier_is_drawn(design, tmp_path, name, magic):
     status, _, _ = design("vernier", "--plot", tmp_path / name)
@@ -59,6 +61,7 @@ def test_the_bound_of_any_rig(design):
     assert flight["residual_px"] < 0.004
 
 
+@pytest.mark.long
 def test_the_coarse_loop_and_what_its_play_does(design):
     found = json.loads(design("coarse", "--json")[1])
     assert found["crossover_hz"] == pytest.approx(0.074, abs=1e-3)
@@ -66,6 +69,7 @@ def test_the_coarse_loop_and_what_its_play_does(design):
     assert all(part["bounded"] for part in found["deadzone"].values())
 
 
+@pytest.mark.long
 def test_all_designs_beside_the_bound(design):
     status, out, _ = design("compare")
     assert status == 0
@@ -98,6 +102,7 @@ def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["frames"] > 0
 
 
+@pytest.mark.long
 def test_a_saved_design_is_judged_as_it_was_saved_not_made_anew(design, tmp_path):
     path = tmp_path / "mine.json"
     other = ["--set", "loops.right.vernier.fslq.crossover_hz=2"]
@@ -113,6 +118,7 @@ def test_a_saved_design_is_judged_as_it_was_saved_not_made_anew(design, tmp_path
     assert f"fslq of {path}" in design(path)[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["eq20", "coarse", "compare"])
 def test_an_unstable_design_is_said_to_be_so(design, what):
     """Eq. 20 turns too far with two frames and three quarters of delay."""
@@ -122,6 +128,7 @@ def test_an_unstable_design_is_said_to_be_so(design, what):
     assert "inf of" not in out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["vernier", "coarse", "bound", "fslq", "eq20", "lqg-ltr"])
 def test_people_get_text_that_fits_their_terminal(design, what):
     status, out, err = design(what)

@@ -53,6 +53,7 @@ def test_what_could_not_end_well_is_not_begun(identify, monkeypatch, tmp_path, a
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp_path):
     """Each log has a part of the voltages and of the frames; the analysis gets all of them."""
     drives = EXPERIMENTS["delay"].plan(rig, "right")

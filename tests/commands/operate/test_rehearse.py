@@ -37,6 +37,7 @@ def in_vernier(served):
     served.follow(lambda _: served.simulation.supervisor.loops["right"].mode is Mode.VERNIER)
 
 
+@pytest.mark.long
 def test_where_the_stages_end_is_printed_and_nothing_is_sent(served, fitctl):
     in_vernier(served)
     status, out, _ = fitctl("rehearse", "target", "22", "21")
@@ -48,6 +49,7 @@ def test_where_the_stages_end_is_printed_and_nothing_is_sent(served, fitctl):
     assert served.commands("SetTarget") == []
 
 
+@pytest.mark.long
 def test_a_refusal_is_foreseen(served, fitctl):
     in_vernier(served)
     status, out, _ = fitctl("rehearse", "recover", "--json")
@@ -64,6 +66,7 @@ def test_a_mistake_is_named_before_anything_is_simulated(fitctl):
     assert "target needs AZ_PX EL_PX" in err or "needs" in err
 
 
+@pytest.mark.long
 def test_a_sequence_begins_where_the_stages_are(served, fitctl):
     in_vernier(served)
     status, out, _ = fitctl("sequence", "dry-run", "acquire", "--present")

@@ -142,6 +142,7 @@ def test_a_timeout_that_is_none_is_status_2(fitctl, timeout):
     assert fitctl("send", "standby", "--timeout", timeout)[0] == 2
 
 
+@pytest.mark.long
 def test_a_supervisor_that_dies_meanwhile_is_said(fitctl, served, meanwhile):
     fitctl("send", "standby", "--wait")
     darken(served.simulation)

@@ -169,6 +169,7 @@ def test_a_browser_is_given_nothing_that_it_would_show_another_port(page):
     assert "default-src 'self'" in headers["Content-Security-Policy"]
 
 
+@pytest.mark.long
 def test_two_consoles_do_not_log_each_other_out(serve):
     first, second = serve(), serve()
 

@@ -99,6 +99,7 @@ def test_a_wrong_option_is_named(commission, arguments, named):
     assert named in text
 
 
+@pytest.mark.long
 def test_the_next_call_goes_on_where_the_last_one_ended(commission, two_steps):
     status, text = commission("--yes", "--until", "one")
     assert (status, two_steps) == (0, ["one"])

@@ -99,6 +99,7 @@ def testbed(tmp_path):
     return ["--rig", str(TESTBED), "--set", f"service.folder={tmp_path / 'none'}"]
 
 
+@pytest.mark.long
 def test_the_testbed_has_photodiodes_and_a_hexapod_too(doctor, testbed):
     with listening("--rig", str(TESTBED)) as endpoints:
         status, out = doctor("--json", *testbed, *endpoints)
@@ -229,6 +230,7 @@ def test_devices_that_the_running_supervisor_has_not_opened_are_not_found(doctor
     assert status == 1
 
 
+@pytest.mark.long
 def test_a_socket_that_a_supervisor_left_behind_keeps_nobody_from_asking(doctor, mocks, tmp_path):
     folder = tmp_path / "s"
     folder.mkdir(mode=0o700)

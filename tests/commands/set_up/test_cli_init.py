@@ -303,6 +303,7 @@ def test_nothing_is_overwritten(fitctl, tmp_path):
     assert path.read_text() == "precious"
 
 
+@pytest.mark.long
 def test_questions_are_asked_on_a_terminal_and_asked_again_when_the_answer_is_none(tmp_path):
     answers = ["night", "webcam", "gige", "10.0.0.9", "ensemble:10.0.0.5", "tcp", "10.0.0.8"]
     answers += [

@@ -184,6 +184,7 @@ def test_each_page_of_a_browser_is_the_console_that_was_asked_for(
     assert app.log_folder == wanted.log_folder
 
 
+@pytest.mark.long
 def test_a_console_by_its_key_alone_shows_the_instrument_and_says_what_it_needs(console, key_file):
     app = console("--remote", key_file)
 

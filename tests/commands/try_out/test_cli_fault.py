@@ -135,6 +135,7 @@ def test_a_script_with_something_wrong_is_one_line_and_status_2(tmp_path, capsys
     assert said in err
 
 
+@pytest.mark.long
 def test_every_device_has_the_faults_of_its_wire(capsys):
     for table in kinds().values():
         assert table.keys() >= WIRE_FAULTS.keys()

@@ -115,6 +115,7 @@ def step(monkeypatch):
     return run
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("start_m", [(0.0, 0.0), (0.03, -0.02), (-0.03, 0.03)])
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 3, 0, 1), (1, 2, 3, 0)])
 def test_the_beam_is_brought_to_the_middle_and_each_photodiode_is_found(step, start_m, order):
@@ -130,6 +131,7 @@ def test_without_light_the_step_ends(step):
         step((0.0, 0.0), light=0.0)
 
 
+@pytest.mark.long
 def test_a_photodiode_without_light_is_named(step):
     with pytest.raises(StepError, match="AIN3: no light"):
         step((0.01, 0.02), light=(1.0, 1.0, 1.0, 0.0))

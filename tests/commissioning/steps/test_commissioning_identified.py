@@ -21,6 +21,7 @@ def delay():
     return EXPERIMENTS["delay"].from_records(RIG, "right", records)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("later_s", "differs"), [(0.0, False), (0.02, True)])
 def test_a_delay_is_taken_where_it_is_measured_to_differ(delay, later_s, differs):
     finding = dataclasses.replace(delay, delay_s=delay.delay_s + later_s)
@@ -37,6 +38,7 @@ def controller(name):
     return f"loops.right.vernier.controller={name}"
 
 
+@pytest.mark.long
 def test_a_design_without_margins_gives_way_to_the_best_that_has_them():
     outcome = check_design(with_settings(controller("eq20")))
     chosen = outcome.found["loops"]["right"]["vernier"]["controller"]
@@ -46,12 +48,14 @@ def test_a_design_without_margins_gives_way_to_the_best_that_has_them():
     assert outcome.state == "measured"
 
 
+@pytest.mark.long
 def test_a_design_with_margins_that_leaves_as_little_is_kept():
     outcome = check_design(with_settings(controller("minimum-variance")))
     assert outcome.state == "passed"
     assert "minimum-variance, the rig file's controller, stays" in outcome.lines
 
 
+@pytest.mark.long
 def test_without_a_design_that_keeps_its_margins_the_step_fails(monkeypatch):
     monkeypatch.setattr(identified, "Required", lambda: Required(gain_margin_db=60.0))
     with pytest.raises(StepError, match="no design keeps 35 degrees and 60 dB"):

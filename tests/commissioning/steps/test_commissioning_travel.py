@@ -13,6 +13,7 @@ def step(monkeypatch):
     return step_on_bench(monkeypatch, check_travel)
 
 
+@pytest.mark.long
 def test_both_motors_go_to_both_ends_and_back_and_never_beyond(step):
     bench, outcome, _ = step()
     assert outcome.state == "passed"

@@ -36,6 +36,7 @@ def test_pairs_that_know_where_the_mirror_is_need_no_feedback(fit):
         assert deadzone_result(DESIGNS[name](fit), fit).largest_real == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", DESIGNS)
 def test_after_many_jumps_out_of_reach_every_course_comes_to_rest(name, rig, fit):
     random = np.random.default_rng(7)
@@ -50,6 +51,7 @@ def test_after_many_jumps_out_of_reach_every_course_comes_to_rest(name, rig, fit
     assert np.abs(course.error_px[-1000:]).max() < 0.1
 
 
+@pytest.mark.long
 @settings(max_examples=10)
 @given(
     jumps=st.lists(

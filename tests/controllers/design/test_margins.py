@@ -79,6 +79,7 @@ def test_a_design_that_has_its_margins_stays_as_it_is(fit):
     assert np.array_equal(design.a, plain.a)
 
 
+@pytest.mark.long
 def test_a_design_keeps_its_margins_at_little_cost(with_the_fit):
     its_basis, required = with_the_fit, Required()
     plain = design_minimum_variance(its_basis)
@@ -101,6 +102,7 @@ SHAKY = (  # as learnt from a minute of frames under lines at 1.5, 5.3 and 24.3 
 )
 
 
+@pytest.mark.long
 def test_a_night_that_needs_a_strong_guard_has_its_design(fit):
     shaky = dataclasses.replace(
         fit, lines=SHAKY, noise_px=2.14e-5, mirror_gain=0.7445, overshoot=0.0535
@@ -113,6 +115,7 @@ def test_a_night_that_needs_a_strong_guard_has_its_design(fit):
     assert linear_residual(design, shaky) < 1.06 * least_px
 
 
+@pytest.mark.long
 def test_a_search_that_begins_at_a_design_for_nearly_the_same_night_finds_as_good_a_one(fit):
     night = dataclasses.replace(fit, lines=(SIX_HZ,), noise_px=0.003)
     later = dataclasses.replace(night, noise_px=0.0029)
@@ -125,6 +128,7 @@ def test_a_search_that_begins_at_a_design_for_nearly_the_same_night_finds_as_goo
     assert linear_residual(design, later) < 1.005 * linear_residual(anew, later)
 
 
+@pytest.mark.long
 def test_a_search_does_not_begin_at_a_design_for_other_lines(fit):
     quiet = design_with_margins(dataclasses.replace(fit, noise_px=0.002))
     shaken = dataclasses.replace(fit, lines=(SIX_HZ,), noise_px=0.002)
@@ -135,6 +139,7 @@ def test_a_search_does_not_begin_at_a_design_for_other_lines(fit):
     assert np.array_equal(like.a, anew.a)
 
 
+@pytest.mark.long
 def test_where_the_margins_cost_much_the_better_of_two_searches_counts(fit, monkeypatch):
     shaky = dataclasses.replace(
         fit,
@@ -162,6 +167,7 @@ def test_margins_that_no_design_can_have_are_an_error(fit, monkeypatch):
         design_with_margins(fit, Required(peak_sensitivity=1.01))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("overshoot", [0.0, 0.09])
 def test_a_design_with_lines_and_guard_is_made_again_from_its_file(
     six_hz, fit, tmp_path, overshoot

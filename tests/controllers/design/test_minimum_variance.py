@@ -40,6 +40,7 @@ def test_all_of_it_wrong_at_once_is_still_stable(make, fit, changed):
             assert linear_residual(make(fit), truth) < 1.25 * bound(truth).residual_px
 
 
+@pytest.mark.long
 def test_a_shift_of_the_star_is_undone_and_the_mirror_returns_to_its_bias(make, rig, fit):
     star = np.tile([3.0, -2.0], (12_000, 1))
     course = run_pair(rig, make(fit), star)

@@ -42,6 +42,7 @@ def rig_with(file):
     return load_rig(default_rig_path(), [f"loops.right.vernier.controller={file}"])
 
 
+@pytest.mark.long
 def test_the_example_is_a_controller_between_the_bound_and_eq20(file):
     rig = rig_with(file)
     its_basis = basis(rig, "right")
@@ -52,6 +53,7 @@ def test_the_example_is_a_controller_between_the_bound_and_eq20(file):
     assert bound(its_basis).residual_px < mine.residual_px < eq20.residual_px
 
 
+@pytest.mark.long
 def test_it_holds_a_star(file, tmp_path):
     simulation = LoggedSimulation(rig_with(file), tmp_path / "run.mcap")
     simulation.acquire()
@@ -62,6 +64,7 @@ def test_it_holds_a_star(file, tmp_path):
     assert np.sqrt(np.mean(np.square(errors))) < 0.04
 
 
+@pytest.mark.long
 def test_another_process_makes_the_same_design(file):
     rig = rig_with(file)
     here, there = design_for(rig, "right"), design_in_own_process(rig, "right")
@@ -141,6 +144,7 @@ def log(file, tmp_path):
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("arguments", [[], ["--set", "loops.right.requirement_px=0.05"]])
 def test_a_replay_uses_the_logged_matrices_and_never_runs_the_file(
     fitctl_main, file, log, arguments
@@ -152,6 +156,7 @@ def test_a_replay_uses_the_logged_matrices_and_never_runs_the_file(
     assert not ran(file)
 
 
+@pytest.mark.long
 def test_a_report_never_runs_the_file(file, log):
     loop = find(find_run([log])).loops["right"]
 
@@ -160,6 +165,7 @@ def test_a_report_never_runs_the_file(file, log):
     assert not ran(file)
 
 
+@pytest.mark.long
 def test_the_user_may_name_the_file_for_a_replay(fitctl_main, file, log):
     status, out = fitctl_main("replay", log, "--controller", file)
 

@@ -26,6 +26,7 @@ def same(one, other):
     return all(getattr(one, name) == getattr(other, name) for name in rest)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", DESIGNS)
 def test_it_is_the_design_that_this_process_makes_bit_for_bit(controller):
     assert same(
@@ -39,6 +40,7 @@ def test_json_keeps_a_design_bit_for_bit(controller):
     assert same(design_from_json(design_json(design)), design)
 
 
+@pytest.mark.long
 def test_a_saved_design_is_found_from_the_same_folder(tmp_path, monkeypatch):
     save_design(design_for(RIG, "right", "fslq"), tmp_path / "mine.json")
     monkeypatch.chdir(tmp_path)
@@ -47,10 +49,12 @@ def test_a_saved_design_is_found_from_the_same_folder(tmp_path, monkeypatch):
     assert same(made, design_for(RIG, "right", "mine.json"))
 
 
+@pytest.mark.long
 def test_without_a_name_it_is_the_one_of_the_rig_file():
     assert design_in_own_process(RIG, "right").name == RIG.loops["right"].vernier.controller
 
 
+@pytest.mark.long
 def test_what_is_wrong_with_a_controller_is_reported_in_the_same_words():
     with pytest.raises(ConfigError) as here:
         design_for(RIG, "right", "pid")
@@ -122,6 +126,7 @@ def test_a_python_that_cannot_be_started_is_reported(monkeypatch, tmp_path):
         design_in_own_process(RIG, "right", "eq20")
 
 
+@pytest.mark.long
 def test_what_asks_for_it_does_not_import_the_libraries_of_design():
     program = (
         "import sys; import fitctl.controllers.design.own_process; "

@@ -26,6 +26,7 @@ def least_px(rig):
     return bound(basis(rig, "right")).residual_px
 
 
+@pytest.mark.long
 def test_one_short_run_is_near_the_bound(least_px):
     assert worst_axis_px("minimum-variance", 1, 45.0) < 1.15 * least_px
 

@@ -31,6 +31,7 @@ def expected_px(theory):
     return math.sqrt(np.trapezoid(predicted(theory, theory.frequency_hz), theory.frequency_hz))
 
 
+@pytest.mark.long
 def test_a_learnt_design_expects_the_night_that_it_was_made_for(rig):
     design = design_for(rig, "right", learnt_json(LINE))
     left_px2 = left_on_paper(
@@ -42,6 +43,7 @@ def test_a_learnt_design_expects_the_night_that_it_was_made_for(rig):
     assert expected_px(theory) == pytest.approx(math.sqrt(left_px2.mean()), rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("controller", ["eq20", "minimum-variance"])
 def test_other_designs_expect_the_night_of_the_rig_file(rig, controller):
     design = design_for(rig, "right", controller)

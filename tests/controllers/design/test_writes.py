@@ -28,6 +28,7 @@ def test_each_write_is_for_its_own_part_of_the_hold(several):
     assert left_px < 0.93 * once_px
 
 
+@pytest.mark.long
 def test_the_margins_are_those_of_the_mirror_as_a_frame_shows_it(several):
     required = Required()
     design = design_with_margins(several)

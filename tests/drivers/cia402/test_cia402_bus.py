@@ -333,6 +333,7 @@ def test_servos_of_a_bus_reach_their_own_set_points(servos, bench):
         )
 
 
+@pytest.mark.long
 def test_a_silent_drive_is_a_fault_of_its_servo_and_the_others_go_on_at_their_rate(
     servos, bench, siderostat
 ):
@@ -354,6 +355,7 @@ def test_a_silent_drive_is_a_fault_of_its_servo_and_the_others_go_on_at_their_ra
     assert min(counts[1:]) > 0.6 * counts[0]
 
 
+@pytest.mark.long
 def test_a_drive_that_is_opened_again_leaves_the_others_servoed(servos, bench):
     bench.fault(0, "reboot")
     wait_until(lambda: servos[0].fault is not None)
@@ -366,6 +368,7 @@ def test_a_drive_that_is_opened_again_leaves_the_others_servoed(servos, bench):
     wait_until(lambda: bench.motors[1].position_rad()[0] == pytest.approx(0.5, abs=5e-3))
 
 
+@pytest.mark.long
 def test_a_lost_adapter_is_a_fault_of_all_servos_and_each_is_opened_again(servos, bench):
     bench.cut_off()
     for servo in servos:

@@ -95,6 +95,7 @@ def lying(size: int) -> bytes:
     return content.replace(size.to_bytes(4, "little"), (100).to_bytes(4, "little"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("archive", "why"),
     [(bomb, "314572800 bytes once unpacked"), (lying, "Bad CRC-32")],

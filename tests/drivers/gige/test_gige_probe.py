@@ -140,6 +140,7 @@ def asked(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
+@pytest.mark.long
 @given(changes=asked())
 @settings(max_examples=40, deadline=None)
 def test_it_says_what_opening_finds(shared: Served, changes: dict[str, Any]) -> None:

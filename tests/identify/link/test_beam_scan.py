@@ -116,6 +116,7 @@ def test_samples_that_are_late_are_found_at_two_speeds_behind_a_play():
     assert np.mean(plays) == pytest.approx(PLAY_ARCSEC, abs=0.1)
 
 
+@pytest.mark.long
 def test_the_delay_counts_from_when_a_sample_was_truly_taken():
     found = beam.analyse(RIG, "metrology", scan(1), beam.LinkDelayResult)
     assert abs(found.delay_s - DELAY_S) < 3 * found.delay_sd_s
@@ -133,6 +134,7 @@ def test_the_fragment_has_the_scale():
     assert sensor["on_axis_v"] == pytest.approx(4.6, abs=0.01)
 
 
+@pytest.mark.long
 def test_a_saturated_photodiode_does_not_count():
     ticks = scan(1, on_axis_v=7.0)
     sides = ("az_plus", "az_minus", "el_plus", "el_minus")
@@ -149,6 +151,7 @@ def test_it_is_plotted(tmp_path):
     assert (tmp_path / "beam.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_what_shows_nothing_is_refused():
     with pytest.raises(IdentifyError, match="loop left has no photodiodes"):
         beam.analyse(RIG, "left", scan(1), beam.LinkDelayResult)

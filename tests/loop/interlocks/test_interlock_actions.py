@@ -32,6 +32,7 @@ def with_action(action, reset="hand", modes="['VERNIER']"):
     return Bench(*(f"interlocks.frame_age.{key}={value}" for key, value in fields.items()))
 
 
+@pytest.mark.long
 def test_flattened_the_mirror_is_at_its_bias_and_the_siderostat_held_until_it_is_over():
     bench = with_action("flatten", "itself")
     bench.simulation.command(SetTarget(az_px=26.0, el_px=19.5))

@@ -61,6 +61,7 @@ def test_a_star_that_comes_back_where_it_was_is_held_again(held, dark_s):
     assert again(simulation) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moved", [(60.0, 0.0), (-60.0, 60.0), (0.0, 190.0)])
 def test_a_star_that_comes_back_elsewhere_is_found_by_a_wider_round(held, moved):
     simulation = held()
@@ -83,6 +84,7 @@ def test_a_star_in_the_field_is_looked_for_at_its_last_place_before_the_siderost
     assert all(tick.search_progress == 0.0 for tick in searched)
 
 
+@pytest.mark.long
 def test_rounds_grow_to_the_rigs_radius_with_pauses_and_stay_there(held):
     simulation = held()
     darken(simulation)
@@ -102,6 +104,7 @@ def test_rounds_grow_to_the_rigs_radius_with_pauses_and_stay_there(held):
     assert set(rounds[6:]) == {(widest, True), (widest, False)}
 
 
+@pytest.mark.long
 def test_a_long_search_is_reported_once_and_consoles_are_shown_since_when(held):
     simulation = held()
     darken(simulation)
@@ -114,6 +117,7 @@ def test_a_long_search_is_reported_once_and_consoles_are_shown_since_when(held):
     assert again(simulation).since_s == pytest.approx(simulation.mode_changes[-1].time_s)
 
 
+@pytest.mark.long
 def test_the_siderostat_stays_within_its_travel_however_long_it_searches(held):
     simulation = held(
         "loops.right.siderostat.travel_sky_arcsec=100.0",
@@ -131,6 +135,7 @@ def test_the_siderostat_stays_within_its_travel_however_long_it_searches(held):
     assert max(arcsec) < 101.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "ends"),
     [(Release(), Mode.STANDBY), (Stop(), Mode.SAFE), (Acquire(), Mode.ACQUISITION)],
@@ -150,6 +155,7 @@ def test_hold_stop_and_another_acquire_end_it(held, command, ends):
     assert mode_of(simulation) is (Mode.SAFE if ends is Mode.SAFE else Mode.STANDBY)
 
 
+@pytest.mark.long
 def test_it_ends_in_standby_after_the_time_that_the_rig_file_allows(held):
     simulation = held(f"{ACQUISITION}search_again_s=40.0")
     darken(simulation)
@@ -180,6 +186,7 @@ def test_a_first_search_ends_when_its_radius_was_seen(simulate_with):
     assert again(simulation) is None
 
 
+@pytest.mark.long
 def test_a_search_that_finds_the_star_and_loses_it_again_begins_with_the_first_round(held):
     simulation = held()
     lose(simulation, 60.0)

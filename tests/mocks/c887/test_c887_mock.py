@@ -411,6 +411,7 @@ QUESTIONS = ["POS?", "VMO?", "SPA?", "SPI?", "SAI?", "ERR?", "HLP?", "HPA?"]
 names = st.sampled_from(MOVES + QUESTIONS)
 
 
+@pytest.mark.long
 @hypothesis.settings(max_examples=300)
 @given(st.lists(st.tuples(names, st.lists(words, max_size=6)), max_size=8))
 def test_any_words_leave_it_within_its_travel_and_its_answers_readable(lines):

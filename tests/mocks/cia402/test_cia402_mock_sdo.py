@@ -1,5 +1,6 @@
 """The mock drive's object dictionary on the wire, and frames that nobody should send."""
 
+import pytest
 from cia402_bus import on_drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -94,6 +95,7 @@ random_frames = st.tuples(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(st.lists(random_frames, max_size=30))
 def test_no_frame_breaks_the_drive(frames):

@@ -205,6 +205,7 @@ def test_frames_are_stamped_with_milliseconds_where_that_is_wanted():
     on_adapter(script)
 
 
+@pytest.mark.long
 def test_a_client_that_does_not_read_is_told_that_frames_were_lost():
     async def script(_received, adapter, wire):
         await wire.tell(b"S8\rO\r", b"\r\r")

@@ -215,6 +215,7 @@ def test_discovery_is_heard_on_the_loopback_interface_alone(address: str) -> Non
     scenario(check)
 
 
+@pytest.mark.long
 @settings(max_examples=200, deadline=None)
 @given(
     packets=st.lists(

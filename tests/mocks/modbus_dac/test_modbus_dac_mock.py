@@ -203,6 +203,7 @@ async def test_who_is_out_of_step_is_cut_off_and_others_are_served():
         assert (await master.says(READ_ALL)).startswith("00 01 00 00 00 09 01 03 06")
 
 
+@pytest.mark.long
 @in_a_loop
 async def test_who_never_reads_is_not_read_from_either():
     async with station() as (mock, master, _):

@@ -82,6 +82,7 @@ def offset_px(*overrides):
     return true_px.mean(axis=0) - simulation.supervisor.loops["right"].target_px
 
 
+@pytest.mark.long
 def test_a_dark_frame_that_was_measured_is_used_and_the_star_is_held_in_its_place(tmp_path):
     aside = load_rig(default_rig_path(), [HOT])
     with Instrument(aside, simulate=True, seed=1) as instrument:

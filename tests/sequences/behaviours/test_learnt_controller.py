@@ -39,6 +39,7 @@ def run(tried, made, learn="advise"):
     return attempt, link.receive(1.0).loops[0].controller
 
 
+@pytest.mark.long
 def test_it_waits_for_a_design_and_switches_to_it(tried):
     attempt, controller = run(tried, report())
 
@@ -47,6 +48,7 @@ def test_it_waits_for_a_design_and_switches_to_it(tried):
     assert controller == "learnt"
 
 
+@pytest.mark.long
 def test_it_keeps_a_design_that_is_as_good(tried):
     attempt, controller = run(tried, report(worth_it=False))
 
@@ -56,6 +58,7 @@ def test_it_keeps_a_design_that_is_as_good(tried):
     assert controller == "minimum-variance"
 
 
+@pytest.mark.long
 def test_without_a_design_it_times_out(tried):
     with pytest.raises(SequenceError, match="timed out: not done within 60 s"):
         run(tried, None)

@@ -57,6 +57,7 @@ scales = st.floats(0.5, 1.5)
 angles = st.floats(-np.pi, np.pi)
 
 
+@pytest.mark.long
 @settings(max_examples=25)
 @given(scales, angles, scales, angles, st.floats(0.0, 0.5))
 def test_matrices_that_are_known_come_back(
@@ -74,6 +75,7 @@ def test_matrices_that_are_known_come_back(
     np.testing.assert_allclose(fit.siderostat, siderostat, atol=0.01)
 
 
+@pytest.mark.long
 def test_the_uncertainty_is_that_of_repeated_fits():
     fits = []
     for seed in range(30):

@@ -31,6 +31,7 @@ def true_sky_arcsec(instrument):
     return dict(zip(names, origin_px * scales(SKY, loop).sky_arcsec_per_px, strict=True))
 
 
+@pytest.mark.long
 def test_each_star_is_found_where_it_is_and_a_missing_one_is_skipped():
     with Instrument(SKY, simulate=True, seed=3) as instrument:
         figures = instrument.stars([ALPHA, MISSING, BETA], **QUICK)
@@ -47,6 +48,7 @@ def test_each_star_is_found_where_it_is_and_a_missing_one_is_skipped():
     assert np.linalg.norm(truth["alpha"]) > 3.0  # the list's error is real
 
 
+@pytest.mark.long
 def test_a_star_is_taken_for_the_one_that_is_meant_by_its_own_flux():
     faint, bright = {"star_flux_dn": 14000.0}, {"star_flux_dn": 28000.0}
     stars = [
@@ -77,6 +79,7 @@ MOVING_SKY = load_rig(
 )
 
 
+@pytest.mark.long
 def test_each_star_is_followed_at_its_own_rate_from_where_it_was_as_the_list_began():
     rate = {"rate_az_sky_arcsec_s": 12.0, "rate_el_sky_arcsec_s": -9.0}
     with Instrument(MOVING_SKY, simulate=True, seed=3) as instrument:

@@ -142,6 +142,7 @@ def characters(app):
     return "".join(plane.render_line(y).text for y in range(plane.size.height))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [Graphics.SIXEL, Graphics.KITTY])
 @pytest.mark.parametrize("size", [(80, 24), (120, 40)])
 def test_the_frame_is_a_picture_and_its_caption_is_text(pictured, kind, size):
@@ -170,6 +171,7 @@ def test_sixels_stay_within_the_rows_above_the_caption(pictured):
     run_app(app, scenario, size=(80, 24))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cover",
     [

@@ -51,6 +51,7 @@ def recorded():
     return Recorded()
 
 
+@pytest.mark.long
 def test_the_telemetry_carries_the_ticks_of_metrology_and_the_overlap(recorded):
     newest = recorded.messages(0)[-1]
     assert {loop.name: loop.kind for loop in newest.loops} == {
@@ -63,6 +64,7 @@ def test_the_telemetry_carries_the_ticks_of_metrology_and_the_overlap(recorded):
     assert newest.overlaps[-1].visibility > 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("view", SCREENS, ids=lambda view: view.label)
 def test_every_screen_shows_every_loop(recorded, view):
     shown = []
@@ -245,6 +247,7 @@ def test_ill_devices_come_before_healthy_ones():
     assert DeviceList(state).devices()[0].device == "right piezo"
 
 
+@pytest.mark.long
 def test_a_click_on_a_loop_chooses_it():
     async def scenario(app, pilot):
         row = app.view.query_one("#header").render_line(1).text

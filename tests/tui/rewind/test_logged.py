@@ -89,6 +89,7 @@ def at(run, time_s):
     return state_of(run.at(time_s), time_s)[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torn", [False, True], ids=["finished", "torn"])
 @pytest.mark.parametrize("mode", ["VERNIER", "ACQUISITION", "SAFE"])
 def test_every_panel_of_a_log_is_as_it_was(tmp_path, mode, torn):
@@ -103,6 +104,7 @@ def test_every_panel_of_a_log_is_as_it_was(tmp_path, mode, torn):
         assert drawn(at(run, messages[number - 1].time_s)) == drawn(then)
 
 
+@pytest.mark.long
 def test_who_stopped_the_loops_and_what_visibility_is_expected_are_as_they_were(tmp_path):
     stopped = FakeSupervisor(loops=TESTBED, modes={"left": "SAFE"}).messages(300)
     state = at(LoggedRun(write_log(tmp_path / "log.mcap", stopped), loops_at_start), START_S + 14.0)

@@ -75,6 +75,7 @@ def test_every_panel_is_as_it_was(view, mode):
         assert then != now
 
 
+@pytest.mark.long
 def test_the_state_of_a_moment_has_the_minute_before_it():
     recent = kept(FakeSupervisor(), 2000)
     time_s = START_S + 90.0
@@ -129,6 +130,7 @@ def bar(app):
     return "\n".join(panel.render_line(y).text for y in range(panel.content_size.height))
 
 
+@pytest.mark.long
 def test_live_data_go_on_being_kept_while_the_past_is_shown():
     supervisor = FakeSupervisor()
 
@@ -153,6 +155,7 @@ def test_live_data_go_on_being_kept_while_the_past_is_shown():
     run(scenario)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command", [Acquire(), Release(), TakeOver(), SetTarget(az_px=20.0, el_px=20.0)]
 )
@@ -190,6 +193,7 @@ def test_keys_that_would_be_refused_are_not_in_the_last_line():
     run(scenario)
 
 
+@pytest.mark.long
 def test_an_alarm_of_now_is_on_the_screen_of_the_past():
     supervisor = FakeSupervisor()
     supervisor.messages(420)
@@ -214,6 +218,7 @@ def test_an_alarm_of_now_is_on_the_screen_of_the_past():
     run(scenario)
 
 
+@pytest.mark.long
 def test_an_alarm_opens_five_seconds_before_it():
     supervisor = FakeSupervisor()
     app = FixedApp(FakeSupervisor())
@@ -234,6 +239,7 @@ def test_an_alarm_opens_five_seconds_before_it():
     asyncio.run(main())
 
 
+@pytest.mark.long
 def test_the_console_stays_within_what_is_kept():
     async def scenario(app, pilot):
         await pressed(app, pilot, "left_curly_bracket")
@@ -250,6 +256,7 @@ def test_the_console_stays_within_what_is_kept():
     run(scenario)
 
 
+@pytest.mark.long
 def test_loop_and_window_stay_as_chosen():
     async def scenario(app, pilot):
         await pressed(app, pilot, "l", "w", "comma")
@@ -284,6 +291,7 @@ def test_what_is_no_time_is_refused(text):
     run(scenario)
 
 
+@pytest.mark.long
 def test_a_rehearsal_is_a_process_of_its_own_and_ends_with_its_dialog():
     async def scenario(app, pilot):
         await pressed(app, pilot, "t", "right", "d", "enter")

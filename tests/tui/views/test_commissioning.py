@@ -72,6 +72,7 @@ def test_what_a_step_found_and_what_it_needs_is_beside_the_list():
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_silence_is_no_alarm_where_most_steps_have_no_supervisor():
     async def scenario(app, pilot):
         assert "no supervisor" in header_text(app)
@@ -88,6 +89,7 @@ def test_silence_is_no_alarm_where_most_steps_have_no_supervisor():
     on_console(scenario)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("key", "answer"), [("y", "yes"), ("n", "no"), ("escape", "no")])
 def test_a_step_begins_once_the_operator_has_said_yes_to_what_it_moves(key, answer):
     async def scenario(app, pilot):
@@ -136,6 +138,7 @@ def test_the_chosen_step_is_repeated():
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_a_step_is_skipped_with_a_reason():
     async def scenario(app, pilot):
         await pressed(app, pilot, "n", "enter")
@@ -179,6 +182,7 @@ def test_a_stop_without_reply_is_an_error_unless_nothing_runs():
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_when_a_step_ends_its_question_goes_and_the_record_is_read_again():
     async def scenario(app, pilot):
         await pressed(app, pilot, "g")
@@ -194,6 +198,7 @@ def test_when_a_step_ends_its_question_goes_and_the_record_is_read_again():
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_nothing_is_started_while_a_step_runs():
     async def scenario(app, pilot):
         await pressed(app, pilot, "g")
@@ -204,6 +209,7 @@ def test_nothing_is_started_while_a_step_runs():
     on_console(scenario)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("key", "ends"), [("y", False), ("n", True)])
 def test_a_hand_that_is_needed_is_asked_for(key, ends):
     cable = "    watching\nTake off the camera's network cable, then press Enter: "
@@ -218,6 +224,7 @@ def test_a_hand_that_is_needed_is_asked_for(key, ends):
     on_console(scenario, cable)
 
 
+@pytest.mark.long
 def test_a_console_of_a_supervisor_shows_the_steps_and_does_none():
     async def scenario(app, pilot):
         await pressed(app, pilot, "7")
@@ -230,6 +237,7 @@ def test_a_console_of_a_supervisor_shows_the_steps_and_does_none():
     run(scenario)
 
 
+@pytest.mark.long
 def test_without_a_rig_file_the_screen_says_so():
     app = FixedApp(FakeSupervisor(), rig_arguments=None)
 

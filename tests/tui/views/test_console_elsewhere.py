@@ -56,6 +56,7 @@ def test_without_the_rig_file_no_margins_are_shown_and_it_is_said_why():
     assert commands(attached(scenario, size=(80, 24))) == []
 
 
+@pytest.mark.long
 def test_without_the_rig_file_no_sequence_is_checked_or_run_but_what_is_under_way_is_ended():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4")
@@ -74,6 +75,7 @@ def test_without_the_rig_file_no_sequence_is_checked_or_run_but_what_is_under_wa
 # ---------------------------------------------------------------- with it
 
 
+@pytest.mark.long
 def test_margins_and_sequences_go_by_the_rig_file_that_was_given():
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")
@@ -92,6 +94,7 @@ def test_margins_and_sequences_go_by_the_rig_file_that_was_given():
 # ---------------------------------------------------------------- saved designs
 
 
+@pytest.mark.long
 def test_margins_of_a_saved_design_are_those_of_its_file():
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")
@@ -107,6 +110,7 @@ def test_margins_of_a_saved_design_are_those_of_its_file():
     assert commands(app) == [["design", "--json", "--loop", "right", *RIG, "--", "/rigs/mine.json"]]
 
 
+@pytest.mark.long
 def test_a_file_on_another_machine_is_not_looked_for_on_this_one():
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")
@@ -127,6 +131,7 @@ def learning(design_json):
     return LearningState(setting="on", state="in force", design_json=design_json)
 
 
+@pytest.mark.long
 def test_margins_and_error_budget_of_a_learnt_design_are_by_its_parameters():
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")
@@ -137,6 +142,7 @@ def test_margins_and_error_budget_of_a_learnt_design_are_by_its_parameters():
     assert commands(app) == [["design", "--json", "--loop", "right", *RIG, "--", LEARNT_JSON]]
 
 
+@pytest.mark.long
 def test_a_design_for_the_measured_light_is_evaluated_with_the_light_that_the_console_sees():
     (command,) = commands(attached(on_loop, rig=RIG, noise_px=0.02))
     *rest, light, separator, name = command
@@ -168,6 +174,7 @@ def test_what_a_supervisor_says_becomes_no_path_and_no_option(told_design):
     assert commands(attached(scenario, rig=RIG, **told_design)) == []
 
 
+@pytest.mark.long
 def test_a_name_that_stands_for_no_design_is_a_problem_and_no_design(monkeypatch):
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")

@@ -21,6 +21,7 @@ from tests.tui.piloted import pressed, run, sent, typed_at_once
 # ---------------------------------------------------------------- devices
 
 
+@pytest.mark.long
 def test_a_device_and_a_reading_are_told_in_full():
     async def scenario(app, pilot):
         await pressed(app, pilot, "2", "down", "enter")
@@ -40,6 +41,7 @@ def test_an_interlock_is_reset_from_its_row():
     assert sent(run(scenario)) == [Reset(loop="right", name="dac_slow")]
 
 
+@pytest.mark.long
 def test_keys_typed_faster_than_drawn_go_to_the_list_that_tab_chose():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "down")
@@ -80,6 +82,7 @@ def test_a_sequence_is_rehearsed():
     run(scenario)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("answer", "runs"), [("y", True), ("n", False)])
 def test_a_sequence_runs_on_the_instrument_once_the_operator_says_yes(answer, runs):
     async def scenario(app, pilot):
@@ -94,6 +97,7 @@ def test_a_sequence_runs_on_the_instrument_once_the_operator_says_yes(answer, ru
     assert all(job.ended for job in app.jobs if job.arguments[:2] == ["sequence", "run"])
 
 
+@pytest.mark.long
 def test_a_parameter_is_edited_checked_and_used():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "down", "tab", *["down"] * 6, "enter")
@@ -113,6 +117,7 @@ def test_a_parameter_is_edited_checked_and_used():
     assert not Path(edited[0]).exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("status", "stays"), [(None, True), (0, False)])
 def test_a_run_that_goes_on_without_the_console_keeps_its_file(status, stays):
     """It may not have read the file yet."""
@@ -140,6 +145,7 @@ def test_a_run_that_goes_on_without_the_console_keeps_its_file(status, stays):
         shutil.rmtree(edition.parent.parent)
 
 
+@pytest.mark.long
 def test_the_file_of_an_edited_sequence_is_written_once():
     """A process that was started with it may read it only after the next edit."""
 
@@ -164,6 +170,7 @@ def test_the_file_of_an_edited_sequence_is_written_once():
     run(scenario)
 
 
+@pytest.mark.long
 def test_editing_is_left_by_escape_and_s_is_a_letter_there():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "down", "tab", "down", "enter", "s", "escape")
@@ -172,6 +179,7 @@ def test_editing_is_left_by_escape_and_s_is_a_letter_there():
     assert sent(run(scenario)) == []
 
 
+@pytest.mark.long
 def test_a_file_of_ones_own_is_opened(tmp_path):
     path = tmp_path / "mine.toml"
     path.touch()
@@ -188,6 +196,7 @@ def test_a_file_of_ones_own_is_opened(tmp_path):
     run(scenario)
 
 
+@pytest.mark.long
 def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_stages(tmp_path):
     path = tmp_path / "mine.toml"
     path.touch()
@@ -209,6 +218,7 @@ def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_st
     assert unreadable.ended
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("state", "wanted", "key", "action"),
     [
@@ -240,6 +250,7 @@ def test_a_value_is_read_as_toml_or_as_text(text, value):
     assert parsed(text) == value
 
 
+@pytest.mark.long
 def test_without_an_active_parameter_nothing_is_edited():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "enter")
@@ -254,6 +265,7 @@ def test_without_an_active_parameter_nothing_is_edited():
 # ---------------------------------------------------------------- logs
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("key", "command"),
     [("enter", ["log", "info"]), ("f", ["log", "verify"]), ("t", ["report"]), ("y", ["replay"])],
@@ -282,6 +294,7 @@ def test_a_log_is_kept_and_no_longer(tmp_path):
     run(scenario, log_folder=tmp_path)
 
 
+@pytest.mark.long
 def test_the_log_that_is_recorded_is_marked_and_a_new_one_does_not_take_the_choice(tmp_path):
     make_logs(tmp_path)
     (tmp_path / "fit-mock-20261130T031500Z.mcap").touch()
@@ -299,6 +312,7 @@ def test_the_log_that_is_recorded_is_marked_and_a_new_one_does_not_take_the_choi
     run(scenario, log_folder=tmp_path)
 
 
+@pytest.mark.long
 def test_a_folder_that_does_not_exist_is_an_empty_list(tmp_path):
     async def scenario(app, pilot):
         await pressed(app, pilot, "5", "enter", "m")

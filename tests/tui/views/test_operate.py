@@ -58,6 +58,7 @@ def test_the_mouse_alone_puts_the_window_on_another_star():
     assert sent(run(scenario)) == [Look(loop="right", az_px=10.0, el_px=28.5)]
 
 
+@pytest.mark.long
 def test_the_cursor_stays_on_the_frame():
     async def scenario(app, pilot):
         await pressed(app, pilot, "t", *["left"] * 50)
@@ -66,6 +67,7 @@ def test_the_cursor_stays_on_the_frame():
     run(scenario)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["OFF", "STANDBY", "ACQUISITION", "SAFE"])
 def test_no_target_is_put_without_a_star(mode):
     async def scenario(app, pilot):
@@ -150,6 +152,7 @@ async def clicked(app, pilot, shown):
     await settle(app, pilot)
 
 
+@pytest.mark.long
 def test_arrows_and_steps_in_the_footer_are_buttons():
     async def scenario(app, pilot):
         await pressed(app, pilot, "j")
@@ -164,6 +167,7 @@ def test_arrows_and_steps_in_the_footer_are_buttons():
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mode", "keys", "there", "missing"),
     [

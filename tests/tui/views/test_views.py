@@ -11,6 +11,7 @@ from tests.tui.piloted import pressed, run, sent
 # ---------------------------------------------------------------- screens
 
 
+@pytest.mark.long
 def test_every_screen_is_a_key_a_click_and_a_palette_entry_away():
     async def scenario(app, pilot):
         for view in SCREENS:
@@ -36,6 +37,7 @@ def test_stop_is_one_key_on_every_screen(view, key):
     assert sent(run(scenario)) == [Stop()]
 
 
+@pytest.mark.long
 def test_stop_is_one_click_on_every_screen():
     async def scenario(app, pilot):
         for view in SCREENS:
@@ -56,6 +58,7 @@ def test_stop_reaches_through_every_dialog(opening):
     assert sent(run(scenario, "STANDBY")) == [Stop()]
 
 
+@pytest.mark.long
 def test_commands_work_on_every_screen():
     async def scenario(app, pilot):
         for view in SCREENS:
@@ -76,6 +79,7 @@ def test_no_key_means_two_things_on_one_screen():
         assert len(keys) == len(set(keys)), view.name
 
 
+@pytest.mark.long
 def test_help_is_left_for_the_screen_before():
     async def scenario(app, pilot):
         for key in ("escape", "question_mark"):
@@ -87,6 +91,7 @@ def test_help_is_left_for_the_screen_before():
     run(scenario)
 
 
+@pytest.mark.long
 def test_escape_in_a_filtered_help_shows_everything_first():
     async def scenario(app, pilot):
         await pressed(app, pilot, "3", "question_mark", "slash", *"jog", "escape")
@@ -97,6 +102,7 @@ def test_escape_in_a_filtered_help_shows_everything_first():
     run(scenario)
 
 
+@pytest.mark.long
 def test_the_past_is_left_from_the_help_too():
     async def scenario(app, pilot):
         await pressed(app, pilot, "question_mark", "comma")
@@ -109,6 +115,7 @@ def test_the_past_is_left_from_the_help_too():
     run(scenario)
 
 
+@pytest.mark.long
 def test_every_key_is_in_the_help():
     async def scenario(app, pilot):
         await pressed(app, pilot, "6")

@@ -75,6 +75,7 @@ def test_eq_20_leaves_what_it_leaves(fit):
     assert linear_residual(design_eq20(fit), fit) == pytest.approx(0.0177, abs=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "delay_s"),
     [("eq20", 0.035), ("minimum-variance", 0.0), ("minimum-variance", 0.013), ("fslq", 0.035)],

@@ -53,6 +53,7 @@ def test_sampling_and_holding_eq_20_adds_to_the_delay_what_the_fractional_frame_
     assert sampled == pytest.approx((vernier + coarse) / z**2, rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", DESIGNS)
 def test_every_design_has_margins_at_both_rates(name, fit, flight):
     for basis in (fit, flight):
