@@ -162,7 +162,7 @@ def on_its_mirror(basis: Basis, parameters: Mapping[str, Any]) -> Basis:
 
 
 def night_of(design: Design, rig_basis: Basis) -> Basis:
-    """What is expected of the night: for a learnt design what was learnt, for others what the rig file says."""
+    """The night that a design expects: the one it was made for if it is learnt, otherwise the rig file's."""
     if not design.learnt:
         return on_its_mirror(rig_basis, design.parameters)
     return replace(basis_of(design.parameters, rig_basis), guard=None)

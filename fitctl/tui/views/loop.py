@@ -22,7 +22,7 @@ NEEDS_RIG = (
     "The console computes margins from the rig file and does not have it here. Start the console again with "
     "--rig FILE."
 )
-NO_DESIGN = "What the supervisor says of it cannot be evaluated here."
+NO_DESIGN = "The console cannot evaluate the design that the supervisor names."
 FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known here."
 
 

@@ -67,7 +67,9 @@ class DesignFigures:
             return
         figures = json.loads(output.strip().splitlines()[-1])
         if "stable" not in figures:
-            self.problem = f"{design.design} is no design"  # a name from elsewhere, such as "bound"
+            self.problem = (
+                f"{design.design} is not a design"  # a name from elsewhere, such as "bound"
+            )
             return
         self.figures, theory = figures, figures.pop("theory", None)
         self.theory = None if theory is None else theory_from_plain(theory)

@@ -169,7 +169,7 @@ def test_a_design_for_the_measured_light_is_evaluated_with_the_light_that_the_co
 def test_what_a_supervisor_says_becomes_no_path_and_no_option(told_design):
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")
-        assert "cannot be evaluated here" in told(app.view.query_one(Margins))
+        assert "cannot evaluate the design" in told(app.view.query_one(Margins))
 
     assert commands(attached(scenario, rig=RIG, **told_design)) == []
 
@@ -178,7 +178,7 @@ def test_what_a_supervisor_says_becomes_no_path_and_no_option(told_design):
 def test_a_name_that_stands_for_no_design_is_a_problem_and_no_design(monkeypatch):
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")
-        assert "bound is no design" in told(app.view.query_one(Margins))
+        assert "bound is not a design" in told(app.view.query_one(Margins))
 
     monkeypatch.setattr(FakeJob, "text", lambda _: json.dumps({"residual_px": 0.013}))
     attached(scenario, rig=RIG, controller="bound")
