@@ -73,7 +73,7 @@ test-instrument: $(READY)  ## Test the whole instrument in real time, as process
 	$(BIN)/pytest --numprocesses 2 --dist loadfile --ignore tests/system/alone tests/system
 	$(BIN)/pytest tests/system/alone
 
-test-long: compiled  ## Run batches, campaigns, whole nights, the commands of the documents: all that takes seconds (15 minutes)
+test-long: compiled  ## Run batches, campaigns, whole nights, the commands of the documents: all that takes seconds (20 minutes)
 	$(BIN)/pytest -m long --numprocesses 3 --dist loadfile $(ARGS)
 
 # Each takes a minute of one core; workers that begin at once would each compile the same, and not be done in time.
@@ -98,13 +98,13 @@ test-faults-all: $(READY)
 
 # As much as fits into continuous integration; with the PART_SEED that it prints, a run is repeated.
 PART_SEED := $(or $(PART_SEED),$(shell od -An -N2 -tu2 /dev/urandom | tr -d ' '))
-test-long-part: export FITCTL_TESTS_PART = 250
-test-instrument-part: export FITCTL_TESTS_PART = 20
-test-faults-part: export FITCTL_TESTS_PART = 50
+test-long-part: export FITCTL_TESTS_PART = 200
+test-instrument-part: export FITCTL_TESTS_PART = 16
+test-faults-part: export FITCTL_TESTS_PART = 40
 %-part: export FITCTL_TESTS_SEED = $(PART_SEED)
-test-long-part: test-long  ## Run 250 of the tests of test-long, drawn at random
-test-instrument-part: test-instrument  ## Run 20 tests of test-instrument, drawn at random, and those that must run alone
-test-faults-part: test-faults-all  ## Run 50 entries of the whole fault catalogue, drawn at random
+test-long-part: test-long  ## Run 200 of the tests of test-long, drawn at random
+test-instrument-part: test-instrument  ## Run 16 tests of test-instrument, drawn at random, and those that must run alone
+test-faults-part: test-faults-all  ## Run 40 entries of the whole fault catalogue, drawn at random
 
 test-faults-testbed: $(READY)  ## Run the fault catalogue's entries for the whole testbed
 	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)
