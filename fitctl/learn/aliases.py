@@ -33,6 +33,8 @@ LITTLE = 0.8
 """A design that leaves more than this part of what the present one leaves, if no line is an alias, gains too
 little for a risk: if lines are aliases, it may leave no more even with `LEAST_MOTION`."""
 LEAST_MOTION = 0.9
+"""A night that shows less than this has a hysteresis too unlike the rig file's to compare designs within 2 %: a
+design may then leave no more at all if lines are aliases."""
 PARTS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.06, 0.0)
 """Of a line's RMS that a design may expect, the largest first."""
 
@@ -93,7 +95,7 @@ def both_if_aliases(
     slow_present_px, slow_learnt_px = (linear_residual(one, truth) for one in (present, learnt))
     if not lines:
         return IfAliases(slow_present_px, slow_learnt_px, math.inf)
-    motions = {LESS_MOTION: MOST_IF_ALIAS}
+    motions = {LESS_MOTION: _most(shown_gain)}
     if slow_learnt_px > LITTLE * slow_present_px:
         motions[LEAST_MOTION] = 1.0
     cases = []
@@ -117,7 +119,7 @@ def safe_parts(truth: Basis, present: Design, shown_gain: float) -> Iterator[tup
     gain = min(LESS_MOTION * truth.mirror_gain, shown_gain)
     parts = [_safe_part(line, truth, present, gain) for line in truth.lines]
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
-    limits_px = MOST_IF_ALIAS * if_aliases(present, truth, suspects, gain)
+    limits_px = _most(shown_gain) * if_aliases(present, truth, suspects, gain)
     reductions = dict.fromkeys(  # each once: a limit above all parts changes none
         tuple(
             min(part, most) if line in suspects else part
@@ -131,6 +133,10 @@ def safe_parts(truth: Basis, present: Design, shown_gain: float) -> Iterator[tup
         if (if_aliases(design, truth, suspects, gain) <= limits_px).all():
             yield reduced
     yield least
+
+
+def _most(shown_gain: float) -> float:
+    return MOST_IF_ALIAS if shown_gain >= LEAST_MOTION else 1.0
 
 
 def expecting(parts: tuple[float, ...], truth: Basis) -> Basis:
@@ -147,7 +153,7 @@ def _safe_part(line: Line, truth: Basis, present: Design, gain: float) -> float:
     """Of one line, the others expected in full; 0 where no part would leave less than leaving it alone."""
     alone = design_minimum_variance(_without((line,), truth))
     alone_px = linear_residual(alone, truth)
-    limits_px = MOST_IF_ALIAS * np.maximum(
+    limits_px = _most(gain) * np.maximum(
         *(if_aliases(one, truth, (line,), gain) for one in (alone, present))
     )
     suspect = can_be_alias(line, truth)
