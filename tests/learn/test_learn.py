@@ -12,7 +12,7 @@ from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
-from fitctl.learn.advice import advise
+from fitctl.learn.advice import advise, estimated
 from fitctl.learn.aliases import IfAliases
 from fitctl.learn.goodness_of_fit import fit_test
 from fitctl.learn.night import estimate
@@ -351,6 +351,18 @@ def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed)
     assert linear_residual(advice.design, truth) < 1.02 * least_px
     assert linear_residual(fixed, truth) > 1.1 * least_px
     assert margins(advice.design, truth).excess(Required()) < 1.02
+
+
+@pytest.mark.parametrize(("fastest_line_hz", "gain"), [(30.0, 0.73), (math.inf, 1.0)])
+def test_a_gain_that_a_fast_line_could_imitate_is_left_to_the_margins(
+    paper, fixed, fastest_line_hz, gain
+):
+    truth = dataclasses.replace(paper, lines=(SIX_HZ,))
+    _, series = held(truth, fixed, TWO_MINUTES_S, 5, mirror_gain=0.73)
+    night, known = estimated([series], dataclasses.replace(paper, fastest_line_hz=fastest_line_hz))
+
+    assert night.mirror_gain.value == pytest.approx(0.73, abs=0.05)
+    assert known.mirror_gain == pytest.approx(gain, abs=0.05)
 
 
 @pytest.mark.long
