@@ -65,7 +65,7 @@ class LoopTheory(NamedTuple):
         One-sided power spectral density, on frames, of what is expected to move the star: air path and lines.
     noise_px, flux_dn : float
         One standard deviation of the place of a star of so much light. Less light means more noise, in
-        proportion; a noise of any light (nan) is taken as it is.
+        proportion. If `flux_dn` is nan, the noise is the same with any light.
     period_s : float
         Of frames.
     mirror_px_per_rad, motor_px_per_rad : arrays, shape (2, 2)

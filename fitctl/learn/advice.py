@@ -41,12 +41,12 @@ WORTH_IT = 0.98
 BETTER_LATELY = 0.995
 """On the last frames it must leave at most this part: what is only true of the mean of minutes is past."""
 UNEXPLAINED = 0.8
-"""Both of these where the model does not explain the frames: what is much better on them is so all the same."""
+"""Instead of `WORTH_IT` and `BETTER_LATELY` where the model does not explain the frames."""
 LATELY_S = 60.0
 TOLERATED = (0.85, 1.15)
-"""A mirror's gain between these is left to the margins; """
+"""A design does not compensate for a mirror's gain between these: its margins cover the deviation."""
 TOLERATED_IF_ALIAS = (0.7, 1.4)
-"""also one between these if a line may be an alias."""
+"""The same if a line may be an alias, which spoils the estimate of the gain."""
 _AXES = ("az", "el")
 _DESIGNS = ("present", "learnt")
 
@@ -295,7 +295,8 @@ def advise(
     night, truth = estimated(series, rig_basis)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     present_stands = standing(present, truth)
-    gain = min(1.0, night.mirror_gain.value)  # known or not: a line may be an alias
+    # For aliases the estimate counts even if its interval includes 1, because too much gain hides harm.
+    gain = min(1.0, night.mirror_gain.value)
     shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, _shown_gain(night)))
     for parts in safe_parts(truth, present, gain):
         design = design_with_margins(expecting(parts, truth), required, like)

@@ -62,8 +62,8 @@ class EnsembleControllerMock:
       has it ("clockwise (positive)"). epics-motor's driver takes 1 for negative: with
       ReverseMotionDirection 0 its record shows the opposite direction. Turning a disabled axis by hand
       does not change the bit (unknown).
-    - While the computer stands still the motors turn on as they were last told, also where the trajectory ends
-      meanwhile; a position error may follow.
+    - While the computer stands still, the motors keep their last velocity, even if the trajectory ends in this
+      time. A position error may follow.
     - No S-curves, no current limits; enabling takes no time.
     - Software limits act on a homed axis only, if FaultMask has their bits, and end a motion if one of
       FaultMaskDecel and FaultMaskDisable has them. So it is on the maker's newer controllers, by their public

@@ -27,7 +27,7 @@ FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known h
 
 
 LONGEST_PARAMETERS = 50_000
-"""Characters, a dozen times what a design with many lines has; no process takes an argument of 131072."""
+"""Characters; those of a design with one line are about 500. Linux accepts arguments of up to 131071 bytes."""
 
 
 class LoopScreen(View):

@@ -85,9 +85,9 @@ def disturbance(basis: Basis) -> Disturbance:
 
 
 def framed_px2_per_hz(basis: Basis, frequency_hz: Floats) -> Floats:
-    """One-sided power spectral density on frames, shape of the frequencies: what is faster is folded back.
+    """One-sided power spectral density of air path and lines on frames, shape as `frequency_hz`.
 
-    So it is up to one and a half times the frame rate.
+    Motion of up to 1.5 times the frame rate is folded back to where frames show it.
     """
     density = np.zeros_like(frequency_hz)
     for turned_hz in (0.0, -1 / basis.period_s, 1 / basis.period_s):
