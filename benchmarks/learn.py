@@ -24,13 +24,13 @@ from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.controllers.design.basis import Basis, Line, basis
 from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.spectrum import air_of
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import pieces_of
 from fitctl.learn.advice import Advice, advise
 from fitctl.learn.opened import rebuild
-from fitctl.learn.spectrum import air_of
 from fitctl.messages.modes import Mode
 from fitctl.simulation.batch.batch import Batch, LoopRun
 from fitctl.simulation.statistics import SETTLE_S

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from fitctl.config import AirPathModel, Rig
+from fitctl.controllers.design.linear_loop.spectrum import air_of, air_px2_per_hz, white_px2_per_hz
 from fitctl.identify.air_fit import AirFit, fit_air_path
 from fitctl.identify.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.frames import Tracks
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
 from fitctl.learn.opened import Series, periodograms
-from fitctl.learn.spectrum import air_of, air_px2_per_hz, white_px2_per_hz
 from fitctl.model.air_path import rms_px, state_space
 from fitctl.model.drives import Drive, standstill
 

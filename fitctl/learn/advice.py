@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import LEAST_GAIN, MOST_OVERSHOOT, Basis
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
-from fitctl.controllers.design.linear_loop.disturbance import framed_px2_per_hz
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, left_on_paper
+from fitctl.controllers.design.linear_loop.spectrum import framed_px2_per_hz, white_px2_per_hz
 from fitctl.controllers.design.margins import (
     Margins,
     Required,
@@ -33,7 +33,6 @@ from fitctl.learn.aliases import (
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night, estimate
 from fitctl.learn.opened import LEAST_S, Series, periodograms
-from fitctl.learn.spectrum import white_px2_per_hz
 
 Floats = NDArray[np.float64]
 WORTH_IT = 0.98

@@ -18,10 +18,10 @@ from scipy.ndimage import uniform_filter1d
 
 from fitctl.config import AirPathModel
 from fitctl.controllers.design.basis import Line
+from fitctl.controllers.design.linear_loop.spectrum import air_of
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
 from fitctl.learn.intervals import Z_95, Interval, of_logarithm
 from fitctl.learn.opened import Opened
-from fitctl.learn.spectrum import air_of
 from fitctl.learn.whittle import (
     BROADEST,
     Guess,

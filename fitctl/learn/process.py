@@ -38,8 +38,7 @@ class LoopLearner:
 
     def hear(self, telemetry: Telemetry, state: LoopState) -> None:
         """One message."""
-        learnt = "" if state.learning is None else state.learning.design_json
-        self._controller = learnt or state.controller_file or state.controller
+        self._controller = state.design
         self._noise_px = state.noise_px
         self._learner.watch(f"{self._controller} {self._noise_px}", telemetry.time_s)
         for tick in telemetry.ticks:

@@ -23,8 +23,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.controllers.design.linear_loop.spectrum import (
+    Air,
+    air_slopes,
+    framed_line_slopes,
+    white_px2_per_hz,
+)
 from fitctl.learn.opened import Opened
-from fitctl.learn.spectrum import Air, air_slopes, framed_line_slopes, white_px2_per_hz
 
 Floats = NDArray[np.float64]
 BROADEST = 0.1

@@ -180,6 +180,12 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     learning: LearningState | None = None
     noise_px: float | None = None
 
+    @property
+    def design(self) -> str:
+        """What the design in force is made from: its parameters if it is learnt, its file, or its name."""
+        learnt = "" if self.learning is None else self.learning.design_json
+        return learnt or self.controller_file or self.controller
+
 
 class CollectorState(msgspec.Struct, frozen=True, kw_only=True):
     """What moves the collector.

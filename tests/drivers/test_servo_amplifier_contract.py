@@ -48,7 +48,7 @@ def reading_of(driver, velocity_rad_s=STILL):
 
 
 def quick_reading_of(driver, velocity_rad_s):
-    """A reading that is known when it was taken: one that took long may be of any moment of it."""
+    """A reading whose time is known within `QUICK_S`, which its exchange took at most."""
     end_s = time.monotonic() + LONGEST_S
     while time.monotonic() < end_s:
         begun_s = time.monotonic()

@@ -11,13 +11,13 @@ from benchmarks.linear_loop import course_px, held
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
+from fitctl.controllers.design.linear_loop.spectrum import Air, air_of, framed_line_slopes
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.learn.advice import advise, estimated
 from fitctl.learn.aliases import IfAliases
 from fitctl.learn.goodness_of_fit import fit_test
 from fitctl.learn.night import estimate
 from fitctl.learn.opened import Series, periodograms
-from fitctl.learn.spectrum import Air, air_of, framed_line_slopes
 from fitctl.learn.whittle import Guess, LineGuess, _Problem, likeliest
 
 TWO_MINUTES_S = 120.0

@@ -10,8 +10,8 @@ import numpy as np
 from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.controllers.design.basis import Basis, basis, basis_of, night_of
 from fitctl.controllers.design.choose import DESIGNS
-from fitctl.controllers.design.linear_loop.disturbance import framed_px2_per_hz
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
+from fitctl.controllers.design.linear_loop.spectrum import framed_px2_per_hz
 from fitctl.controllers.design.margins import frequencies_hz
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.pair import Design

@@ -24,8 +24,6 @@ NEEDS_RIG = (
 )
 NO_DESIGN = "The console cannot evaluate the design that the supervisor names."
 FILE_ELSEWHERE = "A saved file on the rig's machine: its margins are not known here."
-
-
 LONGEST_PARAMETERS = 50_000
 """Characters; those of a design with one line are about 500. Linux accepts arguments of up to 131071 bytes."""
 
@@ -76,7 +74,7 @@ class LoopScreen(View):
     def _why_unknown(self, loop: LoopState) -> str:
         if self.console.rig_arguments is None:
             return NEEDS_RIG
-        design = design_in_use(loop).design
+        design = loop.design
         learnt = design.startswith("{")
         if loop.controller_file and not learnt:
             return FILE_ELSEWHERE if self.console.remote_arguments else ""

@@ -35,8 +35,7 @@ class DesignInUse(NamedTuple):
 
 def design_in_use(loop: LoopState) -> DesignInUse:
     """The design that a loop works with."""
-    learnt = "" if loop.learning is None else loop.learning.design_json
-    return DesignInUse(loop.name, learnt or loop.controller_file or loop.controller, loop.noise_px)
+    return DesignInUse(loop.name, loop.design, loop.noise_px)
 
 
 class DesignFigures:
@@ -67,9 +66,8 @@ class DesignFigures:
             return
         figures = json.loads(output.strip().splitlines()[-1])
         if "stable" not in figures:
-            self.problem = (
-                f"{design.design} is not a design"  # a name from elsewhere, such as "bound"
-            )
+            # A supervisor elsewhere may name anything that the command knows, such as "bound".
+            self.problem = f"{design.design} is not a design"
             return
         self.figures, theory = figures, figures.pop("theory", None)
         self.theory = None if theory is None else theory_from_plain(theory)

@@ -15,9 +15,9 @@ from fitctl.controllers.design.files import load_design, save_design
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.disturbance import disturbance
 from fitctl.controllers.design.linear_loop.loopshape import loop_shape, sampled_response
+from fitctl.controllers.design.linear_loop.spectrum import framed_line_slopes
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.learn.spectrum import framed_line_slopes
 
 SIX_HZ = Line(frequency_hz=6.0, damping=0.005, rms_px=0.05)
 

@@ -8,8 +8,9 @@ import pytest
 
 from fitctl.controllers.design.basis import Line, basis, night_of
 from fitctl.controllers.design.choose import design_for
-from fitctl.controllers.design.linear_loop.disturbance import disturbance, framed_px2_per_hz
+from fitctl.controllers.design.linear_loop.disturbance import disturbance
 from fitctl.controllers.design.linear_loop.on_paper import left_on_paper
+from fitctl.controllers.design.linear_loop.spectrum import framed_px2_per_hz
 from fitctl.controllers.design.theory import loop_theory
 from fitctl.error_budget import predicted
 from tests.samples.learner_reports import LINE, learnt_json

@@ -397,9 +397,10 @@ def test_the_software_limit_ends_a_run_with_a_fault_and_leads_back(bench_of, out
     end_s = time.monotonic() + 5
     while not (reading := bench.driver.exchange((30.0 * outward, 0.0))).fault:
         assert time.monotonic() < end_s
-    assert (
-        f"{name} software limit" in reading.fault
-    )  # perhaps a position error, too: see the mock's limitations
+    faults = reading.fault.removeprefix("azimuth: ").split(", ")
+    assert faults[-1] == f"{name} software limit"
+    # The computer may have stood still: see the mock's limitations.
+    assert faults[:-1] in ([], ["position error"])
     bench.driver.reset_fault()
     bench.driver.enable()
     while bench.driver.exchange((-10.0 * outward, 0.0)).position_rad[0] * outward > 11.0:

@@ -84,23 +84,6 @@ def disturbance(basis: Basis) -> Disturbance:
     return Disturbance((basis.air_path, *basis.lines, *guard))
 
 
-def framed_px2_per_hz(basis: Basis, frequency_hz: Floats) -> Floats:
-    """One-sided power spectral density of air path and lines on frames, shape as `frequency_hz`.
-
-    Motion of up to 1.5 times the frame rate is folded back to where frames show it.
-    """
-    density = np.zeros_like(frequency_hz)
-    for turned_hz in (0.0, -1 / basis.period_s, 1 / basis.period_s):
-        i_omega = 2j * math.pi * (frequency_hz + turned_hz)
-        for part in (basis.air_path, *basis.lines):
-            own = _oscillator(part)
-            response = np.linalg.solve(
-                i_omega[:, None, None] * np.eye(2) - own.a.T, own.seen[:, None]
-            )[..., 0]
-            density += 2 * np.einsum("fi,ij,fj->f", response, own.noise, response.conj()).real
-    return density
-
-
 def blocks(*parts: Floats) -> Floats:
     """Square matrices along a diagonal; scipy's takes five times as long."""
     made = np.zeros((sum(map(len, parts)),) * 2)

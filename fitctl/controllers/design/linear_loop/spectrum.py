@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import AirPathModel
+from fitctl.controllers.design.basis import Basis
 
 Floats = NDArray[np.float64]
 _ALIASES = (
@@ -48,6 +49,18 @@ class Air(NamedTuple):
 def air_of(model: AirPathModel) -> Air:
     """The same for a model."""
     return Air(model.gain_px / model.b1_s2, model.b2_s / model.b1_s2, 1 / model.b1_s2)
+
+
+def framed_px2_per_hz(basis: Basis, frequency_hz: Floats) -> Floats:
+    """One-sided density of a basis' air path and lines on frames, px²/Hz, shape as `frequency_hz`."""
+    density = air_px2_per_hz(air_of(basis.air_path), frequency_hz, basis.period_s)
+    for line in basis.lines:
+        half_width_hz = np.full(len(frequency_hz), line.damping * line.frequency_hz)
+        of_1_px = framed_line_slopes(
+            line.frequency_hz, half_width_hz, frequency_hz, basis.period_s
+        )[0]
+        density = density + line.rms_px**2 * of_1_px
+    return density
 
 
 def air_px2_per_hz(air: Air, frequency_hz: Floats, period_s: float) -> Floats:
