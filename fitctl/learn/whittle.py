@@ -97,76 +97,84 @@ def likeliest(opened: Opened, begin: Guess, *, free_mirror: bool = True) -> Like
     problem = _Problem(opened, begin, free_mirror=free_mirror)
     values, cost = _lowest(problem)
     guess = problem.guess(values)
-    density = problem.density(guess)[0]
-    return Likeliest(guess, cost, density, functools.partial(problem.covariance, values))
+    density = _Place(problem, values).density
+    return Likeliest(guess, cost, density.T, functools.partial(problem.covariance, values))
 
 
 def _lowest(problem: _Problem) -> tuple[Floats, float]:
     """Where the cost is lowest, by Fisher's scoring, damped as Levenberg and Marquardt do."""
-    low, high = np.array(problem.bounds).T
+    low, high = problem.low, problem.high
     values, damping = np.clip(problem.begin, low, high), 1e-2
-    cost, gradient = problem.cost(values)
-    information = problem.information(values)
+    there = _Place(problem, values)
+    cost, gradient, information = there.cost, there.gradient, there.information
     for _ in range(_MOST_STEPS):
         # What is at a bound and would go beyond it stays.
         free = (low < high) & ((values > low) | (gradient < 0)) & ((values < high) | (gradient > 0))
         some = np.ix_(free, free)
         damped = information[some] + damping * np.diag(np.diag(information)[free])
         step = np.zeros_like(values)
-        step[free] = -np.linalg.lstsq(damped, gradient[free], rcond=None)[0]
+        step[free] = -np.linalg.solve(damped, gradient[free])
         tried = np.clip(values + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP), low, high)
-        lower, its_gradient = problem.cost(tried)
-        if not lower < cost:
+        there = _Place(problem, tried)
+        if not there.cost < cost:
             damping *= 10
             if damping > _MOST_DAMPING:
                 break
             continue
-        gained, damping = cost - lower, damping / 5
-        values, cost, gradient = tried, lower, its_gradient
+        gained, damping = cost - there.cost, damping / 5
+        values, cost = tried, there.cost
         if gained < _ENOUGH:
             break
-        information = problem.information(values)
+        gradient, information = there.gradient, there.information
     return values, cost
 
 
 class _Problem:
-    """Parameters as one vector: logarithms, and frequencies of lines in half widths of a pure sine."""
+    """Parameters as one vector: logarithms, and frequencies of lines in half widths of a pure sine.
+
+    Arrays are of shape (axes, rows), as those of :class:`_Place` are.
+    """
 
     def __init__(self, opened: Opened, begin: Guess, *, free_mirror: bool = True) -> None:
         self.opened = opened
         self.axes = opened.disturbance.shape[1]
-        self._weight = opened.segments[:, None] / opened.inflation
-        self._resolution_hz = float(opened.resolution_hz.min())
+        self.weight = opened.segments / opened.inflation
+        self.resolution_hz = float(opened.resolution_hz.min())
         self._centres_hz = [line.frequency_hz for line in begin.lines]
         highest_hz = 0.5 / opened.period_s
         first = [*np.log(begin.air), math.log(begin.noise_px), math.log(begin.gain)]
         first.append(begin.overshoot)
         # The air must not become a resonance, or it would pass for a line.
         reach = [_FACTOR_20 * part for part in (2, 1, 1, 2)]
-        self.bounds: list[tuple[float, float]] = [
+        bounds = [
             (value - far, value + far) for value, far in zip(first[:_GAIN], reach, strict=True)
         ]
         mirror = [(-_MOST_LOG_GAIN, _MOST_LOG_GAIN), (-_MOST_OVERSHOOT, _MOST_OVERSHOOT)]
         fixed = [(value, value) for value in first[_GAIN:_FIRST_LINE]]
-        self.bounds += mirror if free_mirror else fixed
+        bounds += mirror if free_mirror else fixed
         hints = [_FACTOR_20] * 4 + [_GAIN_HINT, _OVERSHOOT_HINT]
         centre = [*first[:_GAIN], 0.0, 0.0]
         for line in begin.lines:
-            width = math.log(max(line.half_width_hz, self._resolution_hz * _NARROWEST * 2))
+            width = math.log(max(line.half_width_hz, self.resolution_hz * _NARROWEST * 2))
             widest = math.log(BROADEST * line.frequency_hz)
-            away = min(_FARTHEST, (highest_hz - line.frequency_hz) / self._resolution_hz)
+            away = min(_FARTHEST, (highest_hz - line.frequency_hz) / self.resolution_hz)
             rms = np.log(np.maximum(line.rms_px, 1e-3 * begin.noise_px)).tolist()
             first += [0.0, min(width, widest), *rms]
-            centre += [0.0, math.log(self._resolution_hz), *rms]
-            self.bounds += [
+            centre += [0.0, math.log(self.resolution_hz), *rms]
+            bounds += [
                 (-_FARTHEST, away),
-                (math.log(_NARROWEST * self._resolution_hz), widest),
+                (math.log(_NARROWEST * self.resolution_hz), widest),
                 *[(value - 8, value + 8) for value in rms],
             ]
             hints += [10.0, _FACTOR_20, *[_FACTOR_20] * self.axes]
         self.begin = np.array(first)
-        self._centre, self._hints = np.array(centre), np.array(hints)
-        self._last: tuple[Floats, tuple[Guess, Floats, list[Floats]]] | None = None
+        self.low, self.high = np.transpose(bounds)
+        self.centre, self.hints = np.array(centre), np.array(hints)
+        # The periodogram is a polynomial of gain and overshoot; these are its coefficients.
+        step, cross, moved = opened.step_response().T, opened.cross.T, opened.mirror.T
+        self.disturbance = np.ascontiguousarray(opened.disturbance.T)
+        self.with_cross = np.array([2 * cross.real, 2 * (step.conj() * cross).real])
+        self.with_mirror = np.array([moved, moved * step.real, moved * np.abs(step) ** 2])
 
     def guess(self, values: Floats) -> Guess:
         """What a vector stands for."""
@@ -175,7 +183,7 @@ class _Problem:
             at = _FIRST_LINE + number * (2 + self.axes)
             lines.append(
                 LineGuess(
-                    centre_hz + float(values[at]) * self._resolution_hz,
+                    centre_hz + float(values[at]) * self.resolution_hz,
                     math.exp(values[at + 1]),
                     np.exp(values[at + 2 : at + 2 + self.axes]),
                 )
@@ -188,86 +196,120 @@ class _Problem:
             tuple(lines),
         )
 
-    def density(self, guess: Guess) -> tuple[Floats, list[Floats]]:
-        """The spectrum, shape (rows, axes), and its derivatives by all parameters but the mirror's."""
-        opened = self.opened
-        hz, period_s = opened.frequency_hz, opened.period_s
-        air, *by_air = (each[:, None] for each in air_slopes(guess.air, hz, period_s))
-        white = white_px2_per_hz(guess.noise_px, period_s)
-        total = air + white
-        slopes = [2 * air, *by_air, np.full((len(hz), 1), 2 * white)]
-        for line in guess.lines:
-            width_hz = line.half_width_hz + opened.resolution_hz
-            shapes = framed_line_slopes(line.frequency_hz, width_hz, hz, period_s)
-            unit, by_hz, by_width = (each[:, None] for each in shapes)
-            power = np.square(line.rms_px)
-            total = total + unit * power
-            slopes += [by_hz * power * self._resolution_hz, by_width * power * line.half_width_hz]
-            slopes += [2 * unit * power * row for row in np.eye(self.axes)]
-        return np.broadcast_to(total, opened.disturbance.shape), slopes
-
-    def _density_at(self, values: Floats) -> tuple[Guess, Floats, list[Floats]]:
-        """Of a vector, with its guess; the last is kept: cost and information of one follow each other."""
-        if self._last is None or not np.array_equal(values, self._last[0]):
-            guess = self.guess(values)
-            self._last = values.copy(), (guess, *self.density(guess))
-        return self._last[1]
-
-    def cost(self, values: Floats) -> tuple[float, Floats]:
-        """Negative logarithm of the likelihood, and its gradient."""
-        opened = self.opened
-        guess, total, slopes = self._density_at(values)
-        inverse = 1 / total
-        ratio = opened.with_mirror(guess.gain, guess.overshoot) * inverse
-        away = (values - self._centre) / self._hints
-        cost = np.sum(self._weight * (np.log(total) + ratio)) + 0.5 * away @ away
-        pull = self._weight * (1 - ratio) * inverse
-        gradient = [float(np.sum(pull * slope)) for slope in slopes]
-        # Of the periodogram by the gain's logarithm, and by the overshoot.
-        step = opened.step_response()
-        left = opened.cross + (1 - guess.gain - guess.overshoot * step) * opened.mirror
-        for index, by in ((_GAIN, -guess.gain), (_OVERSHOOT, -step.conj())):
-            turned = 2 * (by * left).real
-            gradient.insert(index, float(np.sum(self._weight * turned * inverse)))
-        return float(cost), np.array(gradient) + away / self._hints
-
-    def information(self, values: Floats) -> Floats:
-        """Fisher's information, with what the mirror and the spectrum share."""
-        opened = self.opened
-        guess, total, slopes = self._density_at(values)
-        weight = self._weight / total
-        step = opened.step_response()
-        left = opened.cross + (1 - guess.gain - guess.overshoot * step) * opened.mirror
-        moves = (np.full_like(step, -guess.gain), -step)
-        spectrum = np.array([np.broadcast_to(slope / total, total.shape) for slope in slopes])
-        flat = spectrum.reshape(len(slopes), -1)
-        everything = np.empty((len(values), len(values)))
-        own = np.array([index for index in range(len(values)) if not _GAIN <= index < _FIRST_LINE])
-        by_weight = flat * np.broadcast_to(self._weight, total.shape).ravel()
-        everything[np.ix_(own, own)] = by_weight @ flat.T
-        for index, move in zip((_GAIN, _OVERSHOOT), moves, strict=True):
-            turned = 2 * (move.conj() * left).real * weight
-            shared = -flat @ turned.ravel()
-            everything[index, own] = everything[own, index] = shared
-            for other, also in zip((_GAIN, _OVERSHOOT), moves, strict=True):
-                both = 2 * (move.conj() * also).real * opened.mirror
-                everything[index, other] = np.sum(both * weight)
-        return np.asarray(everything + np.diag(1 / self._hints**2))
-
     def covariance(self, values: Floats) -> Floats:
         """Inverse of the likelihood's curvature; frequencies in Hz."""
         n = len(values)
         curvature = np.empty((n, n))
         for index in range(n):
             step = _PROBE * np.eye(n)[index]
-            curvature[index] = (self.cost(values + step)[1] - self.cost(values - step)[1]) / (
-                2 * _PROBE
-            )
+            curvature[index] = (
+                _Place(self, values + step).gradient - _Place(self, values - step).gradient
+            ) / (2 * _PROBE)
         curvature = (curvature + curvature.T) / 2
         # Where the search ended at a bound, a direction may look like a maximum: it is not known.
         powers, directions = np.linalg.eigh(curvature)
         known = np.maximum(powers, 1e-3)
         covariance = directions @ np.diag(1 / known) @ directions.T
         scale = np.ones(n)
-        scale[_FIRST_LINE :: 2 + self.axes] = self._resolution_hz
+        scale[_FIRST_LINE :: 2 + self.axes] = self.resolution_hz
         return np.asarray(covariance * np.outer(scale, scale))
+
+
+class _Place:
+    """A vector of parameters; arrays of shape (axes, rows).
+
+    Attributes
+    ----------
+    cost : float
+        Negative logarithm of the likelihood.
+    density : array
+        The spectrum.
+    """
+
+    def __init__(self, problem: _Problem, values: Floats) -> None:
+        self._problem = problem
+        self._guess = guess = problem.guess(values)
+        opened = problem.opened
+        hz, period_s = opened.frequency_hz, opened.period_s
+        self._air = air_slopes(guess.air, hz, period_s)
+        self._white = white_px2_per_hz(guess.noise_px, period_s)
+        self._lines = [
+            framed_line_slopes(
+                line.frequency_hz, line.half_width_hz + opened.resolution_hz, hz, period_s
+            )
+            for line in guess.lines
+        ]
+        self.density = np.repeat([self._air[0] + self._white], problem.axes, axis=0)
+        for line, (unit, *_) in zip(guess.lines, self._lines, strict=True):
+            self.density += np.square(line.rms_px)[:, None] * unit
+        self._less, self._overshoot = 1 - guess.gain, guess.overshoot
+        cross, turned = problem.with_cross
+        mirror, across, along = problem.with_mirror
+        less, over = self._less, self._overshoot
+        periodogram = problem.disturbance + less * cross - over * turned
+        periodogram += less**2 * mirror - 2 * less * over * across + over**2 * along
+        self._ratio = periodogram / self.density
+        self._away = (values - problem.centre) / problem.hints
+        likelihood = np.sum((np.log(self.density) + self._ratio) @ problem.weight)
+        self.cost = float(likelihood + 0.5 * self._away @ self._away)
+
+    @functools.cached_property
+    def _own(self) -> Floats:
+        """Of the spectrum, by its own parameters, in parts of it: shape (parameters, axes, rows)."""
+        problem, axes = self._problem, self._problem.axes
+        own = np.zeros((_GAIN + (2 + axes) * len(self._lines), axes, len(problem.weight)))
+        total, by_damping, by_stiffness = self._air
+        own[0], own[1], own[2], own[3] = 2 * total, by_damping, by_stiffness, 2 * self._white
+        at = _GAIN
+        for line, (unit, by_hz, by_width) in zip(self._guess.lines, self._lines, strict=True):
+            power = np.square(line.rms_px)[:, None]
+            own[at] = power * (by_hz * problem.resolution_hz)
+            own[at + 1] = power * (by_width * line.half_width_hz)
+            for axis in range(axes):
+                own[at + 2 + axis, axis] = 2 * power[axis] * unit
+            at += 2 + axes
+        own /= self.density
+        return own
+
+    @functools.cached_property
+    def _mirrors(self) -> Floats:
+        """Of the periodogram, by the gain's logarithm and by the overshoot: shape (2, axes, rows)."""
+        cross, turned = self._problem.with_cross
+        mirror, across, along = self._problem.with_mirror
+        less, over = self._less, self._overshoot
+        by_gain = -self._guess.gain * (cross + 2 * less * mirror - 2 * over * across)
+        return np.array([by_gain, 2 * over * along - turned - 2 * less * across]) / self.density
+
+    @property
+    def gradient(self) -> Floats:
+        """Of the cost."""
+        weight = self._problem.weight
+        pull = weight * (1 - self._ratio)
+        own = self._own.reshape(len(self._own), -1) @ pull.ravel()
+        mirrors = (self._mirrors @ weight).sum(axis=1)
+        gradient = np.concatenate([own[:_GAIN], mirrors, own[_GAIN:]])
+        return np.asarray(gradient + self._away / self._problem.hints)
+
+    @property
+    def information(self) -> Floats:
+        """Fisher's, with what the mirror and the spectrum share."""
+        problem = self._problem
+        n = len(problem.begin)
+        own = np.array([index for index in range(n) if not _GAIN <= index < _FIRST_LINE])
+        mirrors = np.array([_GAIN, _OVERSHOOT])
+        flat = self._own.reshape(len(own), -1)
+        weighted = (self._own * problem.weight).reshape(len(own), -1)
+        everything = np.empty((n, n))
+        everything[np.ix_(own, own)] = weighted @ flat.T
+        shared = -weighted @ self._mirrors.reshape(2, -1).T
+        everything[np.ix_(own, mirrors)] = shared
+        everything[np.ix_(mirrors, own)] = shared.T
+        by_gain, by_both, by_overshoot = 2 * np.sum(
+            problem.with_mirror / self.density @ problem.weight, axis=-1
+        )
+        gain = self._guess.gain
+        everything[np.ix_(mirrors, mirrors)] = [
+            [gain**2 * by_gain, gain * by_both],
+            [gain * by_both, by_overshoot],
+        ]
+        return everything + np.diag(1 / problem.hints**2)

@@ -18,7 +18,7 @@ from fitctl.learn.aliases import IfAliases
 from fitctl.learn.goodness_of_fit import fit_test
 from fitctl.learn.night import estimate
 from fitctl.learn.opened import Series, periodograms
-from fitctl.learn.whittle import Guess, LineGuess, _Problem, likeliest
+from fitctl.learn.whittle import Guess, LineGuess, _Place, _Problem, likeliest
 
 TWO_MINUTES_S = 120.0
 THREE_HZ = Line(frequency_hz=3.1, damping=0.005, rms_px=0.05)
@@ -88,9 +88,9 @@ def test_the_likelihoods_slope_is_its_own(shaken, shaken_opened):
     begin = Guess(Air(1.2, 4.0, 3.0), 0.012, 0.9, 0.03, (LineGuess(3.2, 0.02, rms),))
     problem = _Problem(shaken_opened, begin)
     at = problem.begin + 0.05
-    _, slope = problem.cost(at)
+    slope = _Place(problem, at).gradient
     for index, step in enumerate(1e-5 * np.eye(len(at))):
-        by_difference = (problem.cost(at + step)[0] - problem.cost(at - step)[0]) / 2e-5
+        by_difference = (_Place(problem, at + step).cost - _Place(problem, at - step).cost) / 2e-5
         assert slope[index] == pytest.approx(by_difference, rel=1e-3, abs=1e-2)
 
 

@@ -12,11 +12,8 @@ from fitctl.config import AirPathModel
 from fitctl.controllers.design.basis import Basis
 
 Floats = NDArray[np.float64]
-_ALIASES = (
-    -1,
-    0,
-    1,
-)  # of the frame rate: the air falls by the fourth power, so that others hardly count
+# Of the frame rate: the air falls by the fourth power, so that others hardly count.
+_ALIASES = np.array([[-1.0], [0.0], [1.0]])
 
 
 class Air(NamedTuple):
@@ -101,16 +98,12 @@ def _oscillator(
     period_s: float,
 ) -> tuple[Floats, Floats, Floats]:
     """``power / |s² + damping s + stiffness|²`` on frames; derivatives by logarithms of the last two."""
-    total = by_damping = by_stiffness = np.zeros_like(frequency_hz)
-    for alias in _ALIASES:
-        omega2 = (2 * math.pi * (frequency_hz + alias / period_s)) ** 2
-        away, broad = stiffness - omega2, damping**2 * omega2
-        below = 1 / (away**2 + broad)
-        density = power * below
-        total = total + density
-        by_damping = by_damping - 2 * broad * below * density
-        by_stiffness = by_stiffness - 2 * stiffness * away * below * density
-    return total, by_damping, by_stiffness
+    omega2 = (2 * math.pi * (frequency_hz + _ALIASES / period_s)) ** 2
+    away, broad = stiffness - omega2, damping**2 * omega2
+    below = 1 / (away**2 + broad)
+    density = power * below
+    slope = -2 * below * density
+    return density.sum(axis=0), (broad * slope).sum(axis=0), stiffness * (away * slope).sum(axis=0)
 
 
 def white_px2_per_hz(noise_px: float, period_s: float) -> float:
