@@ -16,8 +16,9 @@ from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.drivers.interface import AzEl
 from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading, Tick
-from fitctl.messages.commands import AnyCommand, Recover, Reply, Standby, Stop
-from fitctl.messages.modes import Mode, Trigger
+from fitctl.messages.commands import AnyCommand, Look, Recover, Reply, Standby, Stop
+from fitctl.messages.modes import FOLLOWING, Mode, Trigger
+from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender
 from fitctl.supervisor.supervisor import Supervisor
 
@@ -25,6 +26,7 @@ Floats = NDArray[np.float64]
 _SLACK = 1.0 + 1e-6
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
 _AT_REST = frozenset({Mode.OFF, Mode.SAFE})
+_FOLLOWING = frozenset(mode.name for mode in FOLLOWING)
 _SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
 _FOR_ALL = {"Status", "RecentEvents"}
 _OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
@@ -38,6 +40,9 @@ _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
 _MOST_ALIKE = 3
 _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
+_LOOKED_AT_S = 0.5  # so often is asked whose star a loop follows
+_ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
+_MOST_WRONG_S = 10.0
 
 
 class Violation(NamedTuple):
@@ -59,6 +64,8 @@ class Invariants:
         By loop.
     lines : mapping of str to Line
         By device.
+    plant : Plant
+        Where the stars truly are.
     """
 
     def __init__(
@@ -67,12 +74,14 @@ class Invariants:
         clock: Clock,
         amplifiers: Mapping[str, SwarmAmplifiers],
         lines: Mapping[str, Line],
+        plant: Plant,
     ) -> None:
         self.violations: list[Violation] = []
         self._rig = rig
         self._clock = clock
         self._amplifiers = amplifiers
         self._lines = lines
+        self._plant = plant
         self._supervisor: Supervisor | None = None
         # What every tick needs, once.
         self._stellar_loops = rig.stellar_loops
@@ -102,6 +111,9 @@ class Invariants:
         self._zeros_lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
         self._zeros_read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
         self._zeros_noticed_s: dict[str, float] = {}
+        self._looked_s: dict[str, float] = {}  # by loop: when it was asked whose star it follows,
+        self._wrong_since_s: dict[str, float] = {}  # and since when it follows another
+        self._pointed_at: set[str] = set()  # a person said which star these loops follow
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
@@ -122,6 +134,8 @@ class Invariants:
         self._slowly.clear()
         self._powerless_since_s.clear()
         self._unneeded_since_s.clear()
+        self._wrong_since_s.clear()
+        self._pointed_at.clear()
         self._busy_since_s = math.inf
         # A machine that stands still does so for the next supervisor too.
         self._stepped_s = max(self._stepped_s, self._clock.now_s())
@@ -193,6 +207,8 @@ class Invariants:
                 self._stop_answered_s[name] = now_s
             elif isinstance(command, Standby | Recover):
                 self._power_up_s[name] = now_s
+            elif isinstance(command, Look):
+                self._pointed_at.add(name)
 
     def _named(self, command: AnyCommand) -> list[str]:
         return [name for name in self._rig.loops if command.loop in {"", name}]
@@ -203,6 +219,7 @@ class Invariants:
             case Tick(number=number):  # the most frequent first
                 if number >= 0:
                     self._acted_on(record)
+                    self._follows(record)
             case ModeChange():
                 self._mode_changed(record)
             case Event():
@@ -242,6 +259,29 @@ class Invariants:
                 f"{tick.loop}: one of {tick.frame_age_s:.3f} s, at most {oldest_s:.3f} s",
             )
 
+    def _follows(self, tick: Tick) -> None:
+        """Whether the star that a loop follows is its own, unless a person pointed at it."""
+        name, now_s = tick.loop, tick.mid_exposure_s
+        if not now_s - self._looked_s.get(name, -math.inf) >= _LOOKED_AT_S:
+            return
+        self._looked_s[name] = now_s
+        if tick.mode not in _FOLLOWING or math.isnan(tick.star_az_px) or name in self._pointed_at:
+            self._wrong_since_s.pop(name, None)
+            return
+        part = self._plant.stellar_loops[name]
+        own_az_px, own_el_px = part.spots_at_px(self._plant.row(now_s))[0, 0].tolist()
+        away_px = math.hypot(tick.star_az_px - own_az_px, tick.star_el_px - own_el_px)
+        if away_px < _ANOTHERS_PX:
+            self._wrong_since_s.pop(name, None)
+            return
+        since_s = self._wrong_since_s.setdefault(name, now_s)
+        if now_s - since_s > _MOST_WRONG_S:
+            self.violated(
+                "a loop follows its own star",
+                f"{name}: in {tick.mode} at az {tick.star_az_px:.1f}, el {tick.star_el_px:.1f} px for "
+                f"{now_s - since_s:.1f} s; its own is at az {own_az_px:.1f}, el {own_el_px:.1f} px",
+            )
+
     def _camera_well(self) -> bool:
         """Nothing has been wrong with the camera's line for a while."""
         line = self._lines["camera"]
@@ -249,6 +289,8 @@ class Invariants:
 
     def _mode_changed(self, change: ModeChange) -> None:
         name = change.loop
+        if change.target == Mode.ACQUISITION.name:
+            self._pointed_at.discard(name)
         if change.target == Mode.STANDBY.name and change.source in {"OFF", "SAFE"}:
             self._stopped_s.pop(name, None)
             stop_s = self._stop_answered_s.get(name, -math.inf)

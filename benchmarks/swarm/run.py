@@ -172,7 +172,7 @@ class Instrument:
             str, float
         ] = {}  # by loop: its star was found, and is not to be forgotten
         self.amplifiers: dict[str, SwarmAmplifiers] = {}
-        self.invariants = Invariants(rig, time, self.amplifiers, self.lines)
+        self.invariants = Invariants(rig, time, self.amplifiers, self.lines, self.plant)
         if not any(isinstance(one, Strike | Stall) for one in plan.happenings):
             self.invariants.nothing_fails = True
         self._console = Console(self.invariants, time, self._random("console"), plan.console_loss)

@@ -3,6 +3,7 @@
 from random import Random
 
 import msgspec
+import numpy as np
 import pytest
 
 from benchmarks.swarm.clients import STEPS
@@ -38,10 +39,12 @@ from fitctl.messages import client
 from fitctl.messages.commands import (
     Acquire,
     Jog,
+    Look,
     Off,
     RecorderReport,
     Recover,
     Release,
+    Reply,
     SetBiasOffset,
     SetTarget,
     Standby,
@@ -50,9 +53,11 @@ from fitctl.messages.commands import (
     TakeOver,
 )
 from fitctl.messages.modes import Mode
+from fitctl.model.plant import Plant
 from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
 from fitctl.tui.state import ConsoleState
+from tests.samples.log_samples import tick
 
 
 def plan(*happenings, duration_s=8.0, rig="fit-mock.toml", settings=()):
@@ -133,8 +138,13 @@ def test_a_record_that_nobody_counts_is_noticed(time, queue):
 
 
 @pytest.fixture
-def invariants(time):
-    return Invariants(load_rig(FOLDER / "fit-mock.toml"), time, {}, {})
+def plant():
+    return Plant(load_rig(FOLDER / "fit-mock.toml"), [1], history_s=20.0)
+
+
+@pytest.fixture
+def invariants(time, plant):
+    return Invariants(load_rig(FOLDER / "fit-mock.toml"), time, {}, {}, plant)
 
 
 STATUS = RecorderStatus(time_s=0.0, path="", records=0, lost=0, bytes_written=0)
@@ -169,6 +179,38 @@ def test_more_or_less_than_ones_rights_is_a_violation(invariants, who, command, 
     invariants.admitted(SENDERS[who], command, refusal)
 
     assert [one.invariant for one in invariants.violations] == ["lease and rights are kept"]
+
+
+# ------------------------------------------------------------ stars
+
+
+def follow(invariants, plant, seconds, away_px, mode="VERNIER"):
+    for at_s in 5.0 + 0.5 * np.arange(2 * seconds):
+        az_px, el_px = plant.spots_px(at_s)[0, 0] + (0.6 * away_px, 0.8 * away_px)
+        row = {"mid_exposure_s": at_s, "star_az_px": az_px, "star_el_px": el_px}
+        invariants.record(tick(1, loop="right", mode=mode, frame_age_s=0.02, **row))
+    return [one.invariant for one in invariants.violations]
+
+
+@pytest.mark.parametrize("mode", ["COARSE", "VERNIER"])
+def test_a_loop_that_follows_anothers_star_is_noticed(invariants, plant, mode):
+    assert follow(invariants, plant, 12, 7.0, mode) == ["a loop follows its own star"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "away_px", "mode"),
+    [(12, 5.0, "VERNIER"), (9, 7.0, "VERNIER"), (12, 7.0, "ACQUISITION"), (12, np.nan, "VERNIER")],
+)
+def test_a_loop_may_see_its_own_star_or_another_for_a_while(
+    invariants, plant, seconds, away_px, mode
+):
+    assert follow(invariants, plant, seconds, away_px, mode) == []
+
+
+def test_a_loop_may_follow_a_star_that_a_person_pointed_at(invariants, plant):
+    invariants.answered(Look(az_px=20.0, el_px=20.0), Reply(accepted=True))
+
+    assert follow(invariants, plant, 12, 7.0) == []
 
 
 # ------------------------------------------------------------ whole runs
