@@ -27,6 +27,7 @@ from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.batch.learning import Change
+from fitctl.simulation.batch.records import DONE
 
 BEGIN_S, END_S = 120.0, 300.0
 LIGHT = ("camera.electrons_per_dn=1.0",)
@@ -73,7 +74,7 @@ class Night(NamedTuple):
     for_bound : tuple of str
         What else the bound knows.
     bounded : bool
-        The night is one throughout, so that it has a bound.
+        The night is one throughout, so that it has a bound; that of a drifting line is of where it begins.
     """
 
     name: str
@@ -187,9 +188,13 @@ class Outcome(NamedTuple):
 
 def residual_px(batch: Batch, seed: int, changes: Sequence[Change]) -> float:
     """Of a run with such changes of designs."""
-    states = [
-        batch.run(seed, end_s, changes=changes).loops[LOOP].state for end_s in (BEGIN_S, END_S)
-    ]
+    runs = [batch.run(seed, end_s, changes=changes) for end_s in (BEGIN_S, END_S)]
+    if any(run.ended != DONE for run in runs):
+        msg = (
+            f"seed {seed}: a run ended early ({[run.ended for run in runs]}), so it has no residual"
+        )
+        raise RuntimeError(msg)
+    states = [run.loops[LOOP].state for run in runs]
     sums, steps = (np.diff([state[name] for state in states], axis=0)[0] for name in _SUMS)
     return float(np.sqrt(sums.max() / steps))
 

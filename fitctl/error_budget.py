@@ -46,10 +46,6 @@ _OVERLAPPING = 4  # segments at any time
 _SEGMENTS_AT_ONCE = 256
 
 
-_STANDS = np.zeros(2)
-_STANDS.flags.writeable = False
-
-
 class LoopTheory(NamedTuple):
     """What the rig file and the design in use say of one loop.
 
@@ -77,8 +73,6 @@ class LoopTheory(NamedTuple):
     link_px_per_rad : array, shape (2, 2)
         The same as `motor_px_per_rad` for the siderostat of the loop's link; zero without a link.
     link_backlash_rad : float
-    star_rate_px_s : array, shape (2,)
-        How fast the star is known to move with the stages at rest.
     """
 
     frequency_hz: Floats
@@ -94,7 +88,6 @@ class LoopTheory(NamedTuple):
     backlash_rad: float
     link_px_per_rad: Floats
     link_backlash_rad: float
-    star_rate_px_s: Floats = _STANDS
 
 
 def theory_to_plain(theory: LoopTheory) -> dict[str, Any]:
@@ -147,15 +140,19 @@ def motion(theory: LoopTheory, ticks: Columns, mirror_rad: Floats | None = None)
         Where the mirror was at mid-exposure, by the identified hysteresis; by default as the ticks have it.
     """
     error_px = _pair(ticks, "error_{}_px")
-    exposed_s = ticks["mid_exposure_s"]
     if mirror_rad is None:
         mirror_rad = _pair(ticks, "mirror_{}_rad")
     commanded_rad = _pair(ticks, "fsm_{}_rad")[in_force(ticks)]
     motor_rad = _pair(ticks, "siderostat_{}_rad")
     played_px = (_played(motor_rad, theory.backlash_rad) - motor_rad) @ theory.motor_px_per_rad.T
     stages_px = mirror_rad @ theory.mirror_px_per_rad.T + motor_rad @ theory.motor_px_per_rad.T
-    # A motion that is known is no disturbance. From the first frame on: a clock's whole time would cost digits.
-    stages_px += (exposed_s - np.nanmin(exposed_s, initial=np.inf))[:, None] * theory.star_rate_px_s
+    # A motion that is known is no disturbance. From its first value on: a clock's whole time would cost digits.
+    sky_rad = _pair(ticks, "sky_{}_rad")
+    moved = np.isfinite(sky_rad[:, 0])
+    if moved.any():
+        stages_px += (
+            np.where(moved[:, None], sky_rad - sky_rad[moved][0], 0.0) @ theory.motor_px_per_rad.T
+        )
     if theory.link_px_per_rad.any():
         link_rad = _pair(ticks, "link_{}_rad")
         slack_rad = _played(link_rad, theory.link_backlash_rad) - link_rad

@@ -87,6 +87,7 @@ _VALUES = {
     "bound_px": 0.014,
     "learnt_camera_px": 0.018,
     "measured_px": 0.022,
+    "noise_px": 0.01,
     "worth_it": True,
     "fits": True,
 }

@@ -184,12 +184,14 @@ class Advice(NamedTuple):
         ]
         if not night.test.fits and not self.worth_it:
             text.append("The model does not explain this night: do not use the learnt design.")
-        elif self.learnt.residual_px > self.present.residual_px:
+        elif WORTH_IT * self.learnt.residual_px > self.present.residual_px:
             peak = self.present.margins.peak_sensitivity
             text.append(
                 f"The present design leaves less, with a peak sensitivity of {peak:.2f}; the learnt one keeps "
                 "its margins."
             )
+        elif self.learnt.residual_px > WORTH_IT * self.present.residual_px:
+            text.append("Keep the present design: the learnt one would leave hardly less.")
         elif not self._better_as_shown:
             text.append(
                 "Keep the present design: the mirror moves less than the rig file has it, and so the present "
@@ -203,8 +205,6 @@ class Advice(NamedTuple):
                 f"{self.if_aliases.learnt_px:.4f} px instead of {self.if_aliases.present_px:.4f}. If you know "
                 "that they are not, set fastest_line_hz."
             )
-        elif not self.worth_it:
-            text.append("Keep the present design: the learnt one would leave hardly less.")
         else:
             gained = 1 - self.learnt.residual_px / self.present.residual_px
             lately = 1 - self.lately_px[1] / self.lately_px[0]

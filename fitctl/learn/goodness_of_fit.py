@@ -60,10 +60,13 @@ class FitTest(NamedTuple):
         """The verdict in words."""
         if self.fits:
             return f"the model fits (p = {min(self.cumulative, self.band):.2g})"
-        return (
-            f"the model does not fit (p = {min(self.cumulative, self.band):.1g}): {self.worst} has "
-            f"{self.ratio:.2f} times its power from {self.low_hz:.2g} to {self.high_hz:.2g} Hz"
-        )
+        why = "the cumulative spectrum deviates from a straight line"
+        if self.band < SIGNIFICANT:
+            why = (
+                f"{self.worst} has {self.ratio:.2f} times the model's power from {self.low_hz:.2g} to "
+                f"{self.high_hz:.2g} Hz"
+            )
+        return f"the model does not fit (p = {min(self.cumulative, self.band):.1g}): {why}"
 
 
 def fit_test(opened: Opened, density: Floats, gain: float, overshoot: float) -> FitTest:

@@ -31,7 +31,7 @@ FIRST_S = 60.0
 EVERY_S = 30.0
 """and another after each of so many more."""
 WINDOW_S = 240.0
-"""A night is estimated from the last frames: what is older was another night."""
+"""A night is estimated from the last frames, and after a gap as long, only from those that follow it."""
 SETTLE_S = 5.0
 """After the star was caught, or the target was moved, frames say more of that than of the night."""
 _STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
@@ -43,6 +43,7 @@ class Shown(NamedTuple):
     number: int
     mode: str
     fsm_saturated: bool
+    held: bool
     star_visible: bool
     target_az_px: float
     target_el_px: float
@@ -58,6 +59,8 @@ class Shown(NamedTuple):
     siderostat_el_rad: float
     link_az_rad: float
     link_el_rad: float
+    sky_az_rad: float
+    sky_el_rad: float
 
 
 _KEPT = Shown._fields[Shown._fields.index("time_s") :]
@@ -80,7 +83,8 @@ class Learner:
         self._ring = np.empty((round(WINDOW_S / period_s), len(_KEPT)))
         self._added = 0
         self._new = 0
-        self._due_after = round(FIRST_S / period_s)
+        self._last_s = math.inf
+        self._first = self._due_after = round(FIRST_S / period_s)
         self._unsettled_s = -math.inf
         self._target_px = (math.nan, math.nan)
         self._design = ""
@@ -97,9 +101,13 @@ class Learner:
         target_px = tick.target_az_px, tick.target_el_px
         moved = not math.dist(target_px, self._target_px) <= _STILL_PX_PER_S * self._period_s
         self._target_px = target_px
-        if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or moved:
+        if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or tick.held or moved:
             self._unsettled_s = tick.time_s
         elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
+            if tick.time_s - self._last_s > WINDOW_S:
+                self._added = self._new = 0
+                self._due_after = self._first
+            self._last_s = tick.time_s
             row = self._added % len(self._ring)
             self._ring[row] = [getattr(tick, name) for name in _KEPT]
             self._added += 1
@@ -117,17 +125,25 @@ class Learner:
 
     def report(self, present: Design) -> LearnerReport:
         """Estimate and design, with `present` in force; a report without a result has the reason."""
-        self._new, self._due_after = 0, round(EVERY_S / self._period_s)
+        self._reported()
         try:
-            with solving("learn", self._loop_name):
+            with solving("learn", self._loop_name, "the next report may have one"):
                 return self._report(self._advice(present))
-        except (ConfigError, np.linalg.LinAlgError) as error:
-            return LearnerReport(
-                loop=self._loop_name,
-                design_json="",
-                text=str(error),
-                evaluated_s=self.frames * self._period_s,
-            )
+        except ConfigError as error:
+            return self.failed(str(error))
+
+    def failed(self, reason: str) -> LearnerReport:
+        """A report without a result."""
+        self._reported()
+        return LearnerReport(
+            loop=self._loop_name,
+            design_json="",
+            text=reason,
+            evaluated_s=self.frames * self._period_s,
+        )
+
+    def _reported(self) -> None:
+        self._new, self._due_after = 0, round(EVERY_S / self._period_s)
 
     def _advice(self, present: Design) -> Advice:
         oldest = self._added % len(self._ring) if self._added > len(self._ring) else 0
@@ -150,6 +166,12 @@ class Learner:
             like=self._learnt,
         )
         self._learnt = advice.design
+        if math.isinf(advice.present.residual_px):
+            msg = (
+                f"learn: the mirror moves by {advice.night.mirror_gain} of what the rig file predicts, and the "
+                "design in force would be unstable with that; measure it with fitctl identify hysteresis"
+            )
+            raise ConfigError(msg)
         return advice
 
     def _report(self, advice: Advice) -> LearnerReport:
@@ -163,6 +185,7 @@ class Learner:
             bound_px=advice.bound_px,
             learnt_camera_px=advice.learnt.camera_px,
             measured_px=max(advice.measured_px),
+            noise_px=advice.night.noise_px.value,
             worth_it=advice.worth_it,
             fits=advice.night.test.fits,
         )

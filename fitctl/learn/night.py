@@ -170,8 +170,9 @@ def _with_more_lines(
 
 def _without_needless_lines(opened: Opened, found: Likeliest) -> Likeliest:
     """Take lines away, newest first, whose absence costs less than their price."""
-    for line in reversed(found.guess.lines):
-        kept = tuple(one for one in found.guess.lines if one.frequency_hz != line.frequency_hz)
+    for number in reversed(range(len(found.guess.lines))):
+        lines = found.guess.lines
+        kept = lines[:number] + lines[number + 1 :]
         less = likeliest(opened, found.guess._replace(lines=kept))
         if less.cost - found.cost < _price(opened):
             found = less

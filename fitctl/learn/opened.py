@@ -21,7 +21,7 @@ from fitctl.learn.gaps import filled
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 SEGMENT_S = 128.0
-"""No segment is longer: the air's slow pole turns over within a few seconds."""
+"""Segments are about so long, at most 1.5 times: the air's slow pole turns over within a few seconds."""
 LEAST_S = 20.0
 """Shorter pieces are left out."""
 TAPERED = 0.2

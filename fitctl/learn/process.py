@@ -10,7 +10,7 @@ import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.learn.learner import Learner
 from fitctl.messages.client import Client
@@ -55,7 +55,11 @@ class LoopLearner:
         return ready
 
     def _make(self, controller: str, noise_px: float | None) -> LearnerReport:
-        return self._learner.report(design_for(self._rig, self.loop_name, controller, noise_px))
+        try:
+            present = design_for(self._rig, self.loop_name, controller, noise_px)
+        except ConfigError as error:  # such as a design file that is gone
+            return self._learner.failed(str(error))
+        return self._learner.report(present)
 
 
 def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:

@@ -99,6 +99,12 @@ class Tick(Record, frozen=True, kw_only=True, gc=False):
     # Where the mirror was at mid-exposure, by the identified hysteresis.
     mirror_az_rad: float = math.nan
     mirror_el_rad: float = math.nan
+    # Motor angles that turn the star as far as it has moved by itself; NaN where it stands.
+    sky_az_rad: float = math.nan
+    sky_el_rad: float = math.nan
+    held: bool = (
+        False  # an interlock, or a wait for the link, kept the stages from following the star
+    )
 
 
 class MetrologyTick(Record, frozen=True, kw_only=True, gc=False):

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.design.basis import basis, on_its_mirror
+from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, OnPaper
+from fitctl.controllers.design.linear_loop.sampled import sampled_loop
 from fitctl.controllers.pair import Design
-from fitctl.model.optics import AzEl, scales
+from fitctl.model.optics import AzEl, Scales, scales
 
 Floats = NDArray[np.float64]
 OVER_S = 30.0
@@ -34,12 +35,13 @@ class Comparison:
 
     Parameters
     ----------
-    rig : Rig
-    loop_name : str
+    scale : Scales
     learnt, before : Design
         The one at work, and the one before it.
-    noise_px2 : float
-        Variance of the noise on a frame, which both leave alike.
+    loop_basis : Basis
+        The loop, with the mirror that the learnt design was made for.
+    noise_px : float
+        One standard deviation of the noise on a frame, which both leave alike.
 
     Attributes
     ----------
@@ -48,12 +50,16 @@ class Comparison:
     """
 
     def __init__(
-        self, rig: Rig, loop_name: str, learnt: Design, before: Design, noise_px2: float
+        self,
+        scale: Scales,
+        learnt: Design,
+        before: Design,
+        loop_basis: Basis,
+        noise_px: float,
     ) -> None:
-        self._noise_px2 = noise_px2
-        loop_basis = on_its_mirror(basis(rig, loop_name), learnt.parameters)
+        self._noise_px2 = noise_px**2
         self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
-        self._scale = scales(rig, rig.stellar_loops[loop_name])
+        self._scale = scale
         self._mirror_gain, self._overshoot = loop_basis.mirror_gain, loop_basis.overshoot
         self._settle_frames = round(SETTLE_S / loop_basis.period_s)
         self._over_frames = round(OVER_S / loop_basis.period_s)
@@ -70,7 +76,7 @@ class Comparison:
         self._means_px2 = np.zeros((3, 2))
 
     def observe(self, error_px: AzEl, mirror_rad: Floats, motor_rad: Floats) -> None:
-        """One frame: the star's error, and where mirror and motors were, shapes (2,)."""
+        """One frame: the star's error, and mirror and motors as :meth:`.Learning.observe` has them."""
         mirror_px = np.asarray(self._scale.mirror_px(mirror_rad))
         last_px = mirror_px if self._mirror_px is None else self._mirror_px
         self._mirror_px = mirror_px
@@ -115,3 +121,14 @@ class Comparison:
             f"the learnt design {left} px {where} over {OVER_S:g} s; the design before would have left "
             f"{math.sqrt(before_px2):.4f} of the same disturbance"
         )
+
+
+def comparison(
+    rig: Rig, loop_name: str, learnt: Design, before: Design, noise_px: float
+) -> Comparison | None:
+    """Of one loop; None if the design before is unstable on the mirror that the learnt one was made for."""
+    loop_basis = on_its_mirror(basis(rig, loop_name), learnt.parameters)
+    if not sampled_loop(before, loop_basis).stable:
+        return None
+    scale = scales(rig, rig.stellar_loops[loop_name])
+    return Comparison(scale, learnt, before, loop_basis, noise_px)

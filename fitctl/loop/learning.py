@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.controllers.pair import Design, Measurement
-from fitctl.loop.comparison import Comparison
+from fitctl.loop.comparison import Comparison, comparison
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LearningState
 from fitctl.model.optics import AzEl
@@ -30,6 +30,7 @@ _WATCHES = ((0.3, 2.0), (10.0, 1.25))
 # A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault.
 _LOUDER = 2.0
 _STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
+_LONGEST_GAP = 5.5  # in frame periods: the comparison of designs bears so few missing frames
 _NEWS = 0.1  # by which part a gain must differ from the one last reported to be reported again
 
 
@@ -55,6 +56,8 @@ class Learning:
         self._loop_name = loop_name
         self._comparison: Comparison | None = None
         self._still_px = _STILL_PX_PER_S * rig.camera.period_s
+        self._longest_gap_s = _LONGEST_GAP * rig.camera.period_s
+        self._last_s = math.inf
         self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
         self._means_px2 = [[0.0, 0.0] for _ in _WATCHES]
         self._before_px2 = [[0.0, 0.0] for _ in _WATCHES]
@@ -64,18 +67,25 @@ class Learning:
         self._paused_until_s = -math.inf
         self._pause_s = PAUSE_S
         self._last_target_px: AzEl = (math.nan, math.nan)
-        self._told = 0.0  # the part gained that an operator was told last
+        self._announced = 0.0  # the part gained that was announced last
         self._fell_back = ""
+        self._failed = False
 
     # ------------------------------------------------------------ reports
 
     def accept(self, report: LearnerReport) -> str:
         """Keep a report; an event's text where there is news for an operator, else empty."""
         self.report = report
+        if not report.design_json:
+            news, self._failed = not self._failed, True
+            return report.text if news else ""
+        self._failed = False
+        if report.worth_it and (self.setting != "on" or self._by_hand):
+            self._fell_back = ""  # newer advice
         gained = _gained(report) if report.worth_it else 0.0
-        if abs(gained - self._told) < _NEWS or (self.setting == "on" and not self._by_hand):
+        if abs(gained - self._announced) < _NEWS or (self.setting == "on" and not self._by_hand):
             return ""
-        self._told = gained
+        self._announced = gained
         if not gained:
             return (
                 "the design in force leaves as little as a learnt one would"
@@ -99,6 +109,11 @@ class Learning:
     def is_calm(self, now_s: float) -> bool:
         """Nothing hinders a change of design: see `CALM_S`."""
         return self._calm_since_s is not None and now_s - self._calm_since_s >= CALM_S
+
+    @property
+    def design_json(self) -> str:
+        """Of the learnt design in force; empty without."""
+        return "" if self.in_force is None else self.in_force.design_json
 
     @property
     def command(self) -> str:
@@ -128,7 +143,7 @@ class Learning:
 
         Recent frames, in their order and without gaps, tell the comparison where star and vibrations are.
         """
-        self._told = 0.0
+        self._announced = 0.0
         self._comparison = None
         if report is None:
             if not by_itself:
@@ -140,8 +155,10 @@ class Learning:
         if not before.learnt:
             self.before = before
         if self.before is not None:
-            noise_px2 = max(0.0, report.learnt_camera_px**2 - report.learnt_px**2)
-            self._comparison = Comparison(self._rig, self._loop_name, now, self.before, noise_px2)
+            self._comparison = comparison(
+                self._rig, self._loop_name, now, self.before, report.noise_px
+            )
+        if self._comparison is not None:
             for seen in recent:
                 self._comparison.observe(seen.error_px, seen.mirror_rad, seen.motor_rad)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
@@ -173,14 +190,19 @@ class Learning:
         target_px : tuple of float
             As the prefilter has it.
         stages_rad : tuple of array, shape (2,)
-            Where mirror and siderostat were at mid-exposure.
+            At mid-exposure: where the mirror was by the control law alone, and motor angles that turn the star
+            as far as all siderostats and the sky did.
         saturated : bool
             The mirror is at the end of its range.
         hindered : bool
-            The loop is not in VERNIER, waits, or an interlock acts.
+            The loop is not in VERNIER, waits, or an interlock keeps the stages from following the star.
         """
         moved = not math.dist(target_px, self._last_target_px) <= self._still_px
         self._last_target_px = target_px
+        if now_s - self._last_s > self._longest_gap_s:
+            self._calm_since_s = None
+            self._restart_comparison()
+        self._last_s = now_s
         if hindered or error_px is None or moved:
             self._calm_since_s = None
             self._restart_comparison()
@@ -251,7 +273,7 @@ class Learning:
             return LearningState(setting=self.setting, state="collecting")
         return LearningState(
             setting=self.setting,
-            state="advice" if report.worth_it else "kept",
+            state="failed" if self._failed else "advice" if report.worth_it else "kept",
             text=text,
             report=report,
         )
@@ -270,6 +292,7 @@ def refused_report(report: LearnerReport) -> str:
         report.bound_px,
         report.learnt_camera_px,
         report.measured_px,
+        report.noise_px,
     )
     if not all(math.isfinite(px) and px >= 0 for px in figures_px):
         return f"a learner's report needs finite residuals, got {figures_px}"

@@ -35,6 +35,8 @@ class Observation(NamedTuple):
         without either.
     link_motor_rad : array, shape (2,), or None
         Angles of the motors of the link's siderostat at the same time as `motor_rad`; None without a link.
+    sky_rad : array, shape (2,), or None
+        Part of `link_rad` that is the sky's; None of a star that stands.
     backlash_rad : array, shape (2,), or None
         Part of `mirror_rad` that makes up for the siderostats' backlash, which is no part of the law's.
     """
@@ -49,6 +51,7 @@ class Observation(NamedTuple):
     now_s: float
     link_rad: NDArray[np.float64] | None = None
     link_motor_rad: NDArray[np.float64] | None = None
+    sky_rad: NDArray[np.float64] | None = None
     backlash_rad: NDArray[np.float64] | None = None
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -17,6 +18,7 @@ from fitctl.model.optics import AzEl, scales
 Floats = NDArray[np.float64]
 _RECENT_S = 3.0  # of frames from which another design knows the night
 _LEAST_RECENT_S = 0.5
+_GAP = 1.5  # in frame periods: between exposures so far apart a frame is missing
 
 
 class Pointing:
@@ -49,6 +51,7 @@ class Pointing:
             loop.coarse.gain_rad_per_m * self._scale.pixel_size_m * period_s
         )
         self._recent: deque[Measurement] = deque(maxlen=round(_RECENT_S / period_s))
+        self._period_s, self._exposed_s = period_s, math.inf
         self._least_recent = round(_LEAST_RECENT_S / period_s)
         self.use(design)
 
@@ -107,6 +110,11 @@ class Pointing:
             self.forget()
             return None
         error_px = error_from(command_px, observation.star)
+        if observation.frame is not None:
+            exposed_s = observation.frame.mid_exposure_s
+            if exposed_s - self._exposed_s > _GAP * self._period_s:
+                self.forget()
+            self._exposed_s = exposed_s
         measured = Measurement(
             error_px, command_px, observation.law_mirror_rad, observation.beam_rad
         )
@@ -118,7 +126,7 @@ class Pointing:
         self._recent.append(measured)
 
     def forget(self) -> None:
-        """Frames are missing: those before tell a design that follows nothing."""
+        """Frames are missing: a design that follows cannot use those before."""
         self._recent.clear()
 
 

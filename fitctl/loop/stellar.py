@@ -102,7 +102,7 @@ class StellarLoop(Loop):
         self._period_s, self._delay_s = rig.camera.period_s, rig.camera.frame_delay_s
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
         self._tick_records = TickRecords(rig, name)
-        self._flattened = False
+        self._flattened = self._held = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
         self._link_counts = (
             False  # what the link's siderostat turns moves the star that is expected
@@ -138,14 +138,14 @@ class StellarLoop(Loop):
             motor_rad = self.servo.position_at(frame.mid_exposure_s)
             mirror_rad = self.mirror.at(frame.mid_exposure_s)
         time_s = begun_s if frame is None else frame.mid_exposure_s
-        link_rad = link_motor_rad = None
+        link_rad = link_motor_rad = sky_rad = None
         if self.link is not None:
             self.link.read_at(time_s)
             link_rad, link_motor_rad = self.link.turned_rad, self.link.motor_rad
         if self.sky is not None:
             self.sky.read_at(time_s)
-            self.search.sky_rad = self.sky.turned_rad
-            link_rad = self.sky.turned_rad if link_rad is None else link_rad + self.sky.turned_rad
+            self.search.sky_rad = sky_rad = self.sky.turned_rad
+            link_rad = sky_rad if link_rad is None else link_rad + sky_rad
         if frame is not None:
             beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
             star = self._find(frame, mirror_rad, beam_rad)
@@ -160,6 +160,7 @@ class StellarLoop(Loop):
             begun_s,
             link_rad,
             link_motor_rad,
+            sky_rad,
             None if self.backlash is None else self.backlash.at(time_s),
         )
         self._sensed_s = self._clock.now_s()
@@ -229,26 +230,35 @@ class StellarLoop(Loop):
             self.pointing,
             self.search,
             TickTimes(self._sensed_s, self._decided_s, self._done_s),
+            held=self._held,
         )
         self.quantities.record_tick(tick.compute_s, tick.time_s)
         return tick
 
     def _move(self, observation: Observation) -> None:
         """Follow the link and the mode's law, unless an interlock holds or flattens."""
-        action = self.interlocks.action if self.mode in TRACKING else None
-        if self.link is not None and action not in {"freeze", "flatten"}:
+        stopped = self._is_stopped
+        if self.link is not None and not stopped:
             self._follow_link(self.link)
-        if self.sky is not None and action not in {"freeze", "flatten"}:
+        if self.sky is not None and not stopped:
             self._follow_sky(self.sky, observation.now_s)
-        if action == "flatten":
+        flattens = stopped and self.interlocks.action == "flatten"
+        if flattens:
             self.mirror.step_to_bias()
         elif self._flattened and self.mode is Mode.VERNIER:
             self._start_pair(observation.beam_rad)
-        self._flattened = action == "flatten"
+        self._flattened = flattens
         # Without a frame to track by, the stages wait where they are.
-        waits = self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
-        if action not in {"freeze", "flatten"} and not waits:
+        self._held = stopped or (
+            self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
+        )
+        if not self._held:
             self._laws[self.mode](observation)
+
+    @property
+    def _is_stopped(self) -> bool:
+        """An interlock keeps the stages from following the star."""
+        return self.mode in TRACKING and self.interlocks.action in {"freeze", "flatten"}
 
     def _evaluate_learning(self, observation: Observation) -> None:
         """Go back to the design before, where the learnt one does worse."""
@@ -262,9 +272,7 @@ class StellarLoop(Loop):
             target_px,
             (observation.law_mirror_rad, observation.beam_rad),
             saturated=self.pointing.saturated,
-            hindered=self.mode is not Mode.VERNIER
-            or bool(self.waits_for)
-            or self.interlocks.action is not None,
+            hindered=self.mode is not Mode.VERNIER or bool(self.waits_for) or self._is_stopped,
         )
         if why_back and self.learning.before is not None:
             self.learning.fell_back(why_back, observation.now_s)

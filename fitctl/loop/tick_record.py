@@ -52,8 +52,10 @@ class TickRecords:
         pointing: Pointing,
         search: SpiralSearch,
         times: TickTimes,
+        *,
+        held: bool,
     ) -> Tick:
-        """What a tick was decided by, and what it did."""
+        """What a tick was decided by, and what it did; `held` if it kept the stages where they are."""
         sensed_s, decided_s, done_s = times
         frame, star, servo = observation.frame, observation.star, observation.servo
         begun_s, sky_arcsec_per_rad = observation.now_s, self._sky_arcsec_per_rad
@@ -66,8 +68,9 @@ class TickRecords:
         motor_az_rad, motor_el_rad = observation.motor_rad.tolist()
         mirror_az_rad, mirror_el_rad = observation.mirror_rad.tolist()
         setpoint_az_rad, setpoint_el_rad = siderostat.setpoint_rad.tolist()
-        link_rad = observation.link_motor_rad
+        link_rad, sky_rad = observation.link_motor_rad, observation.sky_rad
         link_az_rad, link_el_rad = (math.nan, math.nan) if link_rad is None else link_rad.tolist()
+        sky_az_rad, sky_el_rad = (math.nan, math.nan) if sky_rad is None else sky_rad.tolist()
         return Tick(
             time_s=done_s,
             loop=self._loop_name,
@@ -120,4 +123,7 @@ class TickRecords:
             star_sigma_el_px=math.nan if star is None else star.sigma_el_px,
             mirror_az_rad=mirror_az_rad,
             mirror_el_rad=mirror_el_rad,
+            sky_az_rad=sky_az_rad,
+            sky_el_rad=sky_el_rad,
+            held=held,
         )

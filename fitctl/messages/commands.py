@@ -171,7 +171,7 @@ class RecorderReport(Command, frozen=True, kw_only=True):
 
 
 class LearnerReport(Command, frozen=True, kw_only=True):
-    """The learner tells what it makes of a loop's night.
+    """What the learner found in a loop's frames.
 
     Attributes
     ----------
@@ -188,6 +188,8 @@ class LearnerReport(Command, frozen=True, kw_only=True):
         RMS of the error on frames that the learnt design is expected to leave, noise included.
     measured_px : float
         The same, measured with the design in force; of the worst axis.
+    noise_px : float
+        One standard deviation of the noise on a frame, as estimated.
     worth_it : bool
         The learnt design leaves clearly less; much less where the model does not fit the frames.
     fits : bool
@@ -202,6 +204,7 @@ class LearnerReport(Command, frozen=True, kw_only=True):
     bound_px: float = 0.0
     learnt_camera_px: float = 0.0
     measured_px: float = 0.0
+    noise_px: float = 0.0
     worth_it: bool = False
     fits: bool = True
 

@@ -121,7 +121,8 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
         ``learn`` of the rig file.
     state : str
         "collecting" until the first report; "advice" where the learnt design would leave clearly less; "kept"
-        where it would not; "in force" while it drives the loop; "fell back" after it left too much.
+        where it would not; "failed" where nothing could be learnt, and `text` says why; "in force" while it
+        drives the loop; "fell back" after it left too much.
     text : str
         The night, or what happened, for people.
     report : LearnerReport, optional
@@ -136,7 +137,7 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     setting: Literal["off", "advise", "on"]
-    state: Literal["collecting", "advice", "kept", "in force", "fell back"]
+    state: Literal["collecting", "advice", "kept", "failed", "in force", "fell back"]
     text: str = ""
     report: LearnerReport | None = None
     design_json: str = ""

@@ -48,11 +48,14 @@ TICK_FIELDS: dict[str, Any] = {
     "siderostat_el_rad": np.float64,
     "siderostat_setpoint_az_rad": np.float64,
     "siderostat_setpoint_el_rad": np.float64,
+    "sky_az_rad": np.float64,
+    "sky_el_rad": np.float64,
     "number": np.int64,
     "mode_number": np.int8,
     "late": np.bool_,
     "star_visible": np.bool_,
     "fsm_saturated": np.bool_,
+    "held": np.bool_,
     "frames_lost": np.int32,
     **dict.fromkeys(
         (
@@ -73,6 +76,9 @@ TICK_FIELDS: dict[str, Any] = {
         np.float32,
     ),
 }
+
+LATER_FIELDS: dict[str, Any] = {"sky_az_rad": np.nan, "sky_el_rad": np.nan, "held": False}
+"""What logs of earlier versions lack, and what it is there."""
 
 LINK_FIELDS: dict[str, Any] = dict.fromkeys(("link_az_rad", "link_el_rad"), np.float64)
 """Of the ticks of a loop with a link, besides."""
@@ -213,7 +219,7 @@ def _room(run: Run, topic: str, wanted: dict[str, Any]) -> Columns:
 
 def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64], path: str) -> int:
     """Put a block of ticks into their room, from row `at` on; returns how many rows there was room for."""
-    missing = [name for name in room if name not in columns]
+    missing = [name for name in room if name not in columns and name not in LATER_FIELDS]
     if missing:
         msg = f"{path}: its ticks lack {', '.join(missing)}; it was recorded by another version of fitctl"
         raise LogError(msg)
@@ -224,7 +230,7 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
         len(time_s), len(room["time_s"]) - at
     )  # a log in the making has grown since it was counted
     for name, column in room.items():
-        column[at : at + rows] = block[name][:rows]
+        column[at : at + rows] = block[name][:rows] if name in block else LATER_FIELDS[name]
     return rows
 
 

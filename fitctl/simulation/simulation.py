@@ -183,7 +183,8 @@ class Simulation:
         for name, learner in self.learners.items():
             loop = self.supervisor.stellar_loops[name]
             design = loop.pointing.design
-            learner.watch(f"{design.title} {loop.noise_px}", self.clock.now_s())
+            title = loop.learning.design_json or design.title
+            learner.watch(f"{title} {loop.noise_px}", self.clock.now_s())
             if learner.due:
                 self.supervisor.post(learner.report(design), lambda _: None)
 

@@ -48,6 +48,8 @@ TICK_FIELDS = (
     "siderostat_el_rad",
     "link_az_rad",
     "link_el_rad",
+    "sky_az_rad",
+    "sky_el_rad",
 )
 FRINGE_FIELDS = ("time_s", "tilt_az_arcsec", "tilt_el_arcsec", "visibility")
 _NO_BUDGET = (math.nan,) * (len(TICK_FIELDS) - TICK_FIELDS.index("star_flux_dn"))

@@ -15,8 +15,8 @@ from fitctl.controllers.design.linear_loop.spectrum import Air, air_of, framed_l
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.learn.advice import advise, estimated
 from fitctl.learn.aliases import IfAliases
-from fitctl.learn.goodness_of_fit import fit_test
-from fitctl.learn.night import estimate
+from fitctl.learn.goodness_of_fit import FitTest, fit_test
+from fitctl.learn.night import _without_needless_lines, estimate
 from fitctl.learn.opened import Series, periodograms
 from fitctl.learn.whittle import Guess, LineGuess, _Place, _Problem, likeliest
 
@@ -151,6 +151,25 @@ def test_a_model_that_lacks_a_line_does_not_fit(shaken_opened, paper):
     assert without.guess.air.strength > 1.5 * air_of(paper.air_path).strength  # what a line does
     assert not test.fits
     assert "does not fit" in test.text
+
+
+def test_every_line_that_is_not_worth_its_price_is_left_out(shaken_opened, paper):
+    lines = tuple(LineGuess(hz, 0.1, np.array([1e-3, 1e-3])) for hz in (5.2, 8.1, 13.7))
+    true = LineGuess(THREE_HZ.frequency_hz, 0.016, np.array([0.05, 0.05]))
+    guess = Guess(air_of(paper.air_path), paper.noise_px, lines=(lines[0], true, *lines[1:]))
+    found = _without_needless_lines(shaken_opened, likeliest(shaken_opened, guess))
+    (left,) = found.guess.lines
+
+    assert left.frequency_hz == pytest.approx(THREE_HZ.frequency_hz, abs=0.05)
+
+
+def test_only_an_octave_that_deviates_is_named():
+    octave = ("az", 3.1, 6.2)
+    of_band, of_all = (FitTest(*p, *octave, 1.08).text for p in ((0.5, 1e-5), (1e-5, 1.0)))
+
+    assert "az has 1.08 times the model's power from 3.1 to 6.2 Hz" in of_band
+    assert "the cumulative spectrum" in of_all
+    assert "az" not in of_all
 
 
 @pytest.mark.parametrize(
@@ -303,6 +322,18 @@ def test_a_design_that_would_not_have_been_better_lately_is_not_worth_it(six_hz)
     assert learnt_px < 0.5 * present_px
     assert not past.worth_it
     assert "in the last minute" in past.lines_of_text()[-1]
+
+
+def test_a_design_that_leaves_as_little_is_not_refused_for_the_mirrors_gain(six_hz):
+    _, advice = six_hz
+    present_px = advice.present.residual_px
+    alike = advice._replace(
+        learnt=advice.learnt._replace(residual_px=0.99 * present_px),
+        shown_px=(present_px, 0.99 * present_px),
+    )
+
+    assert not alike.worth_it
+    assert "hardly less" in alike.lines_of_text()[-1]
 
 
 @pytest.mark.parametrize(("part", "worth_it"), [(0.7, True), (0.9, False)])

@@ -17,7 +17,7 @@ from fitctl.learn.advice import estimated
 from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, WINDOW_S, Learner
 from fitctl.learn.opened import rebuild
 from fitctl.learn.process import LoopLearner
-from fitctl.messages.commands import MAX_COMMAND_BYTES
+from fitctl.messages.commands import MAX_COMMAND_BYTES, Acquire, Standby
 from fitctl.messages.telemetry import LearningState
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -66,6 +66,7 @@ def test_a_first_report_is_due_after_a_minute_of_frames(rig, vernier):
         {"mode": "COARSE"},
         {"star_visible": False},
         {"fsm_saturated": True},
+        {"held": True},
         {"number": -1},
     ],
     ids=lambda change: next(iter(change)),
@@ -112,6 +113,7 @@ def test_a_report_has_the_night_and_a_design_that_can_be_made_again(rig, ticks):
     assert "6.0" in report.text
     assert report.bound_px <= report.learnt_px < 0.3 * report.present_px
     assert report.measured_px == pytest.approx(0.1, rel=0.3)
+    assert report.noise_px == pytest.approx(basis(rig, "right").noise_px, rel=0.1)
     assert design_for(rig, "right", report.design_json).learnt
     assert len(msgspec.msgpack.encode(report)) < MAX_COMMAND_BYTES
     assert not learner.due
@@ -185,6 +187,50 @@ def test_the_process_knows_the_learnt_design_in_force(rig, ticks):
     assert report.present_px == pytest.approx(
         0.1, rel=0.3
     )  # it was made for a night without the line
+
+
+def test_a_design_that_cannot_be_made_gives_a_report_with_the_reason(rig, vernier, monkeypatch):
+    monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 1.0)
+    heard = message(vernier[:500], controller_file="gone.json")
+    learner = LoopLearner(rig, "right")
+    learner.hear(heard, heard.loops[0])
+    with ThreadPoolExecutor(1) as executor:
+        learner.work(executor)
+        executor.submit(int).result()
+        report = learner.work(executor)
+        again = learner.work(executor)
+
+    assert report.design_json == ""
+    assert "gone.json" in report.text
+    assert again is None
+
+
+def test_after_a_long_gap_only_new_frames_count(rig, vernier):
+    learner = fed(rig, vernier)
+    later_s = WINDOW_S + 1000.0
+    for tick in vernier[:200]:
+        learner.add(msgspec.structs.replace(tick, time_s=tick.time_s + later_s))
+
+    assert learner.frames == 200
+    assert not learner.due
+
+
+@pytest.mark.long
+def test_a_star_that_a_command_says_to_move_is_no_disturbance():
+    """Its rate is in no rig file: the siderostat's motion after it must not look like the night's."""
+    rate = "plant.loops.right.star_rate_sky_arcsec_s={az=12.0,el=-9.0}"
+    simulation = Simulation(load_rig(default_rig_path(), [rate]), 1)
+    for command in (
+        Standby(),
+        Acquire(rate_az_sky_arcsec_s=12.0, rate_el_sky_arcsec_s=-9.0),
+    ):
+        assert simulation.command(command).accepted
+    simulation.run(40.0)
+    ticks = [tick for tick in simulation.ticks if tick.mode == "VERNIER"]
+    series = rebuilt(simulation.supervisor.rig, ticks[round(SETTLE_S / PERIOD_S) :])
+
+    assert len(series.disturbance_px) > 1000
+    assert np.ptp(series.disturbance_px, axis=0).max() < 3.0  # it moved by more than 80 px
 
 
 @pytest.mark.long

@@ -8,8 +8,9 @@ import pytest
 from benchmarks.linear_loop import held
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.loop.comparison import Comparison
+from fitctl.loop.comparison import comparison
 from fitctl.model.optics import scales
 
 NOISE_PX = 0.03
@@ -32,7 +33,7 @@ def with_air(night, times):
     return dataclasses.replace(night, air_path=air)
 
 
-def followed(rig, truth, learnt, comparison, seed):
+def followed(rig, truth, learnt, compared, seed):
     """Whether a comparison sends the loop back, on frames of a loop with the learnt design."""
     error_px, series = held(truth, learnt, SECONDS, seed)
     scale = scales(rig, rig.stellar_loops["right"])
@@ -40,9 +41,9 @@ def followed(rig, truth, learnt, comparison, seed):
     stages_px = error_px - series.disturbance_px
     motors_rad = np.linalg.solve(scale.siderostat_turn, stages_px.T).T / scale.motor_px_per_rad
     for error, motor_rad in zip(error_px, motors_rad, strict=True):
-        comparison.observe(tuple(error), np.zeros(2), motor_rad)
-        if comparison.why_back:
-            return comparison.why_back
+        compared.observe(tuple(error), np.zeros(2), motor_rad)
+        if compared.why_back:
+            return compared.why_back
     return ""
 
 
@@ -54,8 +55,8 @@ def test_noise_does_not_hide_a_design_that_is_worse(rig, noisy, seed):
     learnt, before = design_minimum_variance(with_air(noisy, 0.6)), design_minimum_variance(truth)
 
     whys = [
-        followed(rig, truth, learnt, Comparison(rig, "right", learnt, before, noise_px2), seed)
-        for noise_px2 in (NOISE_PX**2, 0.0)
+        followed(rig, truth, learnt, comparison(rig, "right", learnt, before, noise_px), seed)
+        for noise_px in (NOISE_PX, 0.0)
     ]
     assert "besides the noise" in whys[0]
     assert whys[1] == ""
@@ -65,6 +66,13 @@ def test_noise_does_not_hide_a_design_that_is_worse(rig, noisy, seed):
 def test_a_design_that_is_better_stays(rig, noisy, seed):
     truth = with_air(noisy, 0.6)
     learnt, before = design_minimum_variance(truth), design_minimum_variance(with_air(noisy, 0.95))
-    comparison = Comparison(rig, "right", learnt, before, NOISE_PX**2)
+    compared = comparison(rig, "right", learnt, before, NOISE_PX)
 
-    assert followed(rig, truth, learnt, comparison, seed) == ""
+    assert followed(rig, truth, learnt, compared, seed) == ""
+
+
+def test_a_design_that_is_unstable_on_the_learnt_ones_mirror_is_not_compared(rig, noisy):
+    learnt = design_minimum_variance(dataclasses.replace(noisy, mirror_gain=1.9))
+
+    assert comparison(rig, "right", learnt, design_for(rig, "right", "eq20"), NOISE_PX) is None
+    assert comparison(rig, "right", learnt, learnt, NOISE_PX) is not None

@@ -16,6 +16,7 @@ from fitctl.logging.records import ControllerChange, Event
 from fitctl.loop.learning import CALM_S, PAUSE_S
 from fitctl.messages.commands import (
     Acquire,
+    LearnerReport,
     SetController,
     SetTarget,
     Standby,
@@ -106,6 +107,17 @@ def test_advice_of_a_model_that_does_not_fit_says_so(shaken):
     assert night.loop.state(0.0).learning.state == "advice"
 
 
+def test_a_report_without_a_design_says_why_once():
+    night = Night(learn="advise")
+    for _ in range(2):
+        night.simulation.command(
+            LearnerReport(loop="right", design_json="", text="learn: too short", evaluated_s=60.0)
+        )
+
+    assert night.events().count("learn: too short") == 1
+    assert night.loop.state(0.0).learning.state == "failed"
+
+
 def test_the_operator_applies_what_was_advised():
     night = Night(*SHAKEN, learn="advise")
     refused = night.simulation.command(SetController(name="learnt"))
@@ -179,6 +191,17 @@ def test_the_same_design_goes_on_where_it_was():
 
     assert [len(night.changes()) for night in nights] == [2, 1]
     assert np.abs(changed_px - unchanged_px).max() < 0.03  # 0.12 px if it began from rest
+
+
+def test_another_design_does_not_begin_from_frames_before_a_gap(shaken, monkeypatch):
+    pointing, camera = shaken.loop.pointing, shaken.simulation.supervisor._camera
+    assert len(pointing.recent) == 150
+    monkeypatch.setattr(camera, "ready", False)
+    shaken.simulation.run(0.1)
+    monkeypatch.setattr(camera, "ready", True)
+    shaken.simulation.run(0.2)
+
+    assert 1 < len(pointing.recent) < 15
 
 
 @pytest.mark.long
@@ -300,6 +323,28 @@ def test_after_a_way_back_there_is_a_pause():
     night.simulation.run(PAUSE_S)
     night.report()
     assert night.loop.controller == "learnt"
+
+
+@pytest.mark.long
+def test_after_a_way_back_newer_advice_is_shown():
+    night = Night(*SHAKEN, learn="advise")
+    night.report(lines=(), measured_px=0.02, learnt_camera_px=0.02)
+    assert night.simulation.command(SetController(name="learnt")).accepted
+    night.simulation.run(5.0)
+    assert night.loop.state(0.0).learning.state == "fell back"
+
+    night.report()
+    assert night.loop.state(0.0).learning.state == "advice"
+
+
+def test_an_interlock_that_only_warns_does_not_keep_a_loop_from_learning(shaken):
+    shaken.simulation.supervisor.report_quantity("clock_step_s", 5.0)
+    shaken.simulation.run(1.0)
+    assert shaken.loop.interlocks.action == "warn"
+    shaken.report()
+    shaken.simulation.run(3.0)
+
+    assert shaken.loop.controller == "learnt"
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ import numpy as np
 
 from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
+from fitctl.error_budget import pieces_of
 from fitctl.figures.attenuation import mirror_at_exposure_rad
 from fitctl.identify.record import axis_pair
 from fitctl.learn.opened import Series, rebuild
@@ -23,9 +24,9 @@ class OpenedLoop(NamedTuple):
     ----------
     series : list of Series
     selection : Selection
-        The frames of it.
+        The frames of it; those at which the stages were held are no part of the series.
     measured_px : tuple of float
-        RMS of the error on them, az and el.
+        RMS of the error on the series' frames, az and el.
     present : Design
         That was in force at the end.
     """
@@ -48,12 +49,15 @@ def opened_loop(gathered: Gathered, loop_name: str) -> OpenedLoop:
     loop = rig.stellar_loops[loop_name]
     present = last_design(gathered, loop_name)
     selection = select_frames(ticks, rig.camera.period_s, loop.requirement_px)
+    usable = np.zeros(len(ticks["held"]), bool)
+    usable[selection.rows] = True
+    usable &= ~ticks["held"]
     series = rebuild(
         loop_theory(rig, loop_name, present),
         ticks,
-        selection.pieces,
+        pieces_of(ticks["mid_exposure_s"], usable),
         mirror_at_exposure_rad(loop.fsm, ticks),
     )
-    error_px = axis_pair(ticks, "error_{}_px")[selection.rows]
+    error_px = axis_pair(ticks, "error_{}_px")[usable]
     az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(error_px) else (0.0, 0.0)
     return OpenedLoop(series, selection, (az_px, el_px), present)

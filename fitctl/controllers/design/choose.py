@@ -101,8 +101,12 @@ def _learnt(document_json: str, its_basis: Basis) -> Design:
 
 
 @contextmanager
-def solving(what: str, loop_name: str) -> Iterator[None]:
+def solving(
+    what: str, loop_name: str, advice: str = "go back to those of rigs/fit-mock.toml one by one"
+) -> Iterator[None]:
     """For the mathematics of designs: a problem without a solution is reported as the rig file's error.
+
+    `advice` is what to do about it.
 
     Raises
     ------
@@ -113,8 +117,6 @@ def solving(what: str, loop_name: str) -> Iterator[None]:
         with np.errstate(all="ignore"):
             yield
     except (ValueError, ArithmeticError) as error:
-        msg = (
-            f"{what}: no solution for these values of camera and loops.{loop_name}.vernier ({error}); "
-            "go back to those of rigs/fit-mock.toml one by one"
-        )
+        where = f"camera and loops.{loop_name}.vernier"
+        msg = f"{what}: no solution for these values of {where} ({error}); {advice}"
         raise ConfigError(msg) from None

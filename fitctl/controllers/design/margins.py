@@ -157,7 +157,7 @@ def _frequencies_hz(highest_hz: float, lines: tuple[Line, ...]) -> Floats:
 def _stable(design: Design, basis: Basis, required: Required) -> bool:
     more_s = min(required.delay_s, basis.period_s / 4)
     gains = np.linspace(required.least_gain, required.greatest_gain, _GAINS)
-    for delay_s in (basis.delay_s - more_s, basis.delay_s, basis.delay_s + more_s):
+    for delay_s in (max(0.0, basis.delay_s - more_s), basis.delay_s, basis.delay_s + more_s):
         loop = sampled_loop(design, dataclasses.replace(basis, delay_s=delay_s))
         closed = loop.a + gains[:, None, None] * np.outer(loop.b, loop.star)
         if np.abs(np.linalg.eigvals(closed)).max() >= 1.0:
@@ -282,9 +282,14 @@ def design_with_margins(
     worst_hz = float(frequency_hz[np.argmin(np.abs(1 + response))])
     guards = _Guards(basis, asked, linear_residual(design, basis), _near(basis, like))
     found: list[tuple[float, Design]] = []
+    nearest = margins(design, basis, asked)
     for search in (_by_simplex, _from_a_strong_guard):
-        design = guards.design(search(guards, worst_hz))
+        try:
+            design = guards.design(search(guards, worst_hz))
+        except (ValueError, ArithmeticError):  # the search ended where there is no solution
+            continue
         kept = margins(design, basis, asked)
+        nearest = min(nearest, kept, key=lambda one: one.excess(asked))
         if kept.excess(asked) <= KEPT:
             found.append((linear_residual(design, basis), design))
             if guards.near is not None or found[-1][0] <= _NEAR * guards.least_px:
@@ -294,8 +299,8 @@ def design_with_margins(
     msg = (
         f"design: no minimum-variance pair with sensitivity at most {asked.peak_sensitivity:g}, gain "
         f"margin {asked.gain_margin_db:g} dB and phase margin {asked.phase_margin_deg:g} deg was found at "
-        f"{basis.delay_s * 1e3:g} ms of delay; the best has {kept.peak_sensitivity:.2f}, "
-        f"{kept.gain_margin_db:.1f} dB and {kept.phase_margin_deg:.0f} deg; measure the delay with "
-        "fitctl identify delay, or take another design"
+        f"{basis.delay_s * 1e3:g} ms of delay; the best has {nearest.peak_sensitivity:.2f}, "
+        f"{nearest.gain_margin_db:.1f} dB and {nearest.phase_margin_deg:.0f} deg; measure the delay with "
+        "fitctl identify delay, or choose another design"
     )
     raise ConfigError(msg)

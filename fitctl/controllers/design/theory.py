@@ -16,7 +16,7 @@ from fitctl.controllers.design.margins import frequencies_hz
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import LoopTheory
-from fitctl.model.optics import motor_sky_rad_per_rad, scales, star_rate_px_s
+from fitctl.model.optics import motor_sky_rad_per_rad, scales
 
 _QUICKER = 20
 """So many times the frame rate stands for a loop without hold."""
@@ -72,7 +72,6 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
             loop.siderostat.backlash_sky_arcsec, scale.motor_sky_arcsec_per_rad
         ),
         link_px_per_rad=link_px_per_rad,
-        star_rate_px_s=star_rate_px_s(loop.star_rate_sky_arcsec_s, scale),
         link_backlash_rad=link_backlash_rad,
     )
 

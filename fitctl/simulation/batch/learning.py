@@ -16,16 +16,19 @@ from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import LEAST_EXCESS_PX, Design, Measurement
 from fitctl.learn.learner import Learner, Shown
-from fitctl.loop.learning import Learning
+from fitctl.loop.learning import Learning, refused_report
 from fitctl.loop.pointing import Pointing
+from fitctl.loop.sky import sky_rad_s
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.modes import Mode
+from fitctl.model.optics import scales
 from fitctl.simulation.batch.settings import design_settings
 
 Records = NDArray[np.void]
 _NAMES = {int(mode): mode.name for mode in Mode}
 # Of mirror, fsm, siderostat and link, in the order of Shown.
 _FIELDS = ("exposed_mirror_rad", "mirror_command_rad", "motor_rad", "link_motor_rad")
+_LINK = slice(6, 8)
 
 
 class Change(NamedTuple):
@@ -49,7 +52,6 @@ class _Frame(NamedTuple):
     """A tick on a frame; `beam_rad` is as :class:`fitctl.loop.observation.Observation` has it, shape (2,)."""
 
     shown: Shown
-    waits: bool
     beam_rad: NDArray[np.float64]
 
 
@@ -90,7 +92,9 @@ class _Loop:
         self.name = name
         self._rig = rig
         self._index = index
-        self._linked = rig.stellar_loops[name].link is not None
+        loop = rig.stellar_loops[name]
+        self._linked = loop.link is not None
+        self._sky_rad_s = sky_rad_s(loop.star_rate_sky_arcsec_s, scales(rig, loop))
         self._learner = Learner(rig, name)
         self._learning = Learning(rig, name)
         self._pointing = Pointing(
@@ -107,11 +111,11 @@ class _Loop:
         frame, learning = self._frame(ticks, number), self._learning
         shown, made = frame.shown, []
         report, self._report = self._report, None
-        if report is not None:
+        if report is not None and not refused_report(report):
             learning.accept(report)
             if learning.wants_change(shown.time_s):
                 made += self._designed(number, shown.time_s, report)
-        holds = shown.mode == Mode.VERNIER.name and not frame.waits
+        holds = shown.mode == Mode.VERNIER.name and not shown.held
         if holds and not self._held:
             self._pointing.forget()
             self._saturated = False
@@ -146,7 +150,7 @@ class _Loop:
             pointing.forget()
         self._saturated = shown.fsm_saturated
         self._learner.add(shown)
-        self._learner.watch(pointing.design.title, shown.time_s)
+        self._learner.watch(self._learning.design_json or pointing.design.title, shown.time_s)
         if self._learner.due:
             self._report = self._learner.report(pointing.design)
 
@@ -174,17 +178,17 @@ class _Loop:
     def _frame(self, ticks: Records, number: int) -> _Frame:
         if ticks is not self._ticks:
             self._ticks, self._first = ticks, number
-            self._frames = _frames(ticks[number:], linked=self._linked)
+            self._frames = _frames(ticks[number:], self._sky_rad_s, linked=self._linked)
         return self._frames[number - self._first]
 
 
-def _frames(ticks: Records, *, linked: bool) -> list[_Frame]:
+def _frames(ticks: Records, sky_rad_s: NDArray[np.float64], *, linked: bool) -> list[_Frame]:
     """The ticks of one loop, as its records have them."""
     saturated = np.abs(ticks["excess_px"]).max(axis=1, initial=0.0) > LEAST_EXCESS_PX
     holds = ticks["mode"] == Mode.VERNIER
     stages = np.hstack([ticks[name] for name in _FIELDS])
     if not linked:
-        stages[:, -2:] = np.nan
+        stages[:, _LINK] = np.nan
     columns = np.column_stack(
         [
             ticks["command_px"],
@@ -192,11 +196,12 @@ def _frames(ticks: Records, *, linked: bool) -> list[_Frame]:
             ticks["exposed_s"],
             ticks["star_px"] - ticks["command_px"],
             stages,
+            ticks["exposed_s"][:, None] * sky_rad_s,
         ]
     )
     return [
         _Frame(
-            Shown(number, _NAMES[mode], is_saturated, visible == 1, *values), waits == 1, beam_rad
+            Shown(number, _NAMES[mode], is_saturated, waits == 1, visible == 1, *values), beam_rad
         )
         for number, mode, is_saturated, visible, values, waits, beam_rad in zip(
             ticks["frames"].tolist(),

@@ -153,6 +153,8 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
         gain, colour = "collecting frames in VERNIER", DIM
     elif learning.state == "kept" and report is not None and not report.fits:
         gain, colour = "the model does not explain the frames: kept", ORANGE
+    elif learning.state == "failed":
+        gain, colour = "nothing could be learnt; the design is kept", ORANGE
     elif learning.state == "kept":
         gain = "no other design would leave clearly less"
     elif learning.state == "advice" and report is not None:

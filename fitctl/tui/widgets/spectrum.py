@@ -41,7 +41,7 @@ CAUSE_LOOKS = {
     "missing light": ("▚", INK),
     "unexplained": ("·", DIM),
 }
-_STAGES = ("fsm", "mirror", "siderostat", "link")
+_STAGES = ("fsm", "mirror", "siderostat", "link", "sky")
 _NOT_EVALUATED = "error budget: needs the design's figures, see the panel Design"
 _FIELDS = (
     "mid_exposure_s",

@@ -48,6 +48,12 @@ def test_a_line_has_its_rms_in_time_and_in_its_spectrum(fit, frequency_hz, dampi
     assert np.trapezoid(density, at_hz) == pytest.approx(rms_px**2, rel=0.1)
 
 
+def test_a_loop_with_less_delay_than_the_margin_of_delay_has_margins(fit):
+    quick = dataclasses.replace(fit, delay_s=0.004)
+
+    assert margins(design_minimum_variance(quick), quick).peak_sensitivity < 10.0
+
+
 @pytest.mark.parametrize("values", [(0.0, 0.1, 1.0), (6.0, 1.0, 1.0), (6.0, 0.1, math.nan)])
 def test_a_line_that_cannot_be_is_refused(values):
     with pytest.raises(ValueError, match="expected values above 0"):

@@ -42,6 +42,7 @@ def test_flattened_the_mirror_is_at_its_bias_and_the_siderostat_held_until_it_is
     assert bench.until(lambda: bench.tripped, 2.0)
     held_rad = bench.loop.siderostat.setpoint_rad.copy()
     bench.run(0.3)
+    assert bench.loop.tick_record().held
     assert bench.loop.mirror.at_bias()
     assert np.array_equal(bench.loop.siderostat.setpoint_rad, held_rad)
 
@@ -51,6 +52,7 @@ def test_flattened_the_mirror_is_at_its_bias_and_the_siderostat_held_until_it_is
     bench.run(20.0)
 
     assert bench.loop.mode is Mode.VERNIER
+    assert not bench.loop.tick_record().held
     errors = [tick.error_az_px for tick in bench.simulation.ticks[-250:]]
     assert abs(np.mean(errors)) < 0.05
 

@@ -428,6 +428,7 @@ def learnt(state, fits=True, **values):
             ),
             ["before        0.0980 px on the same frames"],
         ),
+        (learnt("failed"), ["nothing could be learnt", "a line at 6 Hz"]),
         (learnt("fell back"), ["returned to the previous design"]),
     ],
     ids=lambda value: getattr(value, "state", ""),
