@@ -9,7 +9,6 @@ if the line is no alias.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -22,9 +21,6 @@ from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]
-MOST_IF_ALIAS = 1.02
-"""If lines are aliases, a design may leave at most so much of what it would leave without expecting them, or
-of what the present design leaves."""
 LESS_MOTION = 0.95
 """Of the mirror's motion as designs count with it, or less if the night shows less: so designs are compared
 for aliases. Hysteresis beyond the rig file's takes some of the motion, and a design that amplifies a line gains
@@ -33,23 +29,16 @@ LITTLE = 0.8
 """A design that leaves more than this part of what the present one leaves, if no line is an alias, gains too
 little for a risk: if lines are aliases, it may leave no more even with `LEAST_MOTION`."""
 LEAST_MOTION = 0.9
-"""A night that shows less than this has a hysteresis too unlike the rig file's to compare designs within 2 %: a
-design may then leave no more at all if lines are aliases."""
 PARTS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.06, 0.0)
 """Of a line's RMS that a design may expect, the largest first."""
 
 
 class IfAliases(NamedTuple):
-    """Residuals of two designs if lines are aliases, px, and how much of the first the second may leave."""
+    """Residuals of two designs if lines are aliases, px, and whether the second does no harm then."""
 
     present_px: float
     learnt_px: float
-    most: float
-
-    @property
-    def harmless(self) -> bool:
-        """The learnt design does no harm beside the present one."""
-        return self.learnt_px <= self.most * self.present_px
+    harmless: bool
 
 
 def can_be_alias(line: Line, truth: Basis) -> bool:
@@ -94,19 +83,17 @@ def both_if_aliases(
     """
     slow_present_px, slow_learnt_px = (linear_residual(one, truth) for one in (present, learnt))
     if not lines:
-        return IfAliases(slow_present_px, slow_learnt_px, math.inf)
-    motions = {LESS_MOTION: _most(shown_gain)}
+        return IfAliases(slow_present_px, slow_learnt_px, harmless=True)
+    motions = [LESS_MOTION]
     if slow_learnt_px > LITTLE * slow_present_px:
-        motions[LEAST_MOTION] = 1.0
-    cases = []
-    for motion, most in motions.items():
+        motions.append(LEAST_MOTION)
+    cases: list[tuple[float, float]] = []
+    for motion in motions:
         gain = min(motion * truth.mirror_gain, shown_gain)
-        present_px, learnt_px = (if_aliases(one, truth, lines, gain) for one in (present, learnt))
-        cases += [
-            IfAliases(float(one_px), float(other_px), most)
-            for one_px, other_px in zip(present_px, learnt_px, strict=True)
-        ]
-    return max(cases, key=lambda case: case.learnt_px / (case.most * case.present_px))
+        both_px = (if_aliases(one, truth, lines, gain).tolist() for one in (present, learnt))
+        cases += zip(*both_px, strict=True)
+    present_px, learnt_px = max(cases, key=lambda case: case[1] / case[0])
+    return IfAliases(present_px, learnt_px, harmless=learnt_px <= present_px)
 
 
 def safe_parts(truth: Basis, present: Design, shown_gain: float) -> Iterator[tuple[float, ...]]:
@@ -119,7 +106,7 @@ def safe_parts(truth: Basis, present: Design, shown_gain: float) -> Iterator[tup
     gain = min(LESS_MOTION * truth.mirror_gain, shown_gain)
     parts = [_safe_part(line, truth, present, gain) for line in truth.lines]
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
-    limits_px = _most(shown_gain) * if_aliases(present, truth, suspects, gain)
+    limits_px = if_aliases(present, truth, suspects, gain)
     reductions = dict.fromkeys(  # each once: a limit above all parts changes none
         tuple(
             min(part, most) if line in suspects else part
@@ -133,10 +120,6 @@ def safe_parts(truth: Basis, present: Design, shown_gain: float) -> Iterator[tup
         if (if_aliases(design, truth, suspects, gain) <= limits_px).all():
             yield reduced
     yield least
-
-
-def _most(shown_gain: float) -> float:
-    return MOST_IF_ALIAS if shown_gain >= LEAST_MOTION else 1.0
 
 
 def expecting(parts: tuple[float, ...], truth: Basis) -> Basis:
@@ -153,9 +136,7 @@ def _safe_part(line: Line, truth: Basis, present: Design, gain: float) -> float:
     """Of one line, the others expected in full; 0 where no part would leave less than leaving it alone."""
     alone = design_minimum_variance(_without((line,), truth))
     alone_px = linear_residual(alone, truth)
-    limits_px = _most(gain) * np.maximum(
-        *(if_aliases(one, truth, (line,), gain) for one in (alone, present))
-    )
+    limits_px = np.maximum(*(if_aliases(one, truth, (line,), gain) for one in (alone, present)))
     suspect = can_be_alias(line, truth)
     for part in PARTS[:-1]:
         parts = tuple(part if other == line else 1.0 for other in truth.lines)

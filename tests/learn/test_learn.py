@@ -16,6 +16,7 @@ from fitctl.controllers.design.margins import Required, design_with_margins, mar
 from fitctl.learn.advice import advise, estimated
 from fitctl.learn.aliases import IfAliases
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
+from fitctl.learn.intervals import Interval
 from fitctl.learn.night import _without_needless_lines, estimate
 from fitctl.learn.opened import Series, periodograms
 from fitctl.learn.whittle import Guess, LineGuess, _Place, _Problem, likeliest
@@ -278,12 +279,38 @@ def test_a_line_that_may_be_a_faster_one_is_counteracted_only_as_far_as_that_doe
 
 def test_a_design_that_would_do_harm_if_lines_are_aliases_is_not_worth_it(six_hz):
     _, advice = six_hz
-    present_px, learnt_px, most = advice.if_aliases
-    harmful = advice._replace(if_aliases=IfAliases(present_px, 1.01 * most * present_px, most))
+    present_px, learnt_px, _ = advice.if_aliases
+    harmful = advice._replace(if_aliases=IfAliases(present_px, 1.01 * present_px, False))
 
     assert learnt_px < present_px
     assert not harmful.worth_it
     assert "set fastest_line_hz" in harmful.lines_of_text()[-1]
+
+
+def test_a_design_that_loses_more_while_lines_are_weak_than_it_gains_is_not_worth_it(six_hz):
+    _, advice = six_hz
+    gained = advice.shown_px[0] / advice.shown_px[1]
+    found = {
+        lost: advice._replace(without_lines_px=(0.01, 0.01 * lost))
+        for lost in (0.9 * gained, 1.1 * gained)
+    }
+    kept, refused = found.values()
+
+    assert kept.worth_it
+    assert not refused.worth_it
+    assert "while the lines are weak it leaves 0.0100 px" in refused.lines_of_text()[-1]
+
+
+@pytest.mark.parametrize(("part", "worth_it"), [(0.87, True), (0.93, False)])
+def test_a_mirror_that_moves_much_less_must_gain_more(six_hz, part, worth_it):
+    _, advice = six_hz
+    less = advice.night._replace(mirror_gain=Interval(0.76, 0.71, 0.81))
+    present_px, _ = advice.shown_px
+    calm = advice._replace(without_lines_px=(0.01, 0.01))
+    found = calm._replace(night=less, shown_px=(present_px, part * present_px))
+
+    assert found.worth_it == worth_it
+    assert found._replace(night=advice.night).worth_it
 
 
 def test_a_design_that_is_no_better_with_the_gain_that_the_night_shows_is_not_worth_it(six_hz):
@@ -360,6 +387,7 @@ def test_advice_is_the_same_for_people_and_for_programs(six_hz):
         assert f"{value:.4f}" in text
     assert numbers["lines"][0]["frequency_hz"]["value"] == pytest.approx(6.0, abs=0.05)
     assert numbers["worth_it"]
+    assert numbers["without_lines_px"]["learnt"] == advice.without_lines_px[1]
     for reason in ("lately_px", "shown_gain_px", "if_aliases_px"):
         assert numbers[reason]["learnt"] < numbers[reason]["present"]
 
