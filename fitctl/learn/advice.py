@@ -428,7 +428,8 @@ def _gain_for_design(night: Night, rig_basis: Basis) -> float:
     if not LEAST_GAIN <= found.value <= 1 / LEAST_GAIN:
         msg = (
             f"learn: the mirror moves by {found} of what the rig file predicts; expected {LEAST_GAIN:g} to "
-            f"{1 / LEAST_GAIN:g}; look at its amplifiers, then measure it with fitctl identify hysteresis"
+            f"{1 / LEAST_GAIN:g}; look at its amplifiers and measure it with fitctl identify hysteresis; if "
+            "vernier.air_path is far from the night's air, measure that with fitctl identify airpath"
         )
         raise ConfigError(msg)
     return found.value
@@ -451,7 +452,7 @@ def _overshoot_for_design(night: Night) -> float:
 def standing(design: Design, truth: Basis) -> Standing:
     """What a design leaves of a night."""
     return Standing(
-        design.name,
+        design.title,
         linear_residual(design, truth),
         _camera_px(design, truth),
         margins(design, truth),

@@ -7,6 +7,8 @@ is :func:`bridge_rms_px`, 2e-5 px for Eq. 9: a thousandth of what is to be measu
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov
@@ -56,9 +58,15 @@ def discretize(a: Floats, noise_intensity: Floats, step_s: float) -> tuple[Float
     block[:n, :n] = -a
     block[:n, n:] = noise_intensity
     block[n:, n:] = a.T
-    exponential = expm(block * step_s)
+    # In exp(-A t) what decays grows, and of a long step no digit would be left: so by a short one, doubled.
+    decay = float(np.abs(np.linalg.eigvals(a).real).max()) * step_s
+    doublings = max(0, math.ceil(math.log2(decay))) if decay > 0 else 0
+    exponential = expm(block * (step_s / 2**doublings))
     transition = exponential[n:, n:].T
     covariance = transition @ exponential[:n, n:]
+    for _ in range(doublings):
+        covariance = covariance + transition @ covariance @ transition.T
+        transition = transition @ transition
     # Rounding leaves it so little symmetric that scipy may refuse it.
     return transition, (covariance + covariance.T) / 2
 

@@ -86,6 +86,17 @@ def test_a_step_keeps_the_stationary_covariance(air, step_s):
     assert after == pytest.approx(covariance, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.parametrize("b1_s2", [3e-3, 1e-3, 1e-5])
+def test_a_pole_that_decays_within_the_step_costs_no_digits(air, b1_s2):
+    """As it was found: the bound of such air was 31 px at the frames, or no number at all."""
+    fast = air.model_copy(update={"b1_s2": b1_s2})
+    transition, gain = step_matrices(fast, 0.035)
+    covariance = stationary_covariance(fast)
+    after = transition @ covariance @ transition.T + gain @ gain.T
+
+    assert after == pytest.approx(covariance, rel=1e-6, abs=1e-9)
+
+
 def test_the_noise_gain_is_a_root_of_the_step_covariance(air, dynamics):
     for step_s in (1e-6, 5e-4, 0.02):
         _, gain = step_matrices(air, step_s)
