@@ -34,11 +34,14 @@ def _name(text: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_name)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+_MOST = 1e15  # beyond all numbers of an instrument; products and squares of a few such numbers stay finite
+Positive = Annotated[float, Field(gt=0, le=_MOST, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-_MOST, le=_MOST, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 TimeoutS = Annotated[float, Field(gt=0, le=60)]
+DelayS = Annotated[float, Field(ge=0, le=10)]
+OffsetSkyArcsec = Annotated[float, Field(ge=0, le=72_000)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
 

@@ -92,12 +92,12 @@ def below(key: str, value: float, limit: float) -> Part:
 
 def at_least(key: str, value: float, limit: float) -> Part:
     """A key whose value must reach a limit; the message rounds the limit up."""
-    return Part(key, value, f"at least {_rounded(limit, math.ceil)}")
+    return Part(key, value, f"at least {_rounded(limit, math.ceil)}" if limit < math.inf else "")
 
 
 def above(key: str, value: float, limit: float) -> Part:
     """A key whose value must pass a limit, which the message rounds up."""
-    return Part(key, value, f"above {_rounded(limit, math.ceil)}")
+    return Part(key, value, f"above {_rounded(limit, math.ceil)}" if limit < math.inf else "")
 
 
 def _rounded(limit: float, direction: Callable[[float], int]) -> str:

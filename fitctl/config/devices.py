@@ -23,8 +23,10 @@ from fitctl.config.base import (
     AxisGains,
     AxisPair,
     Count,
+    DelayS,
     Finite,
     NonNegative,
+    OffsetSkyArcsec,
     Positive,
     Settings,
     TimeoutS,
@@ -69,6 +71,10 @@ class GigeDevice(Settings):
         return f"{self.address}:{self.gvcp_port}"
 
 
+# Of a pixel that counts to at most 65535.
+PixelNoiseDn = Annotated[float, Field(gt=0, le=65_535)]
+
+
 class Camera(Settings):
     """The focal plane and the camera that reads it.
 
@@ -80,9 +86,9 @@ class Camera(Settings):
     pixel_size_m: Annotated[float, Field(ge=1e-6, le=1e-4)]
     frame_rate_hz: Annotated[float, Field(ge=1, le=2000)]
     exposure_s: Positive
-    frame_delay_s: NonNegative
+    frame_delay_s: DelayS
     bias_dn: NonNegative
-    pixel_noise_dn: Positive
+    pixel_noise_dn: PixelNoiseDn
     electrons_per_dn: Positive | None = None
     dark_file: str | None = None
     device: GigeDevice
@@ -123,14 +129,14 @@ class Camera(Settings):
 
 
 # Full scale of an analogue output: 10 V, and what stations that go a little beyond have.
-OutputV = Annotated[float, Field(gt=0, le=12)]
+OutputV = Annotated[float, Field(ge=1e-3, le=12)]
 
 
 class ServoSettings(Settings):
     """The siderostat's position servo."""
 
     rate_hz: Annotated[float, Field(ge=50, le=2000)]
-    gain_per_s: Positive
+    gain_per_s: Annotated[float, Field(ge=1e-3, le=1e4)]
     following_error_limit_rad: Positive
     reading_timeout_s: TimeoutS
 
@@ -272,7 +278,7 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
     servo: ServoSettings
     device: AmplifierDevice
     wiring: AmplifierWiring | None = None
-    backlash_sky_arcsec: NonNegative | None = None
+    backlash_sky_arcsec: OffsetSkyArcsec | None = None
 
     @property
     def encoder_count_rad(self) -> float:
@@ -487,7 +493,9 @@ class C887Device(Settings):
 class Structure(Settings):
     """Lightly damped modes of the mirror's mount."""
 
-    mode_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    mode_hz: Annotated[
+        list[Annotated[float, Field(gt=0, le=1e5)]], Field(min_length=2, max_length=2)
+    ]
     damping: Annotated[float, Field(gt=0, lt=1)]
     cross_axis: NonNegative
     participation: Annotated[float, Field(ge=0, le=1)]
@@ -523,8 +531,8 @@ class Fsm(Settings):
     beam_per_mirror: Annotated[float, Field(ge=0.1, le=4)]  # one reflection turns a beam by 2
     rotation_deg: RotationDeg
     axis_gains: AxisGains | None = None
-    bias_v: Positive
-    range_rad: Positive
+    bias_v: OutputV
+    range_rad: Annotated[float, Field(ge=1e-9, le=1)]
     slew_v_per_s: Positive
     dac: ModbusDacDevice
     piezo: Mdt693Device

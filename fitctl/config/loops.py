@@ -48,17 +48,22 @@ class Acquisition(Settings):
 class Coarse(Settings):
     """The siderostat's integrator, and when it hands over to the mirror."""
 
-    gain_rad_per_m: Positive
+    gain_rad_per_m: Annotated[float, Field(ge=1e-3, le=1e9)]
     reach_fraction: Fraction
     reach_frames: Count
+
+
+# Wide enough for all that fits try, and no wider than the covariance can be computed.
+AirB1S2 = Annotated[float, Field(ge=1e-6, le=1e4)]
+AirB2S = Annotated[float, Field(ge=1e-5, le=1e4)]
 
 
 class AirPathModel(Settings):
     """Eq. 8: gain / (b1 s^2 + b2 s + 1), px, driven by unit-intensity white noise."""
 
-    gain_px: NonNegative
-    b1_s2: Positive
-    b2_s: Positive
+    gain_px: Annotated[float, Field(ge=0, le=1e6)]
+    b1_s2: AirB1S2
+    b2_s: AirB2S
 
 
 class LqgLtr(Settings):
@@ -116,12 +121,17 @@ class Prefilter(Settings):
     time_constant_s: Positive
 
 
+_MOST_FLUX_DN = 1e9
+FluxDn = Annotated[float, Field(gt=0, le=_MOST_FLUX_DN)]
+SpotDiameterPx = Annotated[float, Field(ge=0.1, le=1000)]
+
+
 class OtherSpot(Settings):
     """A spot that moves with the loop's star and is not the one to point, such as its fringe spot."""
 
     name: Name
     offset_px: AxisPair
-    flux_dn: Positive
+    flux_dn: FluxDn
 
 
 class Feedforward(Settings):
@@ -163,9 +173,9 @@ class Loop(Settings):
     link: Name | None = None
     feedforward: Feedforward | None = None
     target_px: AxisPair
-    star_flux_dn: Positive
+    star_flux_dn: FluxDn
     flux_range: Range
-    spot_diameter_px: Positive = 3.0
+    spot_diameter_px: SpotDiameterPx = 3.0
     sensor: Literal["centroid", "fit"] = "centroid"
     other_spots: Annotated[tuple[OtherSpot, ...], Field(strict=False)]
     requirement_px: Positive
@@ -198,10 +208,13 @@ class Loop(Settings):
         for spot in self.other_spots:
             if low_dn <= spot.flux_dn <= high_dn:
                 star_dn, low, high = self.star_flux_dn, self.flux_range.low, self.flux_range.high
-                dimmer, brighter = spot.flux_dn / high, spot.flux_dn / low
+                # With a range from 0, or nearly, no spot is too dim, and no star bright enough.
+                dimmer = f"below {low_dn:g} or " if low_dn > 0 else ""
+                has_brighter = low * _MOST_FLUX_DN > spot.flux_dn
+                brighter = f" or above {spot.flux_dn / low:.5g}" if has_brighter else ""
                 parts = (
-                    Part("other_spots", spot.flux_dn, f"below {low_dn:g} or above {high_dn:g}"),
-                    Part("star_flux_dn", star_dn, f"below {dimmer:.5g} or above {brighter:.5g}"),
+                    Part("other_spots", spot.flux_dn, f"{dimmer}above {high_dn:g}"),
+                    Part("star_flux_dn", star_dn, f"below {spot.flux_dn / high:.5g}{brighter}"),
                     above("flux_range.low", low, spot.flux_dn / star_dn),
                     below("flux_range.high", high, spot.flux_dn / star_dn),
                 )

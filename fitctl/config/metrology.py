@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fitctl.config.base import NonNegative, Positive, Settings
+from fitctl.config.base import DelayS, NonNegative, Positive, Settings
 from fitctl.config.conflict import Conflict, Conflicts, Part, above, at_least, at_most, below
 from fitctl.config.devices import AnySiderostat, LabJackT7Device
 from fitctl.config.loops import Acquisition
@@ -65,7 +65,7 @@ class MetrologySensor(BeamSensor):
     ``link_delay_s`` is the time from a sample to the tick that uses it.
     """
 
-    link_delay_s: NonNegative
+    link_delay_s: DelayS
     device: LabJackT7Device
 
 

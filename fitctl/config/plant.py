@@ -13,15 +13,16 @@ from fitctl.config.base import (
     STELLAR,
     AxisGains,
     AxisPair,
-    Finite,
+    DelayS,
     Name,
     NonNegative,
+    OffsetSkyArcsec,
     Positive,
     Settings,
     of_kind,
 )
-from fitctl.config.devices import Structure
-from fitctl.config.loops import AirPathModel
+from fitctl.config.devices import PixelNoiseDn, Structure
+from fitctl.config.loops import AirB1S2, AirB2S, AirPathModel, FluxDn, SpotDiameterPx
 from fitctl.config.metrology import BeamSensor
 
 MOST_INSTANTS = 16
@@ -29,12 +30,14 @@ _MOST_HISTORY_STEPS = 10_000_000  # some hundred megabytes
 
 
 LoopWidth = Annotated[float, Field(ge=0, le=0.5)]
+BandwidthHz = Annotated[float, Field(ge=0.1, le=1e6)]
+RmsPx = Annotated[float, Field(ge=0, le=1000)]
 
 
 class Hysteresis(Settings):
     """Play operators of one stack, and by which part of its way it creeps on with each decade of time."""
 
-    full_swing_stroke_m: Positive
+    full_swing_stroke_m: Annotated[float, Field(gt=0, le=0.01)]
     loop_width_fraction: LoopWidth
     breakpoints_from: Literal["virgin", "swept"]
     breakpoints_v: Annotated[list[NonNegative], Field(min_length=2)]
@@ -52,7 +55,7 @@ class Hysteresis(Settings):
 class AirPath(AirPathModel):
     """The air path as it truly is."""
 
-    relative_rms_px: NonNegative
+    relative_rms_px: RmsPx
 
 
 class Spot(Settings):
@@ -60,8 +63,8 @@ class Spot(Settings):
 
     name: Name
     offset_px: AxisPair
-    flux_dn: Positive
-    diameter_px: Positive
+    flux_dn: FluxDn
+    diameter_px: SpotDiameterPx
 
 
 class Line(Settings):
@@ -81,10 +84,10 @@ class Line(Settings):
     """
 
     frequency_hz: Positive
-    rms_px: NonNegative
-    direction_deg: Finite
+    rms_px: RmsPx
+    direction_deg: Annotated[float, Field(ge=-360, le=360)]
     damping: Annotated[float, Field(ge=0, le=0.5)]
-    drift_hz_per_min: Finite
+    drift_hz_per_min: Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
 Lines = Annotated[tuple[Line, ...], Field(strict=False)]
@@ -106,9 +109,9 @@ class LoopPlant(Settings):
     """
 
     kind: Literal["stellar"] = "stellar"
-    star_offset_sky_arcsec_max: NonNegative
-    backlash_sky_arcsec: NonNegative
-    amplifier_bandwidth_hz: Positive
+    star_offset_sky_arcsec_max: OffsetSkyArcsec
+    backlash_sky_arcsec: OffsetSkyArcsec
+    amplifier_bandwidth_hz: BandwidthHz
     hysteresis: Hysteresis
     structure: Structure
     air_path: AirPath
@@ -122,9 +125,9 @@ class LoopPlant(Settings):
 class LinkAir(Settings):
     """The air of a metrology loop's path: Eq. 8's filter, scaled to an RMS angle of the beam on each axis."""
 
-    rms_sky_arcsec: NonNegative
-    b1_s2: Positive
-    b2_s: Positive
+    rms_sky_arcsec: OffsetSkyArcsec
+    b1_s2: AirB1S2
+    b2_s: AirB2S
 
 
 class MetrologyPlant(Settings):
@@ -144,11 +147,11 @@ class MetrologyPlant(Settings):
     """
 
     kind: Literal["metrology"]
-    beam_offset_sky_arcsec_max: NonNegative
-    backlash_sky_arcsec: NonNegative
-    amplifier_bandwidth_hz: Positive
+    beam_offset_sky_arcsec_max: OffsetSkyArcsec
+    backlash_sky_arcsec: OffsetSkyArcsec
+    amplifier_bandwidth_hz: BandwidthHz
     air_path: LinkAir
-    link_round_trip_s: NonNegative
+    link_round_trip_s: DelayS
     sensor: BeamSensor
 
 
@@ -164,7 +167,7 @@ class Change(Settings):
     """What changes of the hardware during a run, at a time from its start."""
 
     at_s: Positive
-    pixel_noise_dn: Positive | None = None
+    pixel_noise_dn: PixelNoiseDn | None = None
     loops: dict[str, LoopChange] = Field(default_factory=dict)
 
 
@@ -176,9 +179,7 @@ class PlantTruth(Settings):
     """
 
     step_s: Annotated[float, Field(gt=0, le=1e-3)]
-    frame_delay_s: NonNegative | None = (
-        None  # where the truth is not what camera.frame_delay_s says
-    )
+    frame_delay_s: DelayS | None = None  # where the truth is not what camera.frame_delay_s says
     history_s: Annotated[float, Field(ge=1, le=3600)]
     hot_pixels: tuple[HotPixel, ...] = Field(default=(), strict=False)
     exposure_instants: Annotated[int, Field(ge=1, le=MOST_INSTANTS)] = 1

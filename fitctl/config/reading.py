@@ -19,11 +19,13 @@ from fitctl.config.interlocks import RENAMED_ACTIONS
 from fitctl.config.loops import CONTROLLERS
 from fitctl.config.origins import Layer, Marks, changed_by, layer_of, lies_on, mark_layer
 from fitctl.config.rig import SCHEMA_VERSION, Rig
+from fitctl.files import read_regular
 from fitctl.text import plain
 
 _EXAMPLE = "camera.frame_rate_hz=50.0"
 _SET = "--set"
 _MOST_BASES = 5
+_MOST_BYTES = 10 << 20
 
 
 class LaidOver(NamedTuple):
@@ -152,15 +154,21 @@ def read_text(path: Path, missing: str) -> str:
     Raises
     ------
     ConfigError
-        If it is missing or cannot be read.
+        If it is missing, cannot be read, is not a regular file or has more than 10 MiB.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return read_regular(path, _MOST_BYTES).decode("utf-8").replace("\r\n", "\n")
     except FileNotFoundError:
         msg = f"{path}: {missing}"
         raise ConfigError(msg) from None
-    except (OSError, UnicodeDecodeError) as error:
-        msg = f"{path}: cannot be read: {error}; expected a text file in UTF-8 that you may read"
+    except OSError as error:
+        msg = (
+            f"{path}: cannot be read: {error.strerror}; give a regular text file of at most "
+            f"{_MOST_BYTES >> 20} MiB that you may read"
+        )
+        raise ConfigError(msg) from None
+    except UnicodeDecodeError as error:
+        msg = f"{path}: cannot be read: {error}; expected a text file in UTF-8"
         raise ConfigError(msg) from None
 
 

@@ -7,7 +7,7 @@ Command line, console and documentation are made from this table and from the st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import msgspec
 
@@ -126,8 +126,8 @@ RENAMED = {"hold": "release"}
 WORDS = {row.word: row for row in COMMANDS if row.word}
 
 
-def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
-    """The command that words on a command line ask for.
+def command_of(word: str, values: Sequence[str], loop: str, caller: str = "send") -> AnyCommand:
+    """The command that words on a command line ask for; errors begin with `caller`.
 
     Raises
     ------
@@ -135,10 +135,10 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         If there is no such command, or its values are not what it needs.
     """
     if word in RENAMED:
-        msg = f"send: {word} is now {RENAMED[word]}"
+        msg = f"{caller}: {word} is now {RENAMED[word]}"
         raise ConfigError(msg)
     if word not in WORDS:
-        msg = f"send: unknown command {word!r}. Available: {', '.join(WORDS)}"
+        msg = f"{caller}: unknown command {word!r}. Available: {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
     named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]
@@ -148,7 +148,7 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         may = (
             f", and may have {', '.join(f'{name}=' for name in row.options)}" if row.options else ""
         )
-        msg = f"send: {word} needs {needs}{may} (is {' '.join(values) or 'nothing'})"
+        msg = f"{caller}: {word} needs {needs}{may} (is {' '.join(values) or 'nothing'})"
         raise ConfigError(msg)
     options = dict(text.split("=", 1) for text in named)
     given = dict(zip(row.values, plain, strict=True)) | options | {"loop": loop}
@@ -156,8 +156,31 @@ def command_of(word: str, values: Sequence[str], loop: str) -> AnyCommand:
         # Numbers come as text here; msgspec reads them, and checks what they may be.
         return msgspec.convert(given, row.make, strict=False)
     except msgspec.ValidationError as error:
-        msg = f"send: {word} {' '.join(values)}: {error}"
+        wrong = _wrong_value(row.make, given) or str(error)
+        msg = f"{caller}: {word} {' '.join(values)}: {wrong}"
         raise ConfigError(msg) from None
+
+
+def _wrong_value(make: type[AnyCommand], given: dict[str, str]) -> str:
+    """The first value that the command cannot have, and what was expected; empty if each could be."""
+    for field in msgspec.structs.fields(make):
+        if field.name not in given:
+            continue
+        text = given[field.name]
+        try:
+            msgspec.convert(text, field.type, strict=False)
+        except msgspec.ValidationError:
+            if choices := _choices(field.type):
+                return f"unknown {field.name} {text!r}. Available: {', '.join(choices)}"
+            return f"{field.name} must be a number, got {text!r}"
+    return ""
+
+
+def _choices(kind: Any) -> list[str]:
+    """The texts that a value may be; empty for a number."""
+    if get_origin(kind) is Literal:
+        return list(get_args(kind))
+    return [choice for part in get_args(kind) for choice in _choices(part)]
 
 
 def as_command(command: AnyCommand | str, loop: str = "") -> AnyCommand:

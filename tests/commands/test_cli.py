@@ -3,9 +3,11 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
+from fitctl import __main__ as entry_point
 from fitctl import __version__
 from fitctl.cli import COMMANDS, main
 from fitctl.config import default_rig_path
@@ -104,6 +106,11 @@ BAD_INPUT = {
         "fitctl status: No such option: --jsn; did you mean --json or --set? (see fitctl status --help)",
     ),
     "a command that is not there": (["point"], "point"),
+    "a broadcast address that is none": (
+        ["discover", "--broadcast", "300.1.1.1"],
+        "discover: --broadcast 300.1.1.1: expected an IPv4 address",
+    ),
+    "a rehearsal of what is no command": (["rehearse", "jog", "a", "1"], "rehearse: jog a 1: "),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
     "an option without its value": (["console", "--log"], "fitctl console: Option '--log'"),
     "a controller that is none": (
@@ -148,6 +155,19 @@ def test_bad_input_gets_a_clear_line_and_status_2(what, capfd):
     assert printed.out == ""
 
 
+def test_ctrl_c_during_the_imports_ends_without_a_traceback(monkeypatch):
+    def find_spec(name, *_):
+        if name == "fitctl.cli":
+            raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "fitctl.cli")
+    monkeypatch.setattr(sys, "meta_path", [SimpleNamespace(find_spec=find_spec), *sys.meta_path])
+    with pytest.raises(SystemExit) as end:
+        entry_point.main()
+
+    assert end.value.code == 130
+
+
 @pytest.mark.long
 def test_bad_input_ends_a_process_with_a_clear_line_and_status_2():
     arguments, complaint = BAD_INPUT["an unknown key"]
@@ -190,6 +210,15 @@ def test_simulate_that_finds_no_star_says_so_by_its_status_and_null():
 
     assert result.returncode == 1
     assert json.loads(result.stdout.splitlines()[-1])["vernier_s"] is None
+
+
+@pytest.mark.long
+def test_simulate_that_is_too_short_says_so_in_one_line():
+    result = fitctl("simulate", "--duration", 5)
+
+    assert result.returncode == 1
+    assert "VERNIER not reached within 5 s; use a longer --duration" in result.stdout
+    assert len(result.stdout.splitlines()) == 1
 
 
 @pytest.mark.long

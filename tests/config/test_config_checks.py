@@ -66,7 +66,14 @@ IMPOSSIBLE = [
     ("camera.device.address", "192.168.1.20:3956"),
     ("camera.device.packet_size_bytes", 9216),
     ("camera.device.pixel_format", "Mono10"),
+    ("camera.frame_delay_s", 1e307),
+    # star
+    ("loops.right.spot_diameter_px", 1e200),
+    ("loops.right.vernier.air_path.gain_px", 1e308),
+    ("loops.right.vernier.air_path.b1_s2", 1e10),
+    ("loops.right.vernier.air_path.b2_s", 1e8),
     # siderostat
+    ("loops.right.coarse.gain_rad_per_m", 5e-324),
     (f"{MOTORS}.encoder_counts_per_rev", 0),
     (f"{MOTORS}.ball_screw_m_per_rad", 0.113),  # mm
     (f"{MOTORS}.lever_arm_m", 115.0),  # mm
@@ -101,6 +108,16 @@ IMPOSSIBLE = [
     (f"{PIEZO}.port", "socket://10.0.0.5:99999"),
     (f"{PIEZO}.baud_rate", 115201),
     (f"{PIEZO}.gain", 150.0),
+    # plant
+    ("plant.frame_delay_s", 1e308),
+    ("plant.loops.right.amplifier_bandwidth_hz", 1e308),
+    ("plant.loops.right.backlash_sky_arcsec", 1e308),
+    ("plant.loops.right.star_offset_sky_arcsec_max", 1e308),
+    ("plant.loops.right.air_path.gain_px", 1e308),
+    ("plant.loops.right.air_path.b1_s2", 1e10),
+    ("plant.loops.right.air_path.b2_s", 1e8),
+    ("plant.loops.right.air_path.relative_rms_px", 1e308),
+    ("plant.loops.right.hysteresis.full_swing_stroke_m", 9.1),  # um
 ]
 
 
@@ -109,6 +126,31 @@ def test_what_a_device_cannot_be_is_refused_by_its_key(key, value):
     line = refusal(ONE_STAR, {key: value})
     assert line.startswith(f"my.toml: {key}: must ")
     assert f"(is {value!r}" in line or f"(is {value:g}" in line
+
+
+LINE = {
+    "frequency_hz": 6.0,
+    "rms_px": 0.05,
+    "direction_deg": 0.0,
+    "damping": 0.01,
+    "drift_hz_per_min": 0.0,
+}
+SPOT = {"name": "a", "offset_px": {"az": 0.0, "el": 0.0}, "flux_dn": 28000.0, "diameter_px": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "item"),
+    [
+        (f"{FSM}.structure.mode_hz", [330.0, 1e200], "1"),
+        ("plant.loops.right.lines", [LINE | {"rms_px": 1e308}], "0.rms_px"),
+        ("plant.loops.right.lines", [LINE | {"direction_deg": 1e308}], "0.direction_deg"),
+        ("plant.loops.right.lines", [LINE | {"drift_hz_per_min": -1e308}], "0.drift_hz_per_min"),
+        ("plant.loops.right.spots", [SPOT | {"diameter_px": 1e200}], "0.diameter_px"),
+        ("plant.loops.right.spots", [SPOT | {"flux_dn": 1e308}], "0.flux_dn"),
+    ],
+)
+def test_so_is_what_an_item_of_a_list_cannot_be(key, value, item):
+    assert refusal(ONE_STAR, {key: value}).startswith(f"my.toml: {key}.{item}: must be ")
 
 
 @pytest.mark.parametrize(
@@ -192,6 +234,7 @@ CONTRADICTIONS = [
     ({"loops.right.target_px.el": 38.0}, "camera.height_px"),
     ({"loops.right.star_flux_dn": 15_000.0}, "loops.right.other_spots"),
     ({"loops.right.flux_range.low": 0.3}, "loops.right.other_spots"),
+    ({"loops.right.flux_range.low": 0.0}, "loops.right.other_spots"),
     # siderostat
     ({f"{SERVO}.gain_per_s": 300.0}, f"{SERVO}.rate_hz"),
     ({f"{SERVO}.rate_hz": 100.0}, f"{SERVO}.gain_per_s"),
@@ -307,6 +350,26 @@ def test_so_does_one_of_analogue_amplifiers(changes, contradicted):
 )
 def test_a_limit_that_always_or_never_holds_is_refused(key, value, demand):
     assert refusal(ONE_STAR, {key: value}).startswith(f"my.toml: {key}: must be {demand}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        (f"{SERVO}.reading_timeout_s", 1e-308),
+        (f"{SERVO}.following_error_limit_rad", 1e-308),
+        ("loops.right.flux_range.low", 1e-308),
+        (f"{SERVO}.gain_per_s", 1e-308),
+        (f"{FSM}.range_rad", 1e308),
+        (f"{FSM}.bias_v", 1e308),
+        ("camera.pixel_noise_dn", 1e308),
+        ("loops.right.star_flux_dn", 1e308),
+        ("loops.right.vernier.fslq.crossover_hz", 1e308),
+    ],
+)
+def test_no_line_has_an_infinite_number_or_one_of_many_digits(key, value):
+    line = refusal(ONE_STAR, {key: value})
+    assert line.startswith(f"my.toml: {key}: must be ")
+    assert not re.search(r"\binf\b|[0-9]{20}", line)
 
 
 def test_a_spot_in_the_stars_own_window_is_refused():

@@ -1,5 +1,7 @@
 """Rig files as files: what is laid over what, and by which name a mistake is told."""
 
+from pathlib import Path
+
 import pytest
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
@@ -33,9 +35,18 @@ def test_a_file_that_is_not_a_rig(tmp_path, content, said):
         load_rig(path)
 
 
-def test_a_folder_is_not_a_rig(tmp_path):
-    with pytest.raises(ConfigError, match=r"cannot be read: .*Is a directory"):
-        load_rig(tmp_path)
+@pytest.mark.parametrize("path", ["/", "/dev/null"])
+def test_a_folder_or_a_device_is_not_a_rig(path):
+    with pytest.raises(ConfigError, match=rf"{path}: cannot be read: not a regular file; give a"):
+        load_rig(Path(path))
+
+
+def test_a_file_much_larger_than_a_rig_is_not_read(tmp_path):
+    path = tmp_path / "huge.toml"
+    with path.open("wb") as file:
+        file.truncate((10 << 20) + 1)
+    with pytest.raises(ConfigError, match=r"huge\.toml: cannot be read: more than 10 MiB; give a"):
+        load_rig(path)
 
 
 # ---------------------------------------------------------------- --set

@@ -67,13 +67,23 @@ def test_a_value_below_zero_is_no_option(tmp_path, capsys):
     [
         ("acquire", ["wide"], "needs no values, and may have search_radius_sky_arcsec="),
         ("acquire", ["field_overlap"], "needs no values"),
-        ("acquire", ["field_overlap=much"], "acquire field_overlap=much"),
+        ("acquire", ["field_overlap=much"], "field_overlap must be a number, got 'much'"),
         ("explode", [], "unknown command 'explode'. Available: stop, "),
         ("target", ["1"], "needs az_px el_px"),
         ("target", ["far", "1"], "target far 1"),
         ("stop", ["now"], "needs no values"),
         ("hold", [], "hold is now release"),
-        ("controller", ["best"], "controller best"),
+        (
+            "controller",
+            ["best"],
+            "controller best: unknown name 'best'. Available: eq20, lqg-ltr, minimum-variance, fslq, learnt",
+        ),
+        ("jog", ["1", "b"], "jog 1 b: el_sky_arcsec must be a number, got 'b'"),
+        (
+            "collector",
+            ["start", "kind=fast"],
+            "collector start kind=fast: unknown kind 'fast'. Available: ",
+        ),
     ],
 )
 def test_what_cannot_be_a_command_is_refused_in_one_line(word, values, complaint):

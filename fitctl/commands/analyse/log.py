@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.exits import FAILED, UNUSABLE
 from fitctl.commands.shared.log_time import time_ns
 from fitctl.commands.shared.logs import (
     LatestOption,
@@ -28,6 +28,8 @@ from fitctl.logging import copying, exporting, folder, verifying
 from fitctl.logging.errors import LogError
 from fitctl.logging.listing import logs_in, rig_name
 from fitctl.logging.reading import LogInfo, log_info
+
+_TOO_LARGE = "too large to be read here"
 
 app = typer.Typer(help="Inspect, repair and convert logs.")
 
@@ -162,17 +164,24 @@ def summary(
 ) -> None:
     """Print start, length and RMS of each log.
 
-    Prints one line for each log as soon as it is read. The verdict is that of `fitctl report`.
+    Prints one line for each log as soon as it is read. The verdict is that of `fitctl report`. Exit status 2 if
+    a log cannot be read; the others are summarised.
     """
+    failed = False
     for log in chosen_logs("log summary", logs, rig, latest=latest):
         line = _summary(log, most_bytes)
+        unreadable = line.error not in {"", _TOO_LARGE}
+        failed = failed or unreadable
         if as_json:
             say(to_json(line))
+        elif unreadable:
+            say(line.error, err=True)
         else:
             start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(line.start_s or 0.0))
             rms = ", ".join(f"{name} {text}" for name, text in line.rms.items())
             words = f"{start}, {line.duration_s or 0.0:.0f} s, requirement {line.verdict}"
             say(f"{log}: {line.error or words}" + (f": {rms}" if rms else ""))
+    raise typer.Exit(UNUSABLE if failed else 0)
 
 
 class LogSummary(msgspec.Struct, kw_only=True):
@@ -200,11 +209,14 @@ def _summary(log: Path, most_bytes: int) -> LogSummary:
         if found.counts:
             line.start_s, line.duration_s = found.start_s, found.duration_s
         if line.bytes > most_bytes:
-            line.error = "too large to be read here"
+            line.error = _TOO_LARGE
             return line
         findings = find(find_run([log]))
-    except (LogError, OSError) as error:
+    except LogError as error:
         line.error = str(error)
+        return line
+    except OSError as error:
+        line.error = f"{log}: cannot be read: {error.strerror or error}; name another log"
         return line
     line.verdict = findings.word
     for name, loop in findings.loops.items():

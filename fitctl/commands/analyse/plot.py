@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,8 +75,11 @@ def plot(
             f"--to {to or 'its end'}"
         )
         raise ConfigError(msg)
-    if ylim is not None and not ylim[0] < ylim[1]:
-        msg = f"plot: --ylim {ylim[0]:g} {ylim[1]:g}: the first must be below the second"
+    if ylim is not None and not 0 < ylim[1] - ylim[0] < math.inf:
+        msg = (
+            f"plot: --ylim {ylim[0]:g} {ylim[1]:g}: the first must be below the second, and their difference "
+            "finite"
+        )
         raise ConfigError(msg)
     if out is not None:
         _save(as_figure(log, series, ylim), out)

@@ -78,6 +78,10 @@ def design(
     if out is not None and out.suffix != ".json":
         msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
         raise ConfigError(msg)
+    name = "lqg-ltr" if what == "vernier" else what
+    if plot is not None and name != "lqg-ltr":
+        msg = f"design {what}: --plot draws Fig. 9: use it with vernier"
+        raise ConfigError(msg)
     if what == "learn":
         chosen = chosen_logs("design learn", logs, rig, latest=latest)
         learn(chosen, rig, overrides, loop, out, as_json=as_json)
@@ -105,12 +109,8 @@ def design(
             "that --out saved, or a Python file (*.py) of your own"
         )
         raise ConfigError(msg)
-    name = "lqg-ltr" if what == "vernier" else what
     if out is not None and name not in DESIGNS and not name.endswith(".py"):
         msg = f"design {what}: --out is for a design: {', '.join(['vernier', *DESIGNS])}"
-        raise ConfigError(msg)
-    if plot is not None and name != "lqg-ltr":
-        msg = f"design {what}: --plot draws Fig. 9: use it with vernier"
         raise ConfigError(msg)
     with solving(f"design {what}", loop):
         result, lines = reports[what](settings, loop)
@@ -281,7 +281,13 @@ def _saved(file: str) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
         design = design_for(rig, loop, file)
         title = LEARNT if design.learnt else f"{design.name} of {file}"
-        return _stands(title, design, night_of(design, basis(rig, loop)), rig, loop)
+        result, lines = _stands(title, design, night_of(design, basis(rig, loop)), rig, loop)
+        if design.parameters.get("lines") and not design.learnt:
+            lines.append(
+                "  of the rig file's night; fitctl design '{...}', with its name and parameters as JSON, shows "
+                "what it leaves of the night that it was made for"
+            )
+        return result, lines
 
     return report
 
@@ -300,7 +306,9 @@ def _compare(rig: Rig, loop: str, files: Sequence[Path]) -> Report:
     its_basis = basis(rig, loop)
     least = bound(its_basis)
     found = [standing(design(its_basis), its_basis) for design in DESIGNS.values()]
-    found += [standing(design_for(rig, loop, str(file)), its_basis) for file in files]
+    for file in files:
+        design = design_for(rig, loop, str(file))
+        found.append(standing(design, night_of(design, its_basis))._replace(name=file.name))
     lines = [
         f"{'design':<17} order  crossover  phase m.  gain m.  peak  1 Hz      residual  of bound",
         *map(_compare_line, found),

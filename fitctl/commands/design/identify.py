@@ -53,7 +53,7 @@ def identify(
     what: Annotated[
         str,
         typer.Argument(
-            help="hysteresis, backlash, response, airpath or delay; of a link: feedforward, photodiodes, "
+            help="hysteresis, backlash, response, airpath, delay or spot; of a link: feedforward, photodiodes, "
             "link_delay or ambient."
         ),
     ],

@@ -21,6 +21,7 @@ from fitctl.commands.shared.plant import require_plant
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
 from fitctl.config import Rig
+from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 from fitctl.simulation.campaign import (
     PERCENTILES,
@@ -79,7 +80,7 @@ def _simulate_once(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> 
         say(to_json(next(iter(loops.values())) if len(loops) == 1 else several))
     else:
         for name, loop in result.loops.items():
-            say_lines(_result_text(name, loop))
+            say_lines(_result_text(name, loop, duration_s))
         if not math.isnan(result.visibility):
             say(f"mean visibility of the fringes {result.visibility:.4f}")
     return 0 if all(_holds(loop) for loop in result.loops.values()) else FAILED
@@ -91,7 +92,17 @@ def _holds(result: SimulationResult | MetrologyResult) -> bool:
     return not math.isnan(held_s)
 
 
-def _result_text(name: str, result: SimulationResult | MetrologyResult) -> str:
+def _result_text(name: str, result: SimulationResult | MetrologyResult, duration_s: float) -> str:
+    of_beam = isinstance(result, MetrologyResult)
+    held, mode = ("beam", Mode.LOCKED) if of_beam else ("star", Mode.VERNIER)
+    too_short = f"within {duration_s:g} s; use a longer --duration"
+    if math.isnan(result.acquired_s):
+        return f"loop {name}: {held} not found {too_short}"
+    if not _holds(result):
+        found = f"{held} found after {result.acquired_s:.1f} s"
+        return f"loop {name}: {found}, {mode.name} not reached {too_short}"
+    if not result.judged_s:
+        return f"loop {name}: {mode.name} reached, but no RMS measured {too_short}"
     if isinstance(result, MetrologyResult):
         beam = result.rms_arcsec
         return (

@@ -54,7 +54,7 @@ def rehearse(
     from fitctl.simulation.rehearsal import RehearsalError
     from fitctl.simulation.rehearsal import rehearse as rehearsed
 
-    wanted = command_of(command, values or [], loop)
+    wanted = command_of(command, values or [], loop, "rehearse")
     if remote is None:
         found = address("rehearse", rig, overrides)
         rig, overrides = found.file, found.settings

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from ipaddress import IPv4Address
 from typing import Annotated
 
 import can
@@ -13,6 +14,7 @@ from serial.tools import list_ports
 
 from fitctl.commands.shared.options import JsonOption
 from fitctl.commands.shared.printing import say, to_json
+from fitctl.config import ConfigError
 from fitctl.drivers.gige.discovery import discover as discover_cameras
 from fitctl.drivers.interface import DeviceUnreachable
 from fitctl.drivers.labjack_t7.discovery import discover_labjacks
@@ -35,6 +37,11 @@ def discover(
 
     Sends a broadcast to which cameras and LabJacks answer. A C-887 has no documented way of discovery.
     """
+    try:
+        IPv4Address(broadcast)
+    except ValueError:
+        msg = f"discover: --broadcast {broadcast}: expected an IPv4 address such as 192.168.1.255"
+        raise ConfigError(msg) from None
     with ThreadPoolExecutor() as pool:
         cameras = pool.submit(_cameras, broadcast, wait_s)
         labjacks = pool.submit(_labjacks, broadcast, wait_s)

@@ -17,6 +17,7 @@ from fitctl.config import CONTROLLERS, ConfigError, is_name
 from fitctl.controllers.design.basis import Basis
 from fitctl.controllers.design.document import MATRICES, matrix_shapes
 from fitctl.controllers.pair import INPUTS, LEARNT, OUTPUTS, Design
+from fitctl.text import plain
 
 SUFFIX = ".py"
 FUNCTION = "design"
@@ -48,8 +49,8 @@ def own_design(path: Path, its_basis: Basis) -> Design:
     make = _function(path)
     try:
         made = make(its_basis)
-    except Exception as error:
-        msg = f"controller {path}: {FUNCTION}(basis) raised {type(error).__name__}: {error}"
+    except (Exception, SystemExit) as error:  # whatever the file does
+        msg = f"controller {path}: {FUNCTION}(basis) raised {type(error).__name__}: {plain(str(error))}"
         raise ConfigError(msg) from error
     if not isinstance(made, Design):
         msg = (
@@ -72,8 +73,8 @@ def _function(path: Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever the file does
-        msg = f"controller {path}: cannot be run: {type(error).__name__}: {error}"
+    except (Exception, SystemExit) as error:
+        msg = f"controller {path}: cannot be run: {type(error).__name__}: {plain(str(error))}"
         raise ConfigError(msg) from error
     make = getattr(module, FUNCTION, None)
     if not callable(make):
@@ -100,10 +101,17 @@ def checked(design: Design, its_basis: Basis, origin: str) -> Design:
     for key, shape in matrix_shapes(len(matrices["a"])).items():
         if matrices[key].size == 0 == np.prod(shape):
             matrices[key] = matrices[key].reshape(shape)
-        if matrices[key].shape != shape or not np.isfinite(matrices[key]).all():
+        if matrices[key].shape != shape:
             msg = (
-                f"controller {origin}: {key} must be finite numbers of shape {shape}, with the inputs "
+                f"controller {origin}: {key} must be a matrix of shape {shape}, with the inputs "
                 f"{', '.join(INPUTS)} and the outputs {', '.join(OUTPUTS)}; its shape is {matrices[key].shape}"
+            )
+            raise ConfigError(msg)
+        if not (finite := np.isfinite(matrices[key])).all():
+            row, column = np.argwhere(~finite)[0]
+            msg = (
+                f"controller {origin}: {key} must have finite numbers only; {key}[{row}, {column}] is "
+                f"{matrices[key][row, column]}"
             )
             raise ConfigError(msg)
     if (design.period_s, design.delay_s) != (its_basis.period_s, its_basis.delay_s):

@@ -236,6 +236,9 @@ def test_keep_marks_and_unmarks(log, whole):
         (["info", "none.mcap"], "none.mcap: cannot be opened: No such file"),
         (["info", "."], ".: cannot be opened: not a regular file"),
         (["verify", "TEXT"], "is not an MCAP log"),
+        (["summary", "none.mcap"], "none.mcap: cannot be read: No such file"),
+        (["summary", ""], ".: cannot be opened: not a regular file"),
+        (["summary", "TEXT"], "is not an MCAP log"),
         (["recover", "TEXT"], "is not an MCAP log"),
         (["recover", "."], ".: cannot be opened: not a regular file"),
         (["cut", "LOG", "--out", ".", "--overwrite"], ".: cannot be opened: not a regular file"),
@@ -273,4 +276,5 @@ def test_bad_input_gets_one_clear_line_and_status_2(
     assert status == 2
     assert said in error
     assert len(error.splitlines()) == 1
+    assert error.count(said) == 1
     assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["a.mcap", "text.mcap"]

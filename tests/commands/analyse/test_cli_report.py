@@ -151,6 +151,10 @@ def test_a_browser_that_is_there_prints_the_page(tmp_path):
             ["plot", "LOG", "star_flux_dn", "--ylim", "1", "-1"],
             "the first must be below the second",
         ),
+        (
+            ["plot", "LOG", "star_flux_dn", "--ylim", "-1e308", "1e308"],
+            "their difference finite",
+        ),
         (["plot", "LOG", "star_flux_dn", "--out", "a.docx"], "expected a name that ends in"),
         (["plot", "missing.mcap", "x"], "cannot be opened"),
     ],

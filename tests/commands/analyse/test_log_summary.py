@@ -32,7 +32,7 @@ def test_start_duration_rms_and_verdict_are_printed(log, tmp_path, capsys):
     torn.write_bytes(log.read_bytes()[:200])
     status, lines = printed(capsys, "--json", log, torn, tmp_path / "none.mcap")
     held, cut, none = map(json.loads, lines)
-    assert status == 0
+    assert status == 2
     assert held["verdict"] == "met"
     assert held["duration_s"] == pytest.approx(60.0, abs=1.0)
     rms, unit = held["rms"]["right"].split()
@@ -44,7 +44,8 @@ def test_start_duration_rms_and_verdict_are_printed(log, tmp_path, capsys):
 
 @pytest.mark.long
 def test_a_log_that_is_too_large_is_only_named(log, capsys):
-    _, (line,) = printed(capsys, "--json", "--most-bytes", "1000", log)
+    status, (line,) = printed(capsys, "--json", "--most-bytes", "1000", log)
+    assert not status
     known = json.loads(line)
     assert known["error"] == "too large to be read here"
     assert known["duration_s"] > 50
@@ -52,6 +53,7 @@ def test_a_log_that_is_too_large_is_only_named(log, capsys):
 
 
 @pytest.mark.long
-def test_a_line_for_people_has_them_too(log, capsys):
-    _, (line,) = printed(capsys, log)
+def test_a_line_for_people_has_them_too_beside_a_log_that_is_missing(log, tmp_path, capsys):
+    status, (line,) = printed(capsys, tmp_path / "none.mcap", log)
+    assert status == 2
     assert "requirement met: right 0.0" in line

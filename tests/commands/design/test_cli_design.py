@@ -1,11 +1,15 @@
 """`fitctl design` as a stranger meets it."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
+from samples.learner_reports import LINE, PAPER
 
 from fitctl.cli import main
+from fitctl.controllers.design.files import save_design
+from fitctl.controllers.design.margins import design_with_margins
 
 FLIGHT = [
     *("--set", "camera.frame_rate_hz=500.0"),
@@ -103,6 +107,16 @@ def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsy
 
 
 @pytest.mark.long
+def test_a_saved_learnt_design_says_of_which_night_its_figures_are(design, tmp_path):
+    path = tmp_path / "mine.json"
+    night = dataclasses.replace(PAPER, lines=(LINE,))
+    save_design(design_with_margins(night), path)
+
+    assert "of the rig file's night" in design(path)[1]
+    assert [line.split()[0] for line in design("compare", path)[1].splitlines()][-2] == "mine.json"
+
+
+@pytest.mark.long
 def test_a_saved_design_is_judged_as_it_was_saved_not_made_anew(design, tmp_path):
     path = tmp_path / "mine.json"
     other = ["--set", "loops.right.vernier.fslq.crossover_hz=2"]
@@ -174,6 +188,7 @@ def test_what_cannot_be_is_one_line_and_status_2(design, arguments, said):
         (["compare", "--latest"], "only fitctl design learn --latest does"),
         (["learn", "missing.mcap"], "missing.mcap"),
         (["learn", "night.mcap", "--out", "learnt.toml"], "must end in .json"),
+        (["learn", "night.mcap", "--plot", "x.png"], "--plot draws Fig. 9: use it with vernier"),
         (["bound", "night.mcap"], "reads no log, got night.mcap"),
     ],
 )

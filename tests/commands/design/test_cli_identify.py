@@ -53,6 +53,13 @@ def test_what_could_not_end_well_is_not_begun(identify, monkeypatch, tmp_path, a
     assert not list(tmp_path.iterdir())
 
 
+def test_the_help_names_every_experiment(capsys):
+    with pytest.raises(SystemExit):
+        main(["identify", "--help"])
+    printed = capsys.readouterr().out
+    assert not [name for name in EXPERIMENTS if name not in printed]
+
+
 @pytest.mark.long
 def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp_path):
     """Each log has a part of the voltages and of the frames; the analysis gets all of them."""

@@ -92,14 +92,20 @@ def test_saved_as_matrices_it_needs_no_python(file, tmp_path):
     [
         ("def design(basis", "cannot be run: SyntaxError"),
         ("raise OSError('no')", "cannot be run: OSError: no"),
+        ("raise OSError('one\\ntwo')", r"cannot be run: OSError: one\\ntwo"),
+        ("import sys\nsys.exit(0)", "cannot be run: SystemExit: 0"),
+        ("def design(basis):\n    raise SystemExit", "raised SystemExit"),
         ("x = 1", "has no function design"),
         ("def design(basis):\n    return 1 / 0", "raised ZeroDivisionError"),
         ("def design(basis):\n    return None", "returned NoneType"),
         (
             EXAMPLE.replace("c=np.array([[1.0], [part]])", "c=np.eye(3)"),
-            "c must be finite numbers of",
+            "c must be a matrix of shape",
         ),
-        (EXAMPLE.replace("0.8 *", "float('nan') *"), "b must be finite numbers"),
+        (
+            EXAMPLE.replace("0.8 *", "float('nan') *"),
+            r"b must have finite numbers only; b\[0, \d\] is nan",
+        ),
         (
             EXAMPLE.replace("delay_s=basis.delay_s", "delay_s=1.0"),
             "period_s and delay_s must be those",
