@@ -80,7 +80,7 @@ test-long: compiled  ## Run batches, campaigns, whole nights, the commands of th
 compiled: $(READY)
 	@echo "Compiling the batch ..."
 	@for rig in fit-mock fit-testbed; do \
-	    $(BIN)/fitctl simulate --rig rigs/$$rig.toml --runs 1 --duration 1 --json > /dev/null & \
+	    $(BIN)/fitctl simulate --rig rigs/$$rig.toml --runs 2 --duration 1 --json > /dev/null & \
 	done; wait
 
 test-slow: $(READY)  ## Run the acceptance tests: ten demos of a minute each, ten long simulations

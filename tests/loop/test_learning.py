@@ -107,6 +107,7 @@ def test_advice_of_a_model_that_does_not_fit_says_so(shaken):
     assert night.loop.state(0.0).learning.state == "advice"
 
 
+@pytest.mark.long
 def test_a_report_without_a_design_says_why_once():
     night = Night(learn="advise")
     for _ in range(2):
@@ -193,6 +194,7 @@ def test_the_same_design_goes_on_where_it_was():
     assert np.abs(changed_px - unchanged_px).max() < 0.03  # 0.12 px if it began from rest
 
 
+@pytest.mark.long
 def test_another_design_does_not_begin_from_frames_before_a_gap(shaken, monkeypatch):
     pointing, camera = shaken.loop.pointing, shaken.simulation.supervisor._camera
     assert len(pointing.recent) == 150
@@ -337,6 +339,7 @@ def test_after_a_way_back_newer_advice_is_shown():
     assert night.loop.state(0.0).learning.state == "advice"
 
 
+@pytest.mark.long
 def test_an_interlock_that_only_warns_does_not_keep_a_loop_from_learning(shaken):
     shaken.simulation.supervisor.report_quantity("clock_step_s", 5.0)
     shaken.simulation.run(1.0)

@@ -94,6 +94,7 @@ def test_the_page_is_sound_html_and_needs_nothing_from_elsewhere(made):
     assert not re.search(r"@import|url\((?!#)", page)
 
 
+@pytest.mark.long
 def test_it_says_the_verdict_and_every_part_that_was_asked_for(made):
     text = " ".join(Reader(made[1]).text)
 
@@ -115,6 +116,7 @@ def test_it_says_the_verdict_and_every_part_that_was_asked_for(made):
         assert part in text
 
 
+@pytest.mark.long
 def test_the_first_screen_has_the_verdict_one_number_and_the_timeline(made, findings):
     _, page = made
     worse = max(found.rms for found in findings.loops["right"].residual.values())
@@ -130,6 +132,7 @@ def test_the_first_screen_has_the_verdict_one_number_and_the_timeline(made, find
     assert "<table" not in first
 
 
+@pytest.mark.long
 def test_the_error_budget_is_on_the_page_and_in_the_figures(made, findings):
     folder, page = made
     (controller,) = json.loads((folder / "report.json").read_text())["loops"]["right"][
@@ -146,6 +149,7 @@ def test_the_error_budget_is_on_the_page_and_in_the_figures(made, findings):
         assert cause in text
 
 
+@pytest.mark.long
 def test_modes_have_the_colours_of_the_console(made):
     folder, page = made
     assert "var(--mode-coarse)" in page
@@ -200,6 +204,7 @@ def test_a_plot_without_data_is_a_line_that_says_why(rig, tmp_path):
     assert not (tmp_path / "right-psd.svg").exists()
 
 
+@pytest.mark.long
 def test_every_plot_is_beside_it_as_png_and_svg(made):
     folder, page = made
     names = {path.stem for path in folder.glob("*.svg")}
@@ -211,6 +216,7 @@ def test_every_plot_is_beside_it_as_png_and_svg(made):
         assert "#ffffff" in (folder / f"{name}.svg").read_text()
 
 
+@pytest.mark.long
 def test_colours_on_the_page_are_those_of_the_light_or_dark_style(made):
     _, page = made
     drawings = "".join(re.findall(r"<svg.*?</svg>", page, re.DOTALL))
@@ -225,6 +231,7 @@ def test_colours_on_the_page_are_those_of_the_light_or_dark_style(made):
         assert f"--{variable}:" in dark
 
 
+@pytest.mark.long
 def test_the_figures_are_there_for_programs(made, findings):
     figures = json.loads((made[0] / "report.json").read_text())
 
@@ -300,6 +307,7 @@ def test_a_trace_shows_its_extremes_however_long_it_is():
     assert at_s[high.argmax()] == pytest.approx(time_s[123_456], abs=time_s[-1] / 900)
 
 
+@pytest.mark.long
 def test_the_page_forbids_itself_scripts_and_everything_from_elsewhere(made):
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', made[1])
 
