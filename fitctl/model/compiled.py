@@ -7,6 +7,7 @@ gives the machine code of one of them, into which the marked functions that it c
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
 import re
@@ -72,13 +73,32 @@ def compiled(function: _Function) -> _Function:
     options = _options[function]
     if not function.__module__.startswith("fitctl."):
         return njit(**options)(function)
-    given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder(function.__module__))
+    folder = cache_folder(function.__module__)
+    given, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
-        return njit(cache=True, **options)(function)
+        return _saved_by_one_at_a_time(njit(cache=True, **options)(function), folder / "lock")
     except RuntimeError:  # the folder cannot be written: each process compiles anew
         return njit(**options)(function)
     finally:
         config.CACHE_DIR = given
+
+
+def _saved_by_one_at_a_time(made: Any, lock: Path) -> Any:
+    """Lock the folder of machine code while a process saves some.
+
+    Numba names files by number: the first that its index lacks. Two processes that save code for different
+    arguments at once would give both one name, and then run each other's code.
+    """
+    cache = made._cache
+    save = cache.save_overload
+
+    def save_alone(signature: Any, data: Any) -> None:
+        with lock.open("a") as held:
+            fcntl.flock(held, fcntl.LOCK_EX)  # until the file is closed
+            save(signature, data)
+
+    cache.save_overload = save_alone
+    return made
 
 
 def record(values: Mapping[str, Any]) -> NDArray[np.void]:

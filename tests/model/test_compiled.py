@@ -74,6 +74,40 @@ def test_machine_code_is_kept_until_a_constant_in_any_imported_module_changes(pa
     assert run_kernel(package) == (10.0, 0)
 
 
+# Between looking for a name and saving under it, another process has time to do the same.
+MEETING = """
+import time
+from numba.core.caching import IndexDataCacheFile
+import numpy as np
+load = IndexDataCacheFile._load_index
+def slow_load(self):
+    found = load(self)
+    time.sleep(0.5)
+    return found
+IndexDataCacheFile._load_index = slow_load
+from fitctl.simulation.trial_kernel import kernel
+print([float(kernel(one)) for one in {arguments}], sum(kernel.stats.cache_hits.values()))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
+def test_processes_that_save_code_for_different_arguments_at_once_keep_their_own(package):
+    def started(arguments):
+        program = MEETING.format(arguments=arguments)
+        return subprocess.Popen(
+            [sys.executable, "-c", program], cwd=package.parent, stdout=subprocess.PIPE, text=True
+        )
+
+    run_kernel(package)
+    both = [started("[1]"), started("[np.float32(1.0)]")]
+    for one in both:
+        assert one.communicate(timeout=60)[0].splitlines()[-1].startswith("[6.0]")
+    third = started("[1.0, 1, np.float32(1.0)]").communicate(timeout=60)[0]
+
+    assert third.splitlines()[-1] == "[6.0, 6.0, 6.0] 3"
+
+
 @pytest.mark.long
 def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():
     program = (
