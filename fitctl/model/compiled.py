@@ -64,9 +64,12 @@ def compiled(function: _Function) -> _Function:
         return function
     from numba import njit
     from numba.core import config as module
+    from numba.core import types
     from numba.extending import register_jitable
 
     config: Any = module  # its options are made when it is imported
+    kinds: Any = types
+    kinds.Record.mangling_args = property(_of_its_layout)
     for marked in _options.keys() - _registered:
         register_jitable(**_options[marked])(marked)
     _registered.update(_options)
@@ -81,6 +84,15 @@ def compiled(function: _Function) -> _Function:
         return njit(**options)(function)
     finally:
         config.CACHE_DIR = given
+
+
+def _of_its_layout(kind: Any) -> tuple[str, tuple[int]]:
+    """What the names of compiled functions have of a record that they take.
+
+    By itself numba numbers records as they come in a process. Code of two processes for different records would
+    have the same names, and a third process that loads both would run one for the other.
+    """
+    return "Record", (int.from_bytes(hashlib.sha256(kind.name.encode()).digest()[:7]),)
 
 
 def _saved_by_one_at_a_time(made: Any, lock: Path) -> Any:

@@ -108,6 +108,39 @@ def test_processes_that_save_code_for_different_arguments_at_once_keep_their_own
     assert third.splitlines()[-1] == "[6.0, 6.0, 6.0] 3"
 
 
+NAMED = """
+from fitctl.model.compiled import compilable, compiled, record
+
+@compilable()
+def kernel(values):
+    return values.second
+
+made = compiled(kernel)
+made(record({fields}))
+print(*(one.fndesc.mangled_name for one in made.overloads.values()))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
+def test_code_for_different_records_has_different_names_in_all_processes():
+    """As it was found: loaded into one process, the code of two rigs ended it (segmentation fault)."""
+    one, other, again = (
+        subprocess.run(
+            [sys.executable, "-c", NAMED.format(fields=fields)],
+            capture_output=True, text=True, check=True, timeout=60,
+        ).stdout
+        for fields in (
+            {"first": 1.0, "second": 2.0},
+            {"second": 2.0, "first": 1.0},
+            {"first": 3.0, "second": 4.0},
+        )
+    )  # fmt: skip
+
+    assert one != other
+    assert one == again
+
+
 @pytest.mark.long
 def test_the_source_read_is_that_of_every_module_that_the_batchs_imports_load():
     program = (
