@@ -308,7 +308,8 @@ def _compare(rig: Rig, loop: str, files: Sequence[Path]) -> Report:
     found = [standing(design(its_basis), its_basis) for design in DESIGNS.values()]
     for file in files:
         design = design_for(rig, loop, str(file))
-        found.append(standing(design, night_of(design, its_basis))._replace(name=file.name))
+        name = design.name if design.own else file.name  # saved designs have those of their kinds
+        found.append(standing(design, night_of(design, its_basis))._replace(name=name))
     lines = [
         f"{'design':<17} order  crossover  phase m.  gain m.  peak  1 Hz      residual  of bound",
         *map(_compare_line, found),
