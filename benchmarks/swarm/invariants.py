@@ -40,7 +40,7 @@ _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
 _MOST_ALIKE = 3
 _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
-_LOOKED_AT_S = 0.5  # so often is asked whose star a loop follows
+_CHECKED_S = 0.5  # so often the swarm checks which star a loop follows
 _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
 
@@ -111,8 +111,8 @@ class Invariants:
         self._zeros_lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
         self._zeros_read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
         self._zeros_noticed_s: dict[str, float] = {}
-        self._looked_s: dict[str, float] = {}  # by loop: when it was asked whose star it follows,
-        self._wrong_since_s: dict[str, float] = {}  # and since when it follows another
+        self._checked_s: dict[str, float] = {}  # by loop: when the swarm last checked its star
+        self._wrong_since_s: dict[str, float] = {}  # by loop: since when it follows another star
         self._pointed_at: set[str] = set()  # a person said which star these loops follow
 
     def watch(self, supervisor: Supervisor | None) -> None:
@@ -262,16 +262,14 @@ class Invariants:
     def _follows(self, tick: Tick) -> None:
         """Whether the star that a loop follows is its own, unless a person pointed at it."""
         name, now_s = tick.loop, tick.mid_exposure_s
-        if not now_s - self._looked_s.get(name, -math.inf) >= _LOOKED_AT_S:
+        if not now_s - self._checked_s.get(name, -math.inf) >= _CHECKED_S:
             return
-        self._looked_s[name] = now_s
-        if tick.mode not in _FOLLOWING or math.isnan(tick.star_az_px) or name in self._pointed_at:
-            self._wrong_since_s.pop(name, None)
-            return
+        self._checked_s[name] = now_s
         part = self._plant.stellar_loops[name]
         own_az_px, own_el_px = part.spots_at_px(self._plant.row(now_s))[0, 0].tolist()
         away_px = math.hypot(tick.star_az_px - own_az_px, tick.star_el_px - own_el_px)
-        if away_px < _ANOTHERS_PX:
+        follows = tick.mode in _FOLLOWING and name not in self._pointed_at
+        if not (follows and away_px >= _ANOTHERS_PX):  # nor without a star
             self._wrong_since_s.pop(name, None)
             return
         since_s = self._wrong_since_s.setdefault(name, now_s)

@@ -22,6 +22,7 @@ from fitctl.error_budget import pieces_of
 from fitctl.learn.advice import Advice, advise
 from fitctl.learn.opened import LEAST_S, rebuild
 from fitctl.logging.records import Tick
+from fitctl.loop.learning import has_moved
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.modes import Mode
 
@@ -34,7 +35,6 @@ WINDOW_S = 240.0
 """A night is estimated from the last frames, and after a gap as long, only from those that follow it."""
 SETTLE_S = 5.0
 """After the star was caught, or the target was moved, frames say more of that than of the night."""
-_STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
 
 
 class Shown(NamedTuple):
@@ -99,7 +99,7 @@ class Learner:
     def add(self, tick: Tick | Shown) -> None:
         """One tick, in their order; kept if it shows the loop undisturbed."""
         target_px = tick.target_az_px, tick.target_el_px
-        moved = not math.dist(target_px, self._target_px) <= _STILL_PX_PER_S * self._period_s
+        moved = has_moved(target_px, self._target_px, self._period_s)
         self._target_px = target_px
         if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or tick.held or moved:
             self._unsettled_s = tick.time_s
@@ -125,16 +125,19 @@ class Learner:
 
     def report(self, present: Design) -> LearnerReport:
         """Estimate and design, with `present` in force; a report without a result has the reason."""
-        self._reported()
+        self._begin_report()
         try:
             with solving("learn", self._loop_name, "the next report may have one"):
                 return self._report(self._advice(present))
         except ConfigError as error:
-            return self.failed(str(error))
+            return self._without_design(str(error))
 
     def failed(self, reason: str) -> LearnerReport:
-        """A report without a result."""
-        self._reported()
+        """Instead of :meth:`report`, where the design in force is not known."""
+        self._begin_report()
+        return self._without_design(reason)
+
+    def _without_design(self, reason: str) -> LearnerReport:
         return LearnerReport(
             loop=self._loop_name,
             design_json="",
@@ -142,7 +145,7 @@ class Learner:
             evaluated_s=self.frames * self._period_s,
         )
 
-    def _reported(self) -> None:
+    def _begin_report(self) -> None:
         self._new, self._due_after = 0, round(EVERY_S / self._period_s)
 
     def _advice(self, present: Design) -> Advice:

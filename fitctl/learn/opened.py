@@ -53,6 +53,44 @@ class Series(NamedTuple):
     filled: int = 0
 
 
+class AnyMirror(NamedTuple):
+    """Periodograms of the disturbance: a polynomial of the mirror's gain and overshoot.
+
+    Attributes
+    ----------
+    disturbance : array, shape (axes, rows)
+        For a mirror that moves as the rig file has it,
+    cross, turned : arrays, shape (axes, rows)
+        by how much more for each part by which its gain is less, and less for each part of overshoot,
+    squares : array, shape (3, axes, rows)
+        and what goes with their squares and their product: gain, both, overshoot.
+    """
+
+    disturbance: Floats
+    cross: Floats
+    turned: Floats
+    squares: Floats
+
+    def periodograms(self, gain: float, overshoot: float) -> Floats:
+        """For a mirror that moves so, shape (axes, rows)."""
+        less = 1 - gain
+        by_gain, by_both, by_overshoot = self.squares
+        found = self.disturbance + less * self.cross - overshoot * self.turned
+        found += less**2 * by_gain - 2 * less * overshoot * by_both + overshoot**2 * by_overshoot
+        return found
+
+    def slopes(self, gain: float, overshoot: float) -> Floats:
+        """Of :meth:`periodograms`, by the gain's logarithm and by the overshoot, shape (2, axes, rows)."""
+        less = 1 - gain
+        by_gain, by_both, by_overshoot = self.squares
+        return np.array(
+            [
+                -gain * (self.cross + 2 * less * by_gain - 2 * overshoot * by_both),
+                2 * overshoot * by_overshoot - self.turned - 2 * less * by_both,
+            ]
+        )
+
+
 class Opened(NamedTuple):
     """One-sided periodograms of the rebuilt disturbance, px²/Hz; its rows are the frequencies of all segments.
 
@@ -84,17 +122,22 @@ class Opened(NamedTuple):
     duration_s: float
     inflation: float
 
-    def step_response(self) -> Complexes:
-        """From the mirror's motion to its last step, m(k) - m(k - 1), shape (rows, 1)."""
-        turn = -2j * np.pi * self.frequency_hz * self.period_s
-        return np.asarray(1 - np.exp(turn))[:, None]
+    @property
+    def any_mirror(self) -> AnyMirror:
+        """Periodograms of the disturbance for every gain and overshoot of the mirror."""
+        # From the mirror's motion to its last step, m(k) - m(k - 1).
+        step = 1 - np.exp(-2j * np.pi * self.frequency_hz * self.period_s)
+        cross, mirror = self.cross.T, self.mirror.T
+        return AnyMirror(
+            np.ascontiguousarray(self.disturbance.T),
+            2 * cross.real,
+            2 * (step.conj() * cross).real,
+            np.array([mirror, mirror * step.real, mirror * np.abs(step) ** 2]),
+        )
 
     def with_mirror(self, gain: float, overshoot: float) -> Floats:
         """Periodograms of the disturbance if the mirror moves so, shape (rows, axes)."""
-        less = 1.0 - gain - overshoot * self.step_response()
-        return np.asarray(
-            self.disturbance + 2 * (less.conj() * self.cross).real + np.abs(less) ** 2 * self.mirror
-        )
+        return self.any_mirror.periodograms(gain, overshoot).T
 
 
 def rebuild(

@@ -170,11 +170,7 @@ class _Problem:
         self.begin = np.array(first)
         self.low, self.high = np.transpose(bounds)
         self.centre, self.hints = np.array(centre), np.array(hints)
-        # The periodogram is a polynomial of gain and overshoot; these are its coefficients.
-        step, cross, moved = opened.step_response().T, opened.cross.T, opened.mirror.T
-        self.disturbance = np.ascontiguousarray(opened.disturbance.T)
-        self.with_cross = np.array([2 * cross.real, 2 * (step.conj() * cross).real])
-        self.with_mirror = np.array([moved, moved * step.real, moved * np.abs(step) ** 2])
+        self.any_mirror = opened.any_mirror
 
     def guess(self, values: Floats) -> Guess:
         """What a vector stands for."""
@@ -242,13 +238,7 @@ class _Place:
         self.density = np.repeat([self._air[0] + self._white], problem.axes, axis=0)
         for line, (unit, *_) in zip(guess.lines, self._lines, strict=True):
             self.density += np.square(line.rms_px)[:, None] * unit
-        self._less, self._overshoot = 1 - guess.gain, guess.overshoot
-        cross, turned = problem.with_cross
-        mirror, across, along = problem.with_mirror
-        less, over = self._less, self._overshoot
-        periodogram = problem.disturbance + less * cross - over * turned
-        periodogram += less**2 * mirror - 2 * less * over * across + over**2 * along
-        self._ratio = periodogram / self.density
+        self._ratio = problem.any_mirror.periodograms(guess.gain, guess.overshoot) / self.density
         self._away = (values - problem.centre) / problem.hints
         likelihood = np.sum((np.log(self.density) + self._ratio) @ problem.weight)
         self.cost = float(likelihood + 0.5 * self._away @ self._away)
@@ -273,12 +263,9 @@ class _Place:
 
     @functools.cached_property
     def _mirrors(self) -> Floats:
-        """Of the periodogram, by the gain's logarithm and by the overshoot: shape (2, axes, rows)."""
-        cross, turned = self._problem.with_cross
-        mirror, across, along = self._problem.with_mirror
-        less, over = self._less, self._overshoot
-        by_gain = -self._guess.gain * (cross + 2 * less * mirror - 2 * over * across)
-        return np.array([by_gain, 2 * over * along - turned - 2 * less * across]) / self.density
+        """Of the periodograms, by the mirror's parameters, in parts of the spectrum: shape (2, axes, rows)."""
+        slopes = self._problem.any_mirror.slopes(self._guess.gain, self._guess.overshoot)
+        return slopes / self.density
 
     @property
     def gradient(self) -> Floats:
@@ -305,7 +292,7 @@ class _Place:
         everything[np.ix_(own, mirrors)] = shared
         everything[np.ix_(mirrors, own)] = shared.T
         by_gain, by_both, by_overshoot = 2 * np.sum(
-            problem.with_mirror / self.density @ problem.weight, axis=-1
+            problem.any_mirror.squares / self.density @ problem.weight, axis=-1
         )
         gain = self._guess.gain
         everything[np.ix_(mirrors, mirrors)] = [

@@ -29,7 +29,8 @@ PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 _WATCHES = ((0.3, 2.0), (10.0, 1.25))
 # A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault.
 _LOUDER = 2.0
-_STILL_PX_PER_S = 0.05  # a target that moves slower is at rest
+STILL_PX_PER_S = 0.05
+"""A target that moves slower is at rest."""
 _LONGEST_GAP = 5.5  # in frame periods: the comparison of designs bears so few missing frames
 _NEWS = 0.1  # by which part a gain must differ from the one last reported to be reported again
 
@@ -55,7 +56,7 @@ class Learning:
         self._rig = rig
         self._loop_name = loop_name
         self._comparison: Comparison | None = None
-        self._still_px = _STILL_PX_PER_S * rig.camera.period_s
+        self._period_s = rig.camera.period_s
         self._longest_gap_s = _LONGEST_GAP * rig.camera.period_s
         self._last_s = math.inf
         self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
@@ -197,7 +198,7 @@ class Learning:
         hindered : bool
             The loop is not in VERNIER, waits, or an interlock keeps the stages from following the star.
         """
-        moved = not math.dist(target_px, self._last_target_px) <= self._still_px
+        moved = has_moved(target_px, self._last_target_px, self._period_s)
         self._last_target_px = target_px
         if now_s - self._last_s > self._longest_gap_s:
             self._calm_since_s = None
@@ -277,6 +278,11 @@ class Learning:
             text=text,
             report=report,
         )
+
+
+def has_moved(target_px: AzEl, before_px: AzEl, period_s: float) -> bool:
+    """Whether the target is not where it was a frame before; so it is where that is not known (NaN)."""
+    return not math.dist(target_px, before_px) <= STILL_PX_PER_S * period_s
 
 
 def _gained(report: LearnerReport) -> float:
