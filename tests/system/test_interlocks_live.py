@@ -11,7 +11,7 @@ from .conftest import Rig, absent_devices
 def supervisor(tmp_path):
     """One that asks for more room on the disk than there is; it needs no devices to say so."""
     rig = Rig(tmp_path)
-    rig.settings.append("interlocks.disk_space.low=1e18")
+    rig.settings.append("interlocks.disk_space.low=1e15")
     rig.endpoints = absent_devices()
     try:
         rig.start_supervisor()
