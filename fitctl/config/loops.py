@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from ipaddress import ip_address
 from typing import Annotated, Literal, get_args
 
@@ -193,6 +194,11 @@ class Loop(Settings):
     def flux_range_dn(self) -> tuple[float, float]:
         """The least and the most light that a spot of this loop's star may have."""
         return self.flux_range.low * self.star_flux_dn, self.flux_range.high * self.star_flux_dn
+
+    @property
+    def brightest_part(self) -> float:
+        """Of a spot's light, in the pixel on whose middle it is."""
+        return math.erf(math.sqrt(2) / self.spot_diameter_px) ** 2
 
     @model_validator(mode="after")
     def _feedforward_is_over_a_link(self) -> Loop:

@@ -79,6 +79,7 @@ IMPOSSIBLE = [
     (f"{MOTORS}.lever_arm_m", 115.0),  # mm
     (f"{MOTORS}.velocity_limit_rad_s", 60_000.0),
     (f"{MOTORS}.rotation_deg", 270.0),
+    (f"{DRIVE}.position_limit_rad", 5e-324),
     (f"{DRIVE}.node_id", 0),
     (f"{DRIVE}.node_id", 128),
     (f"{DRIVE}.bitrate", 1_000_001),

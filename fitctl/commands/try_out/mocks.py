@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +23,7 @@ from fitctl.commands.shared.options import (
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError, Fault, Rig, Settings
+from fitctl.config.reading import read_toml
 from fitctl.logging.pictures import LoggedPictures
 from fitctl.mocks.event_loop import run_on_time
 from fitctl.mocks.faults import UnknownFault
@@ -78,15 +78,12 @@ def _with_script(rig: Rig, path: Path) -> Rig:
         If the script cannot be read, or something is wrong in it.
     """
     _, mocks = rig.mock_parts()
+    document = read_toml(path, "no such file; see docs/devices.md for how to write one")
+    if set(document) != {"fault"}:
+        msg = f"{path}: expected [[fault]] tables and nothing else; see docs/devices.md"
+        raise ConfigError(msg)
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-        if set(document) != {"fault"}:
-            msg = f"{path}: expected [[fault]] tables and nothing else; see docs/devices.md"
-            raise ConfigError(msg)
         script = TypeAdapter(list[Fault]).validate_python(document["fault"])
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        msg = f"{path}: cannot be read as TOML: {error}"
-        raise ConfigError(msg) from None
     except ValidationError as error:
         first = error.errors()[0]
         msg = f"{path}: fault {'.'.join(map(str, first['loc']))}: {first['msg']}"

@@ -98,7 +98,7 @@ def _star(rig: Rig, name: str, loop: Loop) -> Iterator[Conflict]:
     key = f"loops.{name}"
     pixel_format = camera.device.pixel_format
     full_dn = FULL_SCALE_DN[pixel_format]
-    part = math.erf(math.sqrt(2) / loop.spot_diameter_px) ** 2  # of its light in the pixel it is on
+    part = loop.brightest_part
     brightest_dn = part * loop.star_flux_dn
     if camera.bias_dn < full_dn < camera.bias_dn + brightest_dn:
         yield Conflict(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import LinAlgWarning
 
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design.basis import Basis, basis, basis_of, on_its_mirror
@@ -114,7 +116,9 @@ def solving(
         One line, where numpy or scipy give up.
     """
     try:
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            # What comes of an ill-conditioned problem is judged: by stability and margins.
+            warnings.simplefilter("ignore", LinAlgWarning)
             yield
     except (ValueError, ArithmeticError) as error:
         where = f"camera and loops.{loop_name}.vernier"

@@ -158,9 +158,18 @@ def in_pairs(roots: Complexes) -> Complexes:
 
 
 def without_fast_poles(compensator: Compensator, count: int = _REMOVED) -> Compensator:
-    """The fastest poles dropped, the gain at rest kept."""
+    """The fastest poles dropped, the gain at rest kept.
+
+    Raises
+    ------
+    ArithmeticError
+        If that would part a pair of complex poles.
+    """
     order = np.argsort(np.abs(compensator.poles))
     kept, removed = compensator.poles[order[:-count]], compensator.poles[order[-count:]]
+    if abs(removed.imag.sum()) > _ROUNDING * np.abs(removed).max():
+        msg = f"dropping the {count} fastest poles of the compensator would part a pair of complex ones"
+        raise ArithmeticError(msg)
     gain = compensator.gain / float(np.real(np.prod(-removed)))
     return Compensator(compensator.zeros, kept, gain, removed)
 

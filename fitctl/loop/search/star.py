@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, AxisPair, Rig
+from fitctl.config.devices import FULL_SCALE_DN
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.spiral import SpiralPlan, plan_spiral
 from fitctl.loop.search.attribution import Attribution
@@ -177,14 +178,22 @@ class StarSearch(SpiralSearch):
         return self._estimator.motor_for_rad(self._middle_px, np.zeros(2))
 
 
-def _too_faint(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
-    """Why a star of this flux could not be found, or nothing."""
+def _too_faint_or_bright(rig: Rig, loop_name: str, star_flux_dn: float | None) -> str:
+    """Why a star of this flux could not be found or measured, or nothing."""
     if star_flux_dn is None:
         return ""
     if not 0 < star_flux_dn < math.inf:
         return f"star_flux_dn must be above 0 (is {star_flux_dn:g})"
-    acquisition = rig.stellar_loops[loop_name].acquisition
-    least_dn = acquisition.detection_sigma * rig.camera.pixel_noise_dn / LARGEST_PEAK
+    loop, camera = rig.stellar_loops[loop_name], rig.camera
+    pixel_format = camera.device.pixel_format
+    full_dn = FULL_SCALE_DN[pixel_format]
+    most_dn = (full_dn - camera.bias_dn) / loop.brightest_part
+    if star_flux_dn > most_dn:
+        return (
+            f"a star of {star_flux_dn:g} DN would saturate its brightest pixel, which counts to {full_dn} as "
+            f"{pixel_format}; at most {most_dn:.0f} DN can be measured; dim it, or expose for less time"
+        )
+    least_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn / LARGEST_PEAK
     if star_flux_dn < least_dn:
         return (
             f"a star of {star_flux_dn:g} DN could not be distinguished from noise; "
@@ -220,7 +229,7 @@ def refused_search(rig: Rig, loop_name: str, asked: Acquire) -> str:
     if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
         return f"field_overlap must lie in {LEAST_OVERLAP:g} to {MOST_OVERLAP:g} (is {overlap:g})"
     return (
-        _too_faint(rig, loop_name, asked.star_flux_dn)
+        _too_faint_or_bright(rig, loop_name, asked.star_flux_dn)
         or _too_fast(rig, loop_name, asked)
         or refused_area(rig.stellar_loops[loop_name], loop_name, asked)
     )

@@ -116,7 +116,7 @@ def test_without_mocks_it_says_so(capsys):
 @pytest.mark.parametrize(
     ("script", "said"),
     [
-        ("nonsense", "cannot be read as TOML"),
+        ("nonsense", "not TOML"),
         ("[fault]\n", "fault"),
         ("[[faults]]\n", "[[fault]] tables"),
         ('[[fault]]\ndevice = "camera"\nkind = "drop"\nwhen = 1\n', "0.when"),

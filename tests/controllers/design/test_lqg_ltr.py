@@ -7,6 +7,7 @@ import pytest
 from fitctl.controllers.design.linear_loop.loopshape import compensator_response
 from fitctl.controllers.design.lqg_ltr import (
     COMPARED_RAD_S,
+    Compensator,
     design_lqg_ltr,
     distance_db_deg,
     distance_from_eq20,
@@ -17,6 +18,7 @@ from fitctl.controllers.design.lqg_ltr import (
     recovery,
     target_loop,
     vernier_compensator,
+    without_fast_poles,
 )
 
 
@@ -120,3 +122,9 @@ def test_roots_that_rounding_has_left_apart_become_pairs():
 def test_roots_that_are_no_pairs_are_refused(roots):
     with pytest.raises(ArithmeticError, match="pairs"):
         in_pairs(np.array(roots))
+
+
+def test_a_pair_of_poles_is_not_parted():
+    poles = np.array([-1.0, -2.0 + 50.0j, -2.0 - 50.0j, -100.0])
+    with pytest.raises(ArithmeticError, match="part a pair"):
+        without_fast_poles(Compensator(np.empty(0, complex), poles, 1.0, np.empty(0, complex)))

@@ -164,6 +164,7 @@ def test_a_finer_search_takes_longer():
         ({"search_radius_sky_arcsec": 1201.0}, "would reach 1201 arcsec"),
         ({"search_radius_sky_arcsec": 0.0}, "must be above 0"),
         ({"star_flux_dn": math.nan}, "star_flux_dn must be above 0"),
+        ({"star_flux_dn": 1e308}, "would saturate its brightest pixel"),
         ({"star_flux_dn": 1.0}, "a star of 1 DN could not be distinguished from noise"),
         ({"search_radius_sky_arcsec": math.nan}, "must be above 0"),
         ({"search_radius_sky_arcsec": math.inf}, "must be above 0"),
