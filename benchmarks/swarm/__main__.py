@@ -1,7 +1,8 @@
 """Swarm: short nights on virtual time in which devices fail and operators meddle, each from one seed.
 
 Prints one JSON object: simulated hours, happenings by kind, pairs of kinds that met within a second, what was
-violated. Exit status 1 if anything was. ``--replay SEED`` repeats one run and prints what happened in it.
+violated, each time with the happenings that suffice for it. Exit status 1 if anything was. ``--replay SEED``
+repeats one run and prints what happened in it.
 """
 
 from __future__ import annotations
@@ -15,29 +16,55 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from itertools import count, repeat
 from random import Random
+from typing import NamedTuple
 
 import msgspec
 
 from benchmarks.swarm.drivers import NIGHTS
 from benchmarks.swarm.past import DEFECTS, put_back
 from benchmarks.swarm.plan import Plan, plan_of
-from benchmarks.swarm.run import Result, run_plan
-from benchmarks.swarm.shrink import shrunk
+from benchmarks.swarm.run import NO_EXCEPTION, Result, failed_run, run_plan
+from benchmarks.swarm.shrink import shrunk, shrunk_from
 from fitctl.logging.records import AnyRecord, Event
 from fitctl.processes import ended_by_signals
 
 _RUNS_A_SEED = 1_000_000
 _MET_S = 1.0
 _SHOWN = 10
+_MOST_TRIALS = 100  # runs in which the plan of a violation is shrunk
+_DIED = "a process of the swarm died in one of these seeds: "
 
 
-def run_seed(seed: int, defect: str = "") -> tuple[Plan, Result]:
+class Run(NamedTuple):
+    """One run of a seed; `shrunk` is what remains of a plan that violated something."""
+
+    plan: Plan
+    result: Result
+    shrunk: Plan | None = None
+
+
+def run_seed(seed: int, defect: str = "") -> Run:
     """One run, with a defect of the past put back; for a process of its own."""
-    plan = plan_of(seed)
+    try:
+        plan = plan_of(seed)
+    except Exception as error:
+        return Run(
+            Plan(seed=seed, rig="", settings=[], duration_s=0.0, happenings=[]), failed_run(error)
+        )
     with put_back(defect):
-        return plan, run_plan(plan)
+        return Run(plan, run_plan(plan))
+
+
+def run_and_shrink(seed: int) -> Run:
+    """One run; if it violates something, also the plan without what that does not need."""
+    run = run_seed(seed)
+    violations = run.result.violations
+    if not violations:
+        return run
+    return run._replace(shrunk=shrunk_from(run.plan, violations[0], _MOST_TRIALS))
 
 
 def met(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -52,7 +79,10 @@ def met(plan: Plan) -> Iterator[tuple[str, str]]:
 
 
 def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
-    """Run until so many hours are simulated, a thing was violated in ten runs, or somebody presses Ctrl-C."""
+    """Run until so many hours are simulated, a thing was violated in ten runs, or somebody presses Ctrl-C.
+
+    It also ends, with the object as it then is, if a process of the pool dies.
+    """
     started_s, simulated_s, cpu_s, runs = time.monotonic(), 0.0, 0.0, 0
     kinds: Counter[str] = Counter()
     modes: Counter[str] = Counter()
@@ -62,13 +92,22 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
     ending = threading.Event()
     # Its processes inherit the handler, and finish their runs.
     with ended_by_signals(ending.set), ProcessPoolExecutor(jobs) as pool:
-        running: set[Future[tuple[Plan, Result]]] = set()
+        running: dict[Future[Run], int] = {}
         while simulated_s < 3600 * hours and len(found) < _SHOWN and not ending.is_set():
-            while len(running) < 2 * jobs:
-                running.add(pool.submit(run_seed, next(seeds)))
-            done, running = wait(running, return_when=FIRST_COMPLETED)
+            try:
+                while len(running) < 2 * jobs:
+                    begun = next(seeds)
+                    running[pool.submit(run_and_shrink, begun)] = begun
+                done, _ = wait(running, return_when=FIRST_COMPLETED)
+                ended = [future.result() for future in done]
+            except BrokenProcessPool:
+                detail = _DIED + ", ".join(map(str, sorted(running.values())))
+                found.append({"violated": [{"invariant": NO_EXCEPTION, "detail": detail}]})
+                break
             for future in done:
-                plan, result = future.result()
+                del running[future]
+            for run in ended:
+                plan, result = run.plan, run.result
                 runs += 1
                 simulated_s += result.lasted_s
                 cpu_s += result.cpu_s
@@ -76,7 +115,7 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
                 modes.update(result.modes)
                 pairs.update(met(plan))
                 if result.violations:
-                    found.append(_finding(plan, result))
+                    found.append(finding(run))
                     print(f"\n{json.dumps(found[-1])}", file=sys.stderr, flush=True)
             _progress(simulated_s / 3600, hours, len(found), started_s)
         pool.shutdown(cancel_futures=True)
@@ -86,7 +125,7 @@ def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
         "runs": runs,
         "simulated_hours": round(simulated_s / 3600, 3),
         "took_s": round(took_s, 1),
-        "real_time_factor_per_core": round(simulated_s / cpu_s, 1),
+        "real_time_factor_per_core": round(simulated_s / cpu_s, 1) if cpu_s else None,
         "happenings": dict(kinds.most_common()),
         "modes_entered": dict(modes.most_common()),
         "kinds_that_met_within_1_s": len(pairs),
@@ -101,7 +140,9 @@ def find(defect: str, seed: int, hours: float, jobs: int) -> dict[str, object]:
     with ProcessPoolExecutor(jobs) as pool:
         while simulated_s < 3600 * hours:
             first = seed * _RUNS_A_SEED + runs
-            for plan, result in pool.map(run_seed, range(first, first + 2 * jobs), repeat(defect)):
+            for plan, result, _ in pool.map(
+                run_seed, range(first, first + 2 * jobs), repeat(defect)
+            ):
                 runs += 1
                 simulated_s += result.lasted_s
                 if result.violations:
@@ -115,11 +156,17 @@ def find(defect: str, seed: int, hours: float, jobs: int) -> dict[str, object]:
     return {"hours": None, "not_in_hours": round(simulated_s / 3600, 3), "runs": runs}
 
 
-def _finding(plan: Plan, result: Result) -> dict[str, object]:
+def finding(run: Run) -> dict[str, object]:
+    """What the object says of a run that violated something."""
+    plan, result, fewest = run
     return {
         "seed": plan.seed,
         "replay": f"python -m benchmarks.swarm --replay {plan.seed}",
+        "rig": plan.rig,
+        "settings": list(plan.settings),
         "violated": [violation._asdict() for violation in result.violations],
+        "happenings": len(plan.happenings),
+        "remain": [] if fewest is None else msgspec.to_builtins(fewest.happenings),
     }
 
 

@@ -75,6 +75,7 @@ from fitctl.stages.periodic import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
 
 RIGS = Path(__file__).parents[2] / "rigs"
+NO_EXCEPTION = "no exception escapes"
 HEAL_S = 60.0  # within which a loop must hold its star again
 _HISTORY_S = 20.0  # a frame may come so late, after several stalls in a row
 _ANSWER_S = 5.0
@@ -508,8 +509,24 @@ class Instrument:
 
 
 def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None) -> Result:
-    """Run a plan, then heal everything, and require the stars to be held."""
+    """Run a plan, then heal everything, and require the stars to be held.
+
+    An exception of the run itself is a violation too.
+    """
     began_s = process_time()
+    try:
+        return _run(plan, on_record, began_s)
+    except Exception as error:
+        return failed_run(error, process_time() - began_s)
+
+
+def failed_run(error: Exception, cpu_s: float = 0.0) -> Result:
+    """The result of a run that ended in an exception."""
+    violation = Violation(NO_EXCEPTION, 0.0, f"the run: {_told(error)}")
+    return Result(digest="", lasted_s=0.0, modes={}, violations=[violation], cpu_s=cpu_s)
+
+
+def _run(plan: Plan, on_record: Callable[[AnyRecord], None], began_s: float) -> Result:
     rig = load_rig(RIGS / plan.rig, plan.settings)
     time = VirtualTime()
     random = Random(f"{plan.seed} subscribers")  # noqa: S311 - a repeatable draw
@@ -520,21 +537,22 @@ def run_plan(plan: Plan, on_record: Callable[[AnyRecord], None] = lambda _: None
         client_installed(time, subscribers),
         service_installed(time, Random(f"{plan.seed} service")),  # noqa: S311
     ):
-        instrument = Instrument(rig, plan, time, subscribers, on_record)
-        for happening in plan.happenings:
-            time.call_at(happening.at_s, partial(instrument.happen, happening))
-        end_s = 0.0
-        while end_s < plan.duration_s:
-            end_s += 1.0
-            time.run_until(end_s)
-            instrument.answers_due()
-        _recover(instrument)
-        instrument.account_for_records()
-        time.end()
+        try:
+            instrument = Instrument(rig, plan, time, subscribers, on_record)
+            for happening in plan.happenings:
+                time.call_at(happening.at_s, partial(instrument.happen, happening))
+            end_s = 0.0
+            while end_s < plan.duration_s:
+                end_s += 1.0
+                time.run_until(end_s)
+                instrument.answers_due()
+            _recover(instrument)
+            instrument.account_for_records()
+        finally:
+            time.end()
     violations = instrument.invariants.violations
     violations += [
-        Violation("no exception escapes", 0.0, f"{name}: {_told(error)}")
-        for name, error in time.escaped
+        Violation(NO_EXCEPTION, 0.0, f"{name}: {_told(error)}") for name, error in time.escaped
     ]
     return Result(
         digest=instrument.digest,

@@ -2,27 +2,48 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
+from benchmarks.swarm.invariants import Violation
 from benchmarks.swarm.plan import Happening, Plan
 from benchmarks.swarm.run import run_plan
 
 
-def shrunk(plan: Plan) -> Plan:
-    """Leave out ever smaller parts of the plan's happenings, as long as its first violation stays."""
+def shrunk(plan: Plan, most_runs: float = math.inf) -> Plan:
+    """Leave out parts of the plan's happenings, as long as its first violation stays.
+
+    Parameters
+    ----------
+    plan : Plan
+    most_runs : float
+        After so many trial runs, the plan is returned as it then is.
+    """
     violations = run_plan(plan).violations
-    if not violations:
-        return plan
-    wanted = violations[0].invariant
+    return shrunk_from(plan, violations[0], most_runs) if violations else plan
+
+
+def shrunk_from(plan: Plan, violation: Violation, most_runs: float = math.inf) -> Plan:
+    """As :func:`shrunk`, for a plan whose first violation is known."""
+    runs = 0
 
     def violates(happenings: list[Happening]) -> bool:
+        nonlocal runs
+        runs += 1
         found = run_plan(msgspec.structs.replace(plan, happenings=happenings)).violations
-        return any(violation.invariant == wanted for violation in found)
+        return any(one.invariant == violation.invariant for one in found)
 
     happenings, parts = list(plan.happenings), 2
-    while len(happenings) > 1:
+    # Most of what comes after the violation cannot have caused it.
+    before = [happening for happening in happenings if happening.at_s <= violation.at_s]
+    if 0 < len(before) < len(happenings) and most_runs > 0 and violates(before):
+        happenings = before
+    while len(happenings) > 1 and runs < most_runs:
         size = -(-len(happenings) // parts)
         for start in range(0, len(happenings), size):
+            if runs >= most_runs:
+                break
             fewer = happenings[:start] + happenings[start + size :]
             if violates(fewer):
                 happenings, parts = fewer, max(parts - 1, 2)

@@ -44,7 +44,8 @@ class VirtualTime:
     Attributes
     ----------
     escaped : list of (str, Exception)
-        What ended a thread, and its name.
+        Each exception that ended a thread, with the thread's name, or that a function raised which
+        :meth:`call_at` was given, with that function's name.
     """
 
     def __init__(self) -> None:
@@ -192,7 +193,15 @@ class VirtualTime:
                 if self._over:
                     raise GreenletExit
                 return
-            run()
+            self._call(run)
+
+    def _call(self, function: Callable[[], None]) -> None:
+        """Call what was due. What it raises must not reach the thread that happens to switch."""
+        try:
+            function()
+        except Exception as error:
+            named = getattr(function, "func", function)  # that of a partial
+            self.escaped.append((getattr(named, "__qualname__", repr(named)), error))
 
 
 class _Waiters:

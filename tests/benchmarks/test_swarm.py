@@ -8,7 +8,9 @@ import sys
 import msgspec
 import pytest
 
-from benchmarks.swarm.__main__ import met
+from benchmarks.swarm import __main__ as swarm_main
+from benchmarks.swarm import run as swarm_run
+from benchmarks.swarm.__main__ import finding, met, run_and_shrink, run_seed
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike, plan_of
 from benchmarks.swarm.run import run_plan
@@ -80,6 +82,70 @@ def test_a_plan_is_shrunk_to_what_violates():
 
     with put_back("stop-while-opening"):
         assert shrunk(plan).happenings == OVERTAKEN.happenings
+
+
+@pytest.mark.long
+def test_shrinking_ends_after_so_many_runs(monkeypatch):
+    runs = []
+
+    def counted(plan):
+        runs.append(plan)
+        return run_plan(plan)
+
+    monkeypatch.setattr("benchmarks.swarm.shrink.run_plan", counted)
+    idle = [Order(at_s=0.01 * number, who="ada", command=Release()) for number in range(6, 9)]
+    plan = msgspec.structs.replace(OVERTAKEN, happenings=[*idle, *OVERTAKEN.happenings])
+    with put_back("stop-while-opening"):
+        shrunk(plan, most_runs=2)
+
+    assert len(runs) == 1 + 2  # the first finds the violation
+
+
+@pytest.mark.long
+def test_what_a_seed_violates_is_shrunk_at_once(monkeypatch):
+    monkeypatch.setattr(swarm_main, "plan_of", lambda seed: OVERTAKEN)
+    with put_back("stop-while-opening"):
+        found = finding(run_and_shrink(1))
+
+    assert found["replay"] == "python -m benchmarks.swarm --replay 1"
+    assert found["violated"][0]["invariant"] == "a stop has the last word"
+    assert [happening["type"] for happening in json.loads(json.dumps(found))["remain"]] == [
+        "order"
+    ] * len(OVERTAKEN.happenings)
+
+
+def fails(*_args, **_kwargs):
+    msg = "a mistake of the swarm"
+    raise ValueError(msg)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(swarm_main, "plan_of"), (swarm_run, "load_rig"), (swarm_run, "_recover")]
+)
+def test_an_exception_of_the_run_itself_is_a_violation_of_its_seed(monkeypatch, owner, name):
+    quiet = msgspec.structs.replace(OVERTAKEN, duration_s=0.1, happenings=[])
+    monkeypatch.setattr(swarm_main, "plan_of", lambda seed: quiet)
+    monkeypatch.setattr(owner, name, fails)
+    found = finding(run_and_shrink(7))
+
+    assert found["violated"][0]["invariant"] == "no exception escapes"
+    assert "a mistake of the swarm" in found["violated"][0]["detail"]
+    assert run_seed(7).result.lasted_s == 0.0
+
+
+def test_what_is_called_at_a_time_and_fails_reaches_no_thread(time):
+    seen = []
+
+    def thread():
+        time.sleep_until(2.0)
+        seen.append(time.now_s())
+
+    time.spawn(thread, "waits")
+    time.call_at(1.0, fails)
+    time.run_until(3.0)
+
+    assert seen == [2.0]
+    assert [(name, type(error)) for name, error in time.escaped] == [("fails", ValueError)]
 
 
 def test_a_plan_has_commands_and_faults_in_their_order():
